@@ -1,0 +1,401 @@
+"""Frozen configurations with the paper's values as defaults, and the presets.
+
+Fields marked "reading" settle what the paper leaves open; ``docs/assumptions.md`` lists them all.
+Variants are made with :func:`dataclasses.replace`; every configuration is hashable and validated.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+
+def _check(condition: bool, field: str, got: object, expected: str) -> None:
+    if not condition:
+        raise ValueError(f"{field}: got {got!r}, expected {expected}")
+
+
+def _check_choices(config: Any) -> None:
+    """Every ``Literal`` field of a configuration holds one of its choices."""
+    for name, hint in get_type_hints(type(config)).items():
+        if get_origin(hint) is Literal:
+            value = getattr(config, name)
+            choices = get_args(hint)
+            _check(value in choices, name, value, "one of " + ", ".join(map(repr, choices)))
+
+
+@dataclasses.dataclass(frozen=True)
+class ProjectionConfig:
+    """Points to range image (paper, sections 3.1 and 3.2)."""
+
+    num_rounds: int = 5
+    """Rounds of the multi-round projection."""
+    prioritize_current: bool = True
+    """Points of the current sweep win every collision with older ones (table 2)."""
+    remove_close: Literal["all", "sweeps", "none"] = "all"
+    """Reading: drop the points on the car itself, ``|x|, |y| < close_m``, of all sweeps, of the older sweeps
+    only, or not at all."""
+    close_m: float = 1.0
+    """Reading: half the side of the square that ``remove_close`` empties, metres."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(self.num_rounds >= 1, "num_rounds", self.num_rounds, "at least 1")
+        _check(self.close_m > 0, "close_m", self.close_m, "a positive number of metres")
+        _check_choices(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class StemConfig:
+    """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
+
+    groups: Literal["types", "modalities", "all"] = "types"
+    """9 groups by channel type, 5 by modality, or one group (table 3)."""
+    group_rounds: bool = True
+    """All rounds of a channel type share a group (table 3, last row: False)."""
+    num_convs: int = 2
+    """3x3 grouped convolutions a branch (table 4)."""
+    dilations: tuple[int, ...] = (1, 3, 6)
+    """One parallel branch each, summed (table 5)."""
+    channels_per_type: int = 32
+    """Features of one channel type."""
+    out_channels: int = 64
+    """Channels after the 1x1 merge."""
+    merge: Literal["per_branch", "shared"] = "per_branch"
+    """Reading: every branch has its own 1x1 merge, or one is shared."""
+    form: Literal["split", "grouped"] = "split"
+    """The same function in two formulations: independent chains (fast on CPU), or
+    ``feature_group_count``. Parameters are interchangeable."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(self.num_convs >= 1, "num_convs", self.num_convs, "at least 1")
+        _check(
+            len(self.dilations) >= 1 and min(self.dilations) >= 1,
+            "dilations",
+            self.dilations,
+            "one or more integers of at least 1",
+        )
+        _check(
+            self.group_rounds or self.groups == "types",
+            "group_rounds",
+            self.group_rounds,
+            "True unless groups is 'types'",
+        )
+        _check_choices(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """LiDAR-Net, feature pyramid and heads (paper, section 3.4)."""
+
+    num_classes: int = 10
+    """Foreground classes; the logits have one more, the background, last."""
+    stem: StemConfig = StemConfig()
+    """Modality-wise convolutions."""
+    row_upscale: int = 2
+    """Rows are repeated this many times (paper, section 4)."""
+    circular_width: bool = False
+    """Reading: wrap every convolution around the azimuth instead of the paper's zero padding; the azimuth is
+    then binned into a width divisible by 32."""
+    backbone_blocks: tuple[int, int, int, int] = (4, 4, 1, 1)
+    """Bottlenecks a stage."""
+    backbone_widths: tuple[int, int, int, int] = (64, 128, 128, 128)
+    """Bottleneck widths; a stage puts out four times as many channels."""
+    fpn_channels: int = 256
+    """Reading: channels of P2..P7."""
+    head_channels: int = 64
+    """Channels of both towers (128 for the test set)."""
+    head_convs: int = 4
+    """3x3 convolutions a tower."""
+    tied_heads: bool = False
+    """Share the heads between the levels (table 6)."""
+    background_prior: float = 0.99
+    """Reading: the background's probability at the start."""
+    channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
+    """Reading: subtracted from the nine channels at the network's door."""
+    channel_scale: tuple[float, ...] = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
+    """Reading: the nine channels are divided by it."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(self.num_classes >= 1, "num_classes", self.num_classes, "at least 1")
+        _check(self.row_upscale >= 1, "row_upscale", self.row_upscale, "at least 1")
+        _check(len(self.backbone_blocks) == 4, "backbone_blocks", self.backbone_blocks, "four stages")
+        _check(len(self.backbone_widths) == 4, "backbone_widths", self.backbone_widths, "four stages")
+        _check(self.head_convs >= 1, "head_convs", self.head_convs, "at least 1")
+        _check(
+            0 < self.background_prior < 1,
+            "background_prior",
+            self.background_prior,
+            "a probability between 0 and 1",
+        )
+        _check(len(self.channel_mean) == 9, "channel_mean", self.channel_mean, "nine numbers")
+        _check(
+            len(self.channel_scale) == 9 and min(self.channel_scale) > 0,
+            "channel_scale",
+            self.channel_scale,
+            "nine positive numbers",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Assignment and losses (paper, section 3.4)."""
+
+    top_q: int = 20
+    """Q: K of a box is the rounded sum of its Q highest IoUs."""
+    regress_on: Literal["positives", "candidates"] = "positives"
+    """Reading: box and IoU losses act on the positives, or on all locations inside a box."""
+    iou_loss: Literal["iou", "log_iou", "giou", "diou"] = "iou"
+    """Reading: 1 - IoU, UnitBox's -ln IoU, or the generalised and distance forms."""
+    classification_weight: float = 1.0
+    """Reading: of the cross-entropy."""
+    l1_weight: float = 0.25
+    """Reading: of the L1 loss."""
+    iou_weight: float = 1.0
+    """Reading: of the IoU loss."""
+    iou_prediction_weight: float = 1.0
+    """Reading: of the binary cross-entropy of the predicted IoU."""
+    velocity_weight: float = 0.2
+    """Reading: of the two velocity numbers within the L1 loss."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(self.top_q >= 1, "top_q", self.top_q, "at least 1")
+        for name in (
+            "classification_weight",
+            "l1_weight",
+            "iou_weight",
+            "iou_prediction_weight",
+            "velocity_weight",
+        ):
+            value = getattr(self, name)
+            _check(math.isfinite(value) and value >= 0, name, value, "a finite number of at least 0")
+        _check_choices(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class InferenceConfig:
+    """Predictions to detections (paper, section 3.4)."""
+
+    min_probability: float = 0.01
+    """Candidates need a class probability above this, before the IoU factor."""
+    iou_threshold: float = 0.2
+    """NMS suppresses what overlaps a better box of its class by more than this."""
+    max_detections: int = 500
+    """Boxes kept."""
+    candidates_per_level: int = 1000
+    """Reading: (location, class) pairs that enter NMS from each level."""
+    nms_overlap: Literal["bev", "3d"] = "bev"
+    """Reading: rotated IoU in the ground plane, or of the boxes."""
+    nms_form: Literal["rows", "matrix"] = "rows"
+    """The same NMS in two formulations: one row of IoUs per kept box (fast on CPU), or the whole matrix and a
+    fixed point (for GPUs)."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(0 <= self.min_probability < 1, "min_probability", self.min_probability, "within [0, 1)")
+        _check(0 <= self.iou_threshold <= 1, "iou_threshold", self.iou_threshold, "within [0, 1]")
+        _check(self.max_detections >= 1, "max_detections", self.max_detections, "at least 1")
+        _check(
+            self.candidates_per_level >= 1, "candidates_per_level", self.candidates_per_level, "at least 1"
+        )
+        _check_choices(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class AugmentConfig:
+    """On-device augmentation of points and boxes together (paper, section 4)."""
+
+    flip_x_probability: float = 0.5
+    """Reading: of x -> -x."""
+    flip_y_probability: float = 0.5
+    """Reading: of y -> -y, drawn independently."""
+    max_rotation_rad: float = math.pi
+    """The rotation about z is uniform within plus and minus this."""
+    scale_range: tuple[float, float] = (0.95, 1.05)
+    """The scale is uniform within it."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        for name in ("flip_x_probability", "flip_y_probability"):
+            _check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
+        _check(self.max_rotation_rad >= 0, "max_rotation_rad", self.max_rotation_rad, "at least 0")
+        low, high = self.scale_range
+        _check(0 < low <= high, "scale_range", self.scale_range, "(low, high) with 0 < low <= high")
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimizerConfig:
+    """One-cycle AdamW (paper, section 4)."""
+
+    peak_learning_rate: float = 1e-2
+    """At the end of the warm-up."""
+    initial_divisor: float = 10.0
+    """The first learning rate is the peak divided by it."""
+    final_divisor: float = 1e4
+    """The last learning rate is the first divided by it."""
+    warmup_fraction: float = 0.4
+    """Part of the steps on the way up."""
+    b1_range: tuple[float, float] = (0.85, 0.95)
+    """Momentum: high at both ends, low at the peak of the learning rate; cosine (reading)."""
+    b2: float = 0.99
+    """Reading: decay of the second moment."""
+    weight_decay: float = 0.01
+    """On all parameters (reading)."""
+    max_gradient_norm: float = 35.0
+    """Reading: global-norm clipping."""
+    batch_size: int = 32
+    """Reading: samples a step over all devices."""
+    epochs: int = 40
+    """Passes over the training set."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(self.peak_learning_rate > 0, "peak_learning_rate", self.peak_learning_rate, "above 0")
+        _check(0 < self.warmup_fraction < 1, "warmup_fraction", self.warmup_fraction, "between 0 and 1")
+        _check(self.max_gradient_norm > 0, "max_gradient_norm", self.max_gradient_norm, "above 0")
+        _check(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
+        _check(self.epochs >= 1, "epochs", self.epochs, "at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """All that defines a detector and its training, but for the data.
+
+    >>> from dataclasses import replace
+    >>> variant = replace(NUSCENES, projection=replace(NUSCENES.projection, num_rounds=3))
+    >>> variant.projection.num_rounds, variant == NUSCENES
+    (3, False)
+    """
+
+    name: str = "nuscenes"
+    """Preset it started from."""
+    sensor: str = "nuscenes_hdl32e"
+    """Sensor preset, or the path of a sensor file."""
+    num_sweeps: int = 10
+    """Sweeps fused into one cloud, the current one included."""
+    max_points: int = 300_000
+    """Reading: rows a fused cloud is padded to."""
+    max_boxes: int = 256
+    """Reading: rows the ground truth is padded to."""
+    fade_epochs: int = 0
+    """Last epochs without copy-paste (paper, section 4.5: 5 for the test set); see
+    :func:`fcos_lidar_jax.augment.copy_paste_active`."""
+    projection: ProjectionConfig = ProjectionConfig()
+    """Points to range image."""
+    model: ModelConfig = ModelConfig()
+    """The network."""
+    loss: LossConfig = LossConfig()
+    """Assignment and losses."""
+    inference: InferenceConfig = InferenceConfig()
+    """Predictions to detections."""
+    augment: AugmentConfig | None = AugmentConfig()
+    """Augmentation of a training step; None for none."""
+    optimizer: OptimizerConfig = OptimizerConfig()
+    """Optimizer and schedule."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(self.num_sweeps >= 1, "num_sweeps", self.num_sweeps, "at least 1")
+        _check(self.max_points >= 1, "max_points", self.max_points, "at least 1")
+        _check(self.max_boxes >= 1, "max_boxes", self.max_boxes, "at least 1")
+        _check(self.fade_epochs >= 0, "fade_epochs", self.fade_epochs, "at least 0")
+
+
+NUSCENES = Config()
+"""The paper's detector: ten sweeps, five rounds."""
+
+NUSCENES_SINGLE = dataclasses.replace(NUSCENES, name="nuscenes_single", num_sweeps=1, max_points=40_000)
+"""The paper's single-frame detector: the same network on one sweep, five rounds too."""
+
+NUSCENES_TEST = dataclasses.replace(
+    NUSCENES,
+    name="nuscenes_test",
+    fade_epochs=5,
+    model=dataclasses.replace(NUSCENES.model, head_channels=128),
+)
+"""The paper's test-set model "c128" (section 4.5): wider heads, fade strategy."""
+
+QUICKSTART = dataclasses.replace(
+    NUSCENES,
+    name="quickstart",
+    sensor="tiny",
+    num_sweeps=1,
+    max_points=4096,
+    max_boxes=32,
+    projection=ProjectionConfig(num_rounds=1),
+    model=dataclasses.replace(
+        NUSCENES.model,
+        stem=StemConfig(channels_per_type=4, out_channels=16),
+        backbone_widths=(16, 32, 32, 32),
+        fpn_channels=32,
+        head_channels=32,
+    ),
+    inference=InferenceConfig(candidates_per_level=200, max_detections=100),
+    optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=4),
+)
+"""Small enough to train on two CPU cores: the same code, other numbers."""
+
+PRESETS: dict[str, Config] = {c.name: c for c in (NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, QUICKSTART)}
+"""Name -> configuration."""
+
+
+def config_to_json(config: Config) -> dict[str, Any]:
+    """The configuration as a JSON object.
+
+    >>> config_from_json(config_to_json(QUICKSTART)) == QUICKSTART
+    True
+    """
+    return dataclasses.asdict(config)
+
+
+def config_from_json(record: Any, where: str = "config") -> Config:
+    """A configuration from the JSON object that :func:`config_to_json` wrote.
+
+    Args:
+        record: the parsed JSON value.
+        where: what to call the source in messages.
+
+    Raises:
+        ValueError: naming ``where``, the field, what was found and what was expected.
+    """
+    return _from_json(Config, record, where)
+
+
+def _from_json(kind: Any, value: Any, where: str) -> Any:
+    """``value`` as the type ``kind``: a configuration, a tuple, a choice or a plain value."""
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{where}: got {type(value).__name__}, expected a JSON object")
+        hints = get_type_hints(kind)
+        for name in value:
+            if name not in hints:
+                raise ValueError(f"{where}.{name}: unknown field, expected one of {', '.join(hints)}")
+        for name in hints:
+            if name not in value:
+                raise ValueError(f"{where}.{name}: missing")
+        fields = {name: _from_json(hint, value[name], f"{where}.{name}") for name, hint in hints.items()}
+        try:
+            return kind(**fields)  # type: ignore[operator]
+        except ValueError as error:
+            raise ValueError(f"{where}.{error}") from None
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{where}: got {value!r}, expected a list")
+        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
+        if len(kinds) != len(value):
+            raise ValueError(f"{where}: got {len(value)} values, expected {len(kinds)}")
+        return tuple(
+            _from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True))
+        )
+    if args:  # AugmentConfig | None
+        return None if value is None else _from_json(args[0], value, where)
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{where}: got {value!r}, expected {kind.__name__}")
+    return kind(value)

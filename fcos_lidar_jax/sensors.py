@@ -1,0 +1,240 @@
+"""What a LiDAR is, as data: beams, columns, limits. Presets and sensors read from a file."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """A rotating LiDAR, reduced to what the range view needs (paper, section 3.1).
+
+    Attributes:
+        name: for messages and pictures.
+        inclinations_rad: the beams' inclinations in radians, one per image row, strictly falling: row 0 is
+            the highest beam. For a sensor whose rows come from the laser number the table is nominal.
+        num_columns: azimuth bins of one turn. Columns run clockwise, column 0 starts at azimuth pi.
+        origin_m: the sensor's position in the frame of the points; subtracted before equation 1.
+        limit_xy_m: points with ``|x|`` or ``|y|`` at or beyond it are dropped (point frame, metres).
+        limit_z_m: points with z outside this open interval are dropped (point frame, metres).
+        intensity_scale: a file's intensity times this is on the scale 0-255.
+        row_source: ``"inclination"`` bins the angle of each point; ``"laser"`` reads the row from a sixth
+            point column, for stacked sensors whose inclinations overlap.
+
+    Raises:
+        ValueError: at construction, naming the field, what was found and what was expected.
+
+    >>> NUSCENES_HDL32E.num_rows, NUSCENES_HDL32E.num_columns
+    (32, 1086)
+    """
+
+    name: str
+    inclinations_rad: tuple[float, ...]
+    num_columns: int
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    limit_xy_m: float = 54.0
+    limit_z_m: tuple[float, float] = (-5.0, 3.0)
+    intensity_scale: float = 1.0
+    row_source: Literal["inclination", "laser"] = "inclination"
+
+    def __post_init__(self) -> None:
+        """Refuse a sensor that no image can be built from."""
+        table = np.asarray(self.inclinations_rad, np.float64)
+        if table.ndim != 1 or table.size < 2:
+            raise ValueError(f"inclinations_rad: got {table.size} beams, expected at least 2")
+        if not np.isfinite(table).all() or np.abs(table).max() > math.pi / 2:
+            raise ValueError("inclinations_rad: expected finite radians within [-pi/2, pi/2]")
+        if not (np.diff(table) < 0).all():
+            raise ValueError("inclinations_rad: expected strictly falling values, the highest beam first")
+        if not isinstance(self.num_columns, int) or self.num_columns < 2:
+            raise ValueError(f"num_columns: got {self.num_columns!r}, expected an integer of at least 2")
+        if len(self.origin_m) != 3 or not np.isfinite(self.origin_m).all():
+            raise ValueError(f"origin_m: got {self.origin_m!r}, expected three finite numbers")
+        if not self.limit_xy_m > 0:
+            raise ValueError(f"limit_xy_m: got {self.limit_xy_m!r}, expected a positive number")
+        if len(self.limit_z_m) != 2 or not self.limit_z_m[0] < self.limit_z_m[1]:
+            raise ValueError(f"limit_z_m: got {self.limit_z_m!r}, expected (low, high) with low < high")
+        if not (math.isfinite(self.intensity_scale) and self.intensity_scale > 0):
+            raise ValueError(f"intensity_scale: got {self.intensity_scale!r}, expected a positive number")
+        if self.row_source not in ("inclination", "laser"):
+            raise ValueError(f"row_source: got {self.row_source!r}, expected 'inclination' or 'laser'")
+
+    @property
+    def num_rows(self) -> int:
+        """Image rows: one per beam."""
+        return len(self.inclinations_rad)
+
+    @property
+    def point_columns(self) -> int:
+        """Columns of this sensor's point arrays: five, or six with the laser number."""
+        return 6 if self.row_source == "laser" else 5
+
+    @property
+    def even_step_rad(self) -> float | None:
+        """The beams' spacing where it is even (rows are then found by arithmetic), else None."""
+        steps = -np.diff(np.asarray(self.inclinations_rad, np.float64))
+        return float(steps.mean()) if np.abs(steps - steps.mean()).max() < 1e-9 else None
+
+    @property
+    def row_edges_rad(self) -> tuple[float, ...]:
+        """Upper edges of all rows and the lower edge of the last, falling: midpoints between the beams."""
+        table = np.asarray(self.inclinations_rad, np.float64)
+        middle = (table[1:] + table[:-1]) / 2
+        first = table[0] + (table[0] - table[1]) / 2
+        last = table[-1] - (table[-2] - table[-1]) / 2
+        return tuple(float(v) for v in (first, *middle, last))
+
+
+def even_inclinations(lowest_deg: float, highest_deg: float, num_rows: int) -> tuple[float, ...]:
+    """Evenly spaced beams, both ends included, highest first, in radians.
+
+    >>> [round(math.degrees(v), 2) for v in even_inclinations(-30.67, 10.67, 3)]
+    [10.67, -10.0, -30.67]
+    """
+    return tuple(float(v) for v in np.radians(np.linspace(highest_deg, lowest_deg, num_rows)))
+
+
+NUSCENES_HDL32E = Sensor("nuscenes_hdl32e", even_inclinations(-30.67, 10.67, 32), 1086)
+"""nuScenes ``LIDAR_TOP`` (paper, section 3.1): frame x right, y forward, z up."""
+
+KITTI_HDL64E = Sensor(
+    "kitti_hdl64e",
+    # Two laser blocks: the upper 32 a third of a degree apart, the lower 32 half a degree apart.
+    tuple(float(v) for v in np.radians([*(2.0 - np.arange(32) / 3), *(-8.83 - np.arange(32) / 2)])),
+    2048,
+    limit_xy_m=75.0,
+    intensity_scale=255.0,
+)
+"""KITTI's HDL-64E, nominal beam table; intensity in the files is 0-1."""
+
+WAYMO_TOP = Sensor(
+    "waymo_top",
+    even_inclinations(-17.6, 2.4, 64),
+    2650,
+    origin_m=(1.43, 0.0, 2.184),
+    limit_xy_m=75.0,
+    limit_z_m=(-3.0, 5.0),
+    intensity_scale=255.0,
+)
+"""Waymo's top LiDAR, points in the vehicle frame. The beams are nominal: real calibrations carry a table,
+which belongs into a sensor file."""
+
+ARGOVERSE2 = Sensor(
+    "argoverse2",
+    even_inclinations(-25.0, 15.0, 64),
+    1800,
+    origin_m=(1.35, 0.0, 1.64),
+    limit_xy_m=100.0,
+    limit_z_m=(-3.0, 5.0),
+    row_source="laser",
+)
+"""Argoverse 2: two stacked 32-beam sensors whose inclinations overlap; the row is the laser number 0-63."""
+
+TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, limit_xy_m=25.0)
+"""A 16-beam sensor with a short reach, for tests and the quickstart."""
+
+PRESETS: dict[str, Sensor] = {
+    s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY)
+}
+"""Name -> sensor."""
+
+
+def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
+    """The sensor as the JSON object that :func:`sensor_from_json` reads.
+
+    >>> sensor_from_json(sensor_to_json(TINY)) == TINY
+    True
+    """
+    return dataclasses.asdict(sensor)
+
+
+def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
+    """A sensor from a JSON object.
+
+    The fields are those of :class:`Sensor`. Beams may be given as ``inclinations_rad`` (a list) or, evenly
+    spaced, as ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}``.
+
+    Args:
+        record: the parsed JSON value.
+        where: what to call the source in messages.
+
+    Raises:
+        ValueError: naming ``where``, the field, what was found and what was expected.
+
+    >>> beams = {"lowest": -25, "highest": 3, "rows": 64}
+    >>> sensor_from_json({"name": "mine", "num_columns": 1024, "inclinations_deg": beams}).num_rows
+    64
+    """
+    if not isinstance(record, dict):
+        raise ValueError(f"{where}: got {type(record).__name__}, expected a JSON object")
+    record = dict(record)
+    if "inclinations_deg" in record:
+        even = record.pop("inclinations_deg")
+        if not isinstance(even, dict) or set(even) != {"lowest", "highest", "rows"}:
+            raise ValueError(f"{where}: inclinations_deg: expected an object with lowest, highest and rows")
+        _expect_number(even["lowest"], f"{where}: inclinations_deg.lowest")
+        _expect_number(even["highest"], f"{where}: inclinations_deg.highest")
+        if not isinstance(even["rows"], int) or even["rows"] < 2:
+            raise ValueError(f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected an integer >= 2")
+        record["inclinations_rad"] = even_inclinations(even["lowest"], even["highest"], even["rows"])
+    fields = {f.name: f for f in dataclasses.fields(Sensor)}
+    unknown = sorted(set(record) - set(fields))
+    if unknown:
+        raise ValueError(f"{where}: {unknown[0]}: unknown field, expected one of {', '.join(sorted(fields))}")
+    for name, field in fields.items():
+        if name not in record:
+            if field.default is dataclasses.MISSING:
+                raise ValueError(f"{where}: {name}: missing")
+            continue
+        value = record[name]
+        if name in ("inclinations_rad", "origin_m", "limit_z_m"):
+            if not isinstance(value, list | tuple):
+                raise ValueError(f"{where}: {name}: got {value!r}, expected a list of numbers")
+            for v in value:
+                _expect_number(v, f"{where}: {name}")
+            record[name] = tuple(float(v) for v in value)
+        elif name in ("limit_xy_m", "intensity_scale"):
+            _expect_number(value, f"{where}: {name}")
+            record[name] = float(value)
+        elif name == "num_columns":
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise ValueError(f"{where}: {name}: got {value!r}, expected an integer")
+        elif not isinstance(value, str):
+            raise ValueError(f"{where}: {name}: got {value!r}, expected a string")
+    try:
+        return Sensor(**record)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def load_sensor(path: str | Path) -> Sensor:
+    """A sensor by preset name or from a JSON file.
+
+    Args:
+        path: a key of :data:`PRESETS`, or a JSON file as :func:`sensor_from_json` describes.
+
+    Raises:
+        ValueError: naming the file, the field, what was found and what was expected.
+
+    >>> load_sensor("tiny") == TINY
+    True
+    """
+    if str(path) in PRESETS:
+        return PRESETS[str(path)]
+    file = Path(path)
+    if not file.is_file():
+        raise ValueError(f"{path}: no such sensor file, and no preset ({', '.join(PRESETS)})")
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not JSON: {error}") from None
+    return sensor_from_json(record, str(path))
+
+
+def _expect_number(value: Any, where: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{where}: got {value!r}, expected a finite number")

@@ -1,0 +1,1 @@
+"""Pictures and reports. Matplotlib is imported when one is drawn."""

@@ -1,0 +1,27 @@
+"""Shared set-up: shape checks in signatures, a compilation cache, where the real data are."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+# The containers are left out: tree transformations fill their annotated fields with other things.
+_UNCHECKED = ("types",)
+_PACKAGE = Path(__file__).parents[1] / "fcos_lidar_jax"
+_MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", "__main__", *_UNCHECKED)]
+_ROOMS = ["models", "training", "inference", "evaluation"]
+install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "beartype.beartype")
+
+jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / "jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder with real LiDAR data; the test is skipped where there is none."""
+    folder = os.environ.get("FCOS_LIDAR_REAL_DATA")
+    if not folder:
+        pytest.skip("FCOS_LIDAR_REAL_DATA is not set: no real LiDAR data here")
+    return Path(folder)
