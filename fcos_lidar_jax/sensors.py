@@ -137,9 +137,7 @@ ARGOVERSE2 = Sensor(
 TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, limit_xy_m=25.0)
 """A 16-beam sensor with a short reach, for tests and the quickstart."""
 
-PRESETS: dict[str, Sensor] = {
-    s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY)
-}
+PRESETS: dict[str, Sensor] = {s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY)}
 """Name -> sensor."""
 
 
@@ -179,7 +177,9 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
         _expect_number(even["lowest"], f"{where}: inclinations_deg.lowest")
         _expect_number(even["highest"], f"{where}: inclinations_deg.highest")
         if not isinstance(even["rows"], int) or even["rows"] < 2:
-            raise ValueError(f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected an integer >= 2")
+            raise ValueError(
+                f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected an integer >= 2"
+            )
         record["inclinations_rad"] = even_inclinations(even["lowest"], even["highest"], even["rows"])
     fields = {f.name: f for f in dataclasses.fields(Sensor)}
     unknown = sorted(set(record) - set(fields))

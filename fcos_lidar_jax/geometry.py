@@ -1,0 +1,126 @@
+"""Angles, rotations, corners, points in boxes: finite values and gradients on every input."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+# Coefficients of atan(t) / t in t^2 on [0, 1]: minimax in the relative error, 1.2e-9 in exact arithmetic.
+_ATAN = (
+    0.999999998794722,
+    -0.3333327494244605,
+    0.1999679322591366,
+    -0.1423171745399175,
+    0.10729761907310403,
+    -0.07653839393789628,
+    0.044059961216975786,
+    -0.016704039013780557,
+    0.0029650098912646344,
+)
+
+
+def safe_norm(*components: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Euclidean norm over its arguments, with zero gradient (not NaN) at zero.
+
+    >>> float(safe_norm(jnp.float32(3), jnp.float32(4)))
+    5.0
+    """
+    square = sum((c * c for c in components[1:]), components[0] * components[0])
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+def atan2(y: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Angle of (x, y) in [-pi, pi], within 3e-7 of the exact one in float32.
+
+    A polynomial of additions and multiplications: it vectorises where the library call does not, and its
+    gradient is finite at the origin. Signed zeros follow the C convention.
+
+    >>> round(float(atan2(jnp.float32(1), jnp.float32(-1))), 4)
+    2.3562
+    """
+    ax, ay = jnp.abs(x), jnp.abs(y)
+    high = jnp.maximum(ax, ay)
+    t = jnp.minimum(ax, ay) / jnp.where(high > 0, high, 1.0)
+    square = t * t
+    series = jnp.full_like(t, _ATAN[-1])
+    for coefficient in _ATAN[-2::-1]:
+        series = series * square + coefficient
+    angle = series * t
+    angle = jnp.where(ay > ax, np.pi / 2 - angle, angle)
+    angle = jnp.where(jnp.signbit(x), np.pi - angle, angle)
+    return jnp.where(jnp.signbit(y), -angle, angle)
+
+
+def spherical(
+    xyz: Float[Array, "*n 3"],
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
+    """Range, azimuth and inclination of points (paper, equation 1).
+
+    Args:
+        xyz: metres, relative to the sensor.
+
+    Returns:
+        range in metres, azimuth in [-pi, pi], inclination in [-pi/2, pi/2]; zeros at the origin.
+
+    >>> [round(float(v), 4) for v in spherical(jnp.array([0.0, 2.0, 0.0]))]
+    [2.0, 1.5708, 0.0]
+    """
+    x, y, z = xyz[..., 0], xyz[..., 1], xyz[..., 2]
+    return safe_norm(x, y, z), atan2(y, x), atan2(z, safe_norm(x, y))
+
+
+def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The same direction in [-pi, pi).
+
+    >>> round(float(wrap_angle(jnp.float32(3.5))), 4)
+    -2.7832
+    """
+    wrapped = angle - 2 * np.pi * jnp.floor((angle + np.pi) / (2 * np.pi))
+    # Rounding can land on the open end.
+    return jnp.where(wrapped >= np.pi, -np.pi, wrapped)
+
+
+def box_corners(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8 3"]:
+    """The eight corners of upright boxes.
+
+    Args:
+        boxes: ``x, y, z, l, w, h, yaw, ...``.
+
+    Returns:
+        the bottom four, counter-clockwise from the front right, then the top four.
+
+    >>> box_corners(jnp.array([0, 0, 0, 4, 2, 2, 0.0])).shape
+    (8, 3)
+    """
+    signs = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]] * 2) / 2
+    along = boxes[..., 3, None] * signs[:, 0]
+    across = boxes[..., 4, None] * signs[:, 1]
+    up = boxes[..., 5, None] * np.repeat([-0.5, 0.5], 4)
+    cos, sin = jnp.cos(boxes[..., 6, None]), jnp.sin(boxes[..., 6, None])
+    return jnp.stack(
+        [
+            boxes[..., 0, None] + cos * along - sin * across,
+            boxes[..., 1, None] + sin * along + cos * across,
+            boxes[..., 2, None] + up,
+        ],
+        axis=-1,
+    )
+
+
+def points_in_box(points: Float[Array, "*n 3"], box: Float[Array, "*n c"]) -> Bool[Array, "*n"]:
+    """Whether points lie in boxes, boundary included; elementwise with broadcasting.
+
+    Args:
+        points: metres.
+        box: ``x, y, z, l, w, h, yaw, ...``.
+
+    >>> bool(points_in_box(jnp.array([2.0, 1.0, 0.0]), jnp.array([0, 0, 0, 4, 2, 2, 0.0])))
+    True
+    """
+    dx, dy, dz = (points[..., i] - box[..., i] for i in range(3))
+    cos, sin = jnp.cos(box[..., 6]), jnp.sin(box[..., 6])
+    return (
+        (jnp.abs(cos * dx + sin * dy) <= box[..., 3] / 2)
+        & (jnp.abs(cos * dy - sin * dx) <= box[..., 4] / 2)
+        & (jnp.abs(dz) <= box[..., 5] / 2)
+    )

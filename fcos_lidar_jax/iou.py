@@ -1,0 +1,232 @@
+"""Rotated IoU of upright boxes, in the ground plane and in space, with exact gradients.
+
+The intersection area follows from Green's theorem: in one rectangle's frame, sum over the other's four edges
+the integral of the clamped abscissa. There is no polygon clipping, sorting or branching, and the form is
+continuous through every degeneracy. The gradient is analytic: a boundary of the intersection moves the area
+by its length along its normal, so it is the clipped edges times their normals.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_TINY = 1e-7
+_COINCIDENT_M = 1e-5
+"""An edge that runs along a side within this distance counts as inside, so that rounding does not decide the
+gradient of coincident edges."""
+
+Rectangle = tuple[Array, Array, Array, Array, Array, Array]
+"""x, y, l, w, cos yaw, sin yaw: arrays of one shape."""
+
+
+def _corners(rectangle: Rectangle) -> tuple[list[Array], list[Array]]:
+    """Abscissas and ordinates of the four corners, counter-clockwise from the front right."""
+    x, y, l, w, cos, sin = rectangle
+    lx, ly, wx, wy = 0.5 * l * cos, 0.5 * l * sin, -0.5 * w * sin, 0.5 * w * cos
+    return [x + lx - wx, x + lx + wx, x - lx + wx, x - lx - wx], [
+        y + ly - wy,
+        y + ly + wy,
+        y - ly + wy,
+        y - ly - wy,
+    ]
+
+
+def _corners_in_frame(rectangle: Rectangle, frame: Rectangle) -> tuple[list[Array], list[Array]]:
+    """Corners of one rectangle in the axes of another."""
+    fx, fy, _, _, fcos, fsin = frame
+    x, y, l, w, cos, sin = rectangle
+    dx, dy = x - fx, y - fy
+    local = (
+        fcos * dx + fsin * dy,
+        fcos * dy - fsin * dx,
+        l,
+        w,
+        fcos * cos + fsin * sin,
+        fcos * sin - fsin * cos,
+    )
+    return _corners(local)
+
+
+def _crossing(start: Array, step: Array, half: Array) -> tuple[Array, Array]:
+    """Parameters at which ``start + t * step`` enters and leaves the slab of half width ``half``."""
+    safe = jnp.where(jnp.abs(step) < _TINY, _TINY, step)
+    first, second = (-half - start) / safe, (half - start) / safe
+    return jnp.minimum(first, second), jnp.maximum(first, second)
+
+
+def _slack(step: Array) -> Array:
+    """What a slab is widened by for an edge that runs along it."""
+    return jnp.where(jnp.abs(step) < _COINCIDENT_M, _COINCIDENT_M, 0.0)
+
+
+def _area(a: Rectangle, b: Rectangle) -> Array:
+    """Area of the intersection, by Green's theorem in the frame of ``a``."""
+    half_l, half_w = 0.5 * a[2], 0.5 * a[3]
+    xs, ys = _corners_in_frame(b, a)
+    area = jnp.zeros_like(a[0])
+    for i in range(4):
+        x, y = xs[i], ys[i]
+        dx, dy = xs[(i + 1) % 4] - x, ys[(i + 1) % 4] - y
+        low, high = (jnp.clip(t, 0.0, 1.0) for t in _crossing(y, dy, half_w))
+        # Between the crossings of the slab in x the abscissa is linear, outside it is clamped: three pieces.
+        enter, leave = (jnp.clip(t, low, high) for t in _crossing(x, dx, half_l))
+        at = [jnp.clip(x + t * dx, -half_l, half_l) for t in (low, enter, leave, high)]
+        pieces = (
+            (at[0] + at[1]) * (enter - low)
+            + (at[1] + at[2]) * (leave - enter)
+            + (at[2] + at[3]) * (high - leave)
+        )
+        area = area + 0.5 * dy * pieces
+    return jnp.clip(area, 0.0, jnp.minimum(a[2] * a[3], b[2] * b[3]))
+
+
+def _area_gradient(moving: Rectangle, fixed: Rectangle) -> Rectangle:
+    """Derivative of the intersection area by the numbers of ``moving``.
+
+    Of each edge, the part inside ``fixed`` sweeps area when the edge moves along its normal.
+    """
+    half_l, half_w = 0.5 * fixed[2], 0.5 * fixed[3]
+    xs, ys = _corners_in_frame(moving, fixed)
+    world_x, world_y = _corners(moving)
+    push_x, push_y = [jnp.zeros_like(moving[0])] * 4, [jnp.zeros_like(moving[0])] * 4
+    for i in range(4):
+        j = (i + 1) % 4
+        dx, dy = xs[j] - xs[i], ys[j] - ys[i]
+        enter_x, leave_x = _crossing(xs[i], dx, half_l + _slack(dx))
+        enter_y, leave_y = _crossing(ys[i], dy, half_w + _slack(dy))
+        enter = jnp.clip(jnp.maximum(enter_x, enter_y), 0.0, 1.0)
+        leave = jnp.clip(jnp.minimum(leave_x, leave_y), 0.0, 1.0)
+        end_share = jnp.where(leave > enter, 0.5 * (leave * leave - enter * enter), 0.0)
+        start_share = jnp.where(leave > enter, leave - enter, 0.0) - end_share
+        normal_x, normal_y = world_y[j] - world_y[i], world_x[i] - world_x[j]
+        push_x[i] = push_x[i] + normal_x * start_share
+        push_y[i] = push_y[i] + normal_y * start_share
+        push_x[j] = push_x[j] + normal_x * end_share
+        push_y[j] = push_y[j] + normal_y * end_share
+    _, _, l, w, cos, sin = moving
+    along = [0.5 * (p[0] + p[1] - p[2] - p[3]) for p in (push_x, push_y)]
+    across = [0.5 * (p[1] + p[2] - p[0] - p[3]) for p in (push_x, push_y)]
+    return (
+        sum(push_x[1:], push_x[0]),
+        sum(push_y[1:], push_y[0]),
+        along[0] * cos + along[1] * sin,
+        across[1] * cos - across[0] * sin,
+        along[0] * l + across[1] * w,
+        along[1] * l - across[0] * w,
+    )
+
+
+@jax.custom_vjp
+def _intersection_area(a: Rectangle, b: Rectangle) -> Array:
+    return _area(a, b)
+
+
+def _intersection_forward(a: Rectangle, b: Rectangle) -> tuple[Array, tuple[Rectangle, Rectangle]]:
+    return _area(a, b), (a, b)
+
+
+def _intersection_backward(
+    saved: tuple[Rectangle, Rectangle], cotangent: Array
+) -> tuple[Rectangle, Rectangle]:
+    a, b = saved
+    return (
+        tuple(cotangent * g for g in _area_gradient(a, b)),
+        tuple(cotangent * g for g in _area_gradient(b, a)),
+    )  # type: ignore[return-value]
+
+
+_intersection_area.defvjp(_intersection_forward, _intersection_backward)
+
+
+def _columns(boxes: Float[Array, "*m c"]) -> list[Array]:
+    """The columns of oriented boxes, sliced: indexing with an array would make the gradient a scatter."""
+    return [boxes[..., i] for i in range(8)]
+
+
+def oriented(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8"]:
+    """Boxes ``x, y, z, l, w, h, yaw, ...`` as ``x, y, z, l, w, h, cos yaw, sin yaw``.
+
+    >>> oriented(jnp.array([0, 0, 0, 4, 2, 1, 0.0])).tolist()
+    [0.0, 0.0, 0.0, 4.0, 2.0, 1.0, 1.0, 0.0]
+    """
+    yaw = boxes[..., 6:7]
+    return jnp.concatenate([boxes[..., :6], jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
+
+
+def oriented_overlap(
+    a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertical: bool
+) -> tuple[Array, Array]:
+    """Intersection and union of oriented boxes, as areas or volumes; elementwise with broadcasting.
+
+    Args:
+        a: ``x, y, z, l, w, h, cos yaw, sin yaw``.
+        b: likewise.
+        vertical: volumes instead of ground-plane areas (static).
+
+    >>> box = oriented(jnp.array([0, 0, 0, 4, 2, 1, 0.0]))
+    >>> [float(v) for v in oriented_overlap(box, box, vertical=True)]
+    [8.0, 8.0]
+    """
+    a, b = jnp.broadcast_arrays(a, b)
+    ax, ay, az, al, aw, ah, acos, asin = _columns(a)
+    bx, by, bz, bl, bw, bh, bcos, bsin = _columns(b)
+    # In the frame of a's centre the numbers stay small wherever the boxes are.
+    zero = jnp.zeros_like(ax)
+    intersection = _intersection_area(
+        (zero, zero, al, aw, acos, asin), (bx - ax, by - ay, bl, bw, bcos, bsin)
+    )
+    size_a, size_b = al * aw, bl * bw
+    if vertical:
+        shared = jnp.minimum(az + 0.5 * ah, bz + 0.5 * bh) - jnp.maximum(az - 0.5 * ah, bz - 0.5 * bh)
+        intersection = intersection * jnp.maximum(shared, 0.0)
+        size_a, size_b = size_a * ah, size_b * bh
+    return intersection, size_a + size_b - intersection
+
+
+def oriented_iou_3d(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"]) -> Float[Array, "*o"]:
+    """IoU of oriented boxes; elementwise with broadcasting.
+
+    >>> box = oriented(jnp.array([0, 0, 0, 4, 2, 1, 0.5]))
+    >>> round(float(oriented_iou_3d(box, box)), 5)
+    1.0
+    """
+    return _ratio(*oriented_overlap(a, b, vertical=True))
+
+
+def _ratio(intersection: Array, union: Array) -> Array:
+    positive = union > _TINY
+    return jnp.where(positive, intersection / jnp.where(positive, union, 1.0), 0.0)
+
+
+def rotated_iou_bev(a: Float[Array, "*m c"], b: Float[Array, "*n d"]) -> Float[Array, "*o"]:
+    """IoU in the ground plane; elementwise with broadcasting, differentiable.
+
+    Args:
+        a: ``x, y, z, l, w, h, yaw, ...``, metres and radians.
+        b: likewise.
+
+    Returns:
+        values in [0, 1]; 0 where both areas are zero. Gradients are finite everywhere.
+
+    >>> a, b = jnp.array([0, 0, 0, 4, 2, 1, 0.0]), jnp.array([2, 0, 0, 4, 2, 1, 0.0])
+    >>> round(float(rotated_iou_bev(a, b)), 4)
+    0.3333
+    """
+    return _ratio(*oriented_overlap(oriented(a), oriented(b), vertical=False))
+
+
+def rotated_iou_3d(a: Float[Array, "*m c"], b: Float[Array, "*n d"]) -> Float[Array, "*o"]:
+    """IoU of upright boxes; elementwise with broadcasting, differentiable.
+
+    Args:
+        a: ``x, y, z, l, w, h, yaw, ...``, metres and radians, z of the gravity centre.
+        b: likewise.
+
+    Returns:
+        values in [0, 1]; 0 where both volumes are zero. Gradients are finite everywhere.
+
+    >>> a, b = jnp.array([0, 0, 0, 4, 2, 1, 0.0]), jnp.array([0, 0, 0.5, 4, 2, 1, jnp.pi])
+    >>> round(float(rotated_iou_3d(a, b)), 4)
+    0.3333
+    """
+    return oriented_iou_3d(oriented(a), oriented(b))

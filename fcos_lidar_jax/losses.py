@@ -1,0 +1,180 @@
+"""Losses of one sample (paper, section 3.4), each as (sum, count).
+
+The sums are divided once, over the global batch: a mean per sample or per device would weigh samples with
+few positives more.
+"""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Float32, Int32
+
+from fcos_lidar_jax.config import LossConfig
+from fcos_lidar_jax.iou import oriented_overlap
+
+SumCount = tuple[Float[Array, ""], Int32[Array, ""]]
+
+
+def _masked(values: Array, mask: Array) -> SumCount:
+    return jnp.where(mask, values, 0.0).sum(), mask.sum(dtype=jnp.int32)
+
+
+def cross_entropy(logits: Float32[Array, "l c"], labels: Int32[Array, "l"]) -> Float32[Array, "l"]:
+    """Cross-entropy of the softmax against class indices, one value a location.
+
+    >>> round(float(cross_entropy(jnp.zeros((1, 2)), jnp.array([0]))[0]), 4)
+    0.6931
+    """
+    return -jnp.take_along_axis(jax.nn.log_softmax(logits), labels[:, None], axis=1)[:, 0]
+
+
+def classification_loss(
+    logits: Float32[Array, "l c"], labels: Int32[Array, "l"], mask: Bool[Array, "l"]
+) -> SumCount:
+    """Cross-entropy over the locations in ``mask``.
+
+    Args:
+        logits: k classes and the background.
+        labels: class index, k for background.
+        mask: locations that count: the non-empty ones.
+
+    >>> total, count = classification_loss(jnp.zeros((2, 2)), jnp.array([0, 1]), jnp.array([True, False]))
+    >>> round(float(total), 4), int(count)
+    (0.6931, 1)
+    """
+    return _masked(cross_entropy(logits, labels), mask)
+
+
+def l1_loss(
+    prediction: Float32[Array, "l 10"],
+    target: Float32[Array, "l 10"],
+    mask: Bool[Array, "l"],
+    *,
+    velocity_weight: float,
+) -> SumCount:
+    """Weighted sum of absolute differences over the ten regression numbers.
+
+    Args:
+        prediction: numbers of the owner's class.
+        target: from :func:`fcos_lidar_jax.coding.encode`; a NaN velocity is unknown and costs nothing.
+        mask: locations that count.
+        velocity_weight: of the last two numbers; the others weigh 1.
+
+    >>> total, _ = l1_loss(jnp.ones((1, 10)), jnp.zeros((1, 10)), jnp.ones(1, bool), velocity_weight=0.2)
+    >>> round(float(total), 4)
+    8.4
+    """
+    known = ~jnp.isnan(target)
+    difference = jnp.where(known & mask[:, None], prediction - jnp.where(known, target, 0.0), 0.0)
+    weights = jnp.array([1.0] * 8 + [velocity_weight] * 2, prediction.dtype)
+    return _masked((jnp.abs(difference) * weights).sum(axis=1), mask)
+
+
+def iou_loss(
+    prediction: Float32[Array, "l 8"],
+    target: Float32[Array, "l 8"],
+    mask: Bool[Array, "l"],
+    *,
+    kind: str = "iou",
+) -> SumCount:
+    """Loss of the rotated 3D IoU of predicted and true boxes.
+
+    Args:
+        prediction: ``x, y, z, l, w, h, cos yaw, sin yaw``.
+        target: likewise.
+        mask: locations that count.
+        kind: ``"iou"`` 1 - IoU; ``"log_iou"`` -ln IoU (UnitBox); ``"giou"`` and ``"diou"`` with the smallest
+            box around both that is aligned with the target.
+
+    Raises:
+        ValueError: unknown kind.
+
+    >>> box = jnp.array([[0, 0, 0, 4, 2, 1, 1, 0]], jnp.float32)
+    >>> float(iou_loss(box, box, jnp.ones(1, bool))[0])
+    0.0
+    """
+    # What does not count is replaced before it can overflow: 0 * inf is NaN in the gradient.
+    unit = jnp.array([0, 0, 0, 1, 1, 1, 1, 0], prediction.dtype)
+    prediction = jnp.where(mask[:, None], prediction, unit)
+    target = jnp.where(mask[:, None], target, unit)
+    intersection, union = oriented_overlap(prediction, target, vertical=True)
+    union = jnp.maximum(union, 1e-6)
+    iou = intersection / union
+    if kind == "iou":
+        values = 1 - iou
+    elif kind == "log_iou":
+        values = -jnp.log(jnp.maximum(iou, 1e-6))
+    elif kind in ("giou", "diou"):
+        extent = _enclosing(prediction, target)
+        if kind == "giou":
+            volume = jnp.maximum(extent[..., 0] * extent[..., 1] * extent[..., 2], 1e-6)
+            values = 1 - iou + (volume - union) / volume
+        else:
+            distance = jnp.square(prediction[:, :3] - target[:, :3]).sum(axis=1)
+            values = 1 - iou + distance / jnp.maximum(jnp.square(extent).sum(axis=1), 1e-6)
+    else:
+        raise ValueError(f"kind: got {kind!r}, expected 'iou', 'log_iou', 'giou' or 'diou'")
+    return _masked(values, mask)
+
+
+def _enclosing(prediction: Array, target: Array) -> Array:
+    """Length, width and height of the box around both, along the axes of the target."""
+    x, y, z, l, w, h, cos, sin = (target[:, i] for i in range(8))
+    px, py, pz, pl, pw, ph, pcos, psin = (prediction[:, i] for i in range(8))
+    dx, dy = px - x, py - y
+    along, across = cos * dx + sin * dy, cos * dy - sin * dx
+    rcos, rsin = jnp.abs(cos * pcos + sin * psin), jnp.abs(cos * psin - sin * pcos)
+    reach = [(along, rcos * pl + rsin * pw, l), (across, rsin * pl + rcos * pw, w), (pz - z, ph, h)]
+    return jnp.stack(
+        [jnp.maximum(d + s / 2, t / 2) - jnp.minimum(d - s / 2, -t / 2) for d, s, t in reach], axis=-1
+    )
+
+
+def iou_prediction_loss(
+    logits: Float32[Array, "l"], iou: Float32[Array, "l"], mask: Bool[Array, "l"]
+) -> SumCount:
+    """Binary cross-entropy of the predicted IoU against the measured one, which is not differentiated.
+
+    Args:
+        logits: predicted IoU of the true class, before the sigmoid.
+        iou: IoU of the decoded box with its truth.
+        mask: locations that count.
+
+    >>> total, _ = iou_prediction_loss(jnp.zeros(1), jnp.ones(1), jnp.ones(1, bool))
+    >>> round(float(total), 4)
+    0.6931
+    """
+    iou = lax.stop_gradient(iou)
+    return _masked(jax.nn.softplus(logits) - iou * logits, mask)
+
+
+def combine(
+    parts: Mapping[str, SumCount], num_positive: Int32[Array, ""], config: LossConfig
+) -> dict[str, Array]:
+    """The weighted total and its parts, each sum divided once by the positives of the global batch.
+
+    Args:
+        parts: ``classification``, ``l1``, ``iou`` and ``iou_prediction``, summed over the global batch.
+        num_positive: positives of the global batch; at least one is assumed in the division.
+        config: the weights.
+
+    Returns:
+        the divided parts, unweighted, and ``total``.
+
+    >>> one = (jnp.float32(3), jnp.int32(1))
+    >>> parts = {"classification": one, "l1": one, "iou": one, "iou_prediction": one}
+    >>> float(combine(parts, jnp.int32(3), LossConfig())["total"])
+    3.25
+    """
+    scale = 1 / jnp.maximum(num_positive, 1).astype(jnp.float32)
+    weights = {
+        "classification": config.classification_weight,
+        "l1": config.l1_weight,
+        "iou": config.iou_weight,
+        "iou_prediction": config.iou_prediction_weight,
+    }
+    divided = {name: parts[name][0] * scale for name in weights}
+    weighted = [weight * divided[name] for name, weight in weights.items()]
+    return {**divided, "total": sum(weighted[1:], weighted[0])}

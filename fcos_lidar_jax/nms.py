@@ -1,0 +1,111 @@
+"""Rotated non-maximum suppression with static shapes (paper, section 3.4)."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float32, Int32
+
+from fcos_lidar_jax.iou import oriented, oriented_overlap
+
+
+def rotated_nms(
+    boxes: Float32[Array, "n c"],
+    scores: Float32[Array, "n"],
+    valid: Bool[Array, "n"],
+    *,
+    labels: Int32[Array, "n"] | None = None,
+    iou_threshold: float,
+    max_outputs: int,
+    overlap: Literal["bev", "3d"] = "bev",
+    form: Literal["rows", "matrix"] = "rows",
+) -> tuple[Int32[Array, "d"], Bool[Array, "d"]]:
+    """Greedy suppression: the best box stays, whatever overlaps it by more than the threshold goes.
+
+    Args:
+        boxes: ``x, y, z, l, w, h, yaw, ...``.
+        scores: higher is better; equal scores go to the lower index. NaN counts as invalid.
+        valid: rows that take part.
+        labels: boxes of different labels never suppress each other; None for one class.
+        iou_threshold: suppressed if IoU > threshold (static).
+        max_outputs: d, boxes kept at most (static).
+        overlap: IoU in the ground plane or of the boxes (static).
+        form: one row of IoUs per kept box, or the whole matrix and a fixed point; the same result (static).
+
+    Returns:
+        indices of the kept boxes by falling score, 0 in unused slots, and which slots are used.
+
+    >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0], [9, 0, 0, 4, 2, 1, 0]])
+    >>> scores, valid = jnp.array([0.5, 0.9, 0.1]), jnp.ones(3, bool)
+    >>> kept, used = rotated_nms(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)
+    >>> kept.tolist(), used.tolist()
+    ([1, 2, 0], [True, True, False])
+    """
+    valid &= ~jnp.isnan(scores)
+    scores = jnp.where(valid, scores, -jnp.inf)
+    labels = jnp.zeros(scores.shape, jnp.int32) if labels is None else labels
+    if form not in ("rows", "matrix"):
+        raise ValueError(f"form: got {form!r}, expected 'rows' or 'matrix'")
+    if overlap not in ("bev", "3d"):
+        raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
+    suppress = _by_rows if form == "rows" else _by_matrix
+    return suppress(oriented(boxes), scores, valid, labels, iou_threshold, max_outputs, overlap == "3d")
+
+
+def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
+    """IoU > threshold, without the division: false where the union vanishes."""
+    intersection, union = oriented_overlap(a, b, vertical=vertical)
+    return intersection > threshold * union
+
+
+def _by_rows(
+    boxes: Array,
+    scores: Array,
+    valid: Array,
+    labels: Array,
+    threshold: float,
+    max_outputs: int,
+    vertical: bool,
+) -> tuple[Array, Array]:
+    def unfinished(state: tuple[Array, Array, Array]) -> Array:
+        count, alive, _ = state
+        return (count < max_outputs) & alive.any()
+
+    def pick(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, alive, kept = state
+        best = jnp.argmax(jnp.where(alive, scores, -jnp.inf)).astype(jnp.int32)
+        # A lone box with score -inf is still the best one left.
+        best = jnp.where(alive[best], best, jnp.argmax(alive).astype(jnp.int32))
+        rivals = _overlaps(boxes[best], boxes, threshold, vertical) & (labels == labels[best])
+        return count + 1, (alive & ~rivals).at[best].set(False), kept.at[count].set(best)
+
+    start = (jnp.int32(0), valid, jnp.zeros(max_outputs, jnp.int32))
+    count, _, kept = lax.while_loop(unfinished, pick, start)
+    return kept, jnp.arange(max_outputs) < count
+
+
+def _by_matrix(
+    boxes: Array,
+    scores: Array,
+    valid: Array,
+    labels: Array,
+    threshold: float,
+    max_outputs: int,
+    vertical: bool,
+) -> tuple[Array, Array]:
+    number = scores.shape[0]
+    # Valid boxes first, by falling score, equal ones by index.
+    order = jnp.lexsort((-scores, ~valid)).astype(jnp.int32)
+    boxes, labels, valid = boxes[order], labels[order], valid[order]
+    beats = _overlaps(boxes[:, None], boxes[None, :], threshold, vertical) & (labels[:, None] == labels)
+    beats &= jnp.arange(number)[:, None] < jnp.arange(number)
+
+    def suppress(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        kept, _ = state
+        after = valid & ~(beats & kept[:, None]).any(axis=0)
+        return after, (after != kept).any()
+
+    kept, _ = lax.while_loop(lambda state: state[1], suppress, (valid, jnp.bool_(True)))
+    slot = jnp.where(kept, jnp.cumsum(kept) - 1, max_outputs)
+    indices = jnp.zeros(max_outputs, jnp.int32).at[slot].set(order, mode="drop")
+    return indices, jnp.arange(max_outputs) < kept.sum()

@@ -1,0 +1,218 @@
+"""Points to a range image by multi-round projection (paper, sections 3.1 and 3.2).
+
+Every round keeps, per cell, the point with the smallest key, by a scatter-min; the losers enter the next
+round. A key is exact and total, so the result depends neither on the device nor on the order in which it
+works: older sweep, then bits of the range, then row of the input.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float32, Int32
+
+from fcos_lidar_jax.geometry import spherical
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.types import RangeImage
+
+
+def close_to_sensor(points: Float32[Array, "n c"], sensor: Sensor, close_m: float = 1.0) -> Bool[Array, "n"]:
+    """Points on the carrying vehicle itself: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
+
+    Args:
+        points: x, y, z, ... in metres.
+        sensor: gives the origin.
+        close_m: half the side of the square.
+
+    >>> close_to_sensor(jnp.zeros((1, 5)), Sensor("two", (0.1, 0.0), 8)).tolist()
+    [True]
+    """
+    x, y = points[:, 0] - sensor.origin_m[0], points[:, 1] - sensor.origin_m[1]
+    return (jnp.abs(x) < close_m) & (jnp.abs(y) < close_m)
+
+
+def remove_close(
+    points: Float32[Array, "n c"], valid: Bool[Array, "n"], sensor: Sensor, *, mode: str, close_m: float = 1.0
+) -> Bool[Array, "n"]:
+    """``valid`` without the points on the carrying vehicle, judged in the current frame.
+
+    Args:
+        points: x, y, z, intensity, time lag.
+        valid: rows that count.
+        sensor: gives the origin.
+        mode: ``"all"`` drops them from all sweeps, ``"sweeps"`` from the older ones, ``"none"`` not at all.
+        close_m: half the side of the square that is emptied.
+
+    Raises:
+        ValueError: unknown mode.
+
+    >>> me = jnp.zeros((1, 5))
+    >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), mode="all").tolist()
+    [False]
+    """
+    if mode == "none":
+        return valid
+    close = close_to_sensor(points, sensor, close_m)
+    if mode == "sweeps":
+        close &= points[:, 4] != 0
+    elif mode != "all":
+        raise ValueError(f"mode: got {mode!r}, expected 'all', 'sweeps' or 'none'")
+    return valid & ~close
+
+
+def image_cells(
+    points: Float32[Array, "n c"], valid: Bool[Array, "n"], sensor: Sensor
+) -> tuple[Int32[Array, "n"], tuple[Float32[Array, "n"], ...]]:
+    """The image cell of every point.
+
+    Rows are bin centres (the beams), the top row the highest beam; columns run clockwise from azimuth pi.
+    Points that are invalid, non-finite, outside the limits or more than half a row outside the field of view
+    get the sentinel cell ``num_rows * num_columns``.
+
+    Args:
+        points: x, y, z, intensity, time lag and, for sensors that need it, the laser number.
+        valid: rows that count.
+        sensor: the image's geometry.
+
+    Returns:
+        row-major cells, and (range, azimuth, inclination) as seen from the sensor, finite everywhere.
+
+    >>> two = Sensor("two", (0.1, 0.0), 8)
+    >>> image_cells(jnp.array([[-5.0, 1e-3, 0, 0, 0]]), jnp.ones(1, bool), two)[0].tolist()
+    [8]
+    """
+    usable = valid & jnp.isfinite(points).all(axis=1)
+    points = jnp.where(usable[:, None], points, 0.0)
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    low, high = sensor.limit_z_m
+    usable &= (jnp.abs(x) < sensor.limit_xy_m) & (jnp.abs(y) < sensor.limit_xy_m) & (z > low) & (z < high)
+    range_m, azimuth, inclination = spherical(points[:, :3] - np.asarray(sensor.origin_m, np.float32))
+    turn = np.float32(sensor.num_columns / (2 * np.pi))
+    column = jnp.floor((np.float32(np.pi) - azimuth) * turn).astype(jnp.int32) % sensor.num_columns
+    row = points[:, 5].astype(jnp.int32) if sensor.row_source == "laser" else _row(inclination, sensor)
+    usable &= (row >= 0) & (row < sensor.num_rows)
+    cell = jnp.where(usable, row * sensor.num_columns + column, sensor.num_rows * sensor.num_columns)
+    return cell.astype(jnp.int32), (range_m, azimuth, inclination)
+
+
+def _row(inclination: Float32[Array, "n"], sensor: Sensor) -> Int32[Array, "n"]:
+    """Nearest beam; outside the field of view -1 or ``num_rows``."""
+    step = sensor.even_step_rad
+    if step is not None:
+        top = np.float32(sensor.inclinations_rad[0])
+        return jnp.floor((top - inclination) * np.float32(1 / step) + 0.5).astype(jnp.int32)
+    edges = -np.asarray(sensor.row_edges_rad, np.float32)
+    return jnp.searchsorted(edges, -inclination, side="right").astype(jnp.int32) - 1
+
+
+def priority_keys(
+    range_m: Float32[Array, "n"], time_lag: Float32[Array, "n"], *, prioritize_current: bool
+) -> Array:
+    """Exact 32-bit keys, smaller is better: older sweep, then the bits of the range.
+
+    The bits of a non-negative float32 order like the number itself and leave the top bit free.
+
+    >>> keys = priority_keys(jnp.array([9.0, 1.0]), jnp.array([0.0, 0.05]), prioritize_current=True)
+    >>> bool(keys[0] < keys[1])
+    True
+    """
+    bits = lax.bitcast_convert_type(range_m, jnp.uint32)
+    if not prioritize_current:
+        return bits
+    return bits | jnp.where(time_lag != 0, jnp.uint32(1 << 31), jnp.uint32(0))
+
+
+def winners(cell: Int32[Array, "n"], keys: Array, *, num_cells: int, num_rounds: int) -> Int32[Array, "s r"]:
+    """The point that each cell keeps in each round (paper, section 3.2).
+
+    Args:
+        cell: cell of every point, ``num_cells`` for points that take no part.
+        keys: uint32, smaller is better; equal keys are settled by the lower index.
+        num_cells: cells of the image.
+        num_rounds: rounds.
+
+    Returns:
+        point index for every cell and round, -1 where nothing is left.
+
+    >>> keys = jnp.array([7, 3, 5], jnp.uint32)
+    >>> winners(jnp.array([0, 0, 0]), keys, num_cells=1, num_rounds=4).tolist()
+    [[1, 2, 0, -1]]
+    """
+    # Key and index in one word settle ties in the same scatter. 64 bits are switched on for this alone.
+    with jax.enable_x64(True):
+        word = (keys.astype(jnp.uint64) << 32) | lax.iota(jnp.uint64, cell.shape[0])
+        empty = jnp.uint64(np.iinfo(np.uint64).max)
+        left, kept = word, []
+        for round_index in range(num_rounds):
+            best = jnp.full(num_cells + 1, empty).at[cell].min(left, mode="promise_in_bounds")
+            kept.append(best[:num_cells])
+            if round_index + 1 < num_rounds:
+                left = jnp.where(best[cell] >= word, empty, word)
+        word = jnp.stack(kept, axis=-1)
+        index = (word & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
+        return jnp.where(word == empty, jnp.int32(-1), index)
+
+
+@functools.partial(jax.jit, static_argnames=("sensor", "num_rounds", "prioritize_current"))
+def project_points(
+    points: Float32[Array, "n c"] | Float32[np.ndarray, "n c"],
+    valid: Bool[Array, "n"] | Bool[np.ndarray, "n"],
+    sensor: Sensor,
+    *,
+    num_rounds: int = 5,
+    prioritize_current: bool = True,
+) -> RangeImage:
+    """Multi-round range-view projection of one cloud (paper, sections 3.1 and 3.2).
+
+    Applies the sensor's range limits and vertical field of view and drops non-finite rows; never drops close
+    points (see :func:`remove_close`).
+
+    Args:
+        points: x, y, z (metres), intensity (0-255), time lag (seconds, exactly 0 for the current sweep), and
+            the laser number as a sixth column for sensors whose rows come from it.
+        valid: rows that count.
+        sensor: the image's geometry (static).
+        num_rounds: rounds (static).
+        prioritize_current: points of the current sweep win every collision with older ones (static).
+
+    Returns:
+        the image, with ``point_index`` counting rows of ``points`` as given.
+
+    Raises:
+        ValueError: at trace time, when the columns do not fit the sensor.
+
+    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0]], np.float32)
+    >>> image = project_points(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2)
+    >>> image.point_index.max(axis=(0, 1)).tolist()
+    [1, 0]
+    """
+    if points.shape[1] < sensor.point_columns:
+        raise ValueError(
+            f"points: got {points.shape[1]} columns, sensor {sensor.name!r} needs {sensor.point_columns}"
+        )
+    points, valid = jnp.asarray(points), jnp.asarray(valid)
+    rows, columns = sensor.num_rows, sensor.num_columns
+    # The barriers fence the arithmetic off, so that it rounds alike whatever program it is compiled into.
+    points, valid = lax.optimization_barrier((points, valid))
+    cell, angles = lax.optimization_barrier(image_cells(points, valid, sensor))
+    keys = priority_keys(angles[0], points[:, 4], prioritize_current=prioritize_current)
+    index = winners(cell, keys, num_cells=rows * columns, num_rounds=num_rounds)
+    features = _gather_channels(points, angles, index)
+    return RangeImage(
+        features=features.reshape(rows, columns, 9, num_rounds),
+        point_index=index.reshape(rows, columns, num_rounds),
+        num_dropped=jnp.sum(valid & (cell == rows * columns), dtype=jnp.int32),
+    )
+
+
+def _gather_channels(
+    points: Float32[Array, "n c"], angles: tuple[Float32[Array, "n"], ...], index: Int32[Array, "s r"]
+) -> Float32[Array, "s 9 r"]:
+    """The nine channels of the winners, in the order of ``types.CHANNELS``; zero where empty."""
+    x, y, z, intensity, lag = (points[:, i] for i in range(5))
+    channels = jnp.stack([x, y, z, *angles, intensity, jnp.ones_like(x), lag], axis=-1)
+    filled = index >= 0
+    gathered = channels[jnp.where(filled, index, 0)]
+    return jnp.where(filled[..., None], gathered, 0.0).transpose(0, 2, 1)
