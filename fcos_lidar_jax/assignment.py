@@ -7,6 +7,7 @@ by (owner, cost) and a rank do, without a [boxes, locations] matrix.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
@@ -15,10 +16,10 @@ from fcos_lidar_jax.types import Targets
 
 
 def owners(
-    points: Float32[Array, "n 3"],
-    present: Bool[Array, "n"],
-    boxes: Float32[Array, "m c"],
-    box_valid: Bool[Array, "m"],
+    points: Float32[Array | np.ndarray, "n 3"],
+    present: Bool[Array | np.ndarray, "n"],
+    boxes: Float32[Array | np.ndarray, "m c"],
+    box_valid: Bool[Array | np.ndarray, "m"],
 ) -> Int32[Array, "n"]:
     """The box that owns each point: the smallest that holds it, boundary included.
 
@@ -36,12 +37,13 @@ def owners(
     >>> owners(points, jnp.ones(3, bool), boxes, jnp.ones(2, bool)).tolist()
     [1, 0, -1]
     """
-    boxes = jnp.where(box_valid[:, None], boxes, 0.0)
-    volume = boxes[:, 3] * boxes[:, 4] * boxes[:, 5]
+    points, present, box_valid = jnp.asarray(points), jnp.asarray(present), jnp.asarray(box_valid)
+    solid = jnp.where(box_valid[:, None], boxes, 0.0)
+    volume = solid[:, 3] * solid[:, 4] * solid[:, 5]
 
     def visit(best: tuple[Array, Array], index: Array) -> tuple[tuple[Array, Array], None]:
         least, owner = best
-        inside = points_in_box(points, boxes[index]) & present & box_valid[index]
+        inside = points_in_box(points, solid[index]) & present & box_valid[index]
         better = inside & (volume[index] < least)
         return (jnp.where(better, volume[index], least), jnp.where(better, index, owner)), None
 

@@ -18,7 +18,9 @@ from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import RangeImage
 
 
-def close_to_sensor(points: Float32[Array, "n c"], sensor: Sensor, close_m: float = 1.0) -> Bool[Array, "n"]:
+def close_to_sensor(
+    points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float = 1.0
+) -> Bool[Array, "n"]:
     """Points on the carrying vehicle itself: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
 
     Args:
@@ -34,7 +36,12 @@ def close_to_sensor(points: Float32[Array, "n c"], sensor: Sensor, close_m: floa
 
 
 def remove_close(
-    points: Float32[Array, "n c"], valid: Bool[Array, "n"], sensor: Sensor, *, mode: str, close_m: float = 1.0
+    points: Float32[Array | np.ndarray, "n c"],
+    valid: Bool[Array | np.ndarray, "n"],
+    sensor: Sensor,
+    *,
+    mode: str,
+    close_m: float = 1.0,
 ) -> Bool[Array, "n"]:
     """``valid`` without the points on the carrying vehicle, judged in the current frame.
 
@@ -53,7 +60,8 @@ def remove_close(
     [False]
     """
     if mode == "none":
-        return valid
+        return jnp.asarray(valid)
+    points = jnp.asarray(points)
     close = close_to_sensor(points, sensor, close_m)
     if mode == "sweeps":
         close &= points[:, 4] != 0
@@ -157,8 +165,8 @@ def winners(cell: Int32[Array, "n"], keys: Array, *, num_cells: int, num_rounds:
 
 @functools.partial(jax.jit, static_argnames=("sensor", "num_rounds", "prioritize_current"))
 def project_points(
-    points: Float32[Array, "n c"] | Float32[np.ndarray, "n c"],
-    valid: Bool[Array, "n"] | Bool[np.ndarray, "n"],
+    points: Float32[Array | np.ndarray, "n c"],
+    valid: Bool[Array | np.ndarray, "n"],
     sensor: Sensor,
     *,
     num_rounds: int = 5,
@@ -192,18 +200,17 @@ def project_points(
         raise ValueError(
             f"points: got {points.shape[1]} columns, sensor {sensor.name!r} needs {sensor.point_columns}"
         )
-    points, valid = jnp.asarray(points), jnp.asarray(valid)
     rows, columns = sensor.num_rows, sensor.num_columns
     # The barriers fence the arithmetic off, so that it rounds alike whatever program it is compiled into.
-    points, valid = lax.optimization_barrier((points, valid))
-    cell, angles = lax.optimization_barrier(image_cells(points, valid, sensor))
-    keys = priority_keys(angles[0], points[:, 4], prioritize_current=prioritize_current)
+    cloud, counts = lax.optimization_barrier((jnp.asarray(points), jnp.asarray(valid)))
+    cell, angles = lax.optimization_barrier(image_cells(cloud, counts, sensor))
+    keys = priority_keys(angles[0], cloud[:, 4], prioritize_current=prioritize_current)
     index = winners(cell, keys, num_cells=rows * columns, num_rounds=num_rounds)
-    features = _gather_channels(points, angles, index)
+    features = _gather_channels(cloud, angles, index)
     return RangeImage(
         features=features.reshape(rows, columns, 9, num_rounds),
         point_index=index.reshape(rows, columns, num_rounds),
-        num_dropped=jnp.sum(valid & (cell == rows * columns), dtype=jnp.int32),
+        num_dropped=jnp.sum(counts & (cell == rows * columns), dtype=jnp.int32),
     )
 
 

@@ -1,0 +1,124 @@
+"""Points to boxes as one pure function (paper, section 3.4)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from fcos_lidar_jax.coding import decode
+from fcos_lidar_jax.config import Config, InferenceConfig
+from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, look
+from fcos_lidar_jax.models import Detector
+from fcos_lidar_jax.nms import rotated_nms
+from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.types import Detections, Locations, Outputs
+
+Detect = Callable[[Any, Array, Array], Detections]
+
+
+def select_candidates(
+    outputs: Outputs, locations: Locations, *, config: InferenceConfig, layout: ImageLayout
+) -> tuple[Array, Array, Array, Array]:
+    """The best (location, class) pairs of every level, decoded.
+
+    A pair needs a class probability above the threshold, before the IoU factor, and a point to look at.
+    Boxes are decoded only for the pairs that are kept.
+
+    Args:
+        outputs: of one sample.
+        locations: of the same.
+        config: thresholds and counts (static).
+        layout: sizes (static).
+
+    Returns:
+        boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c].
+    """
+    num_classes = outputs.iou_logits.shape[-1]
+    probability = jax.nn.softmax(outputs.logits)[:, :num_classes]
+    eligible = (probability > config.min_probability) & locations.occupied[:, None]
+    scores = jnp.where(eligible, probability * jax.nn.sigmoid(outputs.iou_logits), -1.0)
+    kept, first = [], 0
+    for size in layout.level_sizes:
+        level = scores[first : first + size].reshape(-1)
+        best, index = lax.top_k(level, min(config.candidates_per_level, level.shape[0]))
+        kept.append((best, index + first * num_classes))
+        first += size
+    score, pair = (jnp.concatenate(values) for values in zip(*kept, strict=True))
+    location, label = pair // num_classes, (pair % num_classes).astype(jnp.int32)
+    regression = outputs.regression[location, :, label]
+    boxes = decode(regression, locations.points[location], locations.azimuth_rad[location])
+    valid = score >= 0
+    return boxes, jnp.where(valid, score, 0.0), label, valid
+
+
+def postprocess(
+    outputs: Outputs, locations: Locations, *, config: InferenceConfig, layout: ImageLayout
+) -> tuple[Array, Array, Array, Array]:
+    """Candidates, class-wise rotated NMS, the best boxes.
+
+    Args:
+        outputs: of one sample.
+        locations: of the same.
+        config: thresholds and counts (static).
+        layout: sizes (static).
+
+    Returns:
+        boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d]; zero where invalid.
+    """
+    boxes, scores, labels, valid = select_candidates(outputs, locations, config=config, layout=layout)
+    with jax.named_scope("nms"):
+        index, used = rotated_nms(
+            boxes,
+            scores,
+            valid,
+            labels=labels,
+            iou_threshold=config.iou_threshold,
+            max_outputs=config.max_detections,
+            overlap=config.nms_overlap,
+            form=config.nms_form,
+        )
+    return (
+        jnp.where(used[:, None], boxes[index], 0.0),
+        jnp.where(used, scores[index], 0.0),
+        jnp.where(used, labels[index], 0),
+        used,
+    )
+
+
+def make_detect(detector: Detector, config: Config, sensor: Sensor) -> Detect:
+    """The whole path from points to boxes: projection, network, decoding, NMS.
+
+    Args:
+        detector: the network.
+        config: all choices.
+        sensor: the image's geometry.
+
+    Returns:
+        pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` of one cloud, to be jitted by the
+        caller: one compilation for a point count. Close points are the caller's to drop, see
+        :func:`fcos_lidar_jax.projection.remove_close`.
+    """
+    binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
+
+    def detect(variables: Any, points: Array | np.ndarray, valid: Array | np.ndarray) -> Detections:
+        with jax.named_scope("mrv"):
+            image = project_points(
+                points,
+                valid,
+                binned,
+                num_rounds=config.projection.num_rounds,
+                prioritize_current=config.projection.prioritize_current,
+            )
+        outputs, _ = detector.apply(variables, image.features[None], train=False)
+        outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
+        boxes, scores, labels, used = postprocess(
+            outputs, look(image, layout), config=config.inference, layout=layout
+        )
+        return Detections(boxes, scores, labels, used, image.num_dropped)
+
+    return detect

@@ -1,0 +1,134 @@
+"""Where the feature levels look: the padded image, and the pixel and 3D point of every location.
+
+Paper, sections 3.4 and 4: rows are repeated, a location's pixel is its index times the level's stride, and
+its 3D point is the first-round point there.
+"""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float32
+
+from fcos_lidar_jax.config import ModelConfig
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.types import Locations, RangeImage
+
+STRIDES = (1, 2, 4, 8, 16, 32)
+"""Of P2 ... P7 against the padded image."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageLayout:
+    """Sizes of the image that the network sees.
+
+    Attributes:
+        rows: of the sensor's image.
+        columns: of the sensor's image.
+        row_upscale: row i of the network's image is row ``i // row_upscale`` of the sensor's.
+        height: rows of the network's image, padded with empty rows to a multiple of 32.
+        width: columns, padded on the right with copies of the first ones to a multiple of 32.
+    """
+
+    rows: int
+    columns: int
+    row_upscale: int
+
+    @property
+    def height(self) -> int:
+        """Padded rows."""
+        return _up_to_stride(self.rows * self.row_upscale)
+
+    @property
+    def width(self) -> int:
+        """Padded columns."""
+        return _up_to_stride(self.columns)
+
+    @property
+    def level_sizes(self) -> tuple[int, ...]:
+        """Locations of each level."""
+        return tuple((self.height // s) * (self.width // s) for s in STRIDES)
+
+    @property
+    def num_locations(self) -> int:
+        """Locations of all levels."""
+        return sum(self.level_sizes)
+
+
+def _up_to_stride(size: int) -> int:
+    return -(-size // STRIDES[-1]) * STRIDES[-1]
+
+
+def image_sensor(sensor: Sensor, model: ModelConfig) -> Sensor:
+    """The sensor as binned for a model: with ``circular_width``, columns divisible by the largest stride.
+
+    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+    >>> image_sensor(NUSCENES_HDL32E, ModelConfig(circular_width=True)).num_columns
+    1088
+    """
+    if not model.circular_width:
+        return sensor
+    return dataclasses.replace(sensor, num_columns=_up_to_stride(sensor.num_columns))
+
+
+def image_layout(sensor: Sensor, model: ModelConfig) -> ImageLayout:
+    """Sizes of the image for a sensor and a model.
+
+    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+    >>> layout = image_layout(NUSCENES_HDL32E, ModelConfig())
+    >>> layout.height, layout.width, layout.num_locations
+    (64, 1088, 92820)
+    """
+    binned = image_sensor(sensor, model)
+    return ImageLayout(binned.num_rows, binned.num_columns, model.row_upscale)
+
+
+def pad_image(features: Float32[Array, "*b h w c r"], layout: ImageLayout) -> Float32[Array, "*b i j c r"]:
+    """Repeat the rows and pad to the network's size.
+
+    >>> pad_image(jnp.ones((1, 16, 250, 9, 2)), ImageLayout(16, 250, 2)).shape
+    (1, 32, 256, 9, 2)
+    """
+    image = jnp.repeat(features, layout.row_upscale, axis=-4)
+    extra = layout.width - layout.columns
+    image = jnp.concatenate([image, image[..., :extra, :, :]], axis=-3) if extra else image
+    below = [(0, 0)] * image.ndim
+    below[-4] = (0, layout.height - layout.rows * layout.row_upscale)
+    return jnp.pad(image, below)
+
+
+@functools.cache
+def location_cells(layout: ImageLayout) -> np.ndarray:
+    """Row-major cell of the sensor's image under every location, i32[l]; -1 under a pad row or column.
+
+    >>> location_cells(ImageLayout(16, 256, 2))[:3].tolist()
+    [0, 1, 2]
+    """
+    row, column = np.arange(layout.height) // layout.row_upscale, np.arange(layout.width)
+    inside = (row < layout.rows)[:, None] & (column < layout.columns)
+    cells = np.where(inside, row[:, None] * layout.columns + column, -1).astype(np.int32)
+    return np.concatenate([cells[::s, ::s].ravel() for s in STRIDES])
+
+
+def look(image: RangeImage, layout: ImageLayout) -> Locations:
+    """What every location of one sample looks at.
+
+    Args:
+        image: of one sample.
+        layout: sizes.
+
+    >>> image = RangeImage(jnp.zeros((16, 256, 9, 1)), jnp.full((16, 256, 1), -1), jnp.int32(0))
+    >>> int(look(image, ImageLayout(16, 256, 2)).occupied.sum())
+    0
+    """
+    cells = location_cells(layout)
+    first = image.features[..., 0].reshape(layout.rows * layout.columns, 9)
+    inside = cells >= 0
+    seen = jnp.where(inside[:, None], first[np.maximum(cells, 0)], 0.0)
+    return Locations(
+        points=seen[:, :3],
+        azimuth_rad=seen[:, 4],
+        cell=jnp.asarray(cells),
+        occupied=seen[:, 7] > 0,
+    )

@@ -1,0 +1,5 @@
+"""The network: the only room that knows Flax."""
+
+from fcos_lidar_jax.models.detector import Detector, Variables, build_detector, count_parameters
+
+__all__ = ["Detector", "Variables", "build_detector", "count_parameters"]

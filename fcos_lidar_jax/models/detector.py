@@ -1,0 +1,133 @@
+"""The network as a pair of pure functions."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float32
+
+from fcos_lidar_jax.config import Config, ModelConfig
+from fcos_lidar_jax.locations import ImageLayout, image_layout, pad_image
+from fcos_lidar_jax.models.fpn import FeaturePyramid
+from fcos_lidar_jax.models.heads import Heads
+from fcos_lidar_jax.models.layers import Image
+from fcos_lidar_jax.models.lidar_net import Backbone
+from fcos_lidar_jax.models.modality import Stem
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.types import Outputs
+
+Variables = dict[str, Any]
+"""``params`` and ``batch_stats``, plain dicts of arrays."""
+
+
+class Detector(NamedTuple):
+    """The network's two pure functions.
+
+    Attributes:
+        init: ``key -> variables``.
+        apply: ``(variables, features f32[b, h, w, 9, r], train=False) -> (Outputs, batch_stats)``. The
+            features are a range image's, in raw units; the batch statistics are the given ones unless
+            training.
+    """
+
+    init: Callable[[Any], Variables]
+    apply: Callable[..., tuple[Outputs, Any]]
+
+
+class Network(nn.Module):
+    """Stem, backbone, feature pyramid and heads."""
+
+    config: ModelConfig
+
+    def setup(self) -> None:
+        """The four parts; their names are the top level of the parameters."""
+        c = self.config
+        self.stem = Stem(c.stem, c.circular_width)
+        self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width)
+        self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
+        self.heads = Heads(
+            c.num_classes, c.head_channels, c.head_convs, c.background_prior, c.tied_heads, c.circular_width
+        )
+
+    def __call__(self, image: Image, *, train: bool) -> Outputs:
+        """Predictions from a normalised and padded image."""
+        with jax.named_scope("stem"):
+            x = self.stem(image, train=train)
+        with jax.named_scope("backbone"):
+            levels = self.backbone(x, train=train)
+        with jax.named_scope("fpn"):
+            levels = self.fpn(levels)
+        with jax.named_scope("heads"):
+            return self.heads(levels)
+
+
+def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, layout: ImageLayout) -> Image:
+    """The network's door: normalise, repeat rows, pad, join the channel types and the rounds.
+
+    Empty slots stay zero in all nine channels.
+
+    Args:
+        features: a range image's, in raw units.
+        config: gives the channels' means and scales.
+        layout: sizes.
+
+    Returns:
+        ``9 r`` channels, those of one type adjacent (paper, figure 2).
+
+    >>> network_input(jnp.zeros((1, 16, 256, 9, 2)), ModelConfig(), ImageLayout(16, 256, 2)).shape
+    (1, 32, 256, 18)
+    """
+    mean = jnp.array(config.channel_mean, jnp.float32)[:, None]
+    scale = jnp.array(config.channel_scale, jnp.float32)[:, None]
+    exists = features[..., 7:8, :] > 0
+    image = pad_image(jnp.where(exists, (features - mean) / scale, 0.0), layout)
+    return image.reshape(*image.shape[:3], -1)
+
+
+def build_detector(config: Config, sensor: Sensor) -> Detector:
+    """The network of a configuration as pure functions.
+
+    Args:
+        config: which network.
+        sensor: whose images.
+
+    Returns:
+        the pair ``(init, apply)``.
+
+    >>> from fcos_lidar_jax.config import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> detector = build_detector(QUICKSTART, TINY)
+    >>> sorted(jax.eval_shape(detector.init, jax.random.key(0)))
+    ['batch_stats', 'params']
+    """
+    network = Network(config.model)
+    layout = image_layout(sensor, config.model)
+    channels = 9 * config.projection.num_rounds
+
+    def init(key: Any) -> Variables:
+        # Parameters do not depend on the image's size, and nothing of the forward pass is computed.
+        image = jax.ShapeDtypeStruct((1, 32, 32, channels), jnp.float32)
+        return network.lazy_init(key, image, train=False)  # type: ignore[return-value]
+
+    def apply(
+        variables: Variables, features: Float32[Array, "b h w 9 r"], *, train: bool = False
+    ) -> tuple[Outputs, Any]:
+        image = network_input(features, config.model, layout)
+        outputs, updates = network.apply(
+            variables, image, train=train, mutable=["batch_stats"] if train else []
+        )
+        return outputs, updates["batch_stats"] if train else variables["batch_stats"]
+
+    return Detector(init, apply)
+
+
+def count_parameters(params: Any) -> dict[str, int]:
+    """Parameters of each part of the network, and in total.
+
+    >>> count_parameters({"stem": {"kernel": jnp.ones((3, 4))}, "fpn": {"bias": jnp.ones(2)}})
+    {'stem': 12, 'fpn': 2, 'total': 14}
+    """
+    parts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in params.items()}
+    return {**parts, "total": sum(parts.values())}

@@ -1,0 +1,55 @@
+"""LiDAR-Net's backbone: ResNet-50 without the first two downsamplings (paper, section 3.4)."""
+
+import flax.linen as nn
+import jax
+
+from fcos_lidar_jax.models.layers import ConvNorm, Image
+
+_STRIDES = (1, 2, 2, 2)
+_EXPANSION = 4
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1 with a shortcut; the stride sits on the 3x3 and on the shortcut."""
+
+    width: int
+    stride: int = 1
+    project: bool = False
+    circular: bool = False
+
+    @nn.compact
+    def __call__(self, x: Image, *, train: bool) -> Image:
+        """Apply the block."""
+        wide = self.width * _EXPANSION
+        y = ConvNorm(self.width, 1, name="reduce")(x, train=train)
+        y = ConvNorm(self.width, 3, self.stride, circular=self.circular, name="spatial")(y, train=train)
+        y = ConvNorm(wide, 1, relu=False, name="expand")(y, train=train)
+        if self.project:
+            x = ConvNorm(wide, 1, self.stride, relu=False, name="shortcut")(x, train=train)
+        return jax.nn.relu(x + y)
+
+
+class Backbone(nn.Module):
+    """The first 7x7 convolution, at stride 1 and without pooling, and four stages."""
+
+    blocks: tuple[int, ...]
+    widths: tuple[int, ...]
+    circular: bool = False
+
+    @nn.compact
+    def __call__(self, x: Image, *, train: bool) -> list[Image]:
+        """C2, C3, C4, C5 at 1/1, 1/2, 1/4, 1/8 of the image."""
+        x = ConvNorm(x.shape[-1], 7, circular=self.circular, name="first")(x, train=train)
+        levels = []
+        for stage, (count, width, stride) in enumerate(zip(self.blocks, self.widths, _STRIDES, strict=True)):
+            for block in range(count):
+                first = block == 0
+                x = Bottleneck(
+                    width,
+                    stride if first else 1,
+                    project=first,
+                    circular=self.circular,
+                    name=f"stage{stage}_block{block}",
+                )(x, train=train)
+            levels.append(x)
+        return levels

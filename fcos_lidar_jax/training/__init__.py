@@ -1,0 +1,19 @@
+"""Optimizer, step, loop and checkpoints."""
+
+from fcos_lidar_jax.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.training.loop import NonFiniteLossError, fit
+from fcos_lidar_jax.training.optimizer import make_optimizer
+from fcos_lidar_jax.training.step import make_loss, make_state, make_train_step
+
+__all__ = [
+    "Checkpoint",
+    "CheckpointError",
+    "NonFiniteLossError",
+    "fit",
+    "load_checkpoint",
+    "make_loss",
+    "make_optimizer",
+    "make_state",
+    "make_train_step",
+    "save_checkpoint",
+]

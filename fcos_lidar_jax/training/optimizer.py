@@ -1,0 +1,68 @@
+"""One-cycle AdamW (paper, section 4): learning rate and momentum are functions of the step."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import optax
+
+from fcos_lidar_jax.config import OptimizerConfig
+
+_FIXED = ("b2", "eps", "eps_root", "mu_dtype", "weight_decay", "mask", "nesterov")
+"""AdamW's arguments that stay out of the state."""
+
+
+def learning_rate_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule:
+    """Peak / divisor, up to the peak over the warm-up, down to the last rate at ``num_steps``; cosine.
+
+    >>> schedule = learning_rate_schedule(OptimizerConfig(), 1000)
+    >>> [f"{float(schedule(step)):.1e}" for step in (0, 400, 1000)]
+    ['1.0e-03', '1.0e-02', '1.0e-07']
+    """
+    return optax.cosine_onecycle_schedule(
+        num_steps,
+        config.peak_learning_rate,
+        pct_start=config.warmup_fraction,
+        div_factor=config.initial_divisor,
+        final_div_factor=config.final_divisor,
+    )
+
+
+def momentum_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule:
+    """AdamW's b1: from high to low while the learning rate rises, and back; cosine.
+
+    >>> schedule = momentum_schedule(OptimizerConfig(), 1000)
+    >>> [round(float(schedule(step)), 3) for step in (0, 400, 1000)]
+    [0.95, 0.85, 0.95]
+    """
+    low, high = config.b1_range
+    turn = int(config.warmup_fraction * num_steps)
+    return optax.piecewise_interpolate_schedule("cosine", high, {turn: low / high, num_steps: high / low})
+
+
+def make_optimizer(config: OptimizerConfig, num_steps: int) -> optax.GradientTransformation:
+    """Global-norm clipping, then AdamW with weight decay on all parameters.
+
+    Args:
+        config: rates and bounds.
+        num_steps: updates of the whole run.
+
+    >>> state = make_optimizer(OptimizerConfig(), 10).init({"w": jnp.ones(2)})
+    >>> sorted(current_hyperparameters(state))
+    ['b1', 'learning_rate']
+    """
+    adamw = optax.inject_hyperparams(optax.adamw, static_args=_FIXED, hyperparam_dtype=jnp.float32)
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_gradient_norm),
+        adamw(
+            learning_rate=learning_rate_schedule(config, num_steps),
+            b1=momentum_schedule(config, num_steps),
+            b2=config.b2,
+            weight_decay=config.weight_decay,
+        ),
+    )
+
+
+def current_hyperparameters(opt_state: Any) -> dict[str, Any]:
+    """Learning rate and b1 of the last update, from the state of :func:`make_optimizer`."""
+    hyperparameters = opt_state[1].hyperparams
+    return {name: hyperparameters[name] for name in ("learning_rate", "b1")}
