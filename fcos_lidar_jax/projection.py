@@ -67,7 +67,7 @@ def remove_close(
         close &= points[:, 4] != 0
     elif mode != "all":
         raise ValueError(f"mode: got {mode!r}, expected 'all', 'sweeps' or 'none'")
-    return valid & ~close
+    return jnp.asarray(valid) & ~close
 
 
 def image_cells(

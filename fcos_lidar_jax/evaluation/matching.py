@@ -129,7 +129,7 @@ def average_precision(frames: Sequence[FrameResult], label: int, max_distance_m:
 
     >>> one = np.zeros((1, 9))
     >>> frame = FrameResult(one, np.array([0]), np.array([0.9]), one, np.array([0]))
-    >>> average_precision([frame], 0, 2.0)
+    >>> round(average_precision([frame], 0, 2.0), 9)
     1.0
     """
     scores, hits, num_truth = [], [], 0

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float32
 
-Image = Float32[Array, "b h w c"]
-Kernel = Float32[Array, "i j c o"]
+Image = Float32[Array, "b _ _ _"]
+"""Height, width and channels change from layer to layer."""
+Kernel = Float32[Array, "_ _ _ _"]
 
 kernel_init = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 """He's, over the outputs, as in ResNet."""

@@ -133,6 +133,7 @@ def _compare(folder: Path, config: Config, expected: Any, found: Any) -> None:
     for name in sorted(wanted.keys() | there.keys()):
         if wanted.get(name) != there.get(name):
             raise CheckpointError(
-                f"{folder}: {name}: got {there.get(name, 'nothing')}, expected {wanted.get(name, 'nothing')}: "
+                f"{folder}: {name}: got {there.get(name, 'nothing')}, "
+                f"expected {wanted.get(name, 'nothing')}: "
                 f"the arrays are not of the configuration {config.name!r} beside them"
             )
