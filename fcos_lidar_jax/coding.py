@@ -90,6 +90,4 @@ def decode(
     """
     yaw = wrap_angle(atan2(regression[..., 6], regression[..., 7]) + azimuth_rad)
     size = jnp.exp(jnp.clip(regression[..., 3:6], -LOG_SIZE_LIMIT, LOG_SIZE_LIMIT))
-    return jnp.concatenate(
-        [regression[..., :3] + points, size, yaw[..., None], regression[..., 8:10]], axis=-1
-    )
+    return jnp.concatenate([regression[..., :3] + points, size, yaw[..., None], regression[..., 8:10]], axis=-1)

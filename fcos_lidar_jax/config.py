@@ -198,9 +198,7 @@ class InferenceConfig:
         _check(0 <= self.min_probability < 1, "min_probability", self.min_probability, "within [0, 1)")
         _check(0 <= self.iou_threshold <= 1, "iou_threshold", self.iou_threshold, "within [0, 1]")
         _check(self.max_detections >= 1, "max_detections", self.max_detections, "at least 1")
-        _check(
-            self.candidates_per_level >= 1, "candidates_per_level", self.candidates_per_level, "at least 1"
-        )
+        _check(self.candidates_per_level >= 1, "candidates_per_level", self.candidates_per_level, "at least 1")
         _check_choices(self)
 
 
@@ -390,9 +388,7 @@ def _from_json(kind: Any, value: Any, where: str) -> Any:
         kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
         if len(kinds) != len(value):
             raise ValueError(f"{where}: got {len(value)} values, expected {len(kinds)}")
-        return tuple(
-            _from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True))
-        )
+        return tuple(_from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
     if args:  # AugmentConfig | None
         return None if value is None else _from_json(args[0], value, where)
     accepted = (int, float) if kind is float else kind

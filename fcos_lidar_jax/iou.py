@@ -72,9 +72,7 @@ def _area(a: Rectangle, b: Rectangle) -> Array:
         enter, leave = (jnp.clip(t, low, high) for t in _crossing(x, dx, half_l))
         at = [jnp.clip(x + t * dx, -half_l, half_l) for t in (low, enter, leave, high)]
         pieces = (
-            (at[0] + at[1]) * (enter - low)
-            + (at[1] + at[2]) * (leave - enter)
-            + (at[2] + at[3]) * (high - leave)
+            (at[0] + at[1]) * (enter - low) + (at[1] + at[2]) * (leave - enter) + (at[2] + at[3]) * (high - leave)
         )
         area = area + 0.5 * dy * pieces
     return jnp.clip(area, 0.0, jnp.minimum(a[2] * a[3], b[2] * b[3]))
@@ -125,9 +123,7 @@ def _intersection_forward(a: Rectangle, b: Rectangle) -> tuple[Array, tuple[Rect
     return _area(a, b), (a, b)
 
 
-def _intersection_backward(
-    saved: tuple[Rectangle, Rectangle], cotangent: Array
-) -> tuple[Rectangle, Rectangle]:
+def _intersection_backward(saved: tuple[Rectangle, Rectangle], cotangent: Array) -> tuple[Rectangle, Rectangle]:
     a, b = saved
     return (
         tuple(cotangent * g for g in _area_gradient(a, b)),
@@ -153,9 +149,7 @@ def oriented(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8"]:
     return jnp.concatenate([boxes[..., :6], jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
 
 
-def oriented_overlap(
-    a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertical: bool
-) -> tuple[Array, Array]:
+def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertical: bool) -> tuple[Array, Array]:
     """Intersection and union of oriented boxes, as areas or volumes; elementwise with broadcasting.
 
     Args:
@@ -172,9 +166,7 @@ def oriented_overlap(
     bx, by, bz, bl, bw, bh, bcos, bsin = _columns(b)
     # In the frame of a's centre the numbers stay small wherever the boxes are.
     zero = jnp.zeros_like(ax)
-    intersection = _intersection_area(
-        (zero, zero, al, aw, acos, asin), (bx - ax, by - ay, bl, bw, bcos, bsin)
-    )
+    intersection = _intersection_area((zero, zero, al, aw, acos, asin), (bx - ax, by - ay, bl, bw, bcos, bsin))
     size_a, size_b = al * aw, bl * bw
     if vertical:
         shared = jnp.minimum(az + 0.5 * ah, bz + 0.5 * bh) - jnp.maximum(az - 0.5 * ah, bz - 0.5 * bh)

@@ -132,9 +132,7 @@ def _enclosing(prediction: Array, target: Array) -> Array:
     )
 
 
-def iou_prediction_loss(
-    logits: Float32[Array, "l"], iou: Float32[Array, "l"], mask: Bool[Array, "l"]
-) -> SumCount:
+def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], mask: Bool[Array, "l"]) -> SumCount:
     """Binary cross-entropy of the predicted IoU against the measured one, which is not differentiated.
 
     Args:
@@ -150,9 +148,7 @@ def iou_prediction_loss(
     return _masked(jax.nn.softplus(logits) - iou * logits, mask)
 
 
-def combine(
-    parts: Mapping[str, SumCount], num_positive: Int32[Array, ""], config: LossConfig
-) -> dict[str, Array]:
+def combine(parts: Mapping[str, SumCount], num_positive: Int32[Array, ""], config: LossConfig) -> dict[str, Array]:
     """The weighted total and its parts, each sum divided once by the positives of the global batch.
 
     Args:

@@ -177,9 +177,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
         _expect_number(even["lowest"], f"{where}: inclinations_deg.lowest")
         _expect_number(even["highest"], f"{where}: inclinations_deg.highest")
         if not isinstance(even["rows"], int) or even["rows"] < 2:
-            raise ValueError(
-                f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected an integer >= 2"
-            )
+            raise ValueError(f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected an integer >= 2")
         record["inclinations_rad"] = even_inclinations(even["lowest"], even["highest"], even["rows"])
     fields = {f.name: f for f in dataclasses.fields(Sensor)}
     unknown = sorted(set(record) - set(fields))

@@ -47,8 +47,7 @@ def test_split_stem_equals_grouped_convolution_in_values_and_gradients(group_rou
         return (out * weights).sum(), out
 
     results = {
-        form: jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(variables, image, form)
-        for form in stems
+        form: jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(variables, image, form) for form in stems
     }
     (_, split), split_grads = results["split"]
     (_, grouped), grouped_grads = results["grouped"]
@@ -116,9 +115,7 @@ def test_stem_variants_of_tables_3_4_5_keep_the_size(config):
     assert len(merges) == (1 if config.merge == "shared" else len(config.dilations))
 
 
-@pytest.mark.parametrize(
-    ("stride", "dilation", "size"), [(1, 1, 1), (2, 1, 1), (1, 6, 3), (2, 1, 3), (1, 1, 7)]
-)
+@pytest.mark.parametrize(("stride", "dilation", "size"), [(1, 1, 1), (2, 1, 1), (1, 6, 3), (2, 1, 3), (1, 1, 7)])
 def test_convolve_is_the_library_convolution_with_symmetric_padding(stride, dilation, size):
     x, kernel = normal(0, 2, 12, 16, 3), normal(1, size, size, 3, 4)
     pad = size // 2 * dilation

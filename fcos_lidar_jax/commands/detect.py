@@ -12,7 +12,8 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.commands.clouds import Cloud, expect_points, make_cloud
-from fcos_lidar_jax.data.point_files import read_points, read_sweeps
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.models import build_detector
@@ -108,24 +109,34 @@ def as_records(found: Detections, *, min_score: float = 0.0) -> list[dict[str, A
         found: NumPy arrays.
         min_score: leave out what is below.
     """
-    kept = found.valid & (found.scores >= min_score)
     return [
         {"label": CLASSES[label], "score": float(score), "box": [float(v) for v in box]}
-        for label, score, box in zip(found.labels[kept], found.scores[kept], found.boxes[kept], strict=True)
+        for box, label, score in zip(*confident(found, min_score), strict=True)
     ]
+
+
+def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes, labels and scores of the detections of one cloud that reach a score.
+
+    Args:
+        found: of one cloud.
+        min_score: leave out what is below.
+    """
+    kept = np.asarray(found.valid) & (np.asarray(found.scores) >= min_score)
+    return np.asarray(found.boxes)[kept], np.asarray(found.labels)[kept], np.asarray(found.scores)[kept]
 
 
 def _draw(path: Path, cloud: Cloud, found: Detections, min_score: float, limit_m: float) -> None:
     from fcos_lidar_jax.visualization.bev import draw_bev
 
-    kept = found.valid & (found.scores >= max(min_score, 0.1))
+    least = max(min_score, 0.1)
     path.parent.mkdir(parents=True, exist_ok=True)
     draw_bev(
         cloud.points[cloud.valid],
         path,
-        detections=tuple(np.asarray(a)[kept] for a in (found.boxes, found.labels, found.scores)),  # type: ignore[arg-type]
+        detections=confident(found, least),
         limit_m=limit_m,
-        title=f"{path.stem}: boxes of score {max(min_score, 0.1):g} and more",
+        title=f"{path.stem}: boxes of score {least:g} and more",
     )
 
 

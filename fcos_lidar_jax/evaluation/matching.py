@@ -95,9 +95,7 @@ def nearest_of_class(
     >>> nearest_of_class(box, np.array([0]), box, np.array([1])).tolist()
     [inf]
     """
-    distance = np.hypot(
-        boxes[:, None, 0] - true_boxes[None, :, 0], boxes[:, None, 1] - true_boxes[None, :, 1]
-    )
+    distance = np.hypot(boxes[:, None, 0] - true_boxes[None, :, 0], boxes[:, None, 1] - true_boxes[None, :, 1])
     distance = np.where(labels[:, None] == true_labels, distance, np.inf)
     return distance.min(axis=1, initial=np.inf)
 

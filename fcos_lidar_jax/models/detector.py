@@ -115,9 +115,7 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
         variables: Variables, features: Float32[Array, "b h w 9 r"], *, train: bool = False
     ) -> tuple[Outputs, Any]:
         image = network_input(features, config.model, layout)
-        outputs, updates = network.apply(
-            variables, image, train=train, mutable=["batch_stats"] if train else []
-        )
+        outputs, updates = network.apply(variables, image, train=train, mutable=["batch_stats"] if train else [])
         return outputs, updates["batch_stats"] if train else variables["batch_stats"]
 
     return Detector(init, apply)

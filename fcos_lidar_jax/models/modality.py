@@ -44,9 +44,7 @@ def modality_convolve(
     3
     """
     if form == "split" or len({k.shape for k in kernels}) > 1:
-        return [
-            convolve(x, k, dilation=dilation, circular=circular) for x, k in zip(parts, kernels, strict=True)
-        ]
+        return [convolve(x, k, dilation=dilation, circular=circular) for x, k in zip(parts, kernels, strict=True)]
     x, kernel = jnp.concatenate(parts, axis=-1), jnp.concatenate(kernels, axis=-1)
     y = convolve(x, kernel, dilation=dilation, groups=len(parts), circular=circular)
     return [y[..., cut] for cut in pieces([k.shape[-1] for k in kernels])]

@@ -125,9 +125,7 @@ def _compare(folder: Path, config: Config, expected: Any, found: Any) -> None:
 
     def shapes(tree: Any) -> dict[str, tuple[int, ...]]:
         leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-        return {
-            jax.tree_util.keystr(path, simple=True, separator="/"): tuple(leaf.shape) for path, leaf in leaves
-        }
+        return {jax.tree_util.keystr(path, simple=True, separator="/"): tuple(leaf.shape) for path, leaf in leaves}
 
     wanted, there = shapes(expected), shapes(found)
     for name in sorted(wanted.keys() | there.keys()):

@@ -97,8 +97,7 @@ class _Progress:
         rate = (done - self.first) / (now - self.began) if done > self.first else 0.0
         left = f"{rate:.2f} steps/s, {(self.last - done) / rate:.0f} s left" if rate else "compiled"
         print(
-            f"step {done}/{self.last}  loss {record['loss/total']:.3f}  "
-            f"IoU {record['positive_iou']:.2f}  {left}",
+            f"step {done}/{self.last}  loss {record['loss/total']:.3f}  IoU {record['positive_iou']:.2f}  {left}",
             file=self.log,
             flush=True,
         )

@@ -34,9 +34,7 @@ Metrics = dict[str, Array]
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
-def make_state(
-    variables: dict[str, Any], optimizer: optax.GradientTransformation, key: jax.Array
-) -> TrainState:
+def make_state(variables: dict[str, Any], optimizer: optax.GradientTransformation, key: jax.Array) -> TrainState:
     """The state before the first step.
 
     Args:
@@ -52,9 +50,7 @@ def make_state(
         key=key,
     )
     # Strong types throughout: a weakly typed leaf would compile the step a second time.
-    return jax.tree.map(
-        lambda leaf: lax.convert_element_type(leaf, leaf.dtype) if _numeric(leaf) else leaf, state
-    )
+    return jax.tree.map(lambda leaf: lax.convert_element_type(leaf, leaf.dtype) if _numeric(leaf) else leaf, state)
 
 
 def _numeric(leaf: Any) -> bool:
@@ -235,9 +231,7 @@ def make_train_step(
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         gradient = jax.value_and_grad(loss, has_aux=True)
-        (_, (batch_stats, metrics)), grads = gradient(
-            state.params, state.batch_stats, augmented(state, batch)
-        )
+        (_, (batch_stats, metrics)), grads = gradient(state.params, state.batch_stats, augmented(state, batch))
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         metrics["gradient_norm"] = optax.global_norm(grads)
         metrics.update(current_hyperparameters(opt_state))
