@@ -326,10 +326,12 @@ QUICKSTART = dataclasses.replace(
     projection=ProjectionConfig(num_rounds=1),
     model=dataclasses.replace(
         NUSCENES.model,
-        stem=StemConfig(channels_per_type=4, out_channels=16),
+        stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3)),
+        backbone_blocks=(2, 2, 1, 1),
         backbone_widths=(16, 32, 32, 32),
         fpn_channels=32,
         head_channels=32,
+        head_convs=2,
     ),
     inference=InferenceConfig(candidates_per_level=200, max_detections=100),
     optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=4),

@@ -20,11 +20,12 @@ from fcos_lidar_jax.types import RangeImage
 
 def close_to_sensor(
     points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float = 1.0
-) -> Bool[Array, "n"]:
+) -> Bool[Array | np.ndarray, "n"]:
     """Points on the carrying vehicle itself: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
 
     Args:
-        points: x, y, z, ... in metres.
+        points: x, y, z, ... in metres, NumPy or JAX; the answer is of the same kind, so that clouds of any
+            length can be filtered on the host without compiling.
         sensor: gives the origin.
         close_m: half the side of the square.
 
@@ -32,7 +33,7 @@ def close_to_sensor(
     [True]
     """
     x, y = points[:, 0] - sensor.origin_m[0], points[:, 1] - sensor.origin_m[1]
-    return (jnp.abs(x) < close_m) & (jnp.abs(y) < close_m)
+    return (abs(x) < close_m) & (abs(y) < close_m)
 
 
 def remove_close(
@@ -42,11 +43,11 @@ def remove_close(
     *,
     mode: str,
     close_m: float = 1.0,
-) -> Bool[Array, "n"]:
+) -> Bool[Array | np.ndarray, "n"]:
     """``valid`` without the points on the carrying vehicle, judged in the current frame.
 
     Args:
-        points: x, y, z, intensity, time lag.
+        points: x, y, z, intensity, time lag; NumPy or JAX, as is the answer.
         valid: rows that count.
         sensor: gives the origin.
         mode: ``"all"`` drops them from all sweeps, ``"sweeps"`` from the older ones, ``"none"`` not at all.
@@ -60,14 +61,13 @@ def remove_close(
     [False]
     """
     if mode == "none":
-        return jnp.asarray(valid)
-    points = jnp.asarray(points)
+        return valid
     close = close_to_sensor(points, sensor, close_m)
     if mode == "sweeps":
-        close &= points[:, 4] != 0
+        close = close & (points[:, 4] != 0)
     elif mode != "all":
         raise ValueError(f"mode: got {mode!r}, expected 'all', 'sweeps' or 'none'")
-    return jnp.asarray(valid) & ~close
+    return valid & ~close
 
 
 def image_cells(
