@@ -70,6 +70,7 @@ def remove_close(
     return valid & ~close
 
 
+@functools.partial(jax.jit, static_argnames="sensor")
 def image_cells(
     points: Float32[Array, "n c"], valid: Bool[Array, "n"], sensor: Sensor
 ) -> tuple[Int32[Array, "n"], tuple[Float32[Array, "n"], ...]]:
@@ -91,6 +92,8 @@ def image_cells(
     >>> image_cells(jnp.array([[-5.0, 1e-3, 0, 0, 0]]), jnp.ones(1, bool), two)[0].tolist()
     [8]
     """
+    # The barriers fence the arithmetic off, so that it rounds alike whatever program it is compiled into.
+    points, valid = lax.optimization_barrier((points, valid))
     usable = valid & jnp.isfinite(points).all(axis=1)
     points = jnp.where(usable[:, None], points, 0.0)
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
@@ -102,7 +105,7 @@ def image_cells(
     row = points[:, 5].astype(jnp.int32) if sensor.row_source == "laser" else _row(inclination, sensor)
     usable &= (row >= 0) & (row < sensor.num_rows)
     cell = jnp.where(usable, row * sensor.num_columns + column, sensor.num_rows * sensor.num_columns)
-    return cell.astype(jnp.int32), (range_m, azimuth, inclination)
+    return lax.optimization_barrier((cell.astype(jnp.int32), (range_m, azimuth, inclination)))
 
 
 def _row(inclination: Float32[Array, "n"], sensor: Sensor) -> Int32[Array, "n"]:
@@ -201,9 +204,8 @@ def project_points(
             f"points: got {points.shape[1]} columns, sensor {sensor.name!r} needs {sensor.point_columns}"
         )
     rows, columns = sensor.num_rows, sensor.num_columns
-    # The barriers fence the arithmetic off, so that it rounds alike whatever program it is compiled into.
-    cloud, counts = lax.optimization_barrier((jnp.asarray(points), jnp.asarray(valid)))
-    cell, angles = lax.optimization_barrier(image_cells(cloud, counts, sensor))
+    cloud, counts = jnp.asarray(points), jnp.asarray(valid)
+    cell, angles = image_cells(cloud, counts, sensor)
     keys = priority_keys(angles[0], cloud[:, 4], prioritize_current=prioritize_current)
     index = winners(cell, keys, num_cells=rows * columns, num_rounds=num_rounds)
     features = _gather_channels(cloud, angles, index)

@@ -12,7 +12,7 @@ _UNCHECKED = ("types",)
 _PACKAGE = Path(__file__).parents[1] / "fcos_lidar_jax"
 _MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", "__main__", *_UNCHECKED)]
 _ROOMS = ["models", "training", "inference", "evaluation"]
-install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "beartype.beartype")
+install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "typecheck.check")
 
 jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
