@@ -107,7 +107,7 @@ def box_corners(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8 3"]:
     )
 
 
-def points_in_box(points: Float[Array, "*n 3"], box: Float[Array, "*n c"]) -> Bool[Array, "*n"]:
+def points_in_box(points: Float[Array, "*n 3"], box: Float[Array, "*m c"]) -> Bool[Array, "*o"]:
     """Whether points lie in boxes, boundary included; elementwise with broadcasting.
 
     Args:

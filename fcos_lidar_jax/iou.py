@@ -8,6 +8,7 @@ by its length along its normal, so it is the clipped edges times their normals.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 _TINY = 1e-7
@@ -139,12 +140,13 @@ def _columns(boxes: Float[Array, "*m c"]) -> list[Array]:
     return [boxes[..., i] for i in range(8)]
 
 
-def oriented(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8"]:
+def oriented(boxes: Float[Array | np.ndarray, "*m c"]) -> Float[Array, "*m 8"]:
     """Boxes ``x, y, z, l, w, h, yaw, ...`` as ``x, y, z, l, w, h, cos yaw, sin yaw``.
 
     >>> oriented(jnp.array([0, 0, 0, 4, 2, 1, 0.0])).tolist()
     [0.0, 0.0, 0.0, 4.0, 2.0, 1.0, 1.0, 0.0]
     """
+    boxes = jnp.asarray(boxes)
     yaw = boxes[..., 6:7]
     return jnp.concatenate([boxes[..., :6], jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
 
@@ -190,7 +192,9 @@ def _ratio(intersection: Array, union: Array) -> Array:
     return jnp.where(positive, intersection / jnp.where(positive, union, 1.0), 0.0)
 
 
-def rotated_iou_bev(a: Float[Array, "*m c"], b: Float[Array, "*n d"]) -> Float[Array, "*o"]:
+def rotated_iou_bev(
+    a: Float[Array | np.ndarray, "*m c"], b: Float[Array | np.ndarray, "*n d"]
+) -> Float[Array, "*o"]:
     """IoU in the ground plane; elementwise with broadcasting, differentiable.
 
     Args:
@@ -207,7 +211,9 @@ def rotated_iou_bev(a: Float[Array, "*m c"], b: Float[Array, "*n d"]) -> Float[A
     return _ratio(*oriented_overlap(oriented(a), oriented(b), vertical=False))
 
 
-def rotated_iou_3d(a: Float[Array, "*m c"], b: Float[Array, "*n d"]) -> Float[Array, "*o"]:
+def rotated_iou_3d(
+    a: Float[Array | np.ndarray, "*m c"], b: Float[Array | np.ndarray, "*n d"]
+) -> Float[Array, "*o"]:
     """IoU of upright boxes; elementwise with broadcasting, differentiable.
 
     Args:

@@ -3,6 +3,7 @@
 from typing import Literal
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
@@ -10,11 +11,11 @@ from fcos_lidar_jax.iou import oriented, oriented_overlap
 
 
 def rotated_nms(
-    boxes: Float32[Array, "n c"],
-    scores: Float32[Array, "n"],
-    valid: Bool[Array, "n"],
+    boxes: Float32[Array | np.ndarray, "n c"],
+    scores: Float32[Array | np.ndarray, "n"],
+    valid: Bool[Array | np.ndarray, "n"],
     *,
-    labels: Int32[Array, "n"] | None = None,
+    labels: Int32[Array | np.ndarray, "n"] | None = None,
     iou_threshold: float,
     max_outputs: int,
     overlap: Literal["bev", "3d"] = "bev",
@@ -41,15 +42,15 @@ def rotated_nms(
     >>> kept.tolist(), used.tolist()
     ([1, 2, 0], [True, True, False])
     """
-    valid &= ~jnp.isnan(scores)
-    scores = jnp.where(valid, scores, -jnp.inf)
-    labels = jnp.zeros(scores.shape, jnp.int32) if labels is None else labels
+    usable = jnp.asarray(valid) & ~jnp.isnan(scores)
+    ranked = jnp.where(usable, scores, -jnp.inf)
+    kinds = jnp.zeros(ranked.shape, jnp.int32) if labels is None else jnp.asarray(labels)
     if form not in ("rows", "matrix"):
         raise ValueError(f"form: got {form!r}, expected 'rows' or 'matrix'")
     if overlap not in ("bev", "3d"):
         raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
     suppress = _by_rows if form == "rows" else _by_matrix
-    return suppress(oriented(boxes), scores, valid, labels, iou_threshold, max_outputs, overlap == "3d")
+    return suppress(oriented(boxes), ranked, usable, kinds, iou_threshold, max_outputs, overlap == "3d")
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:

@@ -1,0 +1,101 @@
+"""Owners and dynamic K against loops, on random and degenerate input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import oracles
+from fcos_lidar_jax.assignment import assign, cheapest, dynamic_k, owners
+
+
+def f32(x):
+    return jnp.asarray(x, jnp.float32)
+
+
+def i32(x):
+    return jnp.asarray(x, jnp.int32)
+
+
+@pytest.mark.parametrize("num_boxes", [1, 40, 256])
+def test_owners_equal_loops_with_overlapping_boxes(num_boxes):
+    rng = np.random.default_rng(num_boxes)
+    boxes = oracles.random_boxes(rng, num_boxes, 4.0).astype(np.float32)
+    points = rng.normal(0, 4, (300, 3)).astype(np.float32) * [1, 1, 0.3]
+    points = points.astype(np.float32)
+    present, valid = rng.random(300) < 0.9, rng.random(num_boxes) < 0.8
+    found = np.asarray(owners(points, present, boxes, valid))
+    expected = [oracles.owner(p, boxes, valid) if here else -1 for p, here in zip(points, present, strict=True)]
+    np.testing.assert_array_equal(found, expected)
+    inside = [sum(oracles.inside(p, b) for b in boxes) for p in points]
+    assert num_boxes == 1 or max(inside) >= 2
+
+
+def test_owner_boundary_equal_volumes_and_padding():
+    boxes = f32([[0, 0, 0, 2, 2, 2, 0], [0.5, 0, 0, 2, 2, 2, 0], [0, 0, 0, np.nan, 1, 1, 0]])
+    points = f32([[1, 1, 1], [1.5, 0, 0], [0, 0, 0], [1.6, 0, 0], [0, 0, 0]])
+    present = jnp.array([True, True, True, True, False])
+    found = owners(points, present, boxes, jnp.array([True, True, False]))
+    assert found.tolist() == [0, 1, 0, -1, -1]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("num_boxes", [1, 20, 256])
+def test_assignment_equals_the_matrix_form(seed, num_boxes):
+    rng = np.random.default_rng(seed)
+    owner = rng.integers(-1, num_boxes, 2000).astype(np.int32)
+    iou = (rng.random(2000) * (rng.random(2000) < 0.7)).astype(np.float32)
+    cost = np.round(rng.random(2000) * 4, 1).astype(np.float32)  # many exact ties
+    iou = np.round(iou * 4) / 4 if seed % 2 else iou  # sums of quarters: exact halves to round
+    iou = iou.astype(np.float32)
+    expected, ks = oracles.assign(owner, cost, iou, num_boxes, 20)
+    targets = jax.jit(assign, static_argnames=("num_boxes", "top_q"))(
+        i32(owner), f32(cost), f32(iou), num_boxes=num_boxes
+    )
+    np.testing.assert_array_equal(targets.num_positive, ks)
+    np.testing.assert_array_equal(targets.positive, expected)
+
+
+@pytest.mark.parametrize(
+    ("ious", "k"),
+    [([1.0, 0.5], 2), ([1, 1, 0.5], 3), ([0.25] * 5, 1), ([0.0] * 4, 1), ([1.0] * 25, 20), ([0.9], 1)],
+)
+def test_k_rounds_half_up_is_at_least_one_and_at_most_the_candidates(ious, k):
+    owner = [0] * len(ious) + [-1] * 3
+    assert dynamic_k(i32(owner), f32([*ious, 1, 1, 1]), num_boxes=1, top_q=20).tolist() == [k]
+
+
+def test_equal_costs_go_to_the_lower_index():
+    assert cheapest(i32([0, 0, 0, 0]), f32([1, 1, 1, 1]), i32([2])).tolist() == [True, True, False, False]
+
+
+def test_no_boxes_all_padding_and_one_point():
+    none = assign(i32([-1] * 5), f32([0] * 5), f32([1] * 5), num_boxes=3)
+    assert none.num_positive.tolist() == [0, 0, 0]
+    assert not none.positive.any()
+    one = assign(i32([1]), f32([9]), f32([0]), num_boxes=2)
+    assert one.positive.tolist() == [True]
+    assert one.num_positive.tolist() == [0, 1]
+
+
+def test_a_diverging_prediction_is_chosen_last():
+    targets = assign(i32([0, 0, 0]), f32([np.nan, 5, np.inf]), f32([0.0, 0.0, 0.0]), num_boxes=1)
+    assert targets.positive.tolist() == [False, True, False]
+
+
+def test_maps_over_a_batch_and_has_no_gradient():
+    rng = np.random.default_rng(0)
+    owner, cost, iou = i32(rng.integers(-1, 4, (3, 50))), f32(rng.random((3, 50))), f32(rng.random((3, 50)))
+
+    def go(o, c, i):
+        return assign(o, c, i, num_boxes=4)
+
+    batched = jax.vmap(go)(owner, cost, iou)
+    for b in range(3):
+        np.testing.assert_array_equal(batched.positive[b], go(owner[b], cost[b], iou[b]).positive)
+
+    def value(c):
+        return jnp.where(go(owner[0], c, iou[0]).positive, c, 0.0).sum()
+
+    gradient = jax.grad(value)(cost[0])
+    np.testing.assert_array_equal(gradient, go(owner[0], cost[0], iou[0]).positive.astype(jnp.float32))

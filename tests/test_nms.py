@@ -1,0 +1,89 @@
+"""Rotated NMS: both forms keep exactly what Shapely's greedy loop keeps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import oracles
+from fcos_lidar_jax.nms import rotated_nms
+
+FORMS = pytest.mark.parametrize("form", ["rows", "matrix"])
+
+
+def clusters(seed: int, number: int = 200):
+    rng = np.random.default_rng(seed)
+    centres = oracles.random_boxes(rng, number // 10, 12.0)
+    boxes = centres[rng.integers(0, len(centres), number)] + rng.normal(0, 0.2, (number, 7))
+    boxes[:, 3:6] = np.maximum(np.abs(boxes[:, 3:6]), 0.3)
+    scores = np.round(rng.random(number), 2).astype(np.float32)  # ties
+    return boxes.astype(np.float32), scores, rng.random(number) < 0.9, rng.integers(0, 3, number).astype(np.int32)
+
+
+def keep(boxes, scores, valid, labels, **options):
+    kept, used = rotated_nms(
+        jnp.asarray(boxes), jnp.asarray(scores), jnp.asarray(valid), labels=jnp.asarray(labels), **options
+    )
+    assert not np.asarray(kept)[~np.asarray(used)].any()
+    return np.asarray(kept)[np.asarray(used)].tolist()
+
+
+@FORMS
+@pytest.mark.parametrize("overlap", ["bev", "3d"])
+@pytest.mark.parametrize("max_outputs", [200, 7])
+def test_keeps_what_shapely_keeps(form, overlap, max_outputs):
+    for seed in range(3):
+        boxes, scores, valid, labels = clusters(seed)
+        expected = oracles.nms(boxes, scores, valid, labels, 0.2, max_outputs, vertical=overlap == "3d")
+        found = keep(
+            boxes, scores, valid, labels, iou_threshold=0.2, max_outputs=max_outputs, overlap=overlap, form=form
+        )
+        assert found == expected
+        assert len(expected) < valid.sum()
+
+
+@FORMS
+def test_ties_go_to_the_lower_index_and_nan_scores_are_out(form):
+    boxes = np.repeat(np.array([[0, 0, 0, 4, 2, 1, 0.0]], np.float32), 4, 0)
+    scores = np.array([np.nan, 0.5, 0.5, 0.4], np.float32)
+    valid, labels = np.ones(4, bool), np.zeros(4, np.int32)
+    assert keep(boxes, scores, valid, labels, iou_threshold=0.2, max_outputs=4, form=form) == [1]
+
+
+@FORMS
+def test_equal_iou_is_not_above_the_threshold(form):
+    boxes = np.array([[0, 0, 0, 4, 2, 1, 0], [1, 0, 0, 4, 2, 1, 0]], np.float32)  # IoU 0.6
+    args = np.array([0.9, 0.8], np.float32), np.ones(2, bool), np.zeros(2, np.int32)
+    assert keep(boxes, *args, iou_threshold=0.61, max_outputs=2, form=form) == [0, 1]
+    assert keep(boxes, *args, iou_threshold=0.59, max_outputs=2, form=form) == [0]
+    still = np.repeat(boxes[:1], 2, 0)
+    assert keep(still, *args, iou_threshold=1.0, max_outputs=2, form=form) == [0, 1]
+
+
+@FORMS
+def test_nothing_valid_and_boxes_without_size(form):
+    boxes = np.zeros((5, 7), np.float32)
+    scores, labels = np.linspace(1, 0, 5, dtype=np.float32), np.zeros(5, np.int32)
+    assert keep(boxes, scores, np.zeros(5, bool), labels, iou_threshold=0.2, max_outputs=3, form=form) == []
+    assert keep(boxes, scores, np.ones(5, bool), labels, iou_threshold=0.2, max_outputs=3, form=form) == [0, 1, 2]
+
+
+@FORMS
+def test_same_under_jit_and_vmap(form):
+    data = [clusters(seed) for seed in range(3)]
+    stacked = [jnp.stack([jnp.asarray(d[i]) for d in data]) for i in range(4)]
+
+    def go(boxes, scores, valid, labels):
+        return rotated_nms(boxes, scores, valid, labels=labels, iou_threshold=0.2, max_outputs=50, form=form)
+
+    kept, used = jax.jit(jax.vmap(go))(*stacked)
+    for i in range(3):
+        single, single_used = go(*(s[i] for s in stacked))
+        np.testing.assert_array_equal(kept[i], single)
+        np.testing.assert_array_equal(used[i], single_used)
+
+
+def test_unknown_options_are_refused():
+    empty = jnp.zeros((1, 7)), jnp.zeros(1), jnp.ones(1, bool)
+    with pytest.raises(Exception, match="form"):
+        rotated_nms(*empty, iou_threshold=0.2, max_outputs=1, form="fast")
