@@ -80,7 +80,7 @@ class Args:
     """Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run each."""
-    steps: int = 200
+    steps: int = 240
     """Updates a run."""
     out: Path = Path("outputs/overfit_keyframe")
     """Where result.json and the pictures go."""

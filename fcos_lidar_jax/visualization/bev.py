@@ -37,8 +37,9 @@ def draw_bev(
     shown = np.isfinite(points[:, :3]).all(axis=1)
     cloud = points[shown]
     heights = np.clip(cloud[:, 2], -2.5, 2.5)
+    dot = float(np.clip(3e4 / max(len(cloud), 1), 0.8, 7))  # sparse clouds get larger dots
     axis.scatter(
-        cloud[:, 0], cloud[:, 1], c=heights, s=0.8, cmap="Greys_r", vmin=-4, vmax=6, linewidths=0, rasterized=True
+        cloud[:, 0], cloud[:, 1], c=heights, s=dot, cmap="Greys_r", vmin=-4, vmax=6, linewidths=0, rasterized=True
     )
     axis.plot(0, 0, marker="+", color="black", markersize=8)
     if truth is not None:
