@@ -4,7 +4,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable
-from typing import TextIO
 
 import jax
 import numpy as np
@@ -26,7 +25,6 @@ def fit(
     *,
     num_steps: int,
     report: Callable[[int, TrainState, Record], None] | None = None,
-    log: TextIO | None = None,
     log_every_s: float = 10.0,
 ) -> tuple[TrainState, list[Record]]:
     """Run the step over batches.
@@ -39,8 +37,7 @@ def fit(
         batches: at least as many as there are steps left.
         num_steps: of the whole run.
         report: called with (steps done, state, metrics of the last of them) after every step.
-        log: where the progress lines go; standard error by default.
-        log_every_s: seconds between two lines.
+        log_every_s: seconds between two progress lines on standard error.
 
     Returns:
         the last state and the metrics of every step.
@@ -49,7 +46,7 @@ def fit(
         NonFiniteLossError: with the step's number and the parts of the loss.
     """
     done = int(state.step)
-    progress = _Progress(done, num_steps, log or sys.stderr, log_every_s)
+    progress = _Progress(done, num_steps, log_every_s)
     records: list[Record] = []
     waiting: tuple[int, TrainState, dict[str, jax.Array]] | None = None
 
@@ -82,8 +79,8 @@ def fit(
 class _Progress:
     """One line now and then, with rate and time left; the same on a terminal and in a pipe."""
 
-    def __init__(self, first: int, last: int, log: TextIO, every_s: float) -> None:
-        self.first, self.last, self.log, self.every_s = first, last, log, every_s
+    def __init__(self, first: int, last: int, every_s: float) -> None:
+        self.first, self.last, self.every_s = first, last, every_s
         self.began: float | None = None
         self.next = 0.0
 
@@ -98,6 +95,6 @@ class _Progress:
         left = f"{rate:.2f} steps/s, {(self.last - done) / rate:.0f} s left" if rate else "compiled"
         print(
             f"step {done}/{self.last}  loss {record['loss/total']:.3f}  IoU {record['positive_iou']:.2f}  {left}",
-            file=self.log,
+            file=sys.stderr,
             flush=True,
         )
