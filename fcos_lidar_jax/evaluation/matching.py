@@ -26,18 +26,21 @@ class Match:
     """Distance of the centres in the ground plane."""
 
 
-def heading_error(
-    predicted_rad: Float[np.ndarray, "*n"], true_rad: Float[np.ndarray, "*n"], label: int
-) -> Float[np.ndarray, "*n"]:
-    """Absolute yaw difference: modulo pi for barriers, zero for cones.
+def heading_error(predicted_rad: float, true_rad: Float[np.ndarray, "n"], label: int) -> Float[np.ndarray, "n"]:
+    """Absolute yaw difference of one prediction to truths: modulo pi for barriers, zero for cones.
 
-    >>> float(round(heading_error(np.array(3.2), np.array(0.0), CLASSES.index("barrier")), 3))
-    0.058
+    Args:
+        predicted_rad: yaw.
+        true_rad: yaws.
+        label: class index of all.
+
+    >>> heading_error(3.2, np.array([0.0]), CLASSES.index("barrier")).round(3).tolist()
+    [0.058]
     """
     if label == _NO_HEADING:
-        return np.zeros(np.broadcast_shapes(np.shape(predicted_rad), np.shape(true_rad)))
+        return np.zeros(len(true_rad))
     period = np.pi if label == _HALF_TURN else 2 * np.pi
-    difference = (np.asarray(predicted_rad) - true_rad + period / 2) % period - period / 2
+    difference = (predicted_rad - true_rad + period / 2) % period - period / 2
     return np.abs(difference)
 
 
@@ -72,7 +75,7 @@ def match_frame(
     for index in np.argsort(-scores, kind="stable"):
         label = int(labels[index])
         allowed = free & (true_labels == label)
-        allowed &= heading_error(boxes[index, 6], true_boxes[:, 6], label) <= max_heading_error_rad
+        allowed &= heading_error(float(boxes[index, 6]), true_boxes[:, 6], label) <= max_heading_error_rad
         distance = np.hypot(*(true_boxes[:, :2] - boxes[index, :2]).T)
         distance = np.where(allowed, distance, np.inf)
         if len(distance) and distance.min() < max_distance_m:

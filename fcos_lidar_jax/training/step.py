@@ -233,7 +233,7 @@ def make_train_step(
         gradient = jax.value_and_grad(loss, has_aux=True)
         (_, (batch_stats, metrics)), grads = gradient(state.params, state.batch_stats, augmented(state, batch))
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        metrics["gradient_norm"] = optax.global_norm(grads)
+        metrics["gradient_norm"] = optax.tree.norm(grads)
         metrics.update(current_hyperparameters(opt_state))
         new_state = TrainState(
             step=state.step + 1,

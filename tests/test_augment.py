@@ -1,0 +1,112 @@
+"""Augmentation against explicit matrices on points, corners and velocities."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import oracles
+from fcos_lidar_jax.augment import augment, copy_paste_active, flip_x, flip_y, rotate, sample_key, scale
+from fcos_lidar_jax.config import AugmentConfig
+
+ANGLE = 0.7
+TURN = np.array([[np.cos(ANGLE), -np.sin(ANGLE), 0], [np.sin(ANGLE), np.cos(ANGLE), 0], [0, 0, 1]])
+CASES = {
+    "flip_x": (flip_x, np.diag([-1.0, 1, 1])),
+    "flip_y": (flip_y, np.diag([1.0, -1, 1])),
+    "rotate": (lambda p, b: rotate(p, b, jnp.float32(ANGLE)), TURN),
+    "scale": (lambda p, b: scale(p, b, jnp.float32(1.03)), np.eye(3) * 1.03),
+}
+
+
+def sample():
+    rng = np.random.default_rng(0)
+    boxes = np.zeros((6, 9), np.float32)
+    boxes[:, :7] = oracles.random_boxes(rng, 6, 15)
+    boxes[:, 7:] = rng.normal(0, 5, (6, 2))
+    points = rng.normal(0, 15, (300, 5)).astype(np.float32)
+    points[:60, :3] = np.repeat(boxes[:, :3], 10, 0) + rng.normal(0, 0.3, (60, 3))
+    return points, boxes
+
+
+def corners(boxes):
+    """All eight corners of each box, as a set: a flip changes their order."""
+    out = []
+    for b in np.asarray(boxes, np.float64):
+        c, s = np.cos(b[6]), np.sin(b[6])
+        r = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        signs = [(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]
+        out.append([b[:3] + r @ (b[3:6] / 2 * sign) for sign in signs])
+    return np.array(out)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_points_corners_headings_and_velocities_move_by_one_matrix(name):
+    function, matrix = CASES[name]
+    points, boxes = sample()
+    new_points, new_boxes = (np.asarray(v) for v in function(jnp.asarray(points), jnp.asarray(boxes)))
+    np.testing.assert_allclose(new_points[:, :3], points[:, :3] @ matrix.T, atol=1e-4)
+    np.testing.assert_array_equal(new_points[:, 3:], points[:, 3:])
+    for found, expected in zip(corners(new_boxes), corners(boxes) @ matrix.T, strict=True):
+        distance = np.linalg.norm(found[:, None] - expected[None], axis=-1)
+        assert distance.min(1).max() < 1e-4
+    heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(6)], 1) @ matrix.T
+    yaw = np.arctan2(heading[:, 1], heading[:, 0])
+    np.testing.assert_allclose(np.exp(1j * new_boxes[:, 6]), np.exp(1j * yaw), atol=1e-5)
+    velocity = np.concatenate([boxes[:, 7:], np.zeros((6, 1))], 1) @ matrix.T
+    np.testing.assert_allclose(new_boxes[:, 7:], velocity[:, :2], atol=1e-5)
+    inside = [[oracles.inside(p, b) for b in boxes] for p in points[:60, :3]]
+    still = [[oracles.inside(p, b) for b in new_boxes] for p in new_points[:60, :3]]
+    assert np.mean(np.array(inside) == np.array(still)) > 0.995
+    assert np.sum(inside) > 20
+
+
+def test_draws_cover_their_ranges_and_the_sensor_stays():
+    origin = (1.43, 0.0, 2.184)
+    points, boxes = sample()
+    points[0, :3] = origin
+    points[1, :3] = (origin[0] + 10, origin[1], origin[2])
+    go = jax.jit(
+        jax.vmap(lambda k: augment(k, jnp.asarray(points), jnp.asarray(boxes), AugmentConfig(), origin_m=origin))
+    )
+    moved, _ = go(jax.random.split(jax.random.key(0), 400))
+    moved = np.asarray(moved)
+    np.testing.assert_allclose(moved[:, 0, :3], np.tile(origin, (400, 1)), atol=1e-5)
+    arm = moved[:, 1, :2] - moved[:, 0, :2]
+    length, angle = np.linalg.norm(arm, axis=1) / 10, np.arctan2(arm[:, 1], arm[:, 0])
+    assert length.min() > 0.95 - 1e-4
+    assert length.max() < 1.05 + 1e-4
+    assert np.ptp(length) > 0.08
+    assert angle.min() < -3
+    assert angle.max() > 3
+    # A mirror image has the opposite handedness.
+    third = moved[:, 60, :2] - moved[:, 0, :2]
+    reference = np.cross([10, 0, 0], [*(points[60, :2] - np.array(origin[:2])), 0])[2]
+    hand = arm[:, 0] * third[:, 1] - arm[:, 1] * third[:, 0]
+    assert 0.35 < np.mean(np.sign(hand) != np.sign(reference)) < 0.65
+
+
+def test_unknown_velocities_stay_unknown():
+    points, boxes = sample()
+    boxes[2, 7:] = np.nan
+    _, moved = augment(jax.random.key(1), jnp.asarray(points), jnp.asarray(boxes), AugmentConfig())
+    unknown = np.isnan(np.asarray(moved))
+    assert unknown[2, 7:].all()
+    assert unknown.sum() == 2
+
+
+def test_sample_keys_depend_on_step_and_index_alone():
+    keys = [sample_key(jax.random.key(0), jnp.int32(s), jnp.int32(i)) for s in range(3) for i in range(3)]
+    assert len({tuple(np.asarray(jax.random.key_data(k)).tolist()) for k in keys}) == 9
+    batched = jax.vmap(lambda i: sample_key(jax.random.key(0), jnp.int32(2), i))(jnp.arange(3, dtype=jnp.int32))
+    for i in range(3):
+        np.testing.assert_array_equal(jax.random.key_data(batched[i]), jax.random.key_data(keys[6 + i]))
+
+
+def test_fade_ends_copy_paste_five_epochs_early():
+    active = [
+        bool(copy_paste_active(jnp.int32(s), steps_per_epoch=100, epochs=40, fade_epochs=5))
+        for s in (0, 3499, 3500)
+    ]
+    assert active == [True, True, False]
+    assert bool(copy_paste_active(jnp.int32(3999), steps_per_epoch=100, epochs=40, fade_epochs=0))

@@ -1,0 +1,118 @@
+"""Configurations: presets, JSON there and back, and one line for nonsense."""
+
+import dataclasses
+import json
+
+import pytest
+
+from fcos_lidar_jax.config import (
+    NUSCENES,
+    NUSCENES_SINGLE,
+    NUSCENES_TEST,
+    PRESETS,
+    QUICKSTART,
+    AugmentConfig,
+    Config,
+    InferenceConfig,
+    LossConfig,
+    ModelConfig,
+    OptimizerConfig,
+    ProjectionConfig,
+    StemConfig,
+    config_from_json,
+    config_to_json,
+)
+
+
+def test_presets_are_the_papers():
+    assert (NUSCENES.num_sweeps, NUSCENES.projection.num_rounds, NUSCENES.projection.prioritize_current) == (
+        10,
+        5,
+        True,
+    )
+    assert NUSCENES.model.backbone_blocks == (4, 4, 1, 1)
+    assert NUSCENES.model.backbone_widths == (64, 128, 128, 128)
+    assert NUSCENES.model.stem == StemConfig("types", True, 2, (1, 3, 6), 32, 64)
+    assert (NUSCENES.inference.min_probability, NUSCENES.inference.iou_threshold) == (0.01, 0.2)
+    assert (NUSCENES.inference.max_detections, NUSCENES.loss.top_q) == (500, 20)
+    assert (NUSCENES.optimizer.epochs, NUSCENES.optimizer.weight_decay) == (40, 0.01)
+    assert NUSCENES_SINGLE.num_sweeps == 1
+    assert NUSCENES_SINGLE.projection == NUSCENES.projection
+    assert (NUSCENES_TEST.model.head_channels, NUSCENES_TEST.fade_epochs) == (128, 5)
+
+
+def test_small_preset_differs_in_numbers_only():
+    def kinds(value):
+        if dataclasses.is_dataclass(value):
+            return {f.name: kinds(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return value if isinstance(value, bool | str) else type(value)
+
+    small, full = kinds(QUICKSTART), kinds(NUSCENES)
+    for record in (small, full):
+        del record["name"], record["sensor"]
+    assert small == full
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_json_gives_back_the_configuration(name):
+    text = json.dumps(config_to_json(PRESETS[name]))
+    assert config_from_json(json.loads(text)) == PRESETS[name]
+    still = dataclasses.replace(PRESETS[name], augment=None)
+    assert config_from_json(json.loads(json.dumps(config_to_json(still)))) == still
+    assert hash(still) != hash(PRESETS[name])
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("model", "stem", "groups"), "colours", "run.model.stem.groups: got 'colours', expected one of 'types'"),
+        (("model", "fpn_channels"), "wide", "run.model.fpn_channels: got 'wide', expected int"),
+        (("model", "fpn_channels"), 1.5, "run.model.fpn_channels: got 1.5, expected int"),
+        (("model", "backbone_blocks"), [1, 2], r"run.model.backbone_blocks: got 2 values, expected 4"),
+        (("model", "stem"), 3, "run.model.stem: got int, expected a JSON object"),
+        (("model", "stem", "dilations"), [0], "run.model.stem.dilations"),
+        (("loss", "weight"), 1, "run.loss.weight: unknown field"),
+        (("optimizer", "epochs"), 0, "run.optimizer.epochs: got 0"),
+        (("num_sweeps",), True, "run.num_sweeps: got True, expected int"),
+        (("augment", "scale_range"), [1.05, 0.95], "run.augment.scale_range"),
+    ],
+)
+def test_bad_json_gets_one_line_with_the_field(path, value, message):
+    record = json.loads(json.dumps(config_to_json(NUSCENES)))
+    place = record
+    for name in path[:-1]:
+        place = place[name]
+    place[path[-1]] = value
+    with pytest.raises(ValueError, match=message):
+        config_from_json(record, "run")
+
+
+def test_missing_field_is_named():
+    record = config_to_json(NUSCENES)
+    del record["loss"]
+    with pytest.raises(ValueError, match=r"config\.loss: missing"):
+        config_from_json(record)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ProjectionConfig(num_rounds=0),
+        lambda: ProjectionConfig(close_m=0),
+        lambda: StemConfig(num_convs=0),
+        lambda: StemConfig(groups="all", group_rounds=False),
+        lambda: ModelConfig(background_prior=1.0),
+        lambda: ModelConfig(channel_scale=(0.0,) * 9),
+        lambda: ModelConfig(row_upscale=0),
+        lambda: LossConfig(l1_weight=-1),
+        lambda: LossConfig(iou_loss="l2"),  # type: ignore[arg-type]
+        lambda: InferenceConfig(iou_threshold=2),
+        lambda: InferenceConfig(nms_form="fast"),  # type: ignore[arg-type]
+        lambda: AugmentConfig(flip_x_probability=2),
+        lambda: OptimizerConfig(warmup_fraction=1.0),
+        lambda: Config(max_points=0),
+    ],
+)
+def test_nonsense_is_refused_at_construction(make):
+    with pytest.raises(ValueError, match="got"):
+        make()

@@ -1,0 +1,65 @@
+"""Angles, norms and boxes against NumPy in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import oracles
+from fcos_lidar_jax.geometry import atan2, box_corners, points_in_box, safe_norm, spherical, wrap_angle
+
+
+def awkward_pairs():
+    special = [0.0, -0.0, 1.0, -1.0, 1e-30, -1e-30, 1e30, -1e30, 54.0, 1e-3]
+    grid = np.array([(y, x) for y in special for x in special], np.float32)
+    rng = np.random.default_rng(0)
+    return np.concatenate([grid, rng.normal(0, 20, (20_000, 2)).astype(np.float32)])
+
+
+def test_atan2_is_the_library_one_on_every_kind_of_pair():
+    pairs = awkward_pairs()
+    expected = np.arctan2(pairs[:, 0].astype(np.float64), pairs[:, 1].astype(np.float64))
+    for function in (atan2, jax.jit(atan2), jax.vmap(atan2)):
+        found = np.asarray(function(jnp.asarray(pairs[:, 0]), jnp.asarray(pairs[:, 1])))
+        assert np.abs(found - expected).max() < 3e-7
+
+
+def test_gradients_of_angles_and_norms_are_those_of_calculus_and_finite_at_zero():
+    y, x = 3.0, -4.0
+    gradient = jax.grad(atan2, argnums=(0, 1))(jnp.float32(y), jnp.float32(x))
+    np.testing.assert_allclose(gradient, [x / 25, -y / 25], atol=1e-6)
+    np.testing.assert_allclose(jax.grad(safe_norm)(jnp.float32(3), jnp.float32(4)), 0.6, rtol=1e-6)
+    for function in (atan2, safe_norm):
+        at_zero = jax.grad(function, argnums=(0, 1))(jnp.float32(0), jnp.float32(0))
+        assert np.isfinite(np.asarray(at_zero)).all()
+
+
+def test_spherical_inverts_to_the_point():
+    points = np.random.default_rng(1).normal(0, 20, (500, 3)).astype(np.float32)
+    r, theta, phi = (np.asarray(v, np.float64) for v in spherical(jnp.asarray(points)))
+    back = np.stack([r * np.cos(phi) * np.cos(theta), r * np.cos(phi) * np.sin(theta), r * np.sin(phi)], 1)
+    np.testing.assert_allclose(back, points, atol=5e-5)
+
+
+@pytest.mark.parametrize("angle", [-np.pi, np.pi, 0.0, 7.0, -7.0, 100.0, np.nextafter(np.float32(np.pi), 4)])
+def test_wrapped_angles_are_in_the_half_open_turn_and_point_the_same_way(angle):
+    wrapped = float(wrap_angle(jnp.float32(angle)))
+    assert -np.pi <= wrapped < np.pi or wrapped == np.float32(-np.pi)
+    np.testing.assert_allclose([np.cos(wrapped), np.sin(wrapped)], [np.cos(angle), np.sin(angle)], atol=1e-5)
+
+
+def test_corners_and_membership_by_explicit_rotation():
+    rng = np.random.default_rng(2)
+    boxes = oracles.random_boxes(rng, 20).astype(np.float32)
+    corners = np.asarray(box_corners(jnp.asarray(boxes)))
+    for box, found in zip(boxes, corners, strict=True):
+        c, s = np.cos(box[6]), np.sin(box[6])
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        signs = [(1, -1), (1, 1), (-1, 1), (-1, -1)]
+        expected = [box[:3] + turn @ (box[3:6] / 2 * (*xy, z)) for z in (-1, 1) for xy in signs]
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    points = rng.normal(0, 2, (200, 3)).astype(np.float32)
+    found = np.asarray(points_in_box(jnp.asarray(points)[:, None], jnp.asarray(boxes)[None]))
+    expected = [[oracles.inside(p, b) for b in boxes] for p in points]
+    np.testing.assert_array_equal(found, expected)
+    assert found.any()

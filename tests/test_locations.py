@@ -1,0 +1,77 @@
+"""Locations against loops over levels, rows and columns."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fcos_lidar_jax.config import ModelConfig
+from fcos_lidar_jax.locations import (
+    STRIDES,
+    ImageLayout,
+    image_layout,
+    image_sensor,
+    location_cells,
+    look,
+    pad_image,
+)
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+from fcos_lidar_jax.types import RangeImage
+
+LAYOUTS = [ImageLayout(16, 256, 2), ImageLayout(32, 1086, 2), ImageLayout(10, 70, 3)]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=str)
+def test_pixel_of_a_location_is_index_times_stride(layout):
+    cells = location_cells(layout)
+    first = 0
+    for stride, size in zip(STRIDES, layout.level_sizes, strict=True):
+        width = layout.width // stride
+        for l in range(0, size, max(1, size // 50)):
+            row, column = (l // width) * stride, (l % width) * stride
+            inside = row < layout.rows * layout.row_upscale and column < layout.columns
+            expected = row // layout.row_upscale * layout.columns + column if inside else -1
+            assert cells[first + l] == expected
+        first += size
+    assert first == len(cells) == layout.num_locations
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=str)
+def test_padding_repeats_rows_and_copies_the_first_columns(layout):
+    image = np.random.default_rng(0).random((1, layout.rows, layout.columns, 9, 2), np.float32)
+    padded = np.asarray(pad_image(jnp.asarray(image), layout))
+    assert padded.shape == (1, layout.height, layout.width, 9, 2)
+    assert layout.height % 32 == layout.width % 32 == 0
+    for row in range(layout.height):
+        for column in range(0, layout.width, 7):
+            inside = row < layout.rows * layout.row_upscale
+            expected = image[0, row // layout.row_upscale, column % layout.columns] if inside else 0
+            np.testing.assert_array_equal(padded[0, row, column], expected)
+
+
+def test_locations_see_the_first_round_and_pad_columns_are_empty():
+    layout = ImageLayout(16, 250, 2)
+    rng = np.random.default_rng(1)
+    features = rng.random((16, 250, 9, 2), np.float32)
+    features[:, :, 7] = rng.random((16, 250, 2)) < 0.6
+    features *= features[:, :, 7:8]
+    image = RangeImage(jnp.asarray(features), jnp.zeros((16, 250, 2), jnp.int32), jnp.int32(0))
+    seen = look(image, layout)
+    cells = location_cells(layout)
+    for l in rng.choice(len(cells), 500, replace=False):
+        row, column = divmod(int(cells[l]), 250)
+        expected = features[row, column, :, 0] if cells[l] >= 0 else np.zeros(9)
+        np.testing.assert_array_equal(seen.points[l], expected[:3])
+        assert float(seen.azimuth_rad[l]) == expected[4]
+        assert bool(seen.occupied[l]) == bool(expected[7])
+    assert not np.asarray(seen.occupied)[cells < 0].any()
+
+
+def test_circular_width_bins_into_whole_strides_and_pads_nothing():
+    circular = ModelConfig(circular_width=True)
+    assert image_sensor(NUSCENES_HDL32E, ModelConfig()) == NUSCENES_HDL32E
+    assert image_sensor(NUSCENES_HDL32E, circular) == dataclasses.replace(NUSCENES_HDL32E, num_columns=1088)
+    layout = image_layout(NUSCENES_HDL32E, circular)
+    assert layout.columns == layout.width == 1088
+    assert (location_cells(layout) >= 0).all()

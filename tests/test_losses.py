@@ -1,0 +1,129 @@
+"""Every loss against NumPy, and finite where nothing is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import oracles
+from fcos_lidar_jax.config import LossConfig
+from fcos_lidar_jax.iou import oriented
+from fcos_lidar_jax.losses import classification_loss, combine, iou_loss, iou_prediction_loss, l1_loss
+
+NUMBER = 50
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def f32(x):
+    return jnp.asarray(x, jnp.float32)
+
+
+def test_classification_is_the_cross_entropy_over_the_mask(rng):
+    logits, labels, mask = rng.normal(0, 3, (NUMBER, 11)), rng.integers(0, 11, NUMBER), rng.random(NUMBER) < 0.6
+    total, count = classification_loss(f32(logits), jnp.asarray(labels, jnp.int32), jnp.asarray(mask))
+    p = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+    np.testing.assert_allclose(total, -np.log(p[np.arange(NUMBER), labels])[mask].sum(), rtol=1e-5)
+    assert int(count) == mask.sum()
+
+
+def test_l1_weighs_velocity_and_skips_what_is_unknown(rng):
+    prediction, target = rng.normal(0, 1, (2, NUMBER, 10))
+    target[::3, 8:] = np.nan
+    target[1, 9] = np.nan
+    mask = rng.random(NUMBER) < 0.6
+    total, count = l1_loss(f32(prediction), f32(target), jnp.asarray(mask), velocity_weight=0.2)
+    expected = np.nansum(np.abs(prediction - target) * ([1] * 8 + [0.2] * 2), axis=1)[mask].sum()
+    np.testing.assert_allclose(total, expected, rtol=1e-5)
+    assert int(count) == mask.sum()
+    gradient = jax.grad(lambda p: l1_loss(p, f32(target), jnp.asarray(mask), velocity_weight=0.2)[0])(
+        f32(prediction)
+    )
+    assert np.isfinite(gradient).all()
+    assert not np.asarray(gradient)[~mask].any()
+    assert not np.asarray(gradient)[::3, 8:].any()
+
+
+def pairs(rng):
+    a = oracles.random_boxes(rng, NUMBER)
+    b = a + rng.normal(0, 0.2, a.shape)
+    b[:, 3:6] = np.abs(b[:, 3:6]) + 0.1
+    b[:5, 0] += 50  # disjoint
+    return a, b
+
+
+@pytest.mark.parametrize("kind", ["iou", "log_iou", "giou", "diou"])
+def test_iou_losses_by_shapely_and_corners(rng, kind):
+    a, b = pairs(rng)
+    mask = rng.random(NUMBER) < 0.8
+    iou = oracles.iou(a, b, vertical=True)
+    extents, unions = [], []
+    for p, t, value in zip(a, b, iou, strict=True):
+        c, s = np.cos(t[6]), np.sin(t[6])
+        corners = []
+        for box in (p, t):
+            bc, bs = np.cos(box[6]), np.sin(box[6])
+            for i in (-1, 1):
+                for j in (-1, 1):
+                    x = box[0] + bc * i * box[3] / 2 - bs * j * box[4] / 2 - t[0]
+                    y = box[1] + bs * i * box[3] / 2 + bc * j * box[4] / 2 - t[1]
+                    corners += [(c * x + s * y, c * y - s * x, box[2] + k * box[5] / 2) for k in (-1, 1)]
+        extents.append(np.ptp(np.array(corners), axis=0))
+        volumes = np.prod(p[3:6]) + np.prod(t[3:6])
+        unions.append(volumes / (1 + value))
+    extents, unions = np.array(extents), np.array(unions)
+    volume = extents.prod(1)
+    distance = ((a[:, :3] - b[:, :3]) ** 2).sum(1)
+    expected = {
+        "iou": 1 - iou,
+        "log_iou": -np.log(np.maximum(iou, 1e-6)),
+        "giou": 1 - iou + (volume - unions) / volume,
+        "diou": 1 - iou + distance / (extents**2).sum(1),
+    }[kind]
+    prediction, target = oriented(f32(a)), oriented(f32(b))
+    total, count = iou_loss(prediction, target, jnp.asarray(mask), kind=kind)
+    np.testing.assert_allclose(total, expected[mask].sum(), rtol=2e-4)
+    assert int(count) == mask.sum()
+    gradient = jax.jit(jax.grad(lambda p: iou_loss(p, target, jnp.asarray(mask), kind=kind)[0]))(prediction)
+    assert np.isfinite(gradient).all()
+    assert not np.asarray(gradient)[~mask].any()
+
+
+def test_masked_out_rubbish_does_not_reach_the_gradient():
+    rubbish = jnp.full((2, 8), jnp.inf).at[1].set(jnp.nan)
+    box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]] * 2))
+    for kind in ("iou", "log_iou", "giou", "diou"):
+        gradient = jax.grad(lambda p, kind=kind: iou_loss(p, box, jnp.zeros(2, bool), kind=kind)[0])(rubbish)
+        assert not np.asarray(gradient).any()
+
+
+def test_iou_prediction_is_the_binary_cross_entropy_and_leaves_the_iou_alone(rng):
+    logits, iou, mask = rng.normal(0, 3, NUMBER), rng.random(NUMBER), rng.random(NUMBER) < 0.6
+    total, _ = iou_prediction_loss(f32(logits), f32(iou), jnp.asarray(mask))
+    p = 1 / (1 + np.exp(-logits))
+    expected = -(iou * np.log(p) + (1 - iou) * np.log(1 - p))
+    np.testing.assert_allclose(total, expected[mask].sum(), rtol=1e-5)
+    gradient = jax.grad(lambda i: iou_prediction_loss(f32(logits), i, jnp.asarray(mask))[0])(f32(iou))
+    assert not np.asarray(gradient).any()
+    huge = iou_prediction_loss(f32([1e4, -1e4]), f32([1, 0]), jnp.ones(2, bool))[0]
+    assert float(huge) == 0
+
+
+def test_parts_are_divided_once_and_weighed():
+    config = LossConfig(
+        classification_weight=1, l1_weight=0.25, iou_weight=2, iou_prediction_weight=0.5, velocity_weight=0.2
+    )
+    names = ("classification", "l1", "iou", "iou_prediction")
+    parts = {n: (f32(v), jnp.int32(99)) for n, v in zip(names, (8.0, 4.0, 2.0, 6.0), strict=True)}
+    assert float(combine(parts, jnp.int32(4), config)["total"]) == (8 + 1 + 4 + 3) / 4
+    assert float(combine(parts, jnp.int32(4), config)["l1"]) == 1.0
+    assert float(combine(parts, jnp.int32(0), config)["total"]) == 16
+
+
+def test_unknown_kind_is_refused():
+    box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]]))
+    with pytest.raises(ValueError, match="kind: got 'ciou'"):
+        iou_loss(box, box, jnp.ones(1, bool), kind="ciou")

@@ -1,0 +1,87 @@
+"""Sensors: presets, files, and one line for what cannot be a sensor."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from fcos_lidar_jax.sensors import PRESETS, TINY, Sensor, load_sensor, sensor_from_json, sensor_to_json
+
+
+def test_presets_are_the_papers_and_the_makers():
+    nuscenes = PRESETS["nuscenes_hdl32e"]
+    assert (nuscenes.num_rows, nuscenes.num_columns) == (32, 1086)
+    degrees = np.degrees(nuscenes.inclinations_rad)
+    np.testing.assert_allclose(degrees, 10.67 - np.arange(32) * (10.67 + 30.67) / 31, atol=1e-9)
+    assert PRESETS["waymo_top"].num_rows == 64
+    assert PRESETS["waymo_top"].num_columns == 2650
+    assert PRESETS["kitti_hdl64e"].num_rows == PRESETS["argoverse2"].num_rows == 64
+    assert PRESETS["argoverse2"].point_columns == 6
+    assert nuscenes.even_step_rad is not None
+    assert PRESETS["kitti_hdl64e"].even_step_rad is None
+
+
+def test_edges_are_midpoints_and_half_a_bin_beyond():
+    sensor = Sensor("three", (0.3, 0.1, 0.0), 8)
+    np.testing.assert_allclose(sensor.row_edges_rad, [0.4, 0.2, 0.05, -0.05])
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_files_give_back_the_sensor(tmp_path, name):
+    path = tmp_path / "sensor.json"
+    path.write_text(json.dumps(sensor_to_json(PRESETS[name])))
+    assert load_sensor(path) == PRESETS[name] == load_sensor(name)
+
+
+def test_even_beams_may_be_given_in_degrees():
+    beams = {"lowest": -25, "highest": 3, "rows": 64}
+    sensor = sensor_from_json({"name": "a", "num_columns": 1024, "inclinations_deg": beams})
+    assert math.degrees(sensor.inclinations_rad[0]) == pytest.approx(3)
+    assert math.degrees(sensor.inclinations_rad[-1]) == pytest.approx(-25)
+
+
+GOOD = {"name": "a", "num_columns": 8, "inclinations_rad": [0.1, 0.0]}
+BAD = [
+    ([1], "got list, expected a JSON object"),
+    ({**GOOD, "colour": 1}, "colour: unknown field"),
+    ({"name": "a", "num_columns": 8}, "inclinations_rad: missing"),
+    ({**GOOD, "num_columns": "many"}, "num_columns: got 'many'"),
+    ({**GOOD, "num_columns": 1}, "num_columns: got 1"),
+    ({**GOOD, "num_columns": True}, "num_columns: got True"),
+    ({**GOOD, "inclinations_rad": [0.0, 0.1]}, "strictly falling"),
+    ({**GOOD, "inclinations_rad": [0.1]}, "got 1 beams"),
+    ({**GOOD, "inclinations_rad": [3.0, 0.0]}, "within"),
+    ({**GOOD, "inclinations_rad": "0.1 0.0"}, "expected a list of numbers"),
+    ({**GOOD, "inclinations_rad": [None, 0.0]}, "got None, expected a finite number"),
+    ({**GOOD, "inclinations_deg": {"lowest": 1}}, "lowest, highest and rows"),
+    ({**GOOD, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 1}}, "rows: got 1"),
+    ({**GOOD, "origin_m": [1, 2]}, "origin_m"),
+    ({**GOOD, "limit_xy_m": -1}, "limit_xy_m: got -1"),
+    ({**GOOD, "limit_z_m": [3, 1]}, "limit_z_m"),
+    ({**GOOD, "intensity_scale": 0}, "intensity_scale: got 0"),
+    ({**GOOD, "row_source": "ring"}, "row_source: got 'ring'"),
+    ({**GOOD, "name": 3}, "name: got 3"),
+]
+
+
+@pytest.mark.parametrize(("record", "message"), BAD)
+def test_bad_files_get_one_line_with_file_and_field(tmp_path, record, message):
+    path = tmp_path / "sensor.json"
+    path.write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=message) as caught:
+        load_sensor(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_garbled_files(tmp_path):
+    with pytest.raises(ValueError, match=r"no such sensor file, and no preset \(nuscenes_hdl32e"):
+        load_sensor(tmp_path / "none.json")
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(ValueError, match=r"a\.json: not JSON"):
+        load_sensor(tmp_path / "a.json")
+
+
+def test_sensors_are_hashable_and_comparable():
+    assert len({TINY, load_sensor("tiny")}) == 1
