@@ -19,7 +19,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -105,7 +105,7 @@ def owned_cells(frame: Frame) -> np.ndarray:
     return np.bincount(np.asarray(owner)[np.asarray(owner) >= 0], minlength=len(frame.boxes))
 
 
-def run(frame: Frame, seed: int, args: Args, config: Config = CONFIG) -> dict[str, float | int | bool]:
+def run(frame: Frame, seed: int, args: Args, config: Config = CONFIG) -> dict[str, Any]:
     """Train on the frame from one seed, detect on it, draw both, and count."""
     started = time.monotonic()
     sensor = NUSCENES_HDL32E
@@ -121,7 +121,8 @@ def run(frame: Frame, seed: int, args: Args, config: Config = CONFIG) -> dict[st
     minutes = (time.monotonic() - started) / 60
 
     boxes, labels, scores = confident(found, MIN_SCORE)
-    counted = owned_cells(frame) >= MIN_CELLS
+    cells = owned_cells(frame)
+    counted = cells >= MIN_CELLS
     # All boxes may be hit, so that a detection of a small box never takes a counted one.
     match = match_frame(
         boxes,
@@ -154,6 +155,11 @@ def run(frame: Frame, seed: int, args: Args, config: Config = CONFIG) -> dict[st
         "far_detections": int(far.sum()),
         "far_fraction": round(float(far.mean()) if len(far) else 0.0, 4),
         "mean_centre_error_m": round(float(match.centre_error_m[hit].mean()) if hit.any() else 0.0, 4),
+        "missed": [
+            f"{CLASSES[frame.labels[i]]} of {cells[i]} cells"
+            for i in np.flatnonzero(counted)
+            if i not in match.truth
+        ],
         "mean_k": round(float(records[-1]["mean_k"]), 2),  # type: ignore[arg-type]
         "final_loss": round(float(records[-1]["loss/total"]), 4),  # type: ignore[arg-type]
         "minutes": round(minutes, 2),

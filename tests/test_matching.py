@@ -76,9 +76,11 @@ def test_average_precision_by_hand():
     assert average_precision([frame([box(0, 0), box(20, 0)], [0.9, 0.8], truth)], 0, 2.0) == pytest.approx(1)
     # One of two found: precision 1 up to recall 0.5, nothing beyond.
     assert average_precision([frame([box(0, 0)], [0.9], truth)], 0, 2.0) == pytest.approx(0.4 / 0.9)
-    # A false positive ranked first: precision rises linearly from 0 ... to 1/2 at recall 1.
+    # A false positive ranked first: precision is recall / 2, of which what is above 0.1 counts, at recalls 11..100 %.
     first_false = frame([box(50, 0), box(0, 0)], [0.9, 0.8], [box(0, 0)])
-    assert average_precision([first_false], 0, 2.0) == pytest.approx(((0.8 * 0.4) / 2) / (0.9 * 0.9), abs=1e-3)
+    assert average_precision([first_false], 0, 2.0) == pytest.approx(
+        sum(max(r / 200 - 0.1, 0) for r in range(11, 101)) / 90 / 0.9
+    )
     assert average_precision([frame([], [], truth)], 0, 2.0) == 0
     assert np.isnan(average_precision([frame([box(0, 0)], [0.9], [])], 0, 2.0))
 
@@ -87,5 +89,6 @@ def test_average_precision_pools_frames_by_score():
     """A false box of a low score in another frame costs less than one of a high score."""
     good = frame([box(0, 0), box(20, 0)], [0.9, 0.5], [box(0, 0), box(20, 0)])
     low, high = (frame([box(0, 0)], [score], []) for score in (0.1, 0.95))
-    assert average_precision([good, low], 0, 2.0) == pytest.approx(1)
+    # At recall 1 the curve ends in the false box: precision 2/3 for the last of 90 samples.
+    assert average_precision([good, low], 0, 2.0) == pytest.approx((89 * 0.9 + 2 / 3 - 0.1) / 90 / 0.9)
     assert average_precision([good, high], 0, 2.0) < 0.8
