@@ -30,7 +30,7 @@ from fcos_lidar_jax.commands.demo import without_close
 from fcos_lidar_jax.commands.detect import confident
 from fcos_lidar_jax.config import QUICKSTART, Config
 from fcos_lidar_jax.data.batching import make_batch
-from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.synthetic.frames import Frame, make_frame
 from fcos_lidar_jax.evaluation.matching import match_frame, nearest_of_class
 from fcos_lidar_jax.files import write_beside
@@ -84,17 +84,6 @@ class Args:
     """Updates a run."""
     out: Path = Path("outputs/overfit_keyframe")
     """Where result.json and the pictures go."""
-
-
-def real_frame(folder: Path) -> Frame:
-    """The keyframe of scene-0061, boxes of the ten classes; unknown velocities are NaN."""
-    record = json.loads((folder / "boxes.json").read_text())
-    points = read_points(folder / record["lidar_file"], NUSCENES_HDL32E)
-    rows = [b for b in record["boxes"] if b["class"] in CLASSES]
-    keys = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
-    boxes = np.array([[np.nan if b[k] is None else b[k] for k in keys] for b in rows], np.float32)
-    labels = np.array([CLASSES.index(b["class"]) for b in rows], np.int32)
-    return Frame(points, boxes, labels, np.array([b["num_lidar_pts"] for b in rows], np.int32))
 
 
 def owned_cells(frame: Frame) -> np.ndarray:
@@ -172,7 +161,9 @@ def main(args: Args) -> None:
         folder = args.data or os.environ.get("FCOS_LIDAR_REAL_DATA")
         if not folder:
             sys.exit("error: --data: missing, expected the folder that holds nuscenes_scene0061/")
-        frame = without_close(real_frame(Path(folder) / "nuscenes_scene0061"), CONFIG, NUSCENES_HDL32E)
+        frame = without_close(
+            read_keyframe(Path(folder) / "nuscenes_scene0061", NUSCENES_HDL32E), CONFIG, NUSCENES_HDL32E
+        )
     else:
         frame = without_close(make_frame(0, NUSCENES_HDL32E), CONFIG, NUSCENES_HDL32E)
     args.out.mkdir(parents=True, exist_ok=True)

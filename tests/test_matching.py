@@ -76,7 +76,7 @@ def test_average_precision_by_hand():
     assert average_precision([frame([box(0, 0), box(20, 0)], [0.9, 0.8], truth)], 0, 2.0) == pytest.approx(1)
     # One of two found: precision 1 up to recall 0.5, nothing beyond.
     assert average_precision([frame([box(0, 0)], [0.9], truth)], 0, 2.0) == pytest.approx(0.4 / 0.9)
-    # A false positive ranked first: precision is recall / 2, of which what is above 0.1 counts, at recalls 11..100 %.
+    # A false positive ranked first: precision is recall / 2; above 0.1 it counts, at 11..100 %.
     first_false = frame([box(50, 0), box(0, 0)], [0.9, 0.8], [box(0, 0)])
     assert average_precision([first_false], 0, 2.0) == pytest.approx(
         sum(max(r / 200 - 0.1, 0) for r in range(11, 101)) / 90 / 0.9

@@ -1,0 +1,240 @@
+"""What the paper's preset costs here: parameters, memory, the time of every stage, and of one training step.
+
+    python experiments/full_size.py --data FOLDER                 # on the real keyframe of scene-0061
+    python experiments/full_size.py                               # on a simulated frame
+    python experiments/full_size.py --peer net_jax.py             # also the forward pass against another program
+
+A peer is a Python file that defines ``FNS``, name -> function that runs once and waits; its ``fwd`` is timed in a
+process of its own, turn by turn with ours, because the speed of a machine drifts.
+
+Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameters; the network is 99 % of the path.
+"""
+
+import dataclasses
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from fcos_lidar_jax.assignment import assign
+from fcos_lidar_jax.coding import decode_oriented
+from fcos_lidar_jax.commands.demo import without_close
+from fcos_lidar_jax.config import NUSCENES, PRESETS
+from fcos_lidar_jax.data.batching import make_batch
+from fcos_lidar_jax.data.keyframe import read_keyframe
+from fcos_lidar_jax.data.synthetic.frames import make_frame
+from fcos_lidar_jax.files import write_beside
+from fcos_lidar_jax.inference import make_detect, postprocess
+from fcos_lidar_jax.iou import oriented, oriented_iou_3d
+from fcos_lidar_jax.locations import image_layout, look
+from fcos_lidar_jax.losses import cross_entropy
+from fcos_lidar_jax.models import build_detector, count_parameters
+from fcos_lidar_jax.models.detector import network_input
+from fcos_lidar_jax.models.fpn import FeaturePyramid
+from fcos_lidar_jax.models.heads import Heads
+from fcos_lidar_jax.models.lidar_net import Backbone
+from fcos_lidar_jax.models.modality import Stem
+from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+from fcos_lidar_jax.training.step import location_owners, sample_losses
+
+_PEER = """
+import json, os, runpy, sys, time
+real = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)
+run = runpy.run_path(sys.argv[1])["FNS"]["fwd"]
+run()
+print("ready", file=real, flush=True)
+for _ in sys.stdin:
+    began = time.perf_counter()
+    run()
+    print(json.dumps(time.perf_counter() - began), file=real, flush=True)
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """What to measure."""
+
+    preset: str = "nuscenes"
+    """Configuration preset."""
+    data: Path | None = None
+    """Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated frame."""
+    repeats: int = 15
+    """Runs of every stage, of which the median counts."""
+    peer: Path | None = None
+    """Program to time the forward pass against, turn by turn."""
+    out: Path = Path("outputs/full_size.json")
+    """Where the figures go."""
+
+
+def timed(function: Callable[[], Any], repeats: int) -> float:
+    """Median seconds of a call, after one that compiles."""
+    jax.block_until_ready(function())
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - began)
+    return statistics.median(times)
+
+
+def against_peer(ours: Callable[[], Any], peer: Path, repeats: int) -> dict[str, float]:
+    """Medians of our forward pass and a peer's, measured turn by turn."""
+    environment = {**os.environ, "FPN": str(NUSCENES.model.fpn_channels)}
+    with subprocess.Popen(
+        [sys.executable, "-c", _PEER, str(peer)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=environment,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        if process.stdout.readline().strip() != "ready":
+            raise SystemExit(f"error: {peer}: found no FNS['fwd'] that runs")
+        jax.block_until_ready(ours())
+        times: dict[str, list[float]] = {"ours": [], "peer": []}
+        for _ in range(repeats):
+            began = time.perf_counter()
+            jax.block_until_ready(ours())
+            times["ours"].append(time.perf_counter() - began)
+            process.stdin.write("go\n")
+            process.stdin.flush()
+            times["peer"].append(json.loads(process.stdout.readline()))
+        process.stdin.close()
+    medians = {name: round(statistics.median(values), 4) for name, values in times.items()}
+    return {**medians, "ratio": round(medians["ours"] / medians["peer"], 3), "repeats": repeats}
+
+
+def stages(args: Args) -> dict[str, Any]:
+    """All figures of the preset on one frame."""
+    config = PRESETS[args.preset]
+    sensor = load_sensor(config.sensor)
+    model, layout = config.model, image_layout(sensor, config.model)
+    folder = args.data or os.environ.get("FCOS_LIDAR_REAL_DATA")
+    frame = read_keyframe(Path(folder) / "nuscenes_scene0061", sensor) if folder else make_frame(0, sensor)
+    frame = without_close(frame, config, sensor)
+    batch = jax.tree.map(
+        jnp.asarray, make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes)
+    )
+    detector = build_detector(config, sensor)
+    variables = detector.init(jax.random.key(0))
+    params, stats = variables["params"], variables["batch_stats"]
+    record: dict[str, Any] = {
+        "preset": config.name,
+        "frame": "scene-0061, real" if folder else "simulated",
+        "parameters": count_parameters(params),
+        "locations": layout.num_locations,
+        "boxes": len(frame.boxes),
+    }
+    print(json.dumps(record), flush=True)
+
+    def of(part: str) -> dict[str, Any]:
+        return {"params": params[part], **({"batch_stats": stats[part]} if part in stats else {})}
+
+    project = jax.jit(lambda p, v: project_points(p, v, sensor, num_rounds=config.projection.num_rounds))
+    image = project(batch.points[0], batch.valid[0])
+    entrance = jax.jit(lambda f: network_input(f, model, layout))
+    seen = entrance(image.features[None])
+    stem = jax.jit(lambda v, x: Stem(model.stem).apply(v, x, train=False))
+    after_stem = stem(of("stem"), seen)
+    backbone = jax.jit(
+        lambda v, x: Backbone(model.backbone_blocks, model.backbone_widths).apply(v, x, train=False)
+    )
+    levels = backbone(of("backbone"), after_stem)
+    fpn = jax.jit(lambda v, x: FeaturePyramid(model.fpn_channels).apply(v, x))
+    pyramid = fpn(of("fpn"), levels)
+    heads = jax.jit(
+        lambda v, x: Heads(
+            model.num_classes, model.head_channels, model.head_convs, model.background_prior, model.tied_heads
+        ).apply(v, x)
+    )
+    outputs = jax.tree.map(lambda leaf: leaf[0], heads(of("heads"), pyramid))
+    locations = jax.jit(lambda i: look(i, layout))(image)
+    boxes, labels, box_valid = batch.boxes[0], batch.labels[0], batch.box_valid[0]
+
+    @jax.jit
+    def assignment(outputs: Any, image: Any) -> Any:
+        owner = location_owners(image, look(image, layout), boxes, box_valid)
+        label = labels[jnp.maximum(owner, 0)]
+        numbers = jnp.take_along_axis(outputs.regression, label[:, None, None], axis=2)[..., 0]
+        predicted = decode_oriented(numbers, locations.points, locations.azimuth_rad)
+        iou = oriented_iou_3d(predicted, oriented(boxes[jnp.maximum(owner, 0)]))
+        return assign(
+            owner, cross_entropy(outputs.logits, label), iou, num_boxes=config.max_boxes, top_q=config.loss.top_q
+        )
+
+    losses = jax.jit(
+        lambda o, i: sample_losses(o, i, boxes, labels, box_valid, config=config.loss, layout=layout)[0]
+    )
+    finish = jax.jit(lambda o, at: postprocess(o, at, config=config.inference, layout=layout))
+    # A trained detector is sure of little: as many candidates as the threshold lets through is the worst case.
+    eager = dataclasses.replace(outputs, logits=outputs.logits.at[:, -1].add(-4.0))
+    detect = jax.jit(make_detect(detector, config, sensor))
+    forward = jax.jit(lambda v, f: detector.apply(v, f, train=False)[0])
+    calls: dict[str, Callable[[], Any]] = {
+        "mrv": lambda: project(batch.points[0], batch.valid[0]),
+        "stem": lambda: stem(of("stem"), seen),
+        "backbone": lambda: backbone(of("backbone"), after_stem),
+        "fpn": lambda: fpn(of("fpn"), levels),
+        "heads": lambda: heads(of("heads"), pyramid),
+        "assignment": lambda: assignment(outputs, image),
+        "assignment and losses": lambda: losses(outputs, image),
+        "candidates and nms": lambda: finish(eager, locations),
+        "forward": lambda: forward(variables, image.features[None]),
+        "points to boxes": lambda: detect(variables, batch.points[0], batch.valid[0]),
+    }
+    record["milliseconds"] = {}
+    for name, call in calls.items():
+        record["milliseconds"][name] = round(1e3 * timed(call, args.repeats), 2)
+        print(f"{name:24s}{record['milliseconds'][name]:10.2f} ms", flush=True)
+    if args.peer is not None:
+        record["forward_against_peer_s"] = against_peer(calls["forward"], args.peer, args.repeats)
+        print(json.dumps(record["forward_against_peer_s"]), flush=True)
+
+    key = jax.random.key(0)
+    optimizer = make_optimizer(config.optimizer, 100)
+    step = jax.jit(make_train_step(detector, config, sensor, optimizer), donate_argnums=0)
+    state, metrics = jax.block_until_ready(step(make_state(variables, optimizer, key), batch))
+    began = time.perf_counter()
+    state, metrics = jax.block_until_ready(step(state, batch))
+    record["milliseconds"]["train step"] = round(1e3 * (time.perf_counter() - began), 1)
+    record["train_metrics"] = {name: np.asarray(value).tolist() for name, value in metrics.items()}
+    record["peak_memory_gib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
+    print(f"{'train step':24s}{record['milliseconds']['train step']:10.1f} ms", flush=True)
+    print(f"peak memory {record['peak_memory_gib']} GiB")
+    return record
+
+
+def main(args: Args) -> None:
+    """Measure, print, write."""
+    if args.preset not in PRESETS:
+        raise SystemExit(f"error: --preset: got {args.preset!r}, expected one of {', '.join(PRESETS)}")
+    record = {
+        **stages(args),
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+        "device": jax.devices()[0].device_kind,
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+    }
+    write_beside(args.out, lambda path: path.write_text(json.dumps(record, indent=1)))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
