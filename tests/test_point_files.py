@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.point_files import PointFileError, read_points
 from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.data.synthetic.frames import make_frame
@@ -307,3 +308,27 @@ def test_bad_sweep_lists_get_one_line(tmp_path, name):
         read_sweeps(path, NUSCENES_HDL32E, remove_close="all", close_m=1.0)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_keyframe_folder_gives_points_boxes_and_unknown_velocities(tmp_path, points):
+    nuscenes_rows(points).tofile(tmp_path / "a.pcd.bin")
+    box = dict(zip("xyzlwh", range(1, 7), strict=True)) | {"yaw": 0.5, "vx": None, "vy": None, "num_lidar_pts": 9}
+    boxes = [{**box, "class": "truck"}, {**box, "class": None}]
+    (tmp_path / "boxes.json").write_text(json.dumps({"lidar_file": "a.pcd.bin", "boxes": boxes}))
+    frame = read_keyframe(tmp_path, NUSCENES_HDL32E)
+    np.testing.assert_array_equal(frame.boxes, np.array([[1, 2, 3, 4, 5, 6, 0.5, np.nan, np.nan]], np.float32))
+    assert frame.labels.tolist() == [1]
+    assert frame.num_points.tolist() == [9]
+    assert len(frame.points) == len(points)
+    for text, message in [("{", "not JSON"), ('{"boxes": []}', "'lidar_file'"), ('{"boxes": 3}', "missing or of")]:
+        (tmp_path / "boxes.json").write_text(text)
+        with pytest.raises(PointFileError, match=message):
+            read_keyframe(tmp_path, NUSCENES_HDL32E)
+
+
+@pytest.mark.real_data
+def test_real_keyframe_has_its_boxes(real_data):
+    frame = read_keyframe(real_data / "nuscenes_scene0061", NUSCENES_HDL32E)
+    assert frame.boxes.shape == (68, 9)
+    assert np.isnan(frame.boxes[:, 7]).sum() == 2
+    assert (frame.num_points == 0).sum() == 3

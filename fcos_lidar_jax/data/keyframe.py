@@ -17,7 +17,8 @@ def read_keyframe(folder: str | Path, sensor: Sensor) -> Frame:
     """The keyframe of a folder, with the boxes of the ten classes.
 
     ``boxes.json`` is ``{"lidar_file": NAME, "boxes": [{"class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy",
-    "num_lidar_pts"}]}`` in the LiDAR frame; an unknown velocity is null and becomes NaN, other classes are left out.
+    "num_lidar_pts"}]}`` in the LiDAR frame; an unknown velocity is null and becomes NaN; other classes are
+    left out.
 
     Args:
         folder: holds ``boxes.json`` and the point file.
