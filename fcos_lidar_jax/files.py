@@ -1,7 +1,7 @@
 """Writing files whole or not at all."""
 
 import os
-import tempfile
+import secrets
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,23 +13,26 @@ def write_beside(path: str | Path, write: Callable[[Path], object]) -> None:
 
     Args:
         path: where the file shall be; missing parent folders are made.
-        write: writes the file it is given; that name ends like ``path``.
+        write: creates and writes the file that it is given; that name ends like ``path``, for writers that go by
+            the extension.
 
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> write_beside(folder / "a.txt", lambda file: file.write_text("whole"))
-    >>> (folder / "a.txt").read_text()
-    'whole'
+    Raises:
+        OSError: a folder stands at ``path``, or what the file system and ``write`` raise.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "new" / "a.txt"
+    >>> write_beside(file, lambda temporary: temporary.write_text("whole"))
+    >>> file.read_text(), [f.name for f in file.parent.iterdir()]
+    ('whole', ['a.txt'])
     """
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path}: found a folder, expected a file to write")
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    # The writer itself creates the file, so that its permissions are those of any other new file.
+    temporary = path.with_name(f".{secrets.token_hex(6)}{path.suffix}")
     try:
         write(temporary)
-        temporary.chmod(0o644)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,146 +1,174 @@
 """PCD files by their header: ascii, binary and binary_compressed."""
 
-from pathlib import Path
-
 import numpy as np
 
-_NAMES = {
-    "x": "x",
-    "y": "y",
-    "z": "z",
-    "intensity": "intensity",
-    "reflectivity": "intensity",
-    "time_lag": "time_lag",
-    "ring": "laser",
-    "laser": "laser",
-    "laser_number": "laser",
+_COLUMNS = {
+    "x": ("x",),
+    "y": ("y",),
+    "z": ("z",),
+    "intensity": ("intensity",),
+    "time_lag": ("time_lag",),
+    "laser": ("laser_number", "laser", "ring"),
 }
-"""Fields that are read, and what they are called here; others are skipped."""
-_KINDS = {"F": "f", "I": "i", "U": "u"}
+"""Column -> the field names it goes by, the most telling first. Other fields are skipped."""
+_KINDS = {"F": ("f", "248"), "I": ("i", "1248"), "U": ("u", "1248")}
+"""TYPE -> NumPy's letter, and the sizes it comes in."""
+_MAX_COUNT = 1_000_000
+"""Values a field of one point may have; more is a damaged header."""
 
 
-def read_pcd(path: Path, error: type[ValueError]) -> dict[str, np.ndarray]:
-    """Named columns of a PCD file: x, y, z, and of intensity, time_lag and laser those that are there.
+def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
+    """Named columns of a PCD file.
 
     Args:
-        path: the file.
-        error: raised with one line that names the file, the finding and the expectation.
+        content: the whole file.
+
+    Returns:
+        x, y, z, and of intensity, time_lag and laser those that are there; one value a point each, in the
+        file's own units and types.
+
+    Raises:
+        ValueError: one line that names the header's field, what was found and what was expected.
+
+    >>> header = "FIELDS x y z ring\\nSIZE 4 4 4 1\\nTYPE F F F U\\nPOINTS 1\\nDATA ascii\\n"
+    >>> {name: column.tolist() for name, column in parse_pcd(header.encode() + b"5 0 -1.5 31\\n").items()}
+    {'x': [5.0], 'y': [0.0], 'z': [-1.5], 'laser': [31.0]}
     """
-    content = path.read_bytes()
-    header, body = _read_header(path, content, error)
-    dtype = _record_type(path, header, error)
-    try:
-        number = int(header["POINTS"][0]) if "POINTS" in header else _product(header)
-    except (KeyError, ValueError, IndexError):
-        raise error(f"{path}: POINTS: missing or not a number in the header") from None
-    form = header.get("DATA", [""])[0].lower()
+    header, body = _read_header(content)
+    fields, types = _field_types(header)
+    number = _num_points(header)
+    form = " ".join(header["DATA"]).lower()
     if form == "ascii":
-        records = _from_ascii(path, body, dtype, number, error)
+        columns = _from_ascii(body, types, number)
     elif form == "binary":
-        if len(body) < number * dtype.itemsize:
-            raise error(f"{path}: truncated: got {len(body)} bytes of points, expected {number * dtype.itemsize}")
-        records = np.frombuffer(body, dtype, number)
+        columns = _from_binary(body, types, number)
     elif form == "binary_compressed":
-        records = _from_compressed(path, body, dtype, number, error)
+        columns = _from_compressed(body, types, number)
     else:
-        raise error(f"{path}: DATA: got {form!r}, expected ascii, binary or binary_compressed")
+        raise ValueError(f"DATA: got {form!r}, expected ascii, binary or binary_compressed")
     table = {}
-    for field in dtype.names or ():
-        name = _NAMES.get(field.lower())
-        if name is not None and records[field].ndim == 1:
-            table[name] = records[field]
-    for axis in "xyz":
-        if axis not in table:
-            raise error(f"{path}: FIELDS: no {axis} among {', '.join(dtype.names or ())}")
+    for name, aliases in _COLUMNS.items():
+        found = next((a for a in aliases if a in fields), None)
+        if found is not None:
+            column = columns[fields.index(found)]
+            if column.shape[1] != 1:
+                raise ValueError(f"COUNT: got {column.shape[1]} for field {found}, expected 1")
+            table[name] = column[:, 0]
     return table
 
 
-def _product(header: dict[str, list[str]]) -> int:
-    return int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-
-
-def _read_header(path: Path, content: bytes, error: type[ValueError]) -> tuple[dict[str, list[str]], bytes]:
+def _read_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
+    """Entry -> its words, and what comes after the DATA line."""
     header: dict[str, list[str]] = {}
     position = 0
-    while position < len(content):
+    while position < len(content) and len(header) <= 32:  # no header is that long: not a PCD file
         end = content.find(b"\n", position)
-        if end < 0:
-            break
-        words = content[position:end].decode("ascii", "replace").split()
-        position = end + 1
+        line = content[position : len(content) if end < 0 else end]
+        position += len(line) + 1
+        words = line.decode("ascii", "replace").split()
         if not words or words[0].startswith("#"):
             continue
         header[words[0].upper()] = words[1:]
         if words[0].upper() == "DATA":
             return header, content[position:]
-        if len(header) > 32:
-            break
-    raise error(f"{path}: not a PCD file: no DATA line in its header")
+    raise ValueError("not a PCD file: no DATA line in its header")
 
 
-def _record_type(path: Path, header: dict[str, list[str]], error: type[ValueError]) -> np.dtype:
-    fields = header.get("FIELDS", [])
-    sizes, kinds = header.get("SIZE", []), header.get("TYPE", [])
-    counts = header.get("COUNT", ["1"] * len(fields))
-    if not fields or not len(fields) == len(sizes) == len(kinds) == len(counts):
-        raise error(f"{path}: header: FIELDS, SIZE, TYPE and COUNT must list as many entries each")
-    columns, used = [], set()
-    for i, (field, size, kind, count) in enumerate(zip(fields, sizes, kinds, counts, strict=True)):
-        if kind not in _KINDS or size not in ("1", "2", "4", "8") or not count.isdigit() or kind + size == "F1":
-            raise error(f"{path}: header: field {field}: got TYPE {kind} SIZE {size} COUNT {count}")
-        name = field if field not in used and field != "_" else f"{field}{i}"
-        used.add(name)
-        base = np.dtype(f"<{_KINDS[kind]}{size}")
-        columns.append((name, base) if count == "1" else (name, base, (int(count),)))
-    return np.dtype(columns)
+def _field_types(header: dict[str, list[str]]) -> tuple[list[str], list[tuple[np.dtype, int]]]:
+    """Names of the fields, and number type and count of each."""
+    fields = [name.lower() for name in header.get("FIELDS", [])]
+    for axis in "xyz":
+        if fields.count(axis) != 1:
+            raise ValueError(f"FIELDS: got {fields.count(axis)} named {axis} in {fields}, expected one")
+    columns = {"COUNT": ["1"] * len(fields)} | {k: header[k] for k in ("SIZE", "TYPE", "COUNT") if k in header}
+    for name in ("SIZE", "TYPE", "COUNT"):
+        if len(columns.get(name, [])) != len(fields):
+            raise ValueError(f"{name}: got {len(columns.get(name, []))} entries, expected {len(fields)} as in FIELDS")
+    types = []
+    for field, size, kind, count in zip(fields, columns["SIZE"], columns["TYPE"], columns["COUNT"], strict=True):
+        letter, sizes = _KINDS.get(kind.upper(), ("", ""))
+        if not letter or size not in tuple(sizes):
+            raise ValueError(
+                f"TYPE and SIZE: got {kind} {size} for field {field}, expected F 2, 4, 8 or I, U 1, 2, 4, 8"
+            )
+        if not count.isdecimal() or not 1 <= int(count) <= _MAX_COUNT:
+            raise ValueError(f"COUNT: got {count} for field {field}, expected an integer of at least 1")
+        types.append((np.dtype(f"<{letter}{size}"), int(count)))
+    return fields, types
 
 
-def _widths(dtype: np.dtype) -> list[int]:
-    assert dtype.names is not None
-    return [int(np.prod(dtype[name].shape, dtype=int)) for name in dtype.names]
+def _num_points(header: dict[str, list[str]]) -> int:
+    numbers = {}
+    for name in ("POINTS", "WIDTH", "HEIGHT"):
+        words = header.get(name)
+        if words is not None and (len(words) != 1 or not words[0].isdecimal()):
+            raise ValueError(f"{name}: got {' '.join(words)!r}, expected an integer of at least 0")
+        if words is not None:
+            numbers[name] = int(words[0])
+    product = numbers["WIDTH"] * numbers["HEIGHT"] if {"WIDTH", "HEIGHT"} <= set(numbers) else None
+    points = numbers.get("POINTS", product)
+    if points is None:
+        raise ValueError("POINTS: missing in the header, as are WIDTH and HEIGHT")
+    if product not in (None, points):
+        raise ValueError(f"POINTS: got {points}, expected WIDTH x HEIGHT, which is {product}")
+    return points
 
 
-def _from_ascii(path: Path, body: bytes, dtype: np.dtype, number: int, error: type[ValueError]) -> np.ndarray:
+def _from_ascii(body: bytes, types: list[tuple[np.dtype, int]], number: int) -> list[np.ndarray]:
     words = body.split()
-    width = sum(_widths(dtype))
+    width = sum(count for _, count in types)
     if len(words) != number * width:
-        raise error(f"{path}: truncated: got {len(words)} values, expected {number} points of {width}")
+        cause = "truncated" if len(words) < number * width else "too long"
+        raise ValueError(f"DATA: {cause}: got {len(words)} values, expected {number} points of {width}")
     try:
         values = np.array(words, np.float64).reshape(number, width)
     except ValueError:
-        raise error(f"{path}: a value among the points is not a number") from None
-    records = np.zeros(number, np.dtype([(n, "<f8", dtype[n].shape) for n in dtype.names or ()]))
-    first = 0
-    for name, size in zip(dtype.names or (), _widths(dtype), strict=True):
-        records[name] = values[:, first : first + size].reshape(number, *dtype[name].shape)
-        first += size
-    return records
+        raise ValueError(f"DATA: got {_first_non_number(words)!r} among the values, expected a number") from None
+    return np.split(values, np.cumsum([count for _, count in types])[:-1], axis=1)
 
 
-def _from_compressed(path: Path, body: bytes, dtype: np.dtype, number: int, error: type[ValueError]) -> np.ndarray:
-    """Points stored field by field and packed by LZF."""
-    if len(body) < 8:
-        raise error(f"{path}: truncated: no room for the sizes of the compressed data")
-    packed, size = (int(v) for v in np.frombuffer(body[:8], "<u4"))
-    if size != number * dtype.itemsize or len(body) < 8 + packed:
-        raise error(f"{path}: truncated: the compressed data do not hold {number} points")
-    plain = _unpack_lzf(body[8 : 8 + packed], size)
-    if plain is None:
-        raise error(f"{path}: the compressed data are damaged")
-    records, first = np.zeros(number, dtype), 0
-    for name in dtype.names or ():
-        count = number * dtype[name].itemsize
-        base, shape = dtype[name].base, dtype[name].shape
-        records[name] = np.frombuffer(plain[first : first + count], base).reshape(number, *shape)
-        first += count
-    return records
+def _first_non_number(words: list[bytes]) -> str:
+    for word in words:
+        try:
+            float(word)
+        except ValueError:
+            return word.decode("ascii", "replace")
+    return ""
 
 
-def _unpack_lzf(packed: bytes, size: int) -> bytes | None:
-    """LZF: literal runs, and copies of what was already written; None where the data are damaged."""
+def _from_binary(body: bytes, types: list[tuple[np.dtype, int]], number: int) -> list[np.ndarray]:
+    """Points stored one after the other."""
+    record = np.dtype([(str(i), base, (count,)) for i, (base, count) in enumerate(types)])
+    if len(body) < number * record.itemsize:
+        raise ValueError(
+            f"DATA: truncated: got {len(body)} bytes, expected {number * record.itemsize} "
+            f"({number} points of {record.itemsize})"
+        )
+    records = np.frombuffer(body, record, number)
+    return [records[str(i)] for i in range(len(types))]
+
+
+def _from_compressed(body: bytes, types: list[tuple[np.dtype, int]], number: int) -> list[np.ndarray]:
+    """Points stored field by field and packed by LZF, behind the packed and the plain size."""
+    expected = number * sum(base.itemsize * count for base, count in types)
+    packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
+    if len(body) < 8 + packed:
+        raise ValueError(f"DATA: truncated: got {max(len(body) - 8, 0)} compressed bytes, expected {packed}")
+    if plain != expected:
+        raise ValueError(f"DATA: got {plain} uncompressed bytes, expected {expected} for {number} points")
+    content = _unpack_lzf(body[8 : 8 + packed], plain)
+    columns, first = [], 0
+    for base, count in types:
+        columns.append(np.frombuffer(content, base, number * count, first).reshape(number, count))
+        first += number * count * base.itemsize
+    return columns
+
+
+def _unpack_lzf(packed: bytes, size: int) -> bytes:
+    """LZF: runs of literal bytes, and copies of what was already written."""
     out, position = bytearray(), 0
     try:
-        while position < len(packed):
+        while position < len(packed) and len(out) <= size:
             control = packed[position]
             position += 1
             if control < 32:
@@ -151,12 +179,16 @@ def _unpack_lzf(packed: bytes, size: int) -> bytes | None:
             if length == 7:
                 length += packed[position]
                 position += 1
-            start = len(out) - ((control & 31) << 8) - packed[position] - 1
+            length += 2
+            distance = ((control & 31) << 8) + packed[position] + 1
             position += 1
-            if start < 0:
-                return None
-            for i in range(start, start + length + 2):  # the copy may overlap what it writes
-                out.append(out[i])
+            if distance > len(out):
+                raise ValueError("DATA: the compressed bytes are damaged: a copy from before the beginning")
+            start = len(out) - distance
+            # A copy longer than its distance repeats what it has just written.
+            out += (out[start : start + length] * (length // distance + 1))[:length]
     except IndexError:
-        return None
-    return bytes(out) if len(out) == size else None
+        raise ValueError("DATA: the compressed bytes are damaged: they end within a copy") from None
+    if len(out) != size:
+        raise ValueError(f"DATA: the compressed bytes are damaged: they do not unpack to {size} bytes")
+    return bytes(out)

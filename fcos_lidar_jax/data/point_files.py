@@ -1,16 +1,30 @@
-"""Point clouds from files: raw nuScenes and KITTI, NumPy, PCD, and lists of sweeps."""
+"""Point clouds from files: raw nuScenes and KITTI, NumPy, PCD."""
 
-import zipfile
+import io
 from pathlib import Path
 
 import numpy as np
 
-from fcos_lidar_jax.data.pcd import read_pcd
+from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.sensors import Sensor
 
-_PLAUSIBLE_M = 300.0
-"""No LiDAR here sees farther; the values of a misread file mostly do not look like metres."""
+_ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd")
 _RAW_COLUMNS = (3, 4, 5, 6)
+_RAW_DTYPES = ("float16", "float32", "float64")
+
+# What tells a raw file that is read with the layout it was written with.
+_REACH_M = 300.0
+"""No LiDAR here sees farther."""
+_HEIGHT_M = (-15.0, 40.0)
+"""Between ditches and bridges; abscissas and intensities that slip into the third column leave it."""
+_FINEST_M = 1e-6
+"""Finer than any LiDAR resolves: text, or another number type."""
+_MARGIN = 0.15
+"""How much better another layout must fit before the one in use is refused."""
+_INSPECTED_VALUES = 240_000
+"""Values that are looked at; a multiple of every number of columns."""
+_MIN_VALUES = 200
+"""Below this the contrast of the columns is chance."""
 
 
 class PointFileError(ValueError):
@@ -26,6 +40,9 @@ def read_points(
     ``columns`` and ``dtype``; a fifth column is then the time lag, but in a ``.pcd.bin`` it stays the ring.
     ``.npy`` and ``.npz`` (one array, or one named ``points``): N x 3 to 6. ``.pcd``: by its header.
 
+    A size cannot tell four from five columns, so a raw file is also refused when its values do not look like
+    metres, or when another layout fits them clearly better.
+
     Args:
         path: the file.
         sensor: scales the intensity and says whether a laser number is needed.
@@ -38,98 +55,148 @@ def read_points(
         non-finite values stay, to be dropped and counted by the projection.
 
     Raises:
-        PointFileError: naming the file, what was found and what was expected.
+        PointFileError: naming the file, the field, what was found and what was expected.
+
+    >>> import tempfile
+    >>> from fcos_lidar_jax.sensors import KITTI_HDL64E
+    >>> file = Path(tempfile.mkdtemp()) / "000000.bin"
+    >>> np.array([[20, 3, -1.5, 0.2], [8, -2, -1.7, 0.4]], np.float32).tofile(file)
+    >>> read_points(file, KITTI_HDL64E).tolist()
+    [[20.0, 3.0, -1.5, 51.0, 0.0], [8.0, -2.0, -1.7000000476837158, 102.0, 0.0]]
     """
     path = Path(path)
+    kind = _kind(path)
+    if columns is not None and columns not in _RAW_COLUMNS:
+        raise PointFileError(f"{path}: columns: got {columns}, expected 3, 4, 5 or 6")
+    if dtype is not None and dtype not in _RAW_DTYPES:
+        raise PointFileError(f"{path}: dtype: got {dtype}, expected {', '.join(_RAW_DTYPES)}")
+    if not kind.endswith(".bin") and (columns is not None or dtype is not None):
+        raise PointFileError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise PointFileError(f"{path}: cannot be read: {error.strerror}") from None
+    if not content:
+        raise PointFileError(f"{path}: empty file, expected points")
+    if kind == ".pcd":
+        try:
+            table = parse_pcd(content)
+        except ValueError as error:
+            raise PointFileError(f"{path}: {error}") from None
+        return _assemble(path, sensor, table)
+    names = ("x", "y", "z", "intensity", "time_lag", "laser")
+    if kind.endswith(".bin"):
+        rows = _read_raw(path, content, columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32")
+        if kind == ".pcd.bin":
+            names = ("x", "y", "z", "intensity", "laser", "unknown")
+    else:
+        rows = _read_numpy(path, content, kind)
+    return _assemble(path, sensor, dict(zip(names, rows.T, strict=False)))
+
+
+def _kind(path: Path) -> str:
     if path.is_dir():
         raise PointFileError(f"{path}: found a folder, expected a point file")
     if not path.is_file():
         raise PointFileError(f"{path}: no such file")
-    kind = _kind(path)
-    if columns is not None and columns not in _RAW_COLUMNS:
-        raise PointFileError(f"{path}: columns: got {columns}, expected 3, 4, 5 or 6")
-    if kind in (".npy", ".npz", ".pcd") and (columns is not None or dtype is not None):
-        raise PointFileError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
-    if path.stat().st_size == 0:
-        raise PointFileError(f"{path}: empty file")
-    if kind == ".pcd":
-        table = read_pcd(path, PointFileError)
-        return _assemble(path, sensor, table)
-    if kind in (".npy", ".npz"):
-        rows = _read_numpy(path, kind)
-    else:
-        default = 5 if kind == ".pcd.bin" else 4
-        rows = _read_raw(path, columns or default, np.dtype(dtype or "float32"), guessed=columns is None)
-    names = ["x", "y", "z", "intensity", "time_lag", "laser"]
-    if kind == ".pcd.bin" and rows.shape[1] >= 5:
-        names[4] = "laser"
-        rows = rows[:, :5]
-    return _assemble(path, sensor, {name: rows[:, i] for i, name in enumerate(names[: rows.shape[1]])})
-
-
-def _kind(path: Path) -> str:
-    for ending in (".pcd.bin", ".bin", ".npy", ".npz", ".pcd"):
+    for ending in _ENDINGS:
         if path.name.lower().endswith(ending):
             return ending
-    raise PointFileError(f"{path}: unknown extension {path.suffix!r}, expected .pcd.bin, .bin, .npy, .npz or .pcd")
+    raise PointFileError(f"{path}: unknown extension {path.suffix!r}, expected {', '.join(_ENDINGS)}")
 
 
-def _read_raw(path: Path, columns: int, dtype: np.dtype, *, guessed: bool) -> np.ndarray:
-    size, row = path.stat().st_size, columns * dtype.itemsize
+def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarray:
+    better = _better_layout(content, columns, dtype)
+    hint = "" if better is None else f", {better[0]} columns would fit"
+    hint += "" if better is None or better[1] == dtype else f" as {better[1]}"
+    size, row = len(content), columns * np.dtype(dtype).itemsize
     if size % row:
         raise PointFileError(
-            f"{path}: {size} bytes are not a multiple of {row} ({columns} {dtype} values a point): truncated, or "
-            "another layout, to be named by columns and dtype"
+            f"{path}: got {size} bytes, not a multiple of {row} ({columns} {dtype} values a point): truncated, or "
+            f"another layout{hint}, to be named by columns and dtype"
         )
-    values = np.fromfile(path, dtype).astype(np.float32)
-    rows = values.reshape(-1, columns)
-    share = _plausible_share(rows)
-    others = {c: _plausible_share(values.reshape(-1, c)) for c in (4, 5) if c != columns and len(values) % c == 0}
-    better = max(others, key=others.__getitem__, default=None)
-    if share < 0.5 or (better is not None and others[better] > share + 0.15):
-        hint = f", {better} columns would fit" if better and others[better] > share else ""
+    if better is not None or _plausible_share(content, columns, dtype) < 0.5:
         raise PointFileError(
-            f"{path}: read with {columns} {dtype} columns most values are not plausible metres{hint}: "
-            f"{'name' if guessed else 'check'} columns and dtype"
+            f"{path}: read with {columns} {dtype} columns most values are not plausible metres{hint}, "
+            "expected a layout named by columns and dtype"
         )
-    return rows
+    return np.frombuffer(content, dtype).reshape(-1, columns)
 
 
-def _plausible_share(rows: np.ndarray) -> float:
-    """Part of the rows that look like a LiDAR's points.
+def _better_layout(content: bytes, columns: int, dtype: str) -> tuple[int, str] | None:
+    """Columns and number type that fit the content clearly better than those in use."""
 
-    Metres within reach, and heights that stay within tens of metres: intensities, rings or misplaced
-    abscissas in the third column do not. Non-finite rows say nothing.
-    """
-    finite = np.isfinite(rows).all(axis=1)
-    if not finite.any():
+    def fits(layout: tuple[int, str]) -> bool:
+        return len(content) % (layout[0] * np.dtype(layout[1]).itemsize) == 0
+
+    share, contrast = 0.0, 0.0
+    divides = fits((columns, dtype))
+    if divides:
+        share, contrast = _plausible_share(content, columns, dtype), _column_contrast(content, columns, dtype)
+    better = {}
+    for layout in filter(fits, ((c, d) for d in _RAW_DTYPES for c in _RAW_COLUMNS)):
+        other_share = _plausible_share(content, *layout)
+        if other_share < 0.9:
+            continue
+        other_contrast = _column_contrast(content, *layout)
+        clearer = other_contrast > contrast + _MARGIN
+        # Halves of misread numbers stand out as columns too: another number type must have the better metres.
+        if other_share > share + _MARGIN if divides and not (clearer and layout[1] == dtype) else clearer:
+            better[layout] = other_share + other_contrast
+    return max(better, key=better.__getitem__, default=None)
+
+
+def _inspected(content: bytes, columns: int, dtype: str) -> np.ndarray:
+    number = min(len(content) // np.dtype(dtype).itemsize, _INSPECTED_VALUES)
+    return np.frombuffer(content, dtype, number).astype(np.float64).reshape(-1, columns)
+
+
+def _plausible_share(content: bytes, columns: int, dtype: str) -> float:
+    """Part of the finite rows whose metres and intensity look like a LiDAR's."""
+    rows = _inspected(content, columns, dtype)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if not len(rows):
         return 1.0
-    xyz = np.abs(rows[finite, :3])
-    good = (xyz < _PLAUSIBLE_M).all(axis=1) & (rows[finite, 2] > -15) & (rows[finite, 2] < 40)
-    # Denormal numbers are other types misread, not metres.
-    good &= ~((xyz > 0) & (xyz < 1e-20)).any(axis=1)
-    if rows.shape[1] > 3:
-        good &= (rows[finite, 3] >= 0) & (rows[finite, 3] < 1e5)
+    xyz = np.abs(rows[:, :3])
+    good = (xyz < _REACH_M).all(axis=1) & ((xyz == 0) | (xyz > _FINEST_M)).all(axis=1)
+    good &= (rows[:, 2] > _HEIGHT_M[0]) & (rows[:, 2] < _HEIGHT_M[1])
+    if columns > 3:
+        good &= (rows[:, 3] >= 0) & (rows[:, 3] < 2**16)
     return float(good.mean())
 
 
-def _read_numpy(path: Path, kind: str) -> np.ndarray:
+def _column_contrast(content: bytes, columns: int, dtype: str) -> float:
+    """How much the columns differ: the part of the values' variance, or of their magnitudes', between columns.
+
+    Abscissa, height, intensity and ring have each their own mean or spread. Another number of columns deals the
+    values out among all columns, which then look alike: 0.3 and more turns into 0.00.
+    """
+    rows = _inspected(content, columns, dtype)
+    if rows.size < _MIN_VALUES:
+        return 0.0
+    rows = np.arcsinh(np.where(np.isfinite(rows), rows, 0))
+    return max(float(v.mean(axis=0).var() / max(v.var(), 1e-12)) for v in (rows, np.abs(rows)))
+
+
+def _read_numpy(path: Path, content: bytes, kind: str) -> np.ndarray:
+    magic = b"\x93NUMPY" if kind == ".npy" else b"PK"
+    if not content.startswith(magic):
+        raise PointFileError(f"{path}: not a readable {kind} file: got {content[:6]!r}, expected {magic!r} first")
     try:
-        if kind == ".npy":
-            array = np.load(path, allow_pickle=False)
-        else:
-            with np.load(path, allow_pickle=False) as archive:
-                names = archive.files
-                if len(names) != 1 and "points" not in names:
-                    raise PointFileError(
-                        f"{path}: got arrays {', '.join(names) or 'none'}, expected one, or one named points"
-                    )
-                array = archive["points" if "points" in names else names[0]]
+        array = np.load(io.BytesIO(content), allow_pickle=False)
+        if kind == ".npz":
+            names = array.files
+            if len(names) != 1 and "points" not in names:
+                found = ", ".join(names) or "none"
+                raise PointFileError(f"{path}: got arrays {found}, expected one, or one named points")
+            array = array["points" if "points" in names else names[0]]
     except PointFileError:
         raise
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+    except Exception as error:  # damaged archives and headers fail in a dozen ways, down to the tokenizer's
         reason = " ".join(str(error).split())
-        raise PointFileError(f"{path}: not a readable {kind} file without pickled objects: {reason}") from None
+        raise PointFileError(
+            f"{path}: not a readable {kind} file, which must be without pickled objects: {reason}"
+        ) from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         found = getattr(array, "dtype", type(array).__name__)
         raise PointFileError(f"{path}: dtype: got {found}, expected real numbers")
@@ -142,22 +209,32 @@ def _assemble(path: Path, sensor: Sensor, table: dict[str, np.ndarray]) -> np.nd
     """The contract's columns from named ones."""
     number = len(table["x"])
     if number == 0:
-        raise PointFileError(f"{path}: no points in it")
+        raise PointFileError(f"{path}: no points in it, expected at least one")
     points = np.zeros((number, sensor.point_columns), np.float32)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, and is dropped with the non-finite
         for i, name in enumerate(("x", "y", "z", "intensity", "time_lag")):
             if name in table:
                 points[:, i] = table[name]
-    points[:, 3] *= np.float32(sensor.intensity_scale)
-    lag = points[:, 4]
-    if (lag < 0).any():
-        raise PointFileError(f"{path}: time_lag: got {lag[lag < 0][0]:g}, expected seconds of at least 0")
+        points[:, 3] *= np.float32(sensor.intensity_scale)
+    negative = np.flatnonzero(points[:, 4] < 0)
+    if len(negative):
+        found = f"{points[negative[0], 4]:g} in row {negative[0]}"
+        raise PointFileError(f"{path}: time_lag: got {found}, expected seconds of at least 0")
     if sensor.row_source == "laser":
-        if "laser" not in table:
-            raise PointFileError(f"{path}: no laser number (sixth column), which sensor {sensor.name} needs")
-        laser = table["laser"]
-        known = np.isfinite(laser.astype(np.float64))
-        if ((laser < 0) | (laser >= sensor.num_rows) | (laser != np.floor(laser)))[known].any():
-            raise PointFileError(f"{path}: laser number: expected whole numbers of 0 to {sensor.num_rows - 1}")
-        points[:, 5] = laser
+        points[:, 5] = _laser_numbers(path, sensor, table)
     return points
+
+
+def _laser_numbers(path: Path, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
+    if "laser" not in table:
+        raise PointFileError(
+            f"{path}: no laser number in it, expected one for every point, since sensor {sensor.name} needs it"
+        )
+    laser = table["laser"].astype(np.float64)
+    bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
+    if len(bad):
+        found = f"{laser[bad[0]]:g} in row {bad[0]}"
+        raise PointFileError(
+            f"{path}: laser number: got {found}, expected whole numbers of 0 to {sensor.num_rows - 1}"
+        )
+    return laser
