@@ -148,7 +148,8 @@ def _better_layout(content: bytes, columns: int, dtype: str) -> tuple[int, str] 
 
 def _inspected(content: bytes, columns: int, dtype: str) -> np.ndarray:
     number = min(len(content) // np.dtype(dtype).itemsize, _INSPECTED_VALUES)
-    return np.frombuffer(content, dtype, number).astype(np.float64).reshape(-1, columns)
+    with np.errstate(invalid="ignore"):  # misread numbers may be NaNs that signal
+        return np.frombuffer(content, dtype, number).astype(np.float64).reshape(-1, columns)
 
 
 def _plausible_share(content: bytes, columns: int, dtype: str) -> float:
@@ -211,7 +212,8 @@ def _assemble(path: Path, sensor: Sensor, table: dict[str, np.ndarray]) -> np.nd
     if number == 0:
         raise PointFileError(f"{path}: no points in it, expected at least one")
     points = np.zeros((number, sensor.point_columns), np.float32)
-    with np.errstate(over="ignore"):  # what is too large becomes infinite, and is dropped with the non-finite
+    # What is too large becomes infinite, and is dropped with the other non-finite values.
+    with np.errstate(over="ignore", invalid="ignore"):
         for i, name in enumerate(("x", "y", "z", "intensity", "time_lag")):
             if name in table:
                 points[:, i] = table[name]
