@@ -333,7 +333,6 @@ QUICKSTART = dataclasses.replace(
         head_channels=32,
         head_convs=2,
     ),
-    inference=InferenceConfig(candidates_per_level=200, max_detections=100),
     optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=4),
 )
 """Small enough to train on two CPU cores: the same code, other numbers."""

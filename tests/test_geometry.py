@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import oracles
 from fcos_lidar_jax.geometry import atan2, box_corners, points_in_box, safe_norm, spherical, wrap_angle
@@ -41,11 +40,27 @@ def test_spherical_inverts_to_the_point():
     np.testing.assert_allclose(back, points, atol=5e-5)
 
 
-@pytest.mark.parametrize("angle", [-np.pi, np.pi, 0.0, 7.0, -7.0, 100.0, np.nextafter(np.float32(np.pi), 4)])
-def test_wrapped_angles_are_in_the_half_open_turn_and_point_the_same_way(angle):
-    wrapped = float(wrap_angle(jnp.float32(angle)))
-    assert -np.pi <= wrapped < np.pi or wrapped == np.float32(-np.pi)
-    np.testing.assert_allclose([np.cos(wrapped), np.sin(wrapped)], [np.cos(angle), np.sin(angle)], atol=1e-5)
+def test_wrapped_angles_are_in_the_half_open_turn_and_point_the_same_way():
+    exact = np.concatenate([np.arange(-9, 10) * np.pi, np.random.default_rng(3).uniform(-20, 20, 5000)])
+    angles = exact.astype(np.float32)
+    angles = np.concatenate([angles, *(np.nextafter(angles, np.float32(end)) for end in (-99, 99))])
+    wrapped = np.asarray(wrap_angle(jnp.asarray(angles)))
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles.astype(float)), atol=1e-5)
+    assert wrapped.max() < np.float32(np.pi)
+    # A sum of two angles lands in the turn exactly, several turns within the rounding of the input.
+    assert wrapped[np.abs(angles) < 6.5].min() == np.float32(-np.pi)
+    assert wrapped.min() >= np.float32(-np.pi) - np.spacing(np.float32(30))
+
+
+def test_boundary_of_a_box_is_inside():
+    box = jnp.array([1, 2, 3, 4, 2, 1, 0], jnp.float32)
+    for axis, half in enumerate((2.0, 1.0, 0.5)):
+        for sign in (-1, 1):
+            point = np.array([1, 2, 3], np.float32)
+            point[axis] += sign * half
+            assert bool(points_in_box(jnp.asarray(point), box))
+            point[axis] += sign * np.float32(1e-5)
+            assert not bool(points_in_box(jnp.asarray(point), box))
 
 
 def test_corners_and_membership_by_explicit_rotation():

@@ -1,5 +1,7 @@
 """Readers: every layout comes back as it was, and every bad file gets one line that names it."""
 
+import dataclasses
+import io
 import json
 
 import numpy as np
@@ -31,22 +33,33 @@ def pcd_header(form, number, fields="x y z intensity", kinds="F F F F", sizes="4
 
 
 def lzf(data: bytes) -> bytes:
-    """A packer that writes literals, and one long run as a copy that overlaps itself."""
-    run = len(data) - len(data.rstrip(data[-1:]))
-    out = bytearray()
-    head = data[: len(data) - run + 1] if run > 20 else data
-    for i in range(0, len(head), 32):
-        out += bytes([len(head[i : i + 32]) - 1]) + head[i : i + 32]
-    left = len(data) - len(head)
-    while left > 0:
-        take = min(left, 264) if left >= 3 else left
-        if take >= 9:
-            out += bytes([7 << 5, take - 9, 0])
-        elif take >= 3:
-            out += bytes([(take - 2) << 5, 0])
-        else:
-            out += bytes([take - 1]) + data[-take:]
-        left -= take
+    """A greedy packer: copies of what came before, near or far, and literals between them."""
+    out, literals, position = bytearray(), bytearray(), 0
+    last: dict[bytes, int] = {}
+
+    def flush():
+        for i in range(0, len(literals), 32):
+            out.extend([len(literals[i : i + 32]) - 1, *literals[i : i + 32]])
+        literals.clear()
+
+    while position < len(data):
+        start = last.get(data[position : position + 3], -1)
+        distance, length = position - start, 0
+        if start >= 0 and distance <= 8192:
+            while (
+                length < 264 and position + length < len(data) and data[start + length] == data[position + length]
+            ):
+                length += 1
+        last[data[position : position + 3]] = position
+        if length < 3:
+            literals.append(data[position])
+            position += 1
+            continue
+        flush()
+        high, low = divmod(distance - 1, 256)
+        out.extend([(7 << 5) + high, length - 9, low] if length >= 9 else [((length - 2) << 5) + high, low])
+        position += length
+    flush()
     return bytes(out)
 
 
@@ -102,32 +115,77 @@ def test_laser_number_is_the_sixth_column_or_the_ring(tmp_path, points):
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
 def test_pcd_files_by_their_header(tmp_path, points, form):
-    names = "x y z normal intensity ring"
-    kinds, sizes, counts = "F F F F F U", "4 4 4 4 4 2", "1 1 1 2 1 1"
-    record = np.dtype([*[(n, "<f4") for n in "xyz"], ("normal", "<f4", (2,)), ("i", "<f4"), ("ring", "<u2")])
+    """Fields of any type, size and count, in any order; those without a meaning here are skipped."""
+    kinds = {"ring": "<u2", "X": "<f8", "y": "<f4", "normal": ("<f4", (2,)), "intensity": "u1"}
+    kinds |= {"_": ("<i2", (3,)), "z": "<f2", "time_lag": "<f4", "t": "<i8"}
+    record = np.dtype([(name, kind) for name, kind in kinds.items()])
     rows = np.zeros(len(points), record)
-    for i, name in enumerate("xyz"):
-        rows[name] = points[:, i]
-    rows["i"] = np.round(points[:, 3])
-    head = pcd_header(form, len(rows), names, kinds, sizes, counts)
+    rows["ring"], rows["X"], rows["y"], rows["z"] = np.arange(len(points)) % 64, *points[:, :3].T
+    rows["intensity"], rows["time_lag"] = points[:, 3], 0.25
+    rows["normal"], rows["t"] = np.nan, -(2**40)
+    base = [record[name].base for name in record.names]
+    head = pcd_header(
+        form,
+        len(rows),
+        " ".join(record.names),
+        " ".join(b.kind.upper() for b in base),
+        " ".join(str(b.itemsize) for b in base),
+        " ".join(str(record[name].itemsize // b.itemsize) for name, b in zip(record.names, base, strict=True)),
+    )
     if form == "ascii":
-        lines = [
-            f"{r['x']!r} {r['y']!r} {r['z']!r} 0 0 {r['i']} 0".replace("np.float32(", "").replace(")", "")
-            for r in rows
-        ]
-        body = "\n".join(lines).encode()
+        lines = (" ".join(str(v) for field in row.item() for v in np.ravel(field)) for row in rows)
+        body = "\r\n".join(lines).encode()
     elif form == "binary":
         body = rows.tobytes()
     else:
-        plain = b"".join(np.ascontiguousarray(rows[n]).tobytes() for n in record.names)
+        plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in record.names)
         packed = lzf(plain)
         assert len(packed) < len(plain)
         body = np.array([len(packed), len(plain)], "<u4").tobytes() + packed
-    (tmp_path / "a.pcd").write_bytes(head + body)
+    (tmp_path / "a.PCD").write_bytes(head + body)
+    read = read_points(tmp_path / "a.PCD", ARGOVERSE2)
+    np.testing.assert_array_equal(read[:, :2], points[:, :2])
+    np.testing.assert_array_equal(read[:, 2], rows["z"])
+    np.testing.assert_array_equal(read[:, 3], rows["intensity"])
+    np.testing.assert_array_equal(read[:, 4:], np.stack([rows["time_lag"], rows["ring"]], 1))
+    np.testing.assert_array_equal(read_points(tmp_path / "a.PCD", NUSCENES_HDL32E), read[:, :5])
+
+
+def test_pcd_packed_by_the_reference_library(tmp_path):
+    """Bytes that liblzf made of x = 1, 2, 3, 4 again and again, y = 0, z = -1.5."""
+    packed = bytes.fromhex("070000803f000000402002200300804003e0360fe0470001c0bfe0410301c0bf")
+    sizes = np.array([len(packed), 240], "<u4").tobytes()
+    head = pcd_header("binary_compressed", 20, "x y z", "F F F", "4 4 4", "1 1 1")
+    (tmp_path / "a.pcd").write_bytes(head + sizes + packed)
     read = read_points(tmp_path / "a.pcd", NUSCENES_HDL32E)
-    np.testing.assert_allclose(read[:, :3], points[:, :3], rtol=1e-6)
-    np.testing.assert_array_equal(read[:, 3], np.round(points[:, 3]))
-    assert not read[:, 4].any()
+    np.testing.assert_array_equal(read, [[1 + i % 4, 0, -1.5, 0, 0] for i in range(20)])
+
+
+def test_a_single_array_of_any_name_is_read_from_npz(tmp_path, points):
+    np.savez_compressed(tmp_path / "a.npz", cloud=points.astype(np.float64))
+    np.testing.assert_array_equal(read_points(tmp_path / "a.npz", NUSCENES_HDL32E), points)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+def test_every_intensity_is_scaled(tmp_path, points, name):
+    rows = points[:, :4] / np.array([1, 1, 1, 255], np.float32)
+    np.save(tmp_path / name, rows) if name == "a.npy" else np.savez(tmp_path / name, rows)
+    np.testing.assert_allclose(read_points(tmp_path / name, KITTI_HDL64E)[:, 3], points[:, 3], rtol=1e-5)
+
+
+def test_too_large_values_become_infinite_without_a_warning(tmp_path, points):
+    rows = points[:, :4].astype(np.float64)
+    rows[3, 0], rows[5, 3] = 1e300, 3e38
+    rows.tofile(tmp_path / "a.bin")
+    read = read_points(tmp_path / "a.bin", KITTI_HDL64E, dtype="float64")
+    assert np.flatnonzero(np.isinf(read).any(1)).tolist() == [3, 5]
+
+
+@pytest.mark.parametrize("name", ["a.bin", "a.pcd.bin", "a.npy"])
+def test_nothing_finite_is_left_to_the_projection(tmp_path, name):
+    rows = np.full((20, 5), np.nan, np.float32)
+    np.save(tmp_path / name, rows) if name == "a.npy" else rows.tofile(tmp_path / name)
+    assert not np.isfinite(read_points(tmp_path / name, NUSCENES_HDL32E)[:, :4]).any()
 
 
 def test_non_finite_points_are_kept_for_the_projection_to_count(tmp_path, points):
@@ -138,25 +196,104 @@ def test_non_finite_points_are_kept_for_the_projection_to_count(tmp_path, points
     assert np.flatnonzero(~np.isfinite(read).all(1)).tolist() == [7, 9]
 
 
-def test_four_and_five_columns_are_told_apart(tmp_path, points):
-    nuscenes_rows(points).tofile(tmp_path / "five.bin")
-    with pytest.raises(PointFileError, match=r"five\.bin: .*not plausible metres.*5 columns would fit"):
+@pytest.mark.parametrize("intensity_scale", [1, 1 / 255, 0], ids=["0-255", "0-1", "none"])
+@pytest.mark.parametrize("fifth", ["ring", "lag"])
+@pytest.mark.parametrize("number", [40, 2000])
+def test_four_and_five_columns_are_told_apart(tmp_path, points, intensity_scale, fifth, number):
+    rows = nuscenes_rows(points)[:number]
+    rows[:, 3] *= intensity_scale
+    if fifth == "lag":
+        rows[:, 4] = 0
+    rows.tofile(tmp_path / "five.bin")
+    assert read_points(tmp_path / "five.bin", NUSCENES_HDL32E, columns=5).shape == (number, 5)
+    with pytest.raises(PointFileError, match=r"five\.bin: .*not plausible metres, 5 columns would fit"):
         read_points(tmp_path / "five.bin", KITTI_HDL64E)
-    np.ascontiguousarray(points[:, :4]).tofile(tmp_path / "four.pcd.bin")
-    with pytest.raises(PointFileError, match=r"four\.pcd\.bin: .*not plausible metres.*4 columns would fit"):
+    np.ascontiguousarray(rows[:, :4]).tofile(tmp_path / "four.pcd.bin")
+    assert read_points(tmp_path / "four.pcd.bin", NUSCENES_HDL32E, columns=4).shape == (number, 5)
+    with pytest.raises(PointFileError, match=r"four\.pcd\.bin: .*not plausible metres, 4 columns would fit"):
         read_points(tmp_path / "four.pcd.bin", NUSCENES_HDL32E)
 
 
+@pytest.mark.parametrize("columns", [3, 4, 6])
+def test_a_wrong_number_of_columns_is_refused_by_name(tmp_path, points, columns):
+    nuscenes_rows(points)[:1800].tofile(tmp_path / "a.bin")
+    with pytest.raises(PointFileError, match="not plausible metres, 5 columns would fit"):
+        read_points(tmp_path / "a.bin", NUSCENES_HDL32E, columns=columns)
+
+
+@pytest.mark.parametrize("stored", ["float16", "float32", "float64"])
+@pytest.mark.parametrize("named", ["float16", "float32", "float64"])
+def test_a_wrong_number_type_is_refused_by_name(tmp_path, points, stored, named):
+    points[:, :4].astype(stored).tofile(tmp_path / "a.bin")
+    if stored == named:
+        assert len(read_points(tmp_path / "a.bin", NUSCENES_HDL32E, dtype=named)) == len(points)
+        return
+    with pytest.raises(PointFileError, match=f"not plausible metres, 4 columns would fit as {stored}"):
+        read_points(tmp_path / "a.bin", NUSCENES_HDL32E, dtype=named)
+
+
+def test_a_size_that_does_not_fit_names_the_columns_that_do(tmp_path, points):
+    nuscenes_rows(points)[:999].tofile(tmp_path / "a.bin")
+    with pytest.raises(PointFileError, match=r"not a multiple of 16 .* another layout, 5 columns would fit"):
+        read_points(tmp_path / "a.bin", KITTI_HDL64E)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.bin", {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
+        ("a.bin", {"dtype": "int16"}, "dtype: got int16, expected float16"),
+        ("a.npy", {"columns": 4}, "columns and dtype are for raw .bin files"),
+        ("a.pcd", {"dtype": "float32"}, "columns and dtype are for raw .bin files"),
+    ],
+)
+def test_bad_layouts_are_refused(tmp_path, name, options, message):
+    (tmp_path / name).write_bytes(good_bytes())
+    with pytest.raises(PointFileError, match=f"{name}: {message}"):
+        read_points(tmp_path / name, NUSCENES_HDL32E, **options)
+
+
 @pytest.mark.real_data
-def test_real_keyframe_reads_whole_and_refuses_four_columns(real_data):
+def test_real_keyframe_reads_whole_and_refuses_other_layouts(real_data, tmp_path):
     (path,) = (real_data / "nuscenes_scene0061").glob("*.pcd.bin")
-    assert read_points(path, NUSCENES_HDL32E).shape == (34_688, 5)
-    with pytest.raises(PointFileError, match="not plausible metres"):
+    read = read_points(path, NUSCENES_HDL32E)
+    assert read.shape == (34_688, 5)
+    with pytest.raises(PointFileError, match="not plausible metres, 5 columns would fit"):
         read_points(path, NUSCENES_HDL32E, columns=4)
+    with pytest.raises(PointFileError, match="not plausible metres, 5 columns would fit as float32"):
+        read_points(path, NUSCENES_HDL32E, dtype="float16")
+    for scale in (1, 1 / 255):
+        four = read[:34_680, :4] * np.array([1, 1, 1, scale], np.float32)
+        four.tofile(tmp_path / "four.pcd.bin")
+        with pytest.raises(PointFileError, match="not plausible metres, 4 columns would fit"):
+            read_points(tmp_path / "four.pcd.bin", NUSCENES_HDL32E)
 
 
 def good_bytes():
     return np.tile(np.array([[5, 6, -1, 30, 2]], np.float32), (8, 1)).tobytes()
+
+
+def npy_header(text):
+    text = text.ljust(53) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+def npy_bytes():
+    stream = io.BytesIO()
+    np.save(stream, np.ones((40, 4), np.float32))
+    return stream.getvalue()
+
+
+def damaged_npz():
+    stream = io.BytesIO()
+    np.savez_compressed(stream, points=np.random.default_rng(0).normal(size=(40, 4)))
+    content = bytearray(stream.getvalue())
+    content[len(content) // 2] ^= 0xFF
+    return bytes(content)
+
+
+def packed_pcd(packed, plain_size=16):
+    return pcd_header("binary_compressed", 1) + np.array([len(packed), plain_size], "<u4").tobytes() + packed
 
 
 BAD = {
@@ -164,33 +301,62 @@ BAD = {
     "empty.bin": (b"", "empty file"),
     "empty.npy": (b"", "empty file"),
     "empty.pcd": (b"", "empty file"),
-    "truncated.pcd.bin": (good_bytes()[:-3], "not a multiple of 20"),
-    "odd.bin": (good_bytes()[:-4], "not a multiple of 16"),
-    "cloud.ply": (b"ply", "unknown extension '.ply'"),
+    "truncated.pcd.bin": (good_bytes()[:-3], "got 157 bytes, not a multiple of 20"),
+    "odd.bin": (good_bytes()[:-4], "got 156 bytes, not a multiple of 16"),
+    "text.bin": (b"12.5 3.75 -1.25 0.5\n" * 80, "not plausible metres"),
+    "noise.bin": (np.random.default_rng(0).bytes(16_000), "not plausible metres"),
+    "cloud.ply": (b"ply", "unknown extension '.ply', expected .pcd.bin"),
     "noextension": (b"1 2 3", "unknown extension"),
-    "text.npy": (b"1 2 3\n4 5 6\n", "not a readable .npy"),
-    "text.npz": (b"1 2 3\n4 5 6\n", "not a readable .npz"),
+    "text.npy": (b"1 2 3\n4 5 6\n", "not a readable .npy file: got b'1 2 3"),
+    "text.npz": (b"1 2 3\n4 5 6\n", "not a readable .npz file: got b'1 2 3"),
+    "really_npy.npz": (npy_bytes(), "not a readable .npz file: got b'.x93NUMPY'"),
     "pickled.npy": (np.array([{"a": 1}], object), "without pickled objects"),
+    "pickled.npz": ({"points": np.array([{"a": 1}], object)}, "without pickled objects"),
+    "truncated.npy": (npy_bytes()[:-7], "not a readable .npy file"),
+    "header.npy": (npy_header("{'descr': '<f4',"), "not a readable .npy file"),
+    "huge.npy": (
+        npy_header("{'descr':'<f4','fortran_order':False,'shape':(20000000000000,4)}"),
+        "not a readable .npy file",
+    ),
+    "damaged.npz": (damaged_npz(), "not a readable .npz file"),
     "one_axis.npy": (np.zeros(5, np.float32), r"shape: got \(5,\)"),
     "two_columns.npy": (np.zeros((5, 2), np.float32), r"shape: got \(5, 2\)"),
     "nine_columns.npy": (np.zeros((5, 9), np.float32), r"shape: got \(5, 9\)"),
     "text_values.npy": (np.array([["a", "b", "c"]]), "dtype: got <U1"),
     "complex.npy": (np.zeros((5, 4), complex), "dtype: got complex128"),
+    "truth.npy": (np.zeros((5, 4), bool), "dtype: got bool"),
     "no_rows.npy": (np.zeros((0, 4), np.float32), "no points"),
-    "future.npy": (np.full((5, 5), -0.1, np.float32), "time_lag: got -0.1"),
+    "future.npy": (np.full((5, 5), -0.1, np.float32), "time_lag: got -0.1 in row 0"),
     "several.npz": ({"a": np.zeros((3, 4)), "b": np.zeros((3, 4))}, "got arrays a, b"),
+    "none.npz": ({}, "got arrays none"),
     "no_header.pcd": (b"hello\nworld\n", "no DATA line"),
     "form.pcd": (pcd_header("zipped", 1) + b"1 2 3 4", "DATA: got 'zipped'"),
-    "short.pcd": (pcd_header("binary", 9) + b"1234", "truncated"),
-    "short_ascii.pcd": (pcd_header("ascii", 2) + b"1 2 3 4\n", "truncated: got 4 values"),
-    "words.pcd": (pcd_header("ascii", 1) + b"1 2 3 four\n", "not a number"),
-    "no_z.pcd": (pcd_header("ascii", 1, "x y q intensity") + b"1 2 3 4\n", "FIELDS: no z"),
-    "kind.pcd": (pcd_header("ascii", 1, kinds="F F F Q") + b"1 2 3 4\n", "field intensity: got TYPE Q"),
-    "lists.pcd": (pcd_header("ascii", 1, sizes="4 4") + b"1 2 3 4\n", "must list as many"),
-    "damaged.pcd": (
-        pcd_header("binary_compressed", 1) + np.array([3, 16], "<u4").tobytes() + b"\xff\xff\xff",
-        "damaged",
+    "short.pcd": (pcd_header("binary", 9) + b"1234", "DATA: truncated: got 4 bytes, expected 144"),
+    "short_ascii.pcd": (pcd_header("ascii", 2) + b"1 2 3 4\n", "DATA: truncated: got 4 values"),
+    "long_ascii.pcd": (pcd_header("ascii", 1) + b"1 2 3 4 5\n", "DATA: too long: got 5 values"),
+    "words.pcd": (pcd_header("ascii", 1) + b"1 2 3 four\n", "DATA: got 'four' among the values"),
+    "no_z.pcd": (pcd_header("ascii", 1, "x y q intensity") + b"1 2 3 4\n", "FIELDS: got 0 named z"),
+    "two_x.pcd": (pcd_header("ascii", 1, "x y z x") + b"1 2 3 4\n", "FIELDS: got 2 named x"),
+    "kind.pcd": (pcd_header("ascii", 1, kinds="F F F Q") + b"1 2 3 4\n", "got Q 4 for field intensity"),
+    "size.pcd": (pcd_header("ascii", 1, sizes="4 4 1 4") + b"1 2 3 4\n", "got F 1 for field z"),
+    "lists.pcd": (pcd_header("ascii", 1, sizes="4 4") + b"1 2 3 4\n", "SIZE: got 2 entries, expected 4"),
+    "count.pcd": (pcd_header("ascii", 1, counts="1 1 1 0") + b"1 2 3\n", "COUNT: got 0 for field intensity"),
+    "huge_count.pcd": (pcd_header("binary", 1, counts="1 1 1 " + "9" * 15), "COUNT: got 9+ for field intensity"),
+    "double_z.pcd": (pcd_header("ascii", 1, counts="1 1 2 1") + b"1 2 3 3 4\n", "COUNT: got 2 for field z"),
+    "negative.pcd": (pcd_header("binary", -1) + bytes(64), "POINTS: got '-1'"),
+    "disagrees.pcd": (
+        pcd_header("ascii", 1).replace(b"HEIGHT 1", b"HEIGHT 2") + b"1 2 3 4\n",
+        "POINTS: got 1, expected WIDTH x HEIGHT, which is 2",
     ),
+    "no_number.pcd": (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nDATA ascii\n1 2 3\n", "POINTS: missing"),
+    "no_points.pcd": (pcd_header("ascii", 0), "no points"),
+    "lag.pcd": (pcd_header("ascii", 1, "x y z time_lag") + b"1 2 3 -4\n", "time_lag: got -4 in row 0"),
+    "ends_within.pcd": (packed_pcd(b"\xff\xff\xff"), "DATA: the compressed bytes are damaged"),
+    "before.pcd": (packed_pcd(b"\x00a\x20\x05"), "damaged: a copy from before the beginning"),
+    "unpacks_short.pcd": (packed_pcd(b"\x00a"), "damaged: they do not unpack to 16 bytes"),
+    "other_size.pcd": (packed_pcd(b"\x00a", 99), "DATA: got 99 uncompressed bytes, expected 16"),
+    "packed_short.pcd": (packed_pcd(b"\x00a")[:-1], "DATA: truncated: got 1 compressed bytes, expected 2"),
+    "no_sizes.pcd": (pcd_header("binary_compressed", 1) + b"\x09", "DATA: truncated"),
 }
 
 
@@ -221,7 +387,7 @@ def test_a_folder_is_refused(tmp_path):
 @pytest.mark.parametrize("value", [-1, 64, 1.5])
 def test_bad_or_missing_laser_numbers_are_refused(tmp_path, value):
     np.save(tmp_path / "a.npy", np.array([[1, 2, 0, 3, 0, value]], np.float32))
-    with pytest.raises(PointFileError, match="laser number: expected whole numbers of 0 to 63"):
+    with pytest.raises(PointFileError, match=f"laser number: got {value:g} in row 0, expected whole"):
         read_points(tmp_path / "a.npy", ARGOVERSE2)
     np.save(tmp_path / "b.npy", np.zeros((1, 5), np.float32))
     with pytest.raises(PointFileError, match=r"b\.npy: no laser number"):
@@ -272,6 +438,16 @@ def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
         assert [0, 0, 0] in fused[:, :3].tolist()
 
 
+def test_close_points_lie_around_the_sensors_origin(tmp_path):
+    origin = (1.4, 0.0, 1.6)
+    np.save(tmp_path / "a.npy", np.array([[0.3, 0, 0], [2.3, 0.5, 0], [1.4, 0, 0]]))
+    entries = [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": np.eye(4).tolist()}]
+    (tmp_path / "s.json").write_text(json.dumps(entries))
+    sensor = dataclasses.replace(TINY, origin_m=origin)
+    fused = read_sweeps(tmp_path / "s.json", sensor, remove_close="all", close_m=1.0)
+    np.testing.assert_array_equal(fused[:, :3], np.array([[0.3, 0, 0]], np.float32))
+
+
 EYE = np.eye(4).tolist()
 BAD_SWEEPS = {
     "not json": ("{", "not JSON"),
@@ -286,6 +462,10 @@ BAD_SWEEPS = {
     "last row": ([{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": [*EYE[:3], [1, 1, 1, 1]]}], "last row"),
     "scaled": (
         [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": (np.diag([2, 2, 2, 1.0])).tolist()}],
+        "not a rotation",
+    ),
+    "mirrored": (
+        [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": (np.diag([-1, 1, 1, 1.0])).tolist()}],
         "not a rotation",
     ),
     "future": (

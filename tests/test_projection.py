@@ -9,7 +9,15 @@ import pytest
 
 import oracles
 from fcos_lidar_jax.projection import image_cells, project_points, remove_close
-from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E, TINY, Sensor, even_inclinations
+from fcos_lidar_jax.sensors import (
+    KITTI_HDL64E,
+    NUSCENES_HDL32E,
+    PRESETS,
+    TINY,
+    WAYMO_TOP,
+    Sensor,
+    even_inclinations,
+)
 
 SMALL = Sensor("small", even_inclinations(-20, 10, 4), 12)
 LASER = dataclasses.replace(SMALL, name="laser", row_source="laser", origin_m=(1.0, -2.0, 0.5))
@@ -20,9 +28,10 @@ def cloud(seed: int, number: int = 400, columns: int = 5) -> np.ndarray:
     points = np.zeros((number, columns), np.float32)
     points[:, :2] = rng.normal(0, 20, (number, 2))
     points[:, 2] = rng.normal(-1, 1.5, number)
+    # Exact ties of cell and range, some of them between sweeps; the intensity tells the points apart.
+    points[rng.integers(0, number, 60)] = points[rng.integers(0, number, 60)]
     points[:, 3] = rng.uniform(0, 255, number)
     points[:, 4] = rng.integers(0, 3, number) * np.float32(0.05)
-    points[rng.integers(0, number, 60)] = points[rng.integers(0, number, 60)]  # exact ties
     if columns == 6:
         points[:, 5] = rng.integers(-1, 5, number)
     return points
@@ -53,7 +62,9 @@ def reference_cells(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.
     return np.where(good, row * sensor.num_columns + np.floor(u).astype(int) % sensor.num_columns, cells), edge
 
 
-@pytest.mark.parametrize("sensor", [SMALL, LASER, TINY, NUSCENES_HDL32E, KITTI_HDL64E], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "sensor", [SMALL, LASER, TINY, NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP], ids=lambda s: s.name
+)
 def test_cells_follow_the_definitions(sensor):
     points = cloud(0, 5000, sensor.point_columns)
     cells, (range_m, azimuth, inclination) = image_cells(jnp.asarray(points), jnp.ones(5000, bool), sensor)
@@ -67,7 +78,7 @@ def test_cells_follow_the_definitions(sensor):
     np.testing.assert_allclose(inclination, np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])), atol=4e-7)
 
 
-@pytest.mark.parametrize("num_rounds", [1, 2, 5, 7])
+@pytest.mark.parametrize("num_rounds", range(1, 8))
 @pytest.mark.parametrize("prioritize_current", [True, False])
 def test_rounds_keep_what_the_loops_keep(num_rounds, prioritize_current):
     points = cloud(num_rounds)
@@ -86,11 +97,62 @@ def test_rounds_keep_what_the_loops_keep(num_rounds, prioritize_current):
             np.testing.assert_array_equal(features[c, :, r], channels[i] if i >= 0 else 0)
 
 
-@pytest.mark.parametrize("y", [0.0, -0.0])
-def test_straight_behind_is_column_zero_for_both_zeros(y):
-    points = np.array([[-5, y, -0.5, 1, 0]], np.float32)
-    image = project_points(points, np.ones(1, bool), NUSCENES_HDL32E, num_rounds=1)
-    assert np.argwhere(np.asarray(image.point_index[..., 0]) == 0)[0, 1] == 0
+@pytest.mark.parametrize("sensor", PRESETS.values(), ids=PRESETS)
+def test_columns_run_clockwise_from_straight_behind(sensor):
+    """Both zeros of y behind the sensor are column 0, and so is a hair to the left; the right is the last one."""
+    x, _, z = sensor.origin_m
+    behind, count = np.float32(x - 5), sensor.num_columns
+    y = np.array([0.0, -0.0, 1e-3, -1e-3], np.float32)
+    points = np.zeros((6, sensor.point_columns), np.float32)
+    points[:4, 0], points[:4, 1], points[:, 2] = behind, y, z - 0.1
+    points[4, :2], points[5, :2] = (x + 1e-3, 5), (x + 1e-3, -5)
+    cells, _ = image_cells(jnp.asarray(points), jnp.ones(6, bool), sensor)
+    assert (np.asarray(cells) % count).tolist() == [0, 0, 0, count - 1, count // 4, (3 * count - 1) // 4]
+
+
+def test_limits_of_the_range_are_open():
+    ends = np.float32([54, -54, -5, 3])
+    inside = np.nextafter(ends, np.float32(0))
+    points = np.zeros((16, 5), np.float32)
+    points[:, 0] = 20
+    for i, (end, below) in enumerate(zip(ends, inside, strict=True)):
+        for j, (axis, value) in enumerate([(0, end), (0, below), (1, end), (1, below)] if i < 2 else []):
+            points[4 * i + j, axis] = value
+        if i >= 2:
+            points[4 * i : 4 * i + 2, 2] = end, below
+            points[4 * i + 2 : 4 * i + 4, 0] = 60  # filler, beyond the limit
+    cells, _ = image_cells(jnp.asarray(points), jnp.ones(16, bool), SMALL)
+    kept = (np.asarray(cells) < SMALL.num_rows * SMALL.num_columns).astype(int).tolist()
+    assert kept == [0, 1] * 4 + [0, 1, 0, 0] * 2
+
+
+@pytest.mark.parametrize("sensor", [NUSCENES_HDL32E, KITTI_HDL64E], ids=lambda s: s.name)
+def test_view_ends_half_a_row_beyond_the_outer_beams(sensor):
+    table = np.array(sensor.inclinations_rad)
+    above, below = (table[0] - table[1]) / 2, (table[-2] - table[-1]) / 2
+    phi = [table[0] + 0.99 * above, table[0] + 1.01 * above, table[-1] - 0.99 * below, table[-1] - 1.01 * below]
+    points = np.array([[0, 8 * np.cos(a), 8 * np.sin(a), 0, 0] for a in phi], np.float32)
+    image = project_points(points, np.ones(4, bool), sensor, num_rounds=1)
+    rows = [np.argwhere(np.asarray(image.point_index[..., 0]) == i)[:, 0].tolist() for i in range(4)]
+    assert rows == [[0], [], [sensor.num_rows - 1], []]
+    assert int(image.num_dropped) == 2
+
+
+def test_a_beam_between_uneven_ones_takes_the_nearest():
+    uneven = Sensor("uneven", (0.10, 0.08, -0.10), 8)
+    phi = [0.0901, 0.0899, -0.0099, -0.0101]  # around the midpoints 0.09 and -0.01
+    points = np.array([[0, 8 * np.cos(a), 8 * np.sin(a), 0, 0] for a in phi], np.float32)
+    cells, _ = image_cells(jnp.asarray(points), jnp.ones(4, bool), uneven)
+    assert (np.asarray(cells) // 8).tolist() == [0, 1, 1, 2]
+
+
+def test_current_means_a_lag_of_exactly_zero():
+    near_old, far_now = [0, 5, 0, 1, 1e-6], [0, 9, 0, 2, -0.0]
+    points = np.array([near_old, far_now, [0, 6, 0, 3, 0.4]], np.float32)
+    cell = np.ravel(project_points(points, np.ones(3, bool), SMALL, num_rounds=3).point_index.max((0, 1)))
+    assert cell.tolist() == [1, 0, 2]
+    cell = project_points(points, np.ones(3, bool), SMALL, num_rounds=3, prioritize_current=False)
+    assert np.ravel(cell.point_index.max((0, 1))).tolist() == [0, 2, 1]
 
 
 def test_bad_rows_are_dropped_and_counted_and_harm_nobody():
@@ -138,7 +200,8 @@ def test_jit_vmap_and_repetition_are_bit_identical():
 
 
 def test_order_of_the_input_does_not_matter_where_keys_are_distinct():
-    points = np.unique(cloud(4), axis=0)
+    points = cloud(4)
+    points = points[np.unique(points[:, :3], axis=0, return_index=True)[1]]
     valid = np.ones(len(points), bool)
     order = np.random.default_rng(0).permutation(len(points))
     straight, shuffled = (project_points(p, valid, SMALL) for p in (points, points[order]))

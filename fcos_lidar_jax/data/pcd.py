@@ -82,8 +82,9 @@ def _field_types(header: dict[str, list[str]]) -> tuple[list[str], list[tuple[np
             raise ValueError(f"FIELDS: got {fields.count(axis)} named {axis} in {fields}, expected one")
     columns = {"COUNT": ["1"] * len(fields)} | {k: header[k] for k in ("SIZE", "TYPE", "COUNT") if k in header}
     for name in ("SIZE", "TYPE", "COUNT"):
-        if len(columns.get(name, [])) != len(fields):
-            raise ValueError(f"{name}: got {len(columns.get(name, []))} entries, expected {len(fields)} as in FIELDS")
+        number = len(columns.get(name, []))
+        if number != len(fields):
+            raise ValueError(f"{name}: got {number} entries, expected {len(fields)} as in FIELDS")
     types = []
     for field, size, kind, count in zip(fields, columns["SIZE"], columns["TYPE"], columns["COUNT"], strict=True):
         letter, sizes = _KINDS.get(kind.upper(), ("", ""))

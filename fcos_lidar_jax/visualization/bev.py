@@ -9,6 +9,10 @@ from fcos_lidar_jax.types import CLASSES
 from fcos_lidar_jax.visualization.figure import new_figure, save_png
 from fcos_lidar_jax.visualization.palette import CLASS_COLORS
 
+_SIZE_IN = 9.0
+_DASHES = (0, (3, 2))
+_TEXT_POINTS = 7.0
+
 
 def draw_bev(
     points: np.ndarray,
@@ -19,48 +23,37 @@ def draw_bev(
     truth: tuple[np.ndarray, np.ndarray] | None = None,
     title: str | None = None,
 ) -> None:
-    """Draw a cloud from above, x right and y forward.
+    """Draw a cloud from above, x right and y forward, higher points darker.
 
-    Detections are solid in their class's colour with the score, truth is dashed black; a line from the centre
-    to the front shows the heading.
+    Detections have solid outlines in their class's colour, and the score beside them where there is room, the
+    best first. Truth has thin dashed black outlines, filled in its class's colour. A line from the centre through
+    the front shows the heading.
 
     Args:
-        points: f32[n, >= 3], metres.
+        points: f32[n, >= 3], metres; non-finite rows do not show.
         path: PNG to write.
         limit_m: half the side of the square that is shown.
         detections: boxes f32[d, 9], labels i32[d], scores f32[d].
         truth: boxes f32[m, 9], labels i32[m].
         title: above the picture.
     """
-    figure = new_figure(9, 9)
+    figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
     axis = figure.add_subplot()
-    shown = np.isfinite(points[:, :3]).all(axis=1)
-    cloud = points[shown]
-    heights = np.clip(cloud[:, 2], -2.5, 2.5)
-    dot = float(np.clip(3e4 / max(len(cloud), 1), 0.8, 7))  # sparse clouds get larger dots
-    axis.scatter(
-        cloud[:, 0], cloud[:, 1], c=heights, s=dot, cmap="Greys_r", vmin=-4, vmax=6, linewidths=0, rasterized=True
-    )
-    axis.plot(0, 0, marker="+", color="black", markersize=8)
+    _draw_points(axis, points, limit_m)
+    present: set[int] = set()
     if truth is not None:
-        for box in truth[0]:
-            _outline(axis, box, color="black", linewidth=1.1, linestyle=(0, (3, 2)))
-    present: list[int] = []
+        for box, label in zip(*truth, strict=True):
+            if _in_view(box, limit_m):
+                axis.fill(*_corners(box), color=CLASS_COLORS[label], alpha=0.3, linewidth=0, zorder=1)
+                _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
+                present.add(int(label))
     if detections is not None:
-        for box, label, score in zip(*detections, strict=True):
-            color = CLASS_COLORS[label]
-            _outline(axis, box, color=color, linewidth=1.6)
-            if max(abs(box[0]), abs(box[1])) < limit_m:
-                reach = np.hypot(box[3], box[4]) / 2
-                axis.annotate(
-                    f"{score:.2f}",
-                    (box[0] + 0.6 * reach, box[1] + 0.6 * reach),
-                    color=color,
-                    fontsize=7,
-                    clip_on=True,
-                )
-        present = sorted({int(label) for label in detections[1]})
-    _legend(axis, present, truth is not None)
+        shown = [d for d in zip(*detections, strict=True) if _in_view(d[0], limit_m)]
+        for box, label, _ in shown:
+            _outline(axis, box, limit_m, color=CLASS_COLORS[label], linewidth=1.7, zorder=4)
+            present.add(int(label))
+        _write_scores(axis, shown, limit_m)
+    _legend(figure, sorted(present), with_truth=truth is not None, with_detections=detections is not None)
     axis.set_xlim(-limit_m, limit_m)
     axis.set_ylim(-limit_m, limit_m)
     axis.set_aspect("equal")
@@ -73,20 +66,66 @@ def draw_bev(
     save_png(figure, path)
 
 
-def _outline(axis: Any, box: np.ndarray, **style: Any) -> None:
+def _draw_points(axis: Any, points: np.ndarray, limit_m: float) -> None:
+    cloud = points[np.isfinite(points[:, :3]).all(axis=1) & (np.abs(points[:, :2]) < limit_m).all(axis=1)]
+    if len(cloud):
+        # The ground stays light, what stands on it is dark, whatever the height of the frame's origin.
+        low, high = np.quantile(cloud[:, 2], (0.1, 0.9))
+        shade = np.clip((cloud[:, 2] - low) / max(high - low, 1.0), 0, 1)
+        dot = float(np.clip(3e4 / len(cloud), 0.8, 7))  # sparse clouds get larger dots
+        axis.scatter(
+            *cloud[:, :2].T, c=0.35 + 0.4 * shade, s=dot, cmap="Greys", vmin=0, vmax=1, linewidths=0, zorder=2
+        )
+    axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
+
+
+def _in_view(box: np.ndarray, limit_m: float) -> bool:
+    reach = np.hypot(box[3], box[4]) / 2
+    return bool(np.isfinite(box[:7]).all() and np.abs(box[:2]).max() < limit_m + reach)
+
+
+def _corners(box: np.ndarray) -> np.ndarray:
+    """The closed outline seen from above, f64[2, 5]: x and y, metres."""
     x, y, l, w, yaw = (float(box[i]) for i in (0, 1, 3, 4, 6))
     cos, sin = np.cos(yaw), np.sin(yaw)
     along = np.array([1, 1, -1, -1, 1]) * l / 2
     across = np.array([1, -1, -1, 1, 1]) * w / 2
-    axis.plot(x + cos * along - sin * across, y + sin * along + cos * across, **style)
-    axis.plot([x, x + cos * l / 2], [y, y + sin * l / 2], **{**style, "linewidth": 0.8})
+    return np.stack([x + cos * along - sin * across, y + sin * along + cos * across])
 
 
-def _legend(axis: Any, present: list[int], with_truth: bool) -> None:
+def _outline(axis: Any, box: np.ndarray, limit_m: float, **style: Any) -> None:
+    axis.plot(*_corners(box), **style)
+    # The mark sticks out a little, so that it also shows on a pedestrian.
+    x, y, reach, yaw = float(box[0]), float(box[1]), float(box[3]) / 2 + 0.008 * limit_m, float(box[6])
+    axis.plot([x, x + np.cos(yaw) * reach], [y, y + np.sin(yaw) * reach], **{**style, "linestyle": "-"})
+
+
+def _write_scores(axis: Any, shown: list[tuple[np.ndarray, int, float]], limit_m: float) -> None:
+    """Scores beside their boxes, the best first; left out where no side has room."""
+    from matplotlib.patheffects import withStroke
+
+    half = np.array([1.5, 0.7]) * _TEXT_POINTS * 2 * limit_m / (0.9 * 72 * _SIZE_IN)  # half a text, metres
+    taken: list[np.ndarray] = []
+    for box, _, score in sorted(shown, key=lambda d: -d[2]):
+        reach = np.ptp(_corners(box), axis=1) / 2 + half
+        beside = (box[:2] + reach * side for side in ((1, 0), (-1, 0), (0, 1), (0, -1)))
+        inside = (p for p in beside if (np.abs(p) + half < limit_m).all())
+        place = next((p for p in inside if all((np.abs(p - t) > 2 * half).any() for t in taken)), None)
+        if place is None:
+            continue
+        taken.append(place)
+        text = axis.text(*place, f"{score:.2f}", fontsize=_TEXT_POINTS, ha="center", va="center", zorder=6)
+        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+
+
+def _legend(figure: Any, present: list[int], *, with_truth: bool, with_detections: bool) -> None:
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
-    entries = [Line2D([], [], color=CLASS_COLORS[k], label=CLASSES[k].replace("_", " ")) for k in present]
+    entries: list[Any] = [Patch(color=CLASS_COLORS[k], label=CLASSES[k].replace("_", " ")) for k in present]
+    if with_detections:
+        entries.append(Line2D([], [], color="#444444", linewidth=1.7, label="detection"))
     if with_truth:
-        entries.append(Line2D([], [], color="black", linestyle=(0, (3, 2)), label="truth"))
+        entries.append(Line2D([], [], color="black", linewidth=0.9, linestyle=_DASHES, label="truth"))
     if entries:
-        axis.legend(handles=entries, loc="upper right", fontsize=8, framealpha=0.9)
+        figure.legend(handles=entries, loc="outside lower center", ncols=6, fontsize=9, frameon=False)

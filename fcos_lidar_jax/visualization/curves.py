@@ -5,6 +5,11 @@ from pathlib import Path
 
 from fcos_lidar_jax.visualization.figure import new_figure, save_png
 
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+"""Okabe and Ito's, which colour-blind readers tell apart."""
+_FEW = 40
+"""Up to so many points are marked one by one; a single one would not show otherwise."""
+
 
 def draw_curves(
     path: str | Path,
@@ -19,22 +24,34 @@ def draw_curves(
 
     Args:
         path: PNG to write.
-        series: name -> points.
+        series: name -> points; non-finite ones leave a gap.
         x_label: below the abscissa.
         y_label: beside the ordinate.
         title: above the picture.
-        log_y: logarithmic ordinate.
+        log_y: logarithmic ordinate; values that are not positive leave a gap.
     """
     figure = new_figure(8, 4.5)
     axis = figure.add_subplot()
-    for name, points in series.items():
-        xs, ys = zip(*points, strict=True) if points else ((), ())
-        axis.plot(xs, ys, label=name.replace("_", " "), linewidth=1.3, marker="o" if len(points) < 12 else None)
+    for i, (name, points) in enumerate(series.items()):
+        xs, ys = [x for x, _ in points], [y for _, y in points]
+        # A second turn through the colours is dashed.
+        axis.plot(
+            xs,
+            ys,
+            label=name.replace("_", " "),
+            color=_COLORS[i % len(_COLORS)],
+            linestyle="-" if i < len(_COLORS) else "--",
+            linewidth=1.3,
+            marker="o" if len(points) <= _FEW else None,
+            markersize=3.5,
+        )
     if log_y:
-        axis.set_yscale("log")
+        axis.set_yscale("log", nonpositive="mask")
     axis.set_xlabel(x_label)
     axis.set_ylabel(y_label)
     axis.set_title(title, fontsize=11)
     axis.grid(color="#e5e5e5", linewidth=0.6)
-    axis.legend(fontsize=8)
+    axis.spines[["top", "right"]].set_visible(False)
+    if series:
+        axis.legend(fontsize=9, frameon=False)
     save_png(figure, path)

@@ -1,53 +1,139 @@
 """Pictures of multi-round range images."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
+from fcos_lidar_jax.geometry import points_in_box
 from fcos_lidar_jax.types import CHANNELS, RangeImage
 from fcos_lidar_jax.visualization.figure import new_figure, save_png
 from fcos_lidar_jax.visualization.palette import EMPTY
 
-_RANGE, _INTENSITY, _EXISTENCE, _LAG = (CHANNELS.index(c) for c in ("range", "intensity", "existence", "time_lag"))
+_RANGE, _INCLINATION, _INTENSITY, _EXISTENCE, _LAG = (
+    CHANNELS.index(c) for c in ("range", "inclination", "intensity", "existence", "time_lag")
+)
+_BOX = "#ff1f1f"
+"""Outlines of boxes: a colour that neither the map of the range nor the empty cells have."""
 
 
-def draw_range_image(image: RangeImage, path: str | Path, *, title: str | None = None) -> None:
-    """Draw the range of every round, and intensity and time lag of the first.
+def draw_range_image(
+    image: RangeImage, path: str | Path, *, title: str | None = None, boxes: np.ndarray | None = None
+) -> None:
+    """Draw the range of every round, and below the first round its intensity and time lag.
 
-    Columns run clockwise from azimuth +180 degrees; row 0 is the highest beam; empty cells are grey.
+    Columns run clockwise from azimuth +180 degrees, the highest beam is on top, empty cells are grey. Ranges are
+    coloured by their logarithm, since most cells are near. The time lag is left out where all points are
+    current.
 
     Args:
         image: of one sample.
         path: PNG to write.
         title: above the picture.
+        boxes: f32[m, >= 7], metres, in the frame of the points; each is outlined in round 1 around the cells
+            whose point lies in it, so a box without such a cell does not show.
     """
-    import matplotlib as mpl
-
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
-    panels = [(f"range [m], round {r + 1}", _RANGE, r, "viridis_r") for r in range(rounds)]
-    panels.append(("intensity, round 1", _INTENSITY, 0, "magma"))
+    panels = [(_RANGE, 0), (_INTENSITY, 0)]
     if features[:, :, _LAG].any():
-        panels.append(("time lag [s], round 1", _LAG, 0, "cividis"))
-    figure = new_figure(13, 1.55 * len(panels) + 0.5)
+        panels.append((_LAG, 0))
+    panels += [(_RANGE, r) for r in range(1, rounds)]
+    figure = new_figure(13, 1.5 * len(panels) + 0.6)
     if title:
-        figure.suptitle(title, fontsize=11)
+        figure.suptitle(title, fontsize=12)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    top_range = float(np.quantile(features[:, :, _RANGE][features[:, :, _EXISTENCE] > 0], 0.98, method="nearest"))
-    for axis, (name, channel, r, colors) in zip(axes, panels, strict=True):
-        filled = features[:, :, _EXISTENCE, r] > 0
-        values = np.ma.masked_where(~filled, features[:, :, channel, r])
-        shades = mpl.colormaps[colors].with_extremes(bad=EMPTY)
-        limits: dict[str, Any] = {"vmin": 0, "vmax": top_range} if channel == _RANGE else {"vmin": 0}
-        picture = axis.imshow(
-            values, cmap=shades, aspect="auto", interpolation="nearest", extent=(180, -180, rows, 0), **limits
-        )
-        axis.set_title(f"{name}: {filled.sum():,} of {rows * columns:,} cells filled", fontsize=9, loc="left")
-        axis.set_ylabel("beam", fontsize=8)
-        axis.set_yticks([0, rows // 2, rows])
-        axis.set_xticks(range(180, -181, -45))
-        axis.tick_params(labelsize=8)
-        figure.colorbar(picture, ax=axis, pad=0.01, aspect=10).ax.tick_params(labelsize=8)
-    axes[-1].set_xlabel("azimuth [degrees], columns run clockwise", fontsize=9)
+    ticks = np.unique(np.linspace(0, rows - 1, 5).round().astype(int))
+    degrees = np.degrees(_row_inclinations(features))[ticks]
+    for axis, (channel, r) in zip(axes, panels, strict=True):
+        name = _draw_channel(figure, axis, features, channel, r)
+        if r == 0 and channel == _RANGE and boxes is not None:
+            name += f"; {_outline(axis, features, boxes)} of {len(boxes)} boxes have a cell"
+        axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
+        axis.set_ylabel("inclination", fontsize=9)
+        axis.set_xlim(180, -180)
+        axis.set_ylim(rows, 0)
+        axis.set_xticks(range(180, -181, -45), [f"{v}°" for v in range(180, -181, -45)])
+        axis.set_yticks(ticks + 0.5, [f"{round(v)}°" for v in degrees])
+        axis.tick_params(labelsize=9)
+    axes[-1].set_xlabel(f"azimuth (0° along +x, 90° along +y), {columns} columns clockwise", fontsize=9)
     save_png(figure, path)
+
+
+def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r: int) -> str:
+    """One channel of one round with its colour bar; returns what it shows."""
+    import matplotlib as mpl
+    from matplotlib.colors import LogNorm, Normalize
+
+    filled = features[:, :, _EXISTENCE, r] > 0
+    shades = {_RANGE: "viridis_r", _INTENSITY: "magma", _LAG: "cividis"}[channel]
+    # All rounds of a channel share their colours; a few far or bright points do not take them all.
+    everything = features[:, :, channel][features[:, :, _EXISTENCE] > 0]
+    low, high = np.quantile(everything, (0.01, 1 if channel == _LAG else 0.99)) if everything.size else (1, 2)
+    norm = LogNorm(max(low, 0.1), max(high, 1.1 * low, 0.2)) if channel == _RANGE else Normalize(0, high or 1)
+    picture = axis.imshow(
+        np.ma.masked_where(~filled, features[:, :, channel, r]),
+        cmap=mpl.colormaps[shades].with_extremes(bad=EMPTY),
+        norm=norm,
+        aspect="auto",
+        interpolation="nearest",
+        extent=(180, -180, filled.shape[0], 0),
+    )
+    beyond = {_RANGE: "both", _INTENSITY: "max", _LAG: "neither"}[channel]
+    bar = figure.colorbar(picture, ax=axis, pad=0.01, aspect=10, extend=beyond)
+    bar.ax.tick_params(labelsize=9)
+    if channel == _RANGE:
+        bar.ax.minorticks_off()
+        metres = [v for v in (1, 2, 5, 10, 20, 50, 100) if low <= v <= high]
+        bar.set_ticks(metres, labels=[f"{v}" for v in metres])
+        return f"range [m], {filled.sum():,} of {filled.size:,} cells filled ({filled.mean():.0%})"
+    return "intensity (0-255)" if channel == _INTENSITY else "time lag [s]"
+
+
+def _row_inclinations(features: np.ndarray) -> np.ndarray:
+    """Inclination of every row, radians: the median of its points, between them for rows without."""
+    rows = features.shape[0]
+    filled = features[:, :, _EXISTENCE] > 0
+    known = [i for i in range(rows) if filled[i].any()]
+    if not known:
+        return np.zeros(rows)
+    medians = [float(np.median(features[i, :, _INCLINATION][filled[i]])) for i in known]
+    if len(known) == 1:
+        return np.full(rows, medians[0])
+    table = np.interp(np.arange(rows), known, medians)
+    step = (medians[-1] - medians[0]) / (known[-1] - known[0])
+    for i in (*range(known[0]), *range(known[-1] + 1, rows)):  # beyond the outermost known rows
+        near = 0 if i < known[0] else -1
+        table[i] = medians[near] + (i - known[near]) * step
+    return table
+
+
+def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray) -> int:
+    """Rectangles around the first-round cells of each box; returns how many boxes have any."""
+    from matplotlib.patches import Rectangle
+
+    columns = features.shape[1]
+    points = jnp.asarray(features[:, :, :3, 0])
+    drawn = 0
+    for box in boxes:
+        inside = np.asarray(points_in_box(points, jnp.asarray(box))) & (features[:, :, _EXISTENCE, 0] > 0)
+        rows_in, columns_in = np.nonzero(inside)
+        if not len(rows_in):
+            continue
+        drawn += 1
+        top, bottom = rows_in.min(), rows_in.max() + 1
+        for first, last in _spans(columns_in, columns):
+            left = 180 - 360 * first / columns
+            width = -360 * (last + 1 - first) / columns
+            axis.add_patch(Rectangle((left, top), width, bottom - top, fill=False, edgecolor=_BOX, linewidth=1.2))
+    return drawn
+
+
+def _spans(columns_in: np.ndarray, columns: int) -> Iterator[tuple[int, int]]:
+    """First and last column of a box's cells: two spans where it lies across the seam."""
+    left, right = columns_in[columns_in < columns // 2], columns_in[columns_in >= columns // 2]
+    across = len(left) and len(right) and right.min() - left.max() > columns // 2
+    for part in (left, right) if across else (columns_in,):
+        yield int(part.min()), int(part.max())

@@ -13,15 +13,18 @@ Table = tuple[str, Sequence[str], Sequence[Sequence[Cell]]]
 
 _STYLE = """
 :root { color-scheme: light dark; }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 0 auto; padding: 1rem; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 0 auto; padding: 1rem; }
+h1 { font-size: 1.6rem; line-height: 1.2; overflow-wrap: anywhere; }
+p { max-width: 42rem; }
 .scroll { overflow-x: auto; }
-table { border-collapse: collapse; margin: .5rem 0 1.5rem; }
+table { border-collapse: collapse; margin: .5rem 0 1.5rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
-th, td { padding: .2rem .7rem; border-bottom: 1px solid #8886; text-align: right; }
+th, td { padding: .25rem .7rem; border-bottom: 1px solid #8886; text-align: right; font-weight: 400; }
+thead th { border-bottom-width: 2px; font-weight: 600; }
 th:first-child, td:first-child { text-align: left; }
 figure { margin: 1.5rem 0; }
-img { max-width: 100%; height: auto; background: white; }
-figcaption { color: #777; font-size: .9rem; }
+img { display: block; max-width: 100%; height: auto; background: white; border-radius: .3rem; }
+figcaption { margin-top: .3rem; opacity: .8; font-size: .9rem; }
 """
 
 
@@ -29,26 +32,34 @@ def write_report(
     path: str | Path,
     *,
     title: str,
-    lead: str,
     summary: Mapping[str, Cell],
+    lead: str = "",
     tables: Sequence[Table] = (),
-    pictures: Sequence[tuple[str, Path]] = (),
+    pictures: Sequence[tuple[str, str | Path]] = (),
 ) -> None:
-    """Write a self-contained report.
+    """Write a self-contained report: one file, no outside address, light or dark as the reader's system is.
 
     Args:
         path: HTML file to write.
         title: heading.
-        lead: one paragraph below it.
-        summary: named values.
-        tables: caption, header and rows each.
-        pictures: caption and PNG each; the files are embedded.
+        summary: named values; of all numbers, those with a point are shown with three decimals, NaN as a dash.
+        lead: one paragraph below the heading.
+        tables: caption, header and rows each; the first column names the row.
+        pictures: caption and PNG each, curves too; the files are embedded.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "report.html"
+    >>> write_report(file, title="Trained & tested", summary={"mAP": 0.5})
+    >>> "<h1>Trained &amp; tested</h1>" in file.read_text(encoding="utf-8")
+    True
     """
-    parts = [f"<h1>{_text(title)}</h1>", f"<p>{_text(lead)}</p>"]
+    parts = [f"<h1>{_text(title)}</h1>"]
+    if lead:
+        parts.append(f"<p>{_text(lead)}</p>")
     parts.append(_table("Summary", ("", "value"), list(summary.items())))
     parts += [_table(*table) for table in tables]
     for caption, file in pictures:
-        data = base64.b64encode(file.read_bytes()).decode("ascii")
+        data = base64.b64encode(Path(file).read_bytes()).decode("ascii")
         parts.append(
             f'<figure><img alt="{_text(caption)}" src="data:image/png;base64,{data}">'
             f"<figcaption>{_text(caption)}</figcaption></figure>"
@@ -56,7 +67,7 @@ def write_report(
     page = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{_text(title)}</title><style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
+        f"<title>{_text(title)}</title><style>{_STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
     )
     write_beside(path, lambda out: out.write_text(page, encoding="utf-8"))
 
@@ -68,8 +79,11 @@ def _text(value: Cell) -> str:
 
 
 def _table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    head = "".join(f"<th>{_text(h)}</th>" for h in header)
-    body = "".join("<tr>" + "".join(f"<td>{_text(c)}</td>" for c in row) + "</tr>" for row in rows)
+    head = "".join(f'<th scope="col">{_text(h)}</th>' for h in header)
+    body = "".join(
+        f'<tr><th scope="row">{_text(name)}</th>' + "".join(f"<td>{_text(c)}</td>" for c in cells) + "</tr>"
+        for name, *cells in rows
+    )
     return (
         f'<div class="scroll"><table><caption>{_text(caption)}</caption>'
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
