@@ -30,8 +30,9 @@ from fcos_lidar_jax.commands.demo import without_close
 from fcos_lidar_jax.commands.detect import confident
 from fcos_lidar_jax.config import QUICKSTART, Config
 from fcos_lidar_jax.data.batching import make_batch
+from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.keyframe import read_keyframe
-from fcos_lidar_jax.data.synthetic.frames import Frame, make_frame
+from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.evaluation.matching import match_frame, nearest_of_class
 from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.inference import make_detect

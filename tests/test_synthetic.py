@@ -6,7 +6,8 @@ from shapely.geometry import Polygon
 
 import oracles
 from fcos_lidar_jax.data.batching import make_batch
-from fcos_lidar_jax.data.synthetic.frames import count_inside, make_frame
+from fcos_lidar_jax.data.frame import count_inside
+from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.data.synthetic.raycast import beam_directions, cast_rays
 from fcos_lidar_jax.data.synthetic.world import GROUND_Z, make_scene
 from fcos_lidar_jax.projection import image_cells

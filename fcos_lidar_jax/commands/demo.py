@@ -15,7 +15,8 @@ from fcos_lidar_jax.commands.clouds import make_cloud
 from fcos_lidar_jax.commands.detect import as_records, confident
 from fcos_lidar_jax.config import QUICKSTART, Config
 from fcos_lidar_jax.data.batching import make_batch
-from fcos_lidar_jax.data.synthetic.frames import Frame, make_frame
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.evaluation.matching import FrameResult, average_precision
 from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.inference import make_detect

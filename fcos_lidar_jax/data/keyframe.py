@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.point_files import PointFileError, read_points
-from fcos_lidar_jax.data.synthetic.frames import Frame
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CLASSES
 
