@@ -1,0 +1,173 @@
+"""The tables boiled down to what a LiDAR detector needs: columns of arrays, saved once, opened in no time."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.data.nuscenes.tables import TABLES, TableError
+from fcos_lidar_jax.files import write_beside
+
+_FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 1
+_MANIFEST = "index.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Index:
+    """All keyframes, LiDAR sweeps, poses and annotations of one version.
+
+    Rotations are unit quaternions w, x, y, z; translations in metres; times in microseconds. Samples are in the
+    order of their scenes and of time, annotations in the order of their samples.
+    """
+
+    scene_name: np.ndarray
+    """str[scenes], in the order of the table."""
+    category_name: np.ndarray
+    """str[categories]."""
+    attribute_name: np.ndarray
+    """str[attributes]."""
+    sample_token: np.ndarray
+    """bytes[samples]."""
+    sample_time_us: np.ndarray
+    """i64[samples]."""
+    sample_scene: np.ndarray
+    """i32[samples]: row of the scene."""
+    sample_sweep: np.ndarray
+    """i32[samples]: row of the keyframe's own sweep."""
+    sample_first: np.ndarray
+    """i64[samples + 1]: annotations of sample i are rows ``sample_first[i]:sample_first[i + 1]``."""
+    sweep_file: np.ndarray
+    """bytes[sweeps]: path below the data root."""
+    sweep_time_us: np.ndarray
+    """i64[sweeps]."""
+    sweep_previous: np.ndarray
+    """i32[sweeps]: the sweep before, -1 at the start of a scene."""
+    sweep_sensor: np.ndarray
+    """i32[sweeps]: row of the calibrated sensor."""
+    ego_rotation: np.ndarray
+    """f64[sweeps, 4]: ego to global at the time of the sweep."""
+    ego_translation: np.ndarray
+    """f64[sweeps, 3]."""
+    sensor_rotation: np.ndarray
+    """f64[sensors, 4]: sensor to ego."""
+    sensor_translation: np.ndarray
+    """f64[sensors, 3]."""
+    box_token: np.ndarray
+    """bytes[annotations]."""
+    box_instance: np.ndarray
+    """i32[annotations]: row of the instance; the same object through a scene."""
+    box_category: np.ndarray
+    """i16[annotations]: row of the category."""
+    box_attribute: np.ndarray
+    """i16[annotations]: row of the attribute, -1 for none."""
+    box_translation: np.ndarray
+    """f64[annotations, 3]: centre, global frame."""
+    box_size: np.ndarray
+    """f64[annotations, 3]: width, length, height."""
+    box_rotation: np.ndarray
+    """f64[annotations, 4]: box to global."""
+    box_velocity: np.ndarray
+    """f64[annotations, 3]: m/s in the global frame, NaN where unknown."""
+    box_lidar_points: np.ndarray
+    """i32[annotations]."""
+    box_radar_points: np.ndarray
+    """i32[annotations]."""
+
+
+def table_sizes(folder: str | Path) -> dict[str, int]:
+    """Bytes of every table of a version: what an index is compared with, to notice that it is of other tables."""
+    files = [Path(folder) / f"{name}.json" for name in TABLES]
+    return {file.name: file.stat().st_size for file in files if file.is_file()}
+
+
+def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
+    """Write an index; the manifest comes last, so a folder with one is whole.
+
+    Args:
+        index: to save.
+        folder: for the columns and the manifest.
+        tables: ``ROOT/VERSION``, of which the index was made.
+    """
+    folder = Path(folder)
+    (folder / _MANIFEST).unlink(missing_ok=True)
+    columns = {}
+    for field in dataclasses.fields(index):
+        column = np.ascontiguousarray(getattr(index, field.name))
+        write_beside(folder / f"{field.name}.npy", lambda path, column=column: np.save(path, column))
+        columns[field.name] = {"rows": len(column), "blake2b": _digest(column)}
+    manifest = {
+        "format": _FORMAT,
+        "format_version": _FORMAT_VERSION,
+        "tables": table_sizes(tables),
+        "columns": columns,
+    }
+    write_beside(folder / _MANIFEST, lambda path: path.write_text(json.dumps(manifest, indent=1)))
+
+
+def has_index(folder: str | Path) -> bool:
+    """Whether a finished index is there, of whatever version."""
+    return (Path(folder) / _MANIFEST).is_file()
+
+
+def open_index(folder: str | Path, *, tables: str | Path) -> Index:
+    """Read an index and verify it: format, counts, hashes, and that it is of these tables.
+
+    Args:
+        folder: where :func:`save_index` wrote.
+        tables: ``ROOT/VERSION``.
+
+    Raises:
+        TableError: naming the file, the field, what was found and what was expected.
+    """
+    folder = Path(folder)
+    manifest = _read_manifest(folder)
+    sizes = table_sizes(tables)
+    if manifest["tables"] != sizes:
+        changed = next(
+            name for name in {**sizes, **manifest["tables"]} if sizes.get(name) != manifest["tables"].get(name)
+        )
+        raise TableError(
+            f"{folder / _MANIFEST}: tables.{changed}: made of {manifest['tables'].get(changed)} bytes, found "
+            f"{sizes.get(changed)} in {tables}: run prepare again"
+        )
+    columns = {}
+    for field in dataclasses.fields(Index):
+        file = folder / f"{field.name}.npy"
+        try:
+            column = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise TableError(f"{file}: cannot be read ({error}): run prepare again") from None
+        wanted = manifest["columns"].get(field.name)
+        if wanted != {"rows": len(column), "blake2b": _digest(column)}:
+            raise TableError(f"{file}: other content than {_MANIFEST} tells: run prepare again")
+        columns[field.name] = column
+    return Index(**columns)
+
+
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    file = folder / _MANIFEST
+    try:
+        manifest = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise TableError(f"{file}: no such file, expected a finished index") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise TableError(f"{file}: not JSON: {error}: run prepare again") from None
+    if not isinstance(manifest, dict) or manifest.get("format") != _FORMAT:
+        raise TableError(f"{file}: format: expected {_FORMAT!r}")
+    if manifest.get("format_version") != _FORMAT_VERSION:
+        raise TableError(
+            f"{file}: format_version: got {manifest.get('format_version')!r}, expected {_FORMAT_VERSION}: "
+            "run prepare again"
+        )
+    for name in ("tables", "columns"):
+        if not isinstance(manifest.get(name), dict):
+            raise TableError(f"{file}: {name}: expected an object: run prepare again")
+    return manifest
+
+
+def _digest(column: np.ndarray) -> str:
+    described = f"{column.dtype.str}{column.shape}".encode()
+    return hashlib.blake2b(column.data if column.size else b"", digest_size=16, key=described[:64]).hexdigest()

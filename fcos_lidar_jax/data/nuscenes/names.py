@@ -1,0 +1,34 @@
+"""What nuScenes calls things, and what they are to a detector."""
+
+from fcos_lidar_jax.types import CLASSES
+
+CATEGORY_TO_CLASS = {
+    "vehicle.car": "car",
+    "vehicle.truck": "truck",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.trailer": "trailer",
+    "vehicle.construction": "construction_vehicle",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.bicycle": "bicycle",
+    "movable_object.trafficcone": "traffic_cone",
+    "movable_object.barrier": "barrier",
+}
+"""Category -> class; every other category, known or not, is background."""
+
+BICYCLE_RACK = "static_object.bicycle_rack"
+"""The evaluation leaves out what stands in one."""
+
+
+def label_of(category: str) -> int:
+    """Index into the classes, -1 for a category that is none of them.
+
+    >>> label_of("vehicle.bus.rigid"), label_of("animal")
+    (2, -1)
+    """
+    name = CATEGORY_TO_CLASS.get(category)
+    return -1 if name is None else CLASSES.index(name)

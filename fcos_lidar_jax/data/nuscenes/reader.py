@@ -1,0 +1,301 @@
+"""Keyframes of nuScenes: fused sweeps and boxes in the LiDAR frame (spec of the data set's official tables)."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.nuscenes.build import build_index
+from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index
+from fcos_lidar_jax.data.nuscenes.names import label_of
+from fcos_lidar_jax.data.nuscenes.splits import SplitError, scenes_of_split
+from fcos_lidar_jax.data.nuscenes.tables import TableError
+from fcos_lidar_jax.data.point_files import PointFileError
+
+_COLUMNS = 5
+"""x, y, z, intensity, ring: float32 each."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Boxes:
+    """The boxes of one keyframe in its LiDAR frame, the ten classes only, unpadded."""
+
+    boxes: np.ndarray
+    """f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown."""
+    labels: np.ndarray
+    """i32[m]: index into ``types.CLASSES``."""
+    num_lidar_pts: np.ndarray
+    """i32[m]: points of the current sweep inside, counted with the full rotation."""
+    attributes: tuple[str, ...]
+    """Attribute name of every box, ``''`` for none."""
+    tokens: tuple[str, ...]
+    """Annotation token of every box."""
+
+
+def default_index(root: str | Path, version: str) -> Path:
+    """Where an index is looked for, and written, unless another place is given."""
+    return Path(root) / ".fcos_lidar" / version
+
+
+def pose_matrix(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """f64[4, 4] on column vectors, from a quaternion w, x, y, z and a translation.
+
+    >>> pose_matrix(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]))[:3, 3].tolist()
+    [1.0, 2.0, 3.0]
+    """
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
+    matrix[:3, 3] = translation
+    return matrix
+
+
+class NuScenes:
+    """One version of nuScenes, or of any data set in its layout.
+
+    Opens the index that ``fcos-lidar prepare`` wrote, or reads the tables where there is none. Immutable; threads
+    and processes may share it.
+
+    Args:
+        root: holds the version's folder, ``samples/`` and ``sweeps/``.
+        version: the folder of the tables, such as ``v1.0-trainval``.
+        index: of ``prepare``; by default ``ROOT/.fcos_lidar/VERSION``.
+        allow_missing_sweeps: older sweeps whose file is missing are left out instead of refused;
+            :meth:`missing_sweeps` counts them. The current sweep is never left out.
+
+    Raises:
+        ValueError: naming the file, the record, the field, what was found and what was expected.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        version: str,
+        *,
+        index: str | Path | None = None,
+        allow_missing_sweeps: bool = False,
+    ) -> None:
+        """Open the index, or read the tables."""
+        self.root, self.version = Path(root), version
+        self.allow_missing_sweeps = allow_missing_sweeps
+        if not self.root.is_dir():
+            raise TableError(f"{root}: no such folder, expected a data root")
+        if not self.tables.is_dir():
+            there = sorted(p.parent.name for p in self.root.glob("*/sample.json"))
+            raise TableError(f"{self.tables}: no such folder, expected one of {', '.join(there) or 'none here'}")
+        folder = default_index(root, version) if index is None else Path(index)
+        if index is not None or has_index(folder):
+            self.index: Index = open_index(folder, tables=self.tables)
+        else:
+            self.index = build_index(self.tables)
+        self._base = self.root.resolve()
+        self._sample_row = {token.decode(): i for i, token in enumerate(self.index.sample_token)}
+        self._label = np.array([label_of(str(name)) for name in self.index.category_name], np.int32)
+
+    @property
+    def tables(self) -> Path:
+        """The folder of the tables."""
+        return self.root / self.version
+
+    @property
+    def sample_tokens(self) -> list[str]:
+        """All keyframes, scene by scene, in the order of time."""
+        return list(self._sample_row)
+
+    def split(self, name: str, *, file: str | Path | None = None) -> list[str]:
+        """The keyframes of a split, scene by scene, in the order of time.
+
+        Args:
+            name: of the split.
+            file: ``{"name": ["scene", ...]}``; by default the version's ``splits.json``, or the official names.
+
+        Raises:
+            ValueError: no such split, a scene that this version does not have, or no keyframe.
+        """
+        row = {str(scene): i for i, scene in enumerate(self.index.scene_name)}
+        wanted = scenes_of_split(name, self.tables, file=file)
+        for scene in wanted:
+            if scene not in row:
+                raise SplitError(f"split {name!r}: {scene}: no such scene in {self.tables / 'scene.json'}")
+        chosen = np.isin(self.index.sample_scene, [row[scene] for scene in wanted])
+        tokens = [token for token, yes in zip(self._sample_row, chosen, strict=True) if yes]
+        if not tokens:
+            raise SplitError(f"split {name!r}: got no keyframe, expected at least one")
+        return tokens
+
+    def scene_of(self, sample_token: str) -> str:
+        """Name of a keyframe's scene."""
+        return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
+
+    def sweeps(
+        self, sample_token: str, num: int = 10, *, remove_close: str = "all", close_m: float = 1.0
+    ) -> np.ndarray:
+        """The nearest sweeps up to a keyframe, fused in its LiDAR frame.
+
+        The current sweep comes first, then the others by age; fewer at the start of a scene. Poses are composed
+        in float64 and times subtracted as whole microseconds.
+
+        Args:
+            sample_token: of the keyframe.
+            num: sweeps at most, the current one included.
+            remove_close: drop the points on the car, ``|x|, |y| < close_m`` in their own sweep's frame: of
+                ``"all"`` sweeps as the official devkit does, of the older ``"sweeps"``, or ``"none"``.
+            close_m: half the side of the square that is emptied.
+
+        Returns:
+            f32[n, 5]: x, y, z, intensity (0-255), time lag in seconds, exactly 0 for the current sweep.
+
+        Raises:
+            ValueError: a file that is missing, cut, empty, or not below the data root.
+        """
+        if remove_close not in ("all", "sweeps", "none"):
+            raise ValueError(f"remove_close: got {remove_close!r}, expected 'all', 'sweeps' or 'none'")
+        chain = self._chain(sample_token, num)
+        current = chain[0]
+        to_current = np.linalg.inv(self._sensor_to_global(current))
+        parts = []
+        for row in chain:
+            older = row != current
+            if older and self.allow_missing_sweeps and not self._path(row).is_file():
+                continue
+            points = self._read(row)
+            if remove_close == "all" or (remove_close == "sweeps" and older):
+                near = (np.abs(points[:, 0]) < close_m) & (np.abs(points[:, 1]) < close_m)
+                points = points[~near]
+            points[:, 4] = (self.index.sweep_time_us[current] - self.index.sweep_time_us[row]) / 1e6
+            if older:  # the current sweep keeps its very bits
+                motion = to_current @ self._sensor_to_global(row)
+                points[:, :3] = points[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
+            parts.append(points)
+        return np.concatenate(parts)
+
+    def boxes(self, sample_token: str) -> Boxes:
+        """The boxes of the ten classes in the keyframe's LiDAR frame, those without points included.
+
+        Boxes are upright in the global frame and slightly tilted in the LiDAR's, where the tilt is lost: yaw is
+        the direction of the heading axis after the full rotation.
+        """
+        index, own = self.index, self._annotations(sample_token)
+        rows = np.arange(own.start, own.stop)
+        labels = self._label[index.box_category[rows]]
+        rows, labels = rows[labels >= 0], labels[labels >= 0]
+        to_lidar = np.linalg.inv(self._sensor_to_global(self._sweep(sample_token)))
+        centre = index.box_translation[rows] @ to_lidar[:3, :3].T + to_lidar[:3, 3]
+        turn = Rotation.from_quat(index.box_rotation[rows].reshape(-1, 4), scalar_first=True)
+        heading = turn.apply(np.array([1.0, 0, 0])).reshape(-1, 3) @ to_lidar[:3, :3].T
+        velocity = index.box_velocity[rows] @ to_lidar[:3, :3].T
+        yaw = wrapped(np.arctan2(heading[:, 1], heading[:, 0]))
+        size = index.box_size[rows][:, [1, 0, 2]]
+        boxes = np.concatenate([centre, size, yaw[:, None], velocity[:, :2]], axis=1).astype(np.float32)
+        names = ["", *map(str, index.attribute_name)]
+        return Boxes(
+            boxes=boxes,
+            labels=labels,
+            num_lidar_pts=index.box_lidar_points[rows],
+            attributes=tuple(names[i + 1] for i in index.box_attribute[rows]),
+            tokens=tuple(token.decode() for token in index.box_token[rows]),
+        )
+
+    def labels(self, sample_token: str) -> np.ndarray:
+        """i32[m]: labels of a keyframe's boxes that hold a LiDAR point."""
+        own = self._annotations(sample_token)
+        labels = self._label[self.index.box_category[own]]
+        return labels[(labels >= 0) & (self.index.box_lidar_points[own] > 0)]
+
+    def missing_sweeps(self, sample_tokens: list[str], num: int = 10) -> int:
+        """How many sweep files of these keyframes are missing, each counted once."""
+        rows = {row for token in sample_tokens for row in self._chain(token, num)}
+        return sum(not self._path(row).is_file() for row in rows)
+
+    def sensor_to_global(self, sample_token: str) -> np.ndarray:
+        """f64[4, 4]: from a keyframe's LiDAR frame to the global frame."""
+        return self._sensor_to_global(self._sweep(sample_token))
+
+    def ego_translation(self, sample_token: str) -> np.ndarray:
+        """f64[3]: where the car is, global frame."""
+        return self.index.ego_translation[self._sweep(sample_token)]
+
+    def _row(self, sample_token: str) -> int:
+        row = self._sample_row.get(sample_token)
+        if row is None:
+            raise TableError(f"{self.tables / 'sample.json'}: {sample_token!r}: no such token")
+        return row
+
+    def _sweep(self, sample_token: str) -> int:
+        return int(self.index.sample_sweep[self._row(sample_token)])
+
+    def _annotations(self, sample_token: str) -> slice:
+        first, last = self.index.sample_first[self._row(sample_token) :][:2]
+        return slice(int(first), int(last))
+
+    def _chain(self, sample_token: str, num: int) -> list[int]:
+        if num < 1:
+            raise ValueError(f"num: got {num}, expected at least 1 sweep")
+        chain = [self._sweep(sample_token)]
+        while len(chain) < num and (before := int(self.index.sweep_previous[chain[-1]])) >= 0:
+            chain.append(before)
+        return chain
+
+    def _sensor_to_global(self, row: int) -> np.ndarray:
+        index, mount = self.index, self.index.sweep_sensor[row]
+        ego = pose_matrix(index.ego_rotation[row], index.ego_translation[row])
+        return ego @ pose_matrix(index.sensor_rotation[mount], index.sensor_translation[mount])
+
+    def _path(self, row: int) -> Path:
+        return self.root / self.index.sweep_file[row].decode()
+
+    def _read(self, row: int) -> np.ndarray:
+        path = self._path(row)
+        if not path.is_file():
+            hint = "" if self.allow_missing_sweeps else "; --allow-missing-sweeps goes on with fewer sweeps"
+            raise PointFileError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
+        if not path.resolve().is_relative_to(self._base):
+            raise PointFileError(f"{path}: leads to {path.resolve()}, expected a file below {self._base}")
+        values = np.fromfile(path, np.float32)
+        size = path.stat().st_size
+        if size == 0 or size % (4 * _COLUMNS):
+            found = "an empty file" if size == 0 else f"{size} bytes"
+            raise PointFileError(f"{path}: got {found}, expected a multiple of {4 * _COLUMNS} (float32 x 5)")
+        return values.reshape(-1, _COLUMNS)
+
+
+def wrapped(angle_rad: np.ndarray) -> np.ndarray:
+    """Angles in [-pi, pi) after rounding to float32.
+
+    >>> wrapped(np.array([np.pi, 7.0])).round(4).tolist()
+    [-3.1416, 0.7168]
+    """
+    turned = ((angle_rad + np.pi) % (2 * np.pi) - np.pi).astype(np.float32)
+    return np.where(turned >= np.float32(np.pi), np.float32(-np.pi), turned)
+
+
+@dataclasses.dataclass(frozen=True)
+class NuScenesFrames:
+    """Keyframes of nuScenes as a :class:`fcos_lidar_jax.data.frame.FrameSet`."""
+
+    nuscenes: NuScenes
+    """The data."""
+    tokens: tuple[str, ...]
+    """Keyframes, in order."""
+    num_sweeps: int = 10
+    """Sweeps fused, the current one included."""
+    remove_close: str = "all"
+    """As in :meth:`NuScenes.sweeps`."""
+    close_m: float = 1.0
+    """As in :meth:`NuScenes.sweeps`."""
+
+    def __len__(self) -> int:
+        """Number of keyframes."""
+        return len(self.tokens)
+
+    def frame(self, index: int) -> Frame:
+        """Fused sweeps and boxes of one keyframe."""
+        token = self.tokens[index]
+        points = self.nuscenes.sweeps(token, self.num_sweeps, remove_close=self.remove_close, close_m=self.close_m)
+        truth = self.nuscenes.boxes(token)
+        return Frame(points, truth.boxes, truth.labels, truth.num_lidar_pts)
+
+    def labels(self, index: int) -> np.ndarray:
+        """Labels of the boxes that hold a point."""
+        return self.nuscenes.labels(self.tokens[index])
