@@ -1,13 +1,12 @@
 """The Python loop around the step: progress, finite checks, a clean stop."""
 
 import math
-import sys
-import time
 from collections.abc import Callable, Iterable
 
 import jax
 import numpy as np
 
+from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.training.step import TrainStep
 from fcos_lidar_jax.types import Batch, TrainState
 
@@ -46,7 +45,7 @@ def fit(
         NonFiniteLossError: with the step's number and the parts of the loss.
     """
     done = int(state.step)
-    progress = _Progress(done, num_steps, log_every_s)
+    progress = Progress("steps", num_steps, every_s=log_every_s)
     records: list[Record] = []
     waiting: tuple[int, TrainState, dict[str, jax.Array]] | None = None
 
@@ -59,7 +58,7 @@ def fit(
             parts = ", ".join(f"{k[5:]} {v}" for k, v in record.items() if k.startswith("loss/"))
             raise NonFiniteLossError(f"step {number}: the loss is not finite ({parts})")
         records.append(record)
-        progress.show(number, record)
+        progress.show(number, f"loss {total:.3f}  IoU {record['positive_iou']:.2f}")
         if report is not None:
             report(number, at, record)
 
@@ -74,27 +73,3 @@ def fit(
     if waiting is not None:
         read()
     return state, records
-
-
-class _Progress:
-    """One line now and then, with rate and time left; the same on a terminal and in a pipe."""
-
-    def __init__(self, first: int, last: int, every_s: float) -> None:
-        self.first, self.last, self.every_s = first, last, every_s
-        self.began: float | None = None
-        self.next = 0.0
-
-    def show(self, done: int, record: Record) -> None:
-        now = time.monotonic()
-        if self.began is None:  # the first step compiles: the rate counts from its end
-            self.began, self.first = now, done
-        if now < self.next and done < self.last:
-            return
-        self.next = now + self.every_s
-        rate = (done - self.first) / (now - self.began) if done > self.first else 0.0
-        left = f"{rate:.2f} steps/s, {(self.last - done) / rate:.0f} s left" if rate else "compiled"
-        print(
-            f"step {done}/{self.last}  loss {record['loss/total']:.3f}  IoU {record['positive_iou']:.2f}  {left}",
-            file=sys.stderr,
-            flush=True,
-        )

@@ -1,6 +1,6 @@
 """From the official tables to an index: read, check, join."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -52,6 +52,15 @@ class _Tables:
     def fail(self, kind: type[Row], token: str | bytes, field: str, problem: str) -> TableError:
         name = token.decode() if isinstance(token, bytes) else token
         return TableError(f"{self.folder / table_file(kind)}: record {name}: {field}: {problem}")
+
+    def number(self, kind: type[Row], tokens: Iterable[str], rows: dict[str, int] | None = None) -> dict[str, int]:
+        """Token -> row, going on from what is there."""
+        rows = {} if rows is None else rows
+        for token in tokens:
+            if token in rows:
+                raise self.fail(kind, token, "token", "occurs twice")
+            rows[token] = len(rows)
+        return rows
 
     def find(self, rows: dict[str, int], token: str, kind: type[Row], record: str, field: str) -> int:
         """The row that a token refers to."""
@@ -107,7 +116,8 @@ def build_index(folder: str | Path, report: Report = lambda name, rows: None) ->
 
 def _keyframes(tables: _Tables, scenes: list[Scene], samples: list[Sample]) -> dict[str, np.ndarray]:
     """Samples scene by scene, in the order of time."""
-    scene_row = {scene.token: i for i, scene in enumerate(scenes)}
+    scene_row = tables.number(Scene, (scene.token for scene in scenes))
+    tables.number(Sample, (sample.token for sample in samples))
     scene_of = [tables.find(scene_row, s.scene_token, Sample, s.token, "scene_token") for s in samples]
     times = np.array([s.timestamp for s in samples], np.int64)
     order = np.lexsort((times, np.array(scene_of, np.int64)))
@@ -130,7 +140,7 @@ def _sweeps(tables: _Tables, sample_row: dict[str, int]) -> dict[str, np.ndarray
             )
     known = {row.token for row in mounted}
     mounted = [row for row in mounted if channel[row.sensor_token] == CHANNEL]
-    sensor_row = {row.token: i for i, row in enumerate(mounted)}
+    sensor_row = tables.number(CalibratedSensor, (row.token for row in mounted))
     rows: list[SampleData] = []
     for piece in tables.pieces(SampleData):
         for row in piece:
@@ -140,9 +150,7 @@ def _sweeps(tables: _Tables, sample_row: dict[str, int]) -> dict[str, np.ndarray
                 tables.find(
                     sensor_row, row.calibrated_sensor_token, SampleData, row.token, "calibrated_sensor_token"
                 )
-    row_of = {row.token: i for i, row in enumerate(rows)}
-    if len(row_of) < len(rows):
-        raise TableError(f"{tables.folder / 'sample_data.json'}: a token occurs twice")
+    row_of = tables.number(SampleData, (row.token for row in rows))
     times = np.array([row.timestamp for row in rows], np.int64)
     previous = np.full(len(rows), -1, np.int32)
     own_sweep = np.full(len(sample_row), -1, np.int32)
@@ -211,15 +219,14 @@ def _ego_poses(tables: _Tables, rows: list[SampleData]) -> tuple[np.ndarray, np.
 def _boxes(tables: _Tables, sample_row: dict[str, int], sample_time_us: np.ndarray) -> dict[str, np.ndarray]:
     """Annotations in the order of their samples, with velocities."""
     categories, attributes = tables.all(Category), tables.all(Attribute)
-    category_row = {row.token: i for i, row in enumerate(categories)}
-    attribute_row = {row.token: i for i, row in enumerate(attributes)}
+    category_row = tables.number(Category, (row.token for row in categories))
+    attribute_row = tables.number(Attribute, (row.token for row in attributes))
     instances = tables.all(Instance)
-    instance_row = {row.token: i for i, row in enumerate(instances)}
+    instance_row = tables.number(Instance, (row.token for row in instances))
     category_of = np.array(
         [tables.find(category_row, r.category_token, Instance, r.token, "category_token") for r in instances],
         np.int16,
     )
-    number = 0
     parts: dict[str, list[np.ndarray]] = {}
     row_of: dict[str, int] = {}
     links: tuple[list[str], list[str]] = ([], [])
@@ -233,9 +240,7 @@ def _boxes(tables: _Tables, sample_row: dict[str, int], sample_time_us: np.ndarr
         return refer(attribute_row, row, "attribute_tokens", row.attribute_tokens[0])
 
     for piece in tables.pieces(SampleAnnotation):
-        for i, row in enumerate(piece):
-            row_of[row.token] = number + i
-        number += len(piece)
+        tables.number(SampleAnnotation, (row.token for row in piece), row_of)
         links[0].extend(row.prev for row in piece)
         links[1].extend(row.next for row in piece)
         new = {
@@ -261,8 +266,6 @@ def _boxes(tables: _Tables, sample_row: dict[str, int], sample_time_us: np.ndarr
         }
         for name, column in new.items():
             parts.setdefault(name, []).append(column)
-    if len(row_of) < number:
-        raise TableError(f"{tables.folder / 'sample_annotation.json'}: a token occurs twice")
     columns = {name: np.concatenate(column) for name, column in parts.items()}
     _check_boxes(tables, columns)
     before, after = (
@@ -275,7 +278,7 @@ def _boxes(tables: _Tables, sample_row: dict[str, int], sample_time_us: np.ndarr
         )
         for tokens, field in zip(links, ("prev", "next"), strict=True)
     )
-    time_us = sample_time_us[columns["sample"]] if number else np.zeros(0, np.int64)
+    time_us = sample_time_us[columns["sample"]] if row_of else np.zeros(0, np.int64)
     columns["velocity"] = velocities(columns["translation"], time_us, before, after)
     sample = columns.pop("sample")
     order = np.argsort(sample, kind="stable")

@@ -124,15 +124,13 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
     """
     folder = Path(folder)
     manifest = _read_manifest(folder)
-    sizes = table_sizes(tables)
-    if manifest["tables"] != sizes:
-        changed = next(
-            name for name in {**sizes, **manifest["tables"]} if sizes.get(name) != manifest["tables"].get(name)
-        )
-        raise TableError(
-            f"{folder / _MANIFEST}: tables.{changed}: made of {manifest['tables'].get(changed)} bytes, found "
-            f"{sizes.get(changed)} in {tables}: run prepare again"
-        )
+    was, now = manifest["tables"], table_sizes(tables)
+    for name in {**now, **was}:
+        if was.get(name) != now.get(name):
+            raise TableError(
+                f"{folder / _MANIFEST}: {name}: the index was made when it had {was.get(name)} bytes, now it has "
+                f"{now.get(name)} in {tables}: run prepare again"
+            )
     columns = {}
     for field in dataclasses.fields(Index):
         file = folder / f"{field.name}.npy"

@@ -263,7 +263,7 @@ class NuScenes:
 def wrapped(angle_rad: np.ndarray) -> np.ndarray:
     """Angles in [-pi, pi) after rounding to float32.
 
-    >>> wrapped(np.array([np.pi, 7.0])).round(4).tolist()
+    >>> [round(float(angle), 4) for angle in wrapped(np.array([np.pi, 7.0]))]
     [-3.1416, 0.7168]
     """
     turned = ((angle_rad + np.pi) % (2 * np.pi) - np.pi).astype(np.float32)

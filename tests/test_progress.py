@@ -1,0 +1,29 @@
+"""Progress lines."""
+
+import re
+import time
+
+from fcos_lidar_jax.progress import Progress
+
+
+def test_first_and_last_are_shown_with_rate_and_time_left(capsys):
+    progress = Progress("scenes", 4, every_s=60)
+    for done in (1, 2, 3, 4):
+        progress.show(done, "32 objects")
+        time.sleep(0.02)
+    first, last = capsys.readouterr().err.splitlines()
+    assert first == "scenes 1/4  32 objects"
+    rate = re.fullmatch(r"scenes 4/4  32 objects  (\d+\.\d\d) scenes/s, 0 s left", last)
+    assert rate is not None
+    assert 10 < float(rate[1]) <= 50
+
+
+def test_resumed_work_counts_only_what_is_new(capsys):
+    progress = Progress("steps", 100, every_s=0)
+    progress.show(90)
+    time.sleep(0.05)
+    progress.show(91)
+    lines = capsys.readouterr().err.splitlines()
+    left = re.search(r"(\d+\.\d\d) steps/s, (\d+) s left", lines[1])
+    assert left is not None
+    assert float(left[1]) <= 20
