@@ -8,7 +8,8 @@ import numpy as np
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.sensors import Sensor
 
-_ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd")
+ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd")
+"""File names that are read, the longest first."""
 _RAW_COLUMNS = (3, 4, 5, 6)
 _RAW_DTYPES = ("float16", "float32", "float64")
 
@@ -99,10 +100,10 @@ def _kind(path: Path) -> str:
         raise PointFileError(f"{path}: found a folder, expected a point file")
     if not path.is_file():
         raise PointFileError(f"{path}: no such file")
-    for ending in _ENDINGS:
+    for ending in ENDINGS:
         if path.name.lower().endswith(ending):
             return ending
-    raise PointFileError(f"{path}: unknown extension {path.suffix!r}, expected {', '.join(_ENDINGS)}")
+    raise PointFileError(f"{path}: unknown extension {path.suffix!r}, expected {', '.join(ENDINGS)}")
 
 
 def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarray:

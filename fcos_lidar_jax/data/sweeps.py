@@ -11,7 +11,9 @@ from fcos_lidar_jax.data.point_files import PointFileError, read_points
 from fcos_lidar_jax.sensors import Sensor
 
 
-def read_sweeps(path: str | Path, sensor: Sensor, *, remove_close: str, close_m: float) -> np.ndarray:
+def read_sweeps(
+    path: str | Path, sensor: Sensor, *, remove_close: str, close_m: float, num_sweeps: int | None = None
+) -> np.ndarray:
     """The fused cloud of a JSON list of sweeps, current points first, then by age as listed.
 
     The list is ``[{"file", "timestamp_us", "sensor_to_world": 4x4}, ...]``, the first entry the current sweep;
@@ -24,6 +26,7 @@ def read_sweeps(path: str | Path, sensor: Sensor, *, remove_close: str, close_m:
         remove_close: drop the points on the vehicle, judged in each sweep's own frame: ``"all"`` sweeps,
             the older ``"sweeps"``, or ``"none"``.
         close_m: half the side of the square that is emptied.
+        num_sweeps: how many of the list to read at most, from the current one on; None for all.
 
     Returns:
         f32[n, c] in the frame of the current sweep, the lag in seconds.
@@ -31,8 +34,10 @@ def read_sweeps(path: str | Path, sensor: Sensor, *, remove_close: str, close_m:
     Raises:
         PointFileError: naming the file, the entry, the field, what was found and what was expected.
     """
+    if remove_close not in ("all", "sweeps", "none"):
+        raise ValueError(f"remove_close: got {remove_close!r}, expected 'all', 'sweeps' or 'none'")
     path = Path(path)
-    entries = _read_entries(path)
+    entries = _read_entries(path)[:num_sweeps]
     now_us = entries[0]["timestamp_us"]
     world_to_current = np.linalg.inv(entries[0]["sensor_to_world"])
     parts = []

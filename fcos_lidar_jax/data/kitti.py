@@ -1,0 +1,262 @@
+"""KITTI object detection: Velodyne clouds with labels in camera coordinates."""
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from fcos_lidar_jax.data.frame import Frame, count_inside
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.projection import remove_close
+from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
+from fcos_lidar_jax.types import CLASSES
+
+CLASS_OF = {
+    "Car": "car",
+    "Van": "car",
+    "Truck": "truck",
+    "Pedestrian": "pedestrian",
+    "Person_sitting": "pedestrian",
+    "Cyclist": "bicycle",
+    "Tram": "bus",
+    "Misc": None,
+    "DontCare": None,
+}
+"""KITTI's type -> one of the ten classes; None is left out. A car of nuScenes may be a van, its bicycle includes
+the rider and its pedestrian may sit; a tram has no class there and looks most like a bus."""
+
+IMAGE_SIZE = (1242, 375)
+"""Pixels of KITTI's left colour image, width and height; single drives are up to 18 columns and 5 rows smaller."""
+
+_FIELDS = (
+    *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
+    *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
+)
+_SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+
+
+class KittiError(ValueError):
+    """A KITTI folder that cannot be used: one line with the file, the line, the field, found and expected."""
+
+
+class KittiFrames:
+    """The frames of KITTI's ``training`` folder: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
+
+    Reads ``training/velodyne/NAME.bin``, ``training/label_2/NAME.txt`` and ``training/calib/NAME.txt``. Points
+    stay in the Velodyne's frame (x forward, y left, z up, where nuScenes has x right, y forward), and the labels
+    are brought there: gravity centre, yaw counter-clockwise from +x. They are upright for the camera, so its tilt
+    against the Velodyne, about a degree, is lost. KITTI knows no velocities: NaN.
+
+    Only what the left colour camera sees is labelled. Points outside of its image are therefore dropped, or a
+    detector would learn that all behind the car is background.
+
+    Args:
+        root: the folder that holds ``training``.
+        split: frames and order from ``ImageSets/SPLIT.txt``, a name a line; all frames, sorted, without it.
+        sensor: beam table, limits and intensity scale.
+        image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.
+        remove_close: ``"all"`` drops the points on the car itself; ``"sweeps"`` and ``"none"`` keep them, for a
+            frame is one sweep.
+        close_m: half the side of the square that is emptied, metres.
+
+    Raises:
+        KittiError: here or on reading a frame, naming the file, the line, the field, found and expected.
+        ValueError: a point file that cannot be used, in the same form.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str | None = None,
+        *,
+        sensor: Sensor = KITTI_HDL64E,
+        image_size: tuple[int, int] | None = IMAGE_SIZE,
+        remove_close: Literal["all", "sweeps", "none"] = "all",
+        close_m: float = 1.0,
+    ) -> None:
+        """List the folder and see that every frame has its three files."""
+        self.root, self.sensor, self.image_size = Path(root), sensor, image_size
+        self.remove_close, self.close_m = remove_close, close_m
+        clouds = _stems(self.root / "training" / "velodyne", ".bin")
+        self.names = tuple(sorted(clouds)) if split is None else _read_split(self.root, split, clouds)
+        """Names of the frames: of their files, without the extension."""
+        for kind in ("label_2", "calib"):
+            present = _stems(self.root / "training" / kind, ".txt")
+            for name in self.names:
+                if name not in present:
+                    raise KittiError(f"{self._file(kind, name)}: no such file, expected one for every cloud")
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.names)
+
+    def frame(self, index: int) -> Frame:
+        """One frame, read anew; the points in each box are counted."""
+        name = self.names[index]
+        calibration = read_calibration(self._file("calib", name))
+        camera_boxes, labels = read_labels(self._file("label_2", name))
+        boxes = to_lidar(camera_boxes, calibration["velo_to_rect"]).astype(np.float32)
+        points = read_points(self._file("velodyne", name), self.sensor)
+        kept = np.ones(len(points), bool)
+        if self.image_size is not None:
+            kept = in_image(points, calibration["P2"] @ calibration["velo_to_rect"], self.image_size)
+        kept = remove_close(points, kept, self.sensor, mode=self.remove_close, close_m=self.close_m)
+        points = points[np.asarray(kept)]
+        return Frame(points, boxes, labels, count_inside(points, boxes))
+
+    def labels(self, index: int) -> np.ndarray:
+        """i32[m]: labels of the frame's boxes, without reading its points."""
+        return read_labels(self._file("label_2", self.names[index]))[1]
+
+    def _file(self, kind: str, name: str) -> Path:
+        return self.root / "training" / kind / (name + (".bin" if kind == "velodyne" else ".txt"))
+
+
+def to_lidar(camera_boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
+    """Boxes in the Velodyne's frame, f64[m, 9], of labels in rectified camera coordinates.
+
+    The camera looks along z, with x right and y down. A label stands on its ``location``, the centre of its bottom
+    face; at ``rotation_y`` zero it heads along x, and it turns about y.
+
+    Args:
+        camera_boxes: f64[m, 7]: ``height, width, length, x, y, z, rotation_y``, metres and radians.
+        velo_to_rect: f64[4, 4], from the Velodyne's to rectified camera coordinates.
+
+    >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+    >>> ahead = np.array([[1.5, 1.6, 4.0, 2.0, 1.7, 20.0, -np.pi / 2]])  # driving off on the right
+    >>> (to_lidar(ahead, axes)[0].round(2) + 0).tolist()
+    [20.0, -2.0, -0.95, 4.0, 1.6, 1.5, 0.0, nan, nan]
+    """
+    height, width, length, x, y, z, turn = camera_boxes.T
+    rect_to_velo = np.linalg.inv(velo_to_rect)
+    centre = np.stack([x, y - height / 2, z], -1) @ rect_to_velo[:3, :3].T + rect_to_velo[:3, 3]
+    heading = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], -1) @ rect_to_velo[:3, :3].T
+    yaw = np.arctan2(heading[:, 1], heading[:, 0])
+    unknown = np.full((len(camera_boxes), 2), np.nan)
+    return np.concatenate([centre, np.stack([length, width, height, yaw], -1), unknown], -1)
+
+
+def in_image(points: np.ndarray, velo_to_image: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which points lie before the camera and fall into its image, bool[n].
+
+    Args:
+        points: f32[n, >= 3] in the Velodyne's frame, metres.
+        velo_to_image: f64[3, 4], to homogeneous pixels.
+        image_size: width and height, pixels.
+
+    >>> look_along_x = np.array([[50, -100.0, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]])
+    >>> in_image(np.array([[10, 0, 0], [-10, 0, 0], [10, 6, 0]], np.float32), look_along_x, (100, 100)).tolist()
+    [True, False, False]
+    """
+    width, height = image_size
+    with np.errstate(invalid="ignore"):  # what is not finite falls nowhere
+        u, v, depth = velo_to_image[:, :3] @ points[:, :3].T.astype(np.float64) + velo_to_image[:, 3:]
+    # Without a division by the depth, which may be zero; 0 <= u < width * depth holds before the camera alone.
+    return (u >= 0) & (u < width * depth) & (v >= 0) & (v < height * depth)
+
+
+def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Labels of a file, as :func:`to_lidar` takes them, f64[m, 7], and their classes, i32[m].
+
+    Raises:
+        KittiError: naming the file, the line, the field, what was found and what was expected.
+    """
+    boxes, labels = [], []
+    for where, words in _lines(file):
+        if len(words) not in (15, 16):
+            raise KittiError(f"{where}: got {len(words)} values, expected 15, or 16 with a score")
+        if words[0] not in CLASS_OF:
+            raise KittiError(f"{where}: type: {_unknown(words[0], CLASS_OF)}")
+        fields = dict(zip(_FIELDS, words[1:], strict=False))
+        numbers = {name: _number(word, f"{where}: {name}") for name, word in fields.items()}
+        name = CLASS_OF[words[0]]
+        if name is None:
+            continue
+        for size in ("height", "width", "length"):
+            if numbers[size] <= 0:
+                raise KittiError(f"{where}: {size}: got {fields[size]}, expected a size above 0 m")
+        boxes.append([numbers[name] for name in _FIELDS[7:14]])
+        labels.append(CLASSES.index(name))
+    return np.array(boxes, np.float64).reshape(-1, 7), np.array(labels, np.int32)
+
+
+def read_calibration(file: Path) -> dict[str, np.ndarray]:
+    """``velo_to_rect`` f64[4, 4], metres to metres, and ``P2`` f64[3, 4], on to pixels of the left colour image.
+
+    Raises:
+        KittiError: naming the file, the matrix, what was found and what was expected.
+    """
+    found = {}
+    for where, words in _lines(file):
+        name = words[0].removesuffix(":")
+        if name not in _SHAPES:
+            continue
+        rows, columns = _SHAPES[name]
+        if len(words) - 1 != rows * columns:
+            raise KittiError(f"{where}: {name}: got {len(words) - 1} numbers, expected {rows * columns}")
+        matrix = np.array([_number(word, f"{where}: {name}") for word in words[1:]]).reshape(rows, columns)
+        rotation = matrix[:, :3]
+        if name != "P2" and (
+            np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0
+        ):
+            raise KittiError(f"{where}: {name}: got no rotation in its 3x3, expected orthonormal rows")
+        found[name] = np.eye(4)
+        found[name][:rows, :columns] = matrix
+    for name in _SHAPES:
+        if name not in found:
+            raise KittiError(f"{file}: {name}: missing, expected {', '.join(_SHAPES)}")
+    return {"velo_to_rect": found["R0_rect"] @ found["Tr_velo_to_cam"], "P2": found["P2"][:3]}
+
+
+def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
+    splits = _stems(root / "ImageSets", ".txt")
+    if split not in splits:
+        raise KittiError(f"{root / 'ImageSets'}: split: {_unknown(split, splits)}")
+    names: dict[str, None] = {}
+    for where, words in _lines(root / "ImageSets" / f"{split}.txt"):
+        name = " ".join(words)
+        if name not in clouds:
+            raise KittiError(f"{where}: got {name!r}, expected the name of a cloud in training/velodyne")
+        if name in names:
+            raise KittiError(f"{where}: got {name!r} a second time, expected every frame once")
+        names[name] = None
+    if not names:
+        raise KittiError(f"{root / 'ImageSets' / split}.txt: no frame in it, expected a name a line")
+    return tuple(names)
+
+
+def _stems(folder: Path, ending: str) -> set[str]:
+    if not folder.is_dir():
+        raise KittiError(f"{folder}: no such folder, expected one with {ending} files")
+    stems = {file.stem for file in folder.iterdir() if file.suffix == ending}
+    if not stems:
+        raise KittiError(f"{folder}: no {ending} file in it, expected at least one")
+    return stems
+
+
+def _lines(file: Path) -> list[tuple[str, list[str]]]:
+    """Where each line is, for messages, and its words; blank lines are left out."""
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise KittiError(f"{file}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise KittiError(f"{file}: got {error.reason} at byte {error.start}, expected text") from None
+    return [(f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
+
+
+def _number(word: str, where: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not abs(value) <= float(np.finfo(np.float32).max):
+        raise KittiError(f"{where}: got {word!r}, expected a finite number")
+    return value
+
+
+def _unknown(name: str, known: Iterable[str]) -> str:
+    known = sorted(known)
+    return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"
