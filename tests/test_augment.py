@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import oracles
-from fcos_lidar_jax.augment import augment, copy_paste_active, flip_x, flip_y, rotate, sample_key, scale
+from fcos_lidar_jax.augment import augment, flip_x, flip_y, rotate, sample_key, scale
 from fcos_lidar_jax.config import AugmentConfig
 
 ANGLE = 0.7
@@ -101,12 +101,3 @@ def test_sample_keys_depend_on_step_and_index_alone():
     batched = jax.vmap(lambda i: sample_key(jax.random.key(0), jnp.int32(2), i))(jnp.arange(3, dtype=jnp.int32))
     for i in range(3):
         np.testing.assert_array_equal(jax.random.key_data(batched[i]), jax.random.key_data(keys[6 + i]))
-
-
-def test_fade_ends_copy_paste_five_epochs_early():
-    active = [
-        bool(copy_paste_active(jnp.int32(s), steps_per_epoch=100, epochs=40, fade_epochs=5))
-        for s in (0, 3499, 3500)
-    ]
-    assert active == [True, True, False]
-    assert bool(copy_paste_active(jnp.int32(3999), steps_per_epoch=100, epochs=40, fade_epochs=0))

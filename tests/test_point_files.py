@@ -414,7 +414,8 @@ def test_sweeps_see_a_fixed_world(tmp_path):
         stamp = 1_532_402_927_647_951 - 49_999 * i
         entries.append({"file": f"{i}.npy", "timestamp_us": stamp, "sensor_to_world": matrix.tolist()})
     (tmp_path / "sweeps.json").write_text(json.dumps(entries))
-    fused = read_sweeps(tmp_path / "sweeps.json", NUSCENES_HDL32E, remove_close="none", close_m=1.0)
+    fused, num_close = read_sweeps(tmp_path / "sweeps.json", NUSCENES_HDL32E, remove_close="none", close_m=1.0)
+    assert num_close == 0
     expected = (np.linalg.inv(poses[0]) @ world.T).T[:, :3]
     for i in range(4):
         part = fused[50 * i : 50 * (i + 1)]
@@ -432,8 +433,9 @@ def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
         {"file": "a.npy", "timestamp_us": 50, "sensor_to_world": np.eye(4).tolist()},
     ]
     (tmp_path / "s.json").write_text(json.dumps(entries))
-    fused = read_sweeps(tmp_path / "s.json", TINY, remove_close=mode, close_m=1.0)
+    fused, num_close = read_sweeps(tmp_path / "s.json", TINY, remove_close=mode, close_m=1.0)
     assert [int((fused[:, 4] == 0).sum()), int((fused[:, 4] > 0).sum())] == counts
+    assert num_close == 4 - sum(counts)
     if mode == "all":  # the old sweep's far point now lies at the sensor and stays
         assert [0, 0, 0] in fused[:, :3].tolist()
 
@@ -444,8 +446,9 @@ def test_close_points_lie_around_the_sensors_origin(tmp_path):
     entries = [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": np.eye(4).tolist()}]
     (tmp_path / "s.json").write_text(json.dumps(entries))
     sensor = dataclasses.replace(TINY, origin_m=origin)
-    fused = read_sweeps(tmp_path / "s.json", sensor, remove_close="all", close_m=1.0)
+    fused, num_close = read_sweeps(tmp_path / "s.json", sensor, remove_close="all", close_m=1.0)
     np.testing.assert_array_equal(fused[:, :3], np.array([[0.3, 0, 0]], np.float32))
+    assert num_close == 2
 
 
 EYE = np.eye(4).tolist()

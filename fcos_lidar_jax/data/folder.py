@@ -131,6 +131,10 @@ class FolderFrames:
         """i32[m]: labels of the frame's boxes, without reading its points."""
         return self._annotation(index)[1]
 
+    def name(self, index: int) -> str:
+        """The cloud's name."""
+        return self.names[index]
+
     def _points(self, index: int) -> np.ndarray:
         name = self.names[index]
         cloud, listed = self._clouds[name], self._sweeps.get(name)
@@ -146,7 +150,7 @@ class FolderFrames:
             remove_close=self.remove_close,
             close_m=self.close_m,
             num_sweeps=self.num_sweeps,
-        )
+        )[0]
 
     def _check_sweeps(self, listed: Path, cloud: Path) -> None:
         sweeps = _decode(listed, Annotated[list[_Sweep], msgspec.Meta(min_length=1)])

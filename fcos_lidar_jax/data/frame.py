@@ -5,6 +5,9 @@ from typing import Protocol
 
 import numpy as np
 
+from fcos_lidar_jax.projection import remove_close
+from fcos_lidar_jax.sensors import Sensor
+
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
@@ -35,6 +38,29 @@ class FrameSet(Protocol):
     def labels(self, index: int) -> np.ndarray:
         """i32[m]: labels of the frame's boxes, without reading its points."""
         ...
+
+    def name(self, index: int) -> str:
+        """What messages call a frame."""
+        ...
+
+
+def without_close(frame: Frame, sensor: Sensor, *, mode: str = "all", close_m: float = 1.0) -> Frame:
+    """The frame without the points on the vehicle that carries the sensor, as detectors are trained.
+
+    Args:
+        frame: of one sweep.
+        sensor: gives the origin.
+        mode: as in :func:`fcos_lidar_jax.projection.remove_close`.
+        close_m: half the side of the square that is emptied.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> frame = Frame(np.eye(5, dtype=np.float32) * 9, np.zeros((0, 9)), np.zeros(0), np.zeros(0))
+    >>> len(without_close(frame, TINY).points)
+    2
+    """
+    everything = np.ones(len(frame.points), bool)
+    kept = remove_close(frame.points, everything, sensor, mode=mode, close_m=close_m)
+    return dataclasses.replace(frame, points=frame.points[np.asarray(kept)])
 
 
 def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:

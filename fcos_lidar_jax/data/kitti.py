@@ -110,6 +110,10 @@ class KittiFrames:
         """i32[m]: labels of the frame's boxes, without reading its points."""
         return read_labels(self._file("label_2", self.names[index]))[1]
 
+    def name(self, index: int) -> str:
+        """The frame's number, as in its file names."""
+        return self.names[index]
+
     def _file(self, kind: str, name: str) -> Path:
         return self.root / "training" / kind / (name + (".bin" if kind == "velodyne" else ".txt"))
 

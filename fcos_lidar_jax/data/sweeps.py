@@ -13,7 +13,7 @@ from fcos_lidar_jax.sensors import Sensor
 
 def read_sweeps(
     path: str | Path, sensor: Sensor, *, remove_close: str, close_m: float, num_sweeps: int | None = None
-) -> np.ndarray:
+) -> tuple[np.ndarray, int]:
     """The fused cloud of a JSON list of sweeps, current points first, then by age as listed.
 
     The list is ``[{"file", "timestamp_us", "sensor_to_world": 4x4}, ...]``, the first entry the current sweep;
@@ -29,7 +29,7 @@ def read_sweeps(
         num_sweeps: how many of the list to read at most, from the current one on; None for all.
 
     Returns:
-        f32[n, c] in the frame of the current sweep, the lag in seconds.
+        f32[n, c] in the frame of the current sweep, the lag in seconds; and how many points were dropped.
 
     Raises:
         PointFileError: naming the file, the entry, the field, what was found and what was expected.
@@ -40,7 +40,7 @@ def read_sweeps(
     entries = _read_entries(path)[:num_sweeps]
     now_us = entries[0]["timestamp_us"]
     world_to_current = np.linalg.inv(entries[0]["sensor_to_world"])
-    parts = []
+    parts, num_close = [], 0
     for index, entry in enumerate(entries):
         lag_us = now_us - entry["timestamp_us"]
         if lag_us < 0 or (lag_us == 0) != (index == 0):
@@ -50,15 +50,16 @@ def read_sweeps(
             )
         points = read_points(path.parent / entry["file"], sensor)
         if remove_close == "all" or (remove_close == "sweeps" and index > 0):
-            near = np.abs(points[:, :2] - np.array(sensor.origin_m[:2])) < close_m
-            points = points[~near.all(axis=1)]
+            near = (np.abs(points[:, :2] - np.array(sensor.origin_m[:2])) < close_m).all(axis=1)
+            num_close += int(near.sum())
+            points = points[~near]
         motion = world_to_current @ entry["sensor_to_world"]
         xyz = points[:, :3].astype(np.float64)
         # The current sweep keeps its very bits.
         points[:, :3] = points[:, :3] if index == 0 else xyz @ motion[:3, :3].T + motion[:3, 3]
         points[:, 4] = lag_us / 1e6
         parts.append(points)
-    return np.concatenate(parts)
+    return np.concatenate(parts), num_close
 
 
 def _read_entries(path: Path) -> list[dict[str, Any]]:

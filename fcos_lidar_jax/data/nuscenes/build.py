@@ -323,7 +323,8 @@ def velocities(translation: np.ndarray, time_us: np.ndarray, before: np.ndarray,
     """
     own = np.arange(len(translation))
     first, last = np.where(before < 0, own, before), np.where(after < 0, own, after)
-    seconds = (time_us[last] - time_us[first]) / 1e6
+    # The official rounding, 0.2 microseconds off: the benchmark's velocity errors hang on it.
+    seconds = 1e-6 * time_us[last] - 1e-6 * time_us[first]
     longest = np.where((before >= 0) & (after >= 0), 3.0, 1.5)
     known = (seconds > 0) & (seconds <= longest)
     moved = translation[last] - translation[first]

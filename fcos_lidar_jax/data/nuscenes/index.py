@@ -11,7 +11,7 @@ import numpy as np
 from fcos_lidar_jax.data.nuscenes.tables import TABLES, TableError
 from fcos_lidar_jax.files import write_beside
 
-_FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 1
+_FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 2
 _MANIFEST = "index.json"
 
 

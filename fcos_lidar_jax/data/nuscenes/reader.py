@@ -176,7 +176,7 @@ class NuScenes:
         Boxes are upright in the global frame and slightly tilted in the LiDAR's, where the tilt is lost: yaw is
         the direction of the heading axis after the full rotation.
         """
-        index, own = self.index, self._annotations(sample_token)
+        index, own = self.index, self.annotations(sample_token)
         rows = np.arange(own.start, own.stop)
         labels = self._label[index.box_category[rows]]
         rows, labels = rows[labels >= 0], labels[labels >= 0]
@@ -199,9 +199,14 @@ class NuScenes:
 
     def labels(self, sample_token: str) -> np.ndarray:
         """i32[m]: labels of a keyframe's boxes that hold a LiDAR point."""
-        own = self._annotations(sample_token)
+        own = self.annotations(sample_token)
         labels = self._label[self.index.box_category[own]]
         return labels[(labels >= 0) & (self.index.box_lidar_points[own] > 0)]
+
+    def annotations(self, sample_token: str) -> slice:
+        """Rows of a keyframe's annotations in the index, of all categories."""
+        first, last = self.index.sample_first[self._row(sample_token) :][:2]
+        return slice(int(first), int(last))
 
     def missing_sweeps(self, sample_tokens: list[str], num: int = 10) -> int:
         """How many sweep files of these keyframes are missing, each counted once."""
@@ -224,10 +229,6 @@ class NuScenes:
 
     def _sweep(self, sample_token: str) -> int:
         return int(self.index.sample_sweep[self._row(sample_token)])
-
-    def _annotations(self, sample_token: str) -> slice:
-        first, last = self.index.sample_first[self._row(sample_token) :][:2]
-        return slice(int(first), int(last))
 
     def _chain(self, sample_token: str, num: int) -> list[int]:
         if num < 1:
@@ -291,11 +292,19 @@ class NuScenesFrames:
 
     def frame(self, index: int) -> Frame:
         """Fused sweeps and boxes of one keyframe."""
-        token = self.tokens[index]
-        points = self.nuscenes.sweeps(token, self.num_sweeps, remove_close=self.remove_close, close_m=self.close_m)
-        truth = self.nuscenes.boxes(token)
-        return Frame(points, truth.boxes, truth.labels, truth.num_lidar_pts)
+        truth = self.nuscenes.boxes(self.tokens[index])
+        return Frame(self.points(index), truth.boxes, truth.labels, truth.num_lidar_pts)
+
+    def points(self, index: int) -> np.ndarray:
+        """Fused sweeps alone."""
+        return self.nuscenes.sweeps(
+            self.tokens[index], self.num_sweeps, remove_close=self.remove_close, close_m=self.close_m
+        )
 
     def labels(self, index: int) -> np.ndarray:
         """Labels of the boxes that hold a point."""
         return self.nuscenes.labels(self.tokens[index])
+
+    def name(self, index: int) -> str:
+        """The keyframe's token."""
+        return self.tokens[index]
