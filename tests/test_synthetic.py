@@ -1,59 +1,15 @@
-"""The simulated sensor: hits by another method, exact counts, the same bytes for the same seed."""
+"""Simulated frames: the same bytes for the same seed, exact counts, one cell a beam, all classes."""
 
 import numpy as np
 import pytest
-from shapely.geometry import Polygon
 
 import oracles
 from fcos_lidar_jax.data.batching import make_batch
 from fcos_lidar_jax.data.frame import count_inside
 from fcos_lidar_jax.data.synthetic.frames import make_frame
-from fcos_lidar_jax.data.synthetic.raycast import beam_directions, cast_rays
-from fcos_lidar_jax.data.synthetic.world import GROUND_Z, make_scene
 from fcos_lidar_jax.projection import image_cells
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY, WAYMO_TOP
 from fcos_lidar_jax.types import CLASSES
-
-
-def occupied(point, scene, slack):
-    """Whether a point lies in or on a solid or the ground."""
-    if point[2] <= GROUND_Z + slack:
-        return True
-    for c in scene.cuboids:
-        if oracles.inside(point, [*c[:3], *(c[3:6] + 2 * slack), c[6]]):
-            return True
-    for x, y, radius, low, high in scene.cylinders:
-        if np.hypot(point[0] - x, point[1] - y) <= radius + slack and low - slack <= point[2] <= high + slack:
-            return True
-    return False
-
-
-def test_rays_end_on_the_first_solid():
-    """Marching along the ray: free before the hit, solid right behind it."""
-    scene = make_scene(3, reach_m=20.0)
-    directions = beam_directions(TINY)
-    range_m, _ = cast_rays(directions, scene)
-    rng = np.random.default_rng(0)
-    hits = 0
-    for row, column in zip(rng.integers(0, 16, 150), rng.integers(0, 256, 150), strict=True):
-        ray, reach = directions[row, column], range_m[row, column]
-        end = min(reach, 30.0)
-        for t in np.arange(0.5, end - 0.02, 0.05):
-            assert not occupied(t * ray, scene, -1e-6), (row, column, t, reach)
-        if np.isfinite(reach):
-            hits += 1
-            assert occupied(reach * ray, scene, 1e-6)
-    assert hits > 80
-
-
-def test_ground_and_strength_by_hand():
-    empty = make_scene(0, reach_m=20.0, num_objects=0)
-    bare = type(empty)(empty.cuboids[:0], empty.cuboid_albedo[:0], empty.cylinders[:0], empty.cylinder_albedo[:0],
-                       empty.boxes, empty.labels)  # fmt: skip
-    down = np.array([[[np.cos(0.5), 0, -np.sin(0.5)]], [[1.0, 0, 0]]])
-    range_m, strength = cast_rays(down, bare)
-    np.testing.assert_allclose(range_m[:, 0], [1.84 / np.sin(0.5), np.inf])
-    np.testing.assert_allclose(strength[:, 0], [0.25 * np.sin(0.5), 0])
 
 
 @pytest.mark.parametrize("sensor", [TINY, NUSCENES_HDL32E, WAYMO_TOP, ARGOVERSE2], ids=lambda s: s.name)
@@ -70,8 +26,9 @@ def test_frames_repeat_count_and_fill_one_cell_a_beam(sensor):
     assert inside == frame.num_points[box] > 20
     cells = np.asarray(image_cells(frame.points, np.ones(len(frame.points), bool), sensor)[0])
     seen = cells[cells < sensor.num_rows * sensor.num_columns]
-    assert len(np.unique(seen)) > 0.98 * len(seen)
-    assert len(seen) > 0.6 * sensor.num_rows * sensor.num_columns * 0.5
+    # A turn is slightly more than a full one, and lasers fire one after the other: a few columns are met twice.
+    assert len(np.unique(seen)) > 0.95 * len(seen)
+    assert len(seen) > 0.3 * sensor.num_rows * sensor.num_columns
 
 
 def test_count_inside_is_exact():
@@ -81,26 +38,26 @@ def test_count_inside_is_exact():
     assert count_inside(points, boxes).tolist() == expected
 
 
-def test_scenes_show_all_classes_apart_from_each_other():
-    labels = []
-    for seed in range(20):
-        scene = make_scene(seed, reach_m=20.0)
-        labels += scene.labels.tolist()
-        shapes = []
-        for x, y, _, l, w, _, yaw in scene.boxes[:, :7]:
-            c, s = np.cos(yaw), np.sin(yaw)
-            signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-            shapes.append(
-                Polygon([(x + c * i * l / 2 - s * j * w / 2, y + s * i * l / 2 + c * j * w / 2) for i, j in signs])
-            )
-        for i, a in enumerate(shapes):
-            assert all(a.disjoint(b) for b in shapes[:i])
-        speed = np.hypot(scene.boxes[:, 7], scene.boxes[:, 8])
-        along = scene.boxes[:, 7] * np.cos(scene.boxes[:, 6]) + scene.boxes[:, 8] * np.sin(scene.boxes[:, 6])
-        np.testing.assert_allclose(along, speed, atol=1e-9)
-        np.testing.assert_allclose(scene.boxes[:, 2] - scene.boxes[:, 5] / 2, GROUND_Z, atol=1e-9)
+def test_frames_are_level_and_show_all_classes_apart_from_each_other():
+    labels, moving = [], 0
+    for seed in range(40):
+        frame = make_frame(seed, TINY)
+        labels += frame.labels.tolist()
+        boxes = frame.boxes.astype(np.float64)
+        pairs = [(i, j) for i in range(len(boxes)) for j in range(i)]
+        apart = [oracles.iou(boxes[i : i + 1], boxes[j : j + 1], vertical=False)[0] == 0 for i, j in pairs]
+        assert all(apart)
+        speed = np.hypot(boxes[:, 7], boxes[:, 8])
+        along = boxes[:, 7] * np.cos(boxes[:, 6]) + boxes[:, 8] * np.sin(boxes[:, 6])
+        np.testing.assert_allclose(along, speed, atol=1e-5)
+        moving += (speed > 0.5).sum()
+        bottom = boxes[:, 2] - boxes[:, 5] / 2
+        ground = np.median(frame.points[frame.points[:, 2] < -1.5, 2])
+        assert ((bottom > ground - 0.15) & (bottom < ground + 0.2)).all()  # on the road or on the pavement
     counts = np.bincount(labels, minlength=10)
-    assert counts.min() >= 10, dict(zip(CLASSES, counts, strict=True))
+    assert counts.min() >= 15, dict(zip(CLASSES, counts, strict=True))
+    assert counts.max() < 4 * counts.min(), dict(zip(CLASSES, counts, strict=True))
+    assert 0.1 < moving / len(labels) < 0.6
 
 
 def test_batches_pad_and_refuse_to_drop():

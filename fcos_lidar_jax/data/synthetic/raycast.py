@@ -1,153 +1,159 @@
-"""A ray-cast LiDAR over a scene: nearest hit of every beam, with noise, dropout and intensity."""
+"""First hits of a turning fan of rays on solids and ground.
+
+Each solid meets few rays: the window of columns and rows that its bounding cuboid spans. The windows of all
+solids are laid out as one flat list of (solid, ray) pairs, and every kind of solid is one vectorised test.
+"""
+
+import dataclasses
+import functools
 
 import numpy as np
 
-from fcos_lidar_jax.data.synthetic.world import GROUND_Z, Scene
-from fcos_lidar_jax.sensors import Sensor
-
-_GROUND_ALBEDO = 0.25
-_RANGE_NOISE_M = 0.015
-_DROPOUT = 0.03
-_AZIMUTH_JITTER = 0.2
-"""Of a column's width; below half, so that every ray stays in its column."""
+from fcos_lidar_jax.data.synthetic.crossings import crossings, incidence
+from fcos_lidar_jax.data.synthetic.ground import Ground
+from fcos_lidar_jax.data.synthetic.solids import corners
 
 
-def beam_directions(sensor: Sensor, azimuth_offset: np.ndarray | None = None) -> np.ndarray:
-    """Unit vectors of all beams, f64[h, w, 3].
+@dataclasses.dataclass(frozen=True)
+class Fan:
+    """Rays from one turn of a sensor, column by column, clockwise.
+
+    Ray (column, row) has azimuth ``start - step * (column + delay[row])`` and the inclination of its row.
+    """
+
+    inclinations: np.ndarray
+    """f64[h], radians, falling: row 0 is the highest."""
+    num_columns: int
+    """Columns of the turn; their width times their number may be more than a full turn."""
+    start: float
+    """Azimuth of column 0, radians."""
+    step: float
+    """Width of a column, radians."""
+    delay: np.ndarray
+    """f64[h]: when each laser of a column fires, as part of the column's width."""
+
+    @functools.cached_property
+    def directions(self) -> np.ndarray:
+        """Unit vectors in the sensor's frame, f32[3, w * h], column by column."""
+        azimuth = (self.start - self.step * (np.arange(self.num_columns)[:, None] + self.delay)).ravel()
+        flat = np.tile(np.cos(self.inclinations), self.num_columns)
+        up = np.tile(np.sin(self.inclinations), self.num_columns)
+        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up]).astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True)
+class Hits:
+    """What every ray meets first."""
+
+    range_m: np.ndarray
+    """f32[w, h], inf where nothing is met."""
+    solid: np.ndarray
+    """i32[w, h]: row of the solids, -1 for ground or nothing."""
+    cosine: np.ndarray
+    """f32[w, h]: of the angle of incidence."""
+    reachable: np.ndarray
+    """i64[k]: ``owner * w * h + ray`` of every ray that would meet an owned object if it were alone."""
+
+
+def cast(
+    fan: Fan,
+    rotation: np.ndarray,
+    origin: np.ndarray,
+    solids: np.ndarray,
+    ground: Ground,
+    rng: np.random.Generator,
+) -> Hits:
+    """First hits of all rays.
 
     Args:
-        sensor: rows and columns.
-        azimuth_offset: f64[w], turns each column by this part of its width.
+        fan: the rays.
+        rotation: f64[3, 3], sensor axes to world axes.
+        origin: f64[3], the sensor in the world, above the ground.
+        solids: [s] in the world.
+        ground: below all.
+        rng: how deep each ray gets into porous solids.
 
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> beam_directions(TINY).shape
-    (16, 256, 3)
+    >>> fan = Fan(np.radians([0.0]), 4, np.pi, np.pi / 2, np.zeros(1))
+    >>> from fcos_lidar_jax.data.synthetic.solids import BALL, make_solids
+    >>> ball = make_solids(BALL, [5, 0, 0], 1.0)
+    >>> flat = Ground(np.array([[0, 0, -2.0]]), 7, 0, 7, 0.1, 3, (0.1, 0.2, 0.2))
+    >>> cast(fan, np.eye(3), np.zeros(3), ball, flat, np.random.default_rng(0)).range_m[:, 0].tolist()
+    [inf, inf, 4.0, inf]
     """
-    offset = np.zeros(sensor.num_columns) if azimuth_offset is None else azimuth_offset
-    column = np.arange(sensor.num_columns) + 0.5 + offset
-    azimuth = np.pi - 2 * np.pi * column / sensor.num_columns
-    inclination = np.array(sensor.inclinations_rad)[:, None]
-    return np.stack(
-        [
-            np.cos(inclination) * np.cos(azimuth),
-            np.cos(inclination) * np.sin(azimuth),
-            np.sin(inclination) * np.ones_like(azimuth),
-        ],
-        axis=-1,
-    )
+    d = rotation.astype(np.float32) @ fan.directions
+    best, cosine = ground.first_hits(d, origin)
+    solids = solids.copy()
+    solids["center"] -= origin
+    which, rays = _candidate_pairs(fan, rotation, solids)
+    reach = crossings(solids, which, rays, d, rng)
+    met = np.flatnonzero(np.isfinite(reach))
+    which, rays, reach = which[met], rays[met], reach[met]
+    owner = solids["owner"][which]
+    owned = owner >= 0
+    reachable = np.unique(owner[owned].astype(np.int64) * d.shape[1] + rays[owned])
+    np.minimum.at(best, rays, reach)
+    first = np.flatnonzero(reach == best[rays])
+    winner = np.full(d.shape[1], -1, np.int32)
+    winner[rays[first]] = which[first]
+    struck = np.flatnonzero(winner >= 0)
+    towards = d.take(struck, axis=1)
+    cosine[struck] = incidence(solids, winner[struck], best[struck] * towards, towards)
+    shape = (fan.num_columns, len(fan.inclinations))
+    return Hits(best.reshape(shape), winner.reshape(shape), cosine.reshape(shape), reachable)
 
 
-def cast_rays(directions: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest hit of rays from the sensor.
-
-    Args:
-        directions: f64[h, w, 3], unit vectors; a column shares one azimuth, clockwise from pi.
-        scene: what they hit.
-
-    Returns:
-        range f64[h, w], inf where nothing is hit, and the reflected strength f64[h, w]: albedo times the cosine
-        of the angle of incidence.
-
-    >>> scene = Scene(np.array([[5.0, 0, 0, 2, 2, 2, 0]]), np.ones(1), *[np.zeros((0, 5)), np.zeros(0)] * 1,
-    ...               np.zeros((0, 9)), np.zeros(0, np.int32))
-    >>> [float(v[0, 0]) for v in cast_rays(np.array([[[1.0, 0, 0]]]), scene)]
-    [4.0, 1.0]
-    """
-    down = directions[..., 2] < -1e-9
-    best = np.where(down, GROUND_Z / np.where(down, directions[..., 2], -1), np.inf)
-    strength = np.where(down, -directions[..., 2] * _GROUND_ALBEDO, 0.0)
-    azimuth = np.arctan2(directions[0, :, 1], directions[0, :, 0])
-    solids = [
-        (_hit_cuboid, scene.cuboids, scene.cuboid_albedo),
-        (_hit_cylinder, scene.cylinders, scene.cylinder_albedo),
-    ]
-    for hit, rows, albedos in solids:
-        for solid, albedo in zip(rows, albedos, strict=True):
-            columns = _columns_towards(azimuth, solid, hit is _hit_cuboid)
-            rays = directions[:, columns]
-            reach, cosine = hit(rays, solid)
-            nearer = reach < best[:, columns]
-            best[:, columns] = np.where(nearer, reach, best[:, columns])
-            strength[:, columns] = np.where(nearer, albedo * cosine, strength[:, columns])
-    return best, strength
+def _candidate_pairs(fan: Fan, rotation: np.ndarray, solids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(solid, ray) indices i32[k] whose cell lies in the solid's window."""
+    low, high, left, right = _angular_bounds(rotation, solids)
+    rising = fan.inclinations[::-1]
+    last_row = len(rising) - 1 - np.searchsorted(rising, low - 1e-6)
+    first_row = len(rising) - np.searchsorted(rising, high + 1e-6)
+    turn = 2 * np.pi / fan.step
+    first = (fan.start - left) / fan.step - float(fan.delay.max(initial=0)) - 1e-3
+    last = (fan.start - right) / fan.step + 1e-3
+    # The same solid one turn earlier and later: where a window crosses the seam, and in the surplus columns.
+    shift = turn * (np.array([[-1], [0], [1]]) - np.floor(first / turn))
+    begin = np.ceil(np.maximum(first + shift, 0)).astype(np.int64).ravel()
+    end = np.floor(np.minimum(last + shift, fan.num_columns - 1)).astype(np.int64).ravel()
+    solid = np.tile(np.arange(len(solids), dtype=np.int32), 3)
+    rows = np.tile(last_row - first_row + 1, 3)
+    kept = (end >= begin) & (rows > 0)
+    solid, begin, columns, rows = solid[kept], begin[kept], (end - begin + 1)[kept], rows[kept]
+    strip_solid = np.repeat(solid, columns)
+    strip_column = _ranges(begin, columns)
+    strip_rows = np.repeat(rows, columns)
+    strip_first = strip_column * len(fan.inclinations) + first_row[strip_solid]
+    return np.repeat(strip_solid, strip_rows), _ranges(strip_first, strip_rows).astype(np.int32)
 
 
-def _columns_towards(azimuth: np.ndarray, solid: np.ndarray, cuboid: bool) -> np.ndarray:
-    """Columns whose rays can meet the solid's bounding circle."""
-    distance = np.hypot(solid[0], solid[1])
-    radius = np.hypot(solid[3], solid[4]) / 2 if cuboid else solid[2]
-    if distance <= radius:
-        return np.arange(len(azimuth))
-    off = (azimuth - np.arctan2(solid[1], solid[0]) + np.pi) % (2 * np.pi) - np.pi
-    return np.flatnonzero(np.abs(off) <= np.arcsin(radius / distance) + 1e-6)
+def _ranges(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """``first[0], first[0] + 1, ...`` (counts[0] of them), then those of the next."""
+    ends = np.cumsum(counts)
+    return np.arange(ends[-1] if len(ends) else 0) + np.repeat(first - ends + counts, counts)
 
 
-def _hit_cuboid(rays: np.ndarray, cuboid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Range of the entry into a cuboid and the cosine of incidence there."""
-    x, y, z, l, w, h, yaw = cuboid
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    origin = (-(cos * x + sin * y), -(cos * y - sin * x), -z)
-    local = (
-        cos * rays[..., 0] + sin * rays[..., 1],
-        cos * rays[..., 1] - sin * rays[..., 0],
-        rays[..., 2],
-    )
-    enter, leave = np.full(rays.shape[:2], -np.inf), np.full(rays.shape[:2], np.inf)
-    cosine = np.zeros(rays.shape[:2])
-    for start, step, half in zip(origin, local, (l / 2, w / 2, h / 2), strict=True):
-        safe = np.where(np.abs(step) < 1e-12, 1e-12, step)
-        first, second = (-half - start) / safe, (half - start) / safe
-        near = np.minimum(first, second)
-        cosine = np.where(near > enter, np.abs(step), cosine)
-        enter, leave = np.maximum(enter, near), np.minimum(leave, np.maximum(first, second))
-    return np.where((enter <= leave) & (enter > 0), enter, np.inf), cosine
-
-
-def _hit_cylinder(rays: np.ndarray, cylinder: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Range of the entry into an upright cylinder, through its side or its top, and the cosine there."""
-    x, y, radius, low, high = cylinder
-    flat = rays[..., 0] ** 2 + rays[..., 1] ** 2
-    towards = rays[..., 0] * x + rays[..., 1] * y
-    inside = towards**2 - flat * (x * x + y * y - radius**2)
-    side = (towards - np.sqrt(np.maximum(inside, 0))) / flat
-    height = side * rays[..., 2]
-    meets_side = (inside > 0) & (side > 0) & (height >= low) & (height <= high)
-    nx, ny = side * rays[..., 0] - x, side * rays[..., 1] - y
-    side_cosine = np.abs(nx * rays[..., 0] + ny * rays[..., 1]) / radius
-    down = np.where(rays[..., 2] < -1e-12, rays[..., 2], -1.0)
-    top = high / down
-    meets_top = (high < 0) & (rays[..., 2] < -1e-12)
-    meets_top &= np.hypot(top * rays[..., 0] - x, top * rays[..., 1] - y) <= radius
-    reach = np.minimum(np.where(meets_side, side, np.inf), np.where(meets_top, top, np.inf))
-    return reach, np.where(meets_side & (side <= reach), side_cosine, -rays[..., 2])
-
-
-def scan(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
-    """One sweep of a scene.
-
-    Args:
-        scene: relative to the sensor.
-        sensor: whose beams.
-        rng: noise and dropout.
-
-    Returns:
-        f32[n, c]: x, y, z in the frame of the points, intensity 0-255, time lag 0, and the row as laser number
-        for sensors that need it.
-
-    >>> from fcos_lidar_jax.data.synthetic.world import make_scene
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> scan(make_scene(0, reach_m=20.0), TINY, np.random.default_rng(0)).shape[1]
-    5
-    """
-    offset = rng.uniform(-_AZIMUTH_JITTER, _AZIMUTH_JITTER, sensor.num_columns)
-    directions = beam_directions(sensor, offset)
-    range_m, strength = cast_rays(directions, scene)
-    noisy = range_m + rng.normal(0, _RANGE_NOISE_M, range_m.shape)
-    dropped = rng.random(range_m.shape) < _DROPOUT
-    intensity = np.clip(255 * strength * rng.normal(1, 0.05, range_m.shape), 0, 255)
-    seen = (range_m < 2 * sensor.limit_xy_m) & ~dropped
-    xyz = directions[seen] * noisy[seen, None] + np.array(sensor.origin_m)
-    columns = [xyz, intensity[seen, None], np.zeros((len(xyz), 1))]
-    if sensor.row_source == "laser":
-        columns.append(np.nonzero(seen)[0][:, None])
-    return np.concatenate(columns, axis=1).astype(np.float32)
+def _angular_bounds(rotation: np.ndarray, solids: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Lowest and highest inclination, left and right azimuth of each solid's cuboid, in the sensor's frame."""
+    seen = corners(solids) @ rotation
+    flat = np.hypot(seen[..., 0], seen[..., 1])
+    # The nearest the cuboid comes to the sensor's axis, from its footprint in the world.
+    half = solids["half"][:, :2].copy()
+    half[:, 0] += np.abs(solids["lean"]) * solids["half"][:, 2]
+    c, s = np.cos(solids["yaw"]), np.sin(solids["yaw"])
+    x, y = solids["center"][:, 0], solids["center"][:, 1]
+    off = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x], axis=1)) - half, 0)
+    height = np.abs(seen[..., 2]).max(axis=1)
+    tilt = np.arccos(min(rotation[2, 2], 1.0))
+    near = np.maximum(np.hypot(*off.T) * np.cos(tilt) - height * np.sin(tilt), 1e-6)
+    far = flat.max(axis=1)
+    bottom, top = seen[..., 2].min(axis=1), seen[..., 2].max(axis=1)
+    low = np.arctan2(bottom, np.where(bottom < 0, near, far))
+    high = np.arctan2(top, np.where(top > 0, near, far))
+    middle = seen.mean(axis=1)
+    toward = np.arctan2(middle[:, 1], middle[:, 0])
+    away = np.arctan2(seen[..., 1], seen[..., 0]) - toward[:, None]
+    away = (away + np.pi) % (2 * np.pi) - np.pi
+    around = near < 1e-3
+    left = toward + np.where(around, np.pi, away.max(axis=1))
+    right = toward + np.where(around, -np.pi, away.min(axis=1))
+    return low, high, left, right

@@ -1,229 +1,153 @@
-"""A seeded street scene of simple solids: ground, walls, poles, and objects of the ten classes.
-
-Everything is relative to the sensor: x right, y forward, z up, metres; the ground is flat.
-"""
+"""A simulated world: streets, scenery, traffic, and the car that carries the sensor."""
 
 import dataclasses
 
 import numpy as np
 from numpy.random import Generator
 
+from fcos_lidar_jax.data.synthetic.ground import Ground
+from fcos_lidar_jax.data.synthetic.looks import LOOKS
+from fcos_lidar_jax.data.synthetic.motion import MOTION, pose_at
+from fcos_lidar_jax.data.synthetic.places import LANE_M
+from fcos_lidar_jax.data.synthetic.scenery import draw_scenery
+from fcos_lidar_jax.data.synthetic.shapes import draw_paint, object_solids
+from fcos_lidar_jax.data.synthetic.solids import SOLID, place_solids
+from fcos_lidar_jax.data.synthetic.traffic import Traffic, draw_traffic
 from fcos_lidar_jax.types import CLASSES
 
-GROUND_Z = -1.84
-"""The sensor stands this far above the ground."""
-_MARGIN_M = 0.04
-"""An annotated box stands off from the solids by this on every side, as hand-drawn boxes do."""
-_NEAREST_M = 2.5
-"""Nothing stands closer to the sensor."""
+_SHARES = np.array([0.36, 0.08, 0.02, 0.04, 0.015, 0.17, 0.015, 0.02, 0.09, 0.19])
+"""Of the classes, in their order; every class has one object or more."""
+_MANOEUVRES = ("straight", "straight", "left", "right", "stopped", "braking", "starting")
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
-    """Solids and the boxes around the objects among them."""
+class World:
+    """All that there is, in the street's frame: x along the main street, y left of it, z up."""
 
-    cuboids: np.ndarray
-    """f64[c, 7]: ``x, y, z, l, w, h, yaw`` of upright cuboids."""
-    cuboid_albedo: np.ndarray
-    """f64[c]: reflectivity, 0-1."""
-    cylinders: np.ndarray
-    """f64[y, 5]: ``x, y, radius, low z, high z`` of upright cylinders."""
-    cylinder_albedo: np.ndarray
-    """f64[y]: reflectivity, 0-1."""
-    boxes: np.ndarray
-    """f64[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy`` of the objects."""
-    labels: np.ndarray
-    """i32[m]: index into ``types.CLASSES``."""
+    ground: Ground
+    """Streets and slopes."""
+    scenery: np.ndarray
+    """[s] solids that never move."""
+    traffic: Traffic
+    """The objects of the ten classes."""
+    parts: np.ndarray
+    """[s] solids of the objects, each in the frame of the object that it names as its owner."""
+    ego: np.ndarray
+    """[1] of ``motion.MOTION``: the rear axle of the car that carries the sensor."""
 
+    def object_poses(self, time_s: float) -> np.ndarray:
+        """``x, y, z, yaw`` of the middles of all objects' undersides, f64[m, 4]."""
+        pose = pose_at(self.traffic.motions, time_s)
+        height = self.ground.height(pose[:, 0], pose[:, 1])
+        return np.stack([pose[:, 0], pose[:, 1], height, pose[:, 2]], axis=1)
 
-@dataclasses.dataclass(frozen=True)
-class _Shape:
-    """A class: its box, how fast it moves, and its solids as parts of the box.
+    def solids(self, time_s: float) -> np.ndarray:
+        """Everything but the ground and the car that carries the sensor, at a moment."""
+        return np.concatenate(
+            [self.scenery, place_solids(self.parts, self.object_poses(time_s)[self.parts["owner"]])]
+        )
 
-    Cuboids are ``x, y, l, w`` as fractions of length and width and ``low, high`` as fractions of the height;
-    cylinders ``x, y, radius`` (of the smaller side), ``low, high``.
-    """
-
-    size: tuple[float, float, float]
-    max_speed: float
-    cuboids: tuple[tuple[float, ...], ...] = ()
-    cylinders: tuple[tuple[float, ...], ...] = ()
-
-
-_WHEELS = tuple((x, y, 0.12, 0.2, 0.0, 0.25) for x in (-0.3, 0.3) for y in (-0.38, 0.38))
-
-SHAPES: dict[str, _Shape] = {
-    "car": _Shape((4.6, 1.95, 1.73), 12, ((0, 0, 1, 1, 0.15, 0.6), (-0.06, 0, 0.52, 0.88, 0.6, 1), *_WHEELS)),
-    "truck": _Shape(
-        (6.9, 2.5, 2.85), 10, ((0.39, 0, 0.22, 0.92, 0.12, 0.78), (-0.14, 0, 0.72, 1, 0.25, 1), *_WHEELS)
-    ),
-    "bus": _Shape((11.0, 2.9, 3.5), 10, ((0, 0, 1, 1, 0.1, 1), *_WHEELS)),
-    "trailer": _Shape(
-        (12.0, 2.9, 3.9),
-        0,
-        ((0, 0, 1, 1, 0.32, 1), (-0.33, 0, 0.25, 0.9, 0, 0.32), (0.4, 0, 0.04, 0.5, 0, 0.32)),
-    ),
-    "construction_vehicle": _Shape(
-        (6.4, 2.85, 3.2),
-        2,
-        (
-            (-0.2, 0, 0.6, 1, 0, 0.4),
-            (-0.25, 0, 0.3, 0.6, 0.4, 1),
-            (0.25, 0, 0.5, 0.2, 0.5, 0.68),
-            (0.45, 0, 0.1, 0.7, 0.05, 0.5),
-        ),
-    ),
-    "pedestrian": _Shape(
-        (0.73, 0.67, 1.77),
-        1.8,
-        (),
-        ((0, 0.25, 0.2, 0, 0.5), (0, -0.25, 0.2, 0, 0.5), (0, 0, 0.5, 0.45, 0.85), (0, 0, 0.2, 0.85, 1)),
-    ),
-    "motorcycle": _Shape(
-        (2.1, 0.77, 1.47),
-        10,
-        ((0, 0, 1, 0.3, 0.05, 0.55), (-0.1, 0, 0.2, 0.6, 0.5, 1), (0.25, 0, 0.06, 1, 0.6, 0.75)),
-    ),
-    "bicycle": _Shape(
-        (1.7, 0.6, 1.28),
-        4,
-        ((0, 0, 1, 0.12, 0.02, 0.6), (0.25, 0, 0.06, 1, 0.7, 0.85), (-0.2, 0, 0.14, 0.4, 0.6, 1)),
-    ),
-    "traffic_cone": _Shape(
-        (0.41, 0.41, 1.07), 0, (), ((0, 0, 0.5, 0, 0.08), (0, 0, 0.36, 0.08, 0.5), (0, 0, 0.2, 0.5, 1))
-    ),
-    "barrier": _Shape((0.5, 2.5, 1.0), 0, ((0, 0, 1, 1, 0, 0.3), (0, 0, 0.45, 1, 0.3, 1))),
-}
-"""Sizes near the class means of nuScenes (for barriers the width is the long side, as there)."""
+    def ego_pose(self, time_s: float) -> np.ndarray:
+        """The car at a moment, f64[4, 4]: its axes (x forward, z off the ground) in the street's frame."""
+        x, y, yaw = pose_at(self.ego, time_s)[0]
+        a, b, _ = max(self.ground.planes, key=lambda p: p[0] * x + p[1] * y + p[2])
+        up = np.array([-a, -b, 1]) / np.sqrt(1 + a * a + b * b)
+        forward = np.array([np.cos(yaw), np.sin(yaw), a * np.cos(yaw) + b * np.sin(yaw)])
+        forward /= np.linalg.norm(forward)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
+        pose[:3, 3] = x, y, self.ground.slope_height(x, y)
+        return pose
 
 
-def _rectangles_overlap(a: np.ndarray, others: np.ndarray, gap_m: float) -> bool:
-    """Whether a rectangle ``x, y, l, w, yaw`` comes within ``gap_m`` of any other, by separating axes."""
-
-    def corners(r: np.ndarray) -> np.ndarray:
-        c, s = np.cos(r[..., 4]), np.sin(r[..., 4])
-        along = np.stack([c, s], -1) * (r[..., 2, None] + gap_m) / 2
-        across = np.stack([-s, c], -1) * (r[..., 3, None] + gap_m) / 2
-        signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-        return np.stack([r[..., :2] + i * along + j * across for i, j in signs], -2)
-
-    if len(others) == 0:
-        return False
-    mine, theirs = corners(a)[None], corners(others)
-    apart = np.zeros(len(others), bool)
-    for yaw in (np.broadcast_to(a[4], len(others)), others[:, 4]):
-        for axis in (np.stack([np.cos(yaw), np.sin(yaw)], -1), np.stack([-np.sin(yaw), np.cos(yaw)], -1)):
-            p, q = (np.einsum("mkd,md->mk", c, axis) for c in (np.repeat(mine, len(others), 0), theirs))
-            apart |= (p.min(1) > q.max(1)) | (q.min(1) > p.max(1))
-    return bool((~apart).any())
-
-
-def _too_close(rectangle: np.ndarray) -> bool:
-    """Whether a rectangle comes within the free zone around the sensor."""
-    x, y, l, w, yaw = rectangle
-    dx = abs(np.cos(yaw) * x + np.sin(yaw) * y) - l / 2
-    dy = abs(np.cos(yaw) * y - np.sin(yaw) * x) - w / 2
-    return bool(np.hypot(max(dx, 0), max(dy, 0)) < _NEAREST_M)
-
-
-def _place(
-    rng: Generator,
-    size: tuple[float, float],
-    near_m: float,
-    far_m: float,
-    taken: list[np.ndarray],
-    gap_m: float,
-) -> np.ndarray | None:
-    """A free rectangle ``x, y, l, w, yaw``, its distance uniform; None where no room was found."""
-    for _ in range(30):
-        distance, bearing = rng.uniform(near_m, far_m), rng.uniform(-np.pi, np.pi)
-        yaw = rng.uniform(-np.pi, np.pi)
-        spot = np.array([distance * np.cos(bearing), distance * np.sin(bearing), *size, yaw])
-        others = np.array(taken).reshape(-1, 5)
-        if not _too_close(spot) and not _rectangles_overlap(spot, others, gap_m):
-            return spot
-    return None
-
-
-def _solids(shape: _Shape, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An object's cuboids and cylinders in the world."""
-    x, y, z, l, w, h, yaw = box[:7]
-    l, w, h = l - 2 * _MARGIN_M, w - 2 * _MARGIN_M, h - _MARGIN_M
-    bottom = z - box[5] / 2
-    cos, sin = np.cos(yaw), np.sin(yaw)
-
-    def at(fx: float, fy: float) -> tuple[float, float]:
-        return x + cos * fx * l - sin * fy * w, y + sin * fx * l + cos * fy * w
-
-    cuboids = [
-        (*at(fx, fy), bottom + h * (low + high) / 2, fl * l, fw * w, h * (high - low), yaw)
-        for fx, fy, fl, fw, low, high in shape.cuboids
-    ]
-    cylinders = [
-        (*at(fx, fy), radius * min(l, w), bottom + low * h, bottom + high * h)
-        for fx, fy, radius, low, high in shape.cylinders
-    ]
-    return np.array(cuboids).reshape(-1, 7), np.array(cylinders).reshape(-1, 5)
-
-
-def make_scene(seed: int, *, reach_m: float, num_objects: int = 12) -> Scene:
-    """A random scene; the same seed gives the same scene.
+def draw_world(
+    rng: Generator, *, reach_m: float, beyond_m: float, duration_s: float, labels: np.ndarray, level: bool = False
+) -> World:
+    """A random world.
 
     Args:
-        seed: any non-negative integer.
-        reach_m: objects stand within this distance of the sensor; walls may stand farther.
-        num_objects: to place; fewer where there is no room.
+        rng: draws all of it.
+        reach_m: every object is within this distance of the car at some moment.
+        beyond_m: scenery reaches this far beyond where the car goes.
+        duration_s: how long it lasts.
+        labels: i32[m], objects wanted; those without room are left out.
+        level: without slopes.
 
-    >>> scene = make_scene(0, reach_m=20.0)
-    >>> scene.boxes.shape[1], len(scene.boxes) == len(scene.labels)
-    (9, True)
+    >>> labels = np.arange(10)
+    >>> world = draw_world(np.random.default_rng(0), reach_m=30, beyond_m=40, duration_s=0.0, labels=labels)
+    >>> len(world.traffic.labels) <= 10, world.object_poses(0.0).shape[1]
+    (True, 4)
     """
-    rng = np.random.default_rng([seed, 0xF0C5])
-    taken: list[np.ndarray] = []
-    cuboids, cylinders, albedo = [], [], ([], [])
-    boxes, labels = [], []
-
-    def add(parts: tuple[np.ndarray, np.ndarray], brightness: float) -> None:
-        for store, solids, kind in zip((cuboids, cylinders), parts, albedo, strict=True):
-            store.append(solids)
-            kind.extend([brightness] * len(solids))
-
-    order = rng.permutation(np.resize(rng.permutation(len(CLASSES)), num_objects))
-    for label in sorted(order, key=lambda k: -np.prod(SHAPES[CLASSES[k]].size)):  # the large ones need room
-        shape = SHAPES[CLASSES[label]]
-        l, w, h = np.array(shape.size) * np.clip(rng.normal(1, 0.08, 3), 0.8, 1.2)
-        spot = _place(rng, (l, w), _NEAREST_M + l / 4, reach_m, taken, 0.4)
-        speed = rng.uniform(0, shape.max_speed) * (rng.random() < 0.6)
-        brightness = rng.uniform(0.15, 0.9)
-        if spot is None:
-            continue
-        taken.append(spot)
-        yaw = spot[4]
-        velocity = speed * np.cos(yaw), speed * np.sin(yaw)
-        box = np.array([spot[0], spot[1], GROUND_Z + h / 2, l, w, h, yaw, *velocity])
-        boxes.append(box)
-        labels.append(label)
-        add(_solids(shape, box), brightness)
-    for _ in range(rng.integers(2, 5)):  # walls
-        size = (rng.uniform(6, 25), rng.uniform(0.3, 6))
-        spot = _place(rng, size, 0.5 * reach_m, 1.5 * reach_m, taken, 0.5)
-        if spot is not None:
-            taken.append(spot)
-            height = rng.uniform(2, 12)
-            wall = (spot[0], spot[1], GROUND_Z + height / 2, size[0], size[1], height, spot[4])
-            add((np.array([wall]), np.zeros((0, 5))), rng.uniform(0.1, 0.5))
-    for _ in range(rng.integers(3, 9)):  # poles and trunks
-        radius, height = rng.uniform(0.06, 0.3), rng.uniform(2.5, 9)
-        spot = _place(rng, (2 * radius, 2 * radius), 0.2 * reach_m, 1.2 * reach_m, taken, 0.3)
-        if spot is not None:
-            taken.append(spot)
-            pole = (spot[0], spot[1], radius, GROUND_Z, GROUND_Z + height)
-            add((np.zeros((0, 7)), np.array([pole])), rng.uniform(0.1, 0.6))
-    return Scene(
-        np.concatenate([np.zeros((0, 7)), *cuboids]),
-        np.array(albedo[0]),
-        np.concatenate([np.zeros((0, 5)), *cylinders]),
-        np.array(albedo[1]),
-        np.array(boxes).reshape(-1, 9),
-        np.array(labels, np.int32),
+    ground = _draw_ground(rng, level)
+    ego = _draw_ego(rng, ground, duration_s)
+    path = pose_at(ego, np.arange(0, duration_s + 0.1, 0.5))[:, :2]
+    scenery = draw_scenery(rng, ground, path.min(axis=0), path.max(axis=0), beyond_m=beyond_m)
+    standing = scenery["center"][:, 2] - scenery["half"][:, 2] < 2 + ground.height(*scenery["center"][:, :2].T)
+    columns = [scenery["center"][:, :2], 2 * scenery["half"][:, :2], scenery["yaw"][:, None]]
+    occupied = np.concatenate(columns, axis=1)[standing]
+    largest_first = np.array(sorted(labels, key=lambda k: -np.prod(LOOKS[CLASSES[k]][0].size_m)), np.int32)
+    traffic = draw_traffic(
+        rng, ground, ego, labels=largest_first, reach_m=reach_m, duration_s=duration_s, occupied=occupied
     )
+    parts = [np.zeros(0, SOLID)]
+    for index, (look, size) in enumerate(zip(traffic.looks, traffic.sizes, strict=True)):
+        solids = object_solids(look, size, draw_paint(rng, look))
+        solids["owner"] = index
+        parts.append(solids)
+    return World(ground, scenery, traffic, np.concatenate(parts), ego)
+
+
+def draw_labels(rng: Generator, number: int) -> np.ndarray:
+    """Classes of a street's objects, i32: all ten, the rest as often as in the streets of nuScenes.
+
+    >>> len(np.unique(draw_labels(np.random.default_rng(0), 40)))
+    10
+    """
+    more = rng.choice(len(CLASSES), max(number - len(CLASSES), 0), p=_SHARES / _SHARES.sum())
+    return np.concatenate([np.arange(len(CLASSES)), more]).astype(np.int32)[:number]
+
+
+def _draw_ground(rng: Generator, level: bool) -> Ground:
+    lanes, across = rng.integers(1, 3, 2)
+    slope = 0.0 if level else 1.0
+    a, b = slope * rng.normal(0, 0.012, 2)
+    ahead, behind, beside = slope * rng.uniform(0, 0.02, 3)
+    planes = np.array(
+        [
+            [a, b, 0],
+            [a + ahead, b, -ahead * rng.uniform(30, 90)],
+            [a - behind, b, -behind * rng.uniform(30, 90)],
+            [a, b + beside, -beside * rng.uniform(15, 40)],
+            [a, b - beside, -beside * rng.uniform(15, 40)],
+        ]
+    )
+    return Ground(
+        planes[:1] if level else planes,
+        half_width=lanes * LANE_M + 2.5,
+        crossing_x=rng.uniform(20, 45),
+        crossing_half_width=across * LANE_M + 2.5,
+        kerb=0.13,
+        pavement=rng.uniform(2.5, 4.5),
+        brightness=(rng.uniform(0.03, 0.08), rng.uniform(0.07, 0.16), rng.uniform(0.05, 0.14)),
+    )
+
+
+def _draw_ego(rng: Generator, ground: Ground, duration_s: float) -> np.ndarray:
+    ego = np.zeros(1, MOTION)
+    ego["y"] = -LANE_M / 2 if rng.random() < 0.6 else -(ground.half_width - 2.5 - LANE_M / 2)
+    manoeuvre = rng.choice(_MANOEUVRES)
+    ego["speed"] = rng.uniform(4, 11)
+    if manoeuvre == "stopped":
+        ego["speed"] = 0
+    elif manoeuvre == "braking":
+        ego["acceleration"] = -ego["speed"] / max(0.6 * duration_s, 2.0)
+    elif manoeuvre == "starting":
+        ego["speed"], ego["acceleration"] = 0, rng.uniform(0.4, 0.9)
+    elif manoeuvre in ("left", "right"):
+        left = manoeuvre == "left"
+        lane = ground.crossing_x + (LANE_M / 2 if left else -LANE_M / 2)
+        radius = rng.uniform(10, 14) if left else rng.uniform(6, 9)
+        ego["speed"] = rng.uniform(4, 6.5)
+        ego["straight"] = lane - radius
+        ego["curvature"], ego["turn"] = (1 / radius, np.pi / 2) if left else (-1 / radius, -np.pi / 2)
+    return ego

@@ -1,0 +1,45 @@
+"""Simulated frames as a data set, made as they are asked for."""
+
+import dataclasses
+
+import numpy as np
+
+from fcos_lidar_jax.data.frame import Frame, without_close
+from fcos_lidar_jax.data.synthetic.frames import make_frame
+from fcos_lidar_jax.sensors import Sensor
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulatedFrames:
+    """So many frames of :func:`make_frame`, each of another street, without the points on the carrying vehicle.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> frames = SimulatedFrames(TINY, number=2)
+    >>> len(frames), frames.frame(1).points.shape[1]
+    (2, 5)
+    """
+
+    sensor: Sensor
+    """Who looks."""
+    number: int
+    """Of frames."""
+    first_seed: int = 0
+    """Of the first frame; the others follow."""
+    close_m: float = 1.0
+    """Half the side of the square around the sensor that is emptied."""
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self.number
+
+    def frame(self, index: int) -> Frame:
+        """One frame, simulated anew."""
+        return without_close(make_frame(self.first_seed + index, self.sensor), self.sensor, close_m=self.close_m)
+
+    def labels(self, index: int) -> np.ndarray:
+        """Labels of a frame's boxes; the frame is simulated for it."""
+        return self.frame(index).labels
+
+    def name(self, index: int) -> str:
+        """What messages call a frame."""
+        return f"seed {self.first_seed + index}"

@@ -1,0 +1,100 @@
+"""Ground: sloping planes with streets let into it."""
+
+import dataclasses
+
+import numpy as np
+
+_MARK_HALF_M = 0.08
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """A main street along x and one that crosses it, between raised pavements, on sloping planes.
+
+    The frame is the street's: x along the main street, y to the left of it, z up, metres.
+    """
+
+    planes: np.ndarray
+    """f64[p, 3]: ``z = a x + b y + c``; the highest counts, so the ground is convex."""
+    half_width: float
+    """Of the main street's carriageway."""
+    crossing_x: float
+    """Where the other street crosses, along its own y."""
+    crossing_half_width: float
+    """Of its carriageway."""
+    kerb: float
+    """Height of everything beside the carriageways above them."""
+    pavement: float
+    """Width of the pavements."""
+    brightness: tuple[float, float, float]
+    """Albedo of carriageway, pavement and what lies beyond."""
+
+    def on_road(self, x: np.ndarray, y: np.ndarray, margin: np.ndarray | float = 0.0) -> np.ndarray:
+        """Whether places lie on a carriageway, or within ``margin`` of one."""
+        main = np.abs(y) < self.half_width + margin
+        return main | (np.abs(x - self.crossing_x) < self.crossing_half_width + margin)
+
+    def slope_height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height of the carriageways' planes."""
+        return np.max([a * x + b * y + c for a, b, c in self.planes], axis=0)
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height of the ground, kerbs included."""
+        return self.slope_height(x, y) + np.where(self.on_road(x, y), 0.0, self.kerb)
+
+    def first_hits(self, d: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where rays meet the ground.
+
+        Args:
+            d: f32[3, k], unit vectors.
+            origin: f64[3], above the ground and its kerbs.
+
+        Returns:
+            range f32[k], inf for rays that never do, and the cosine of incidence f32[k].
+        """
+        low, cosine = self._plane_hits(d, origin, 0.0)
+        if self.kerb:
+            high, _ = self._plane_hits(d, origin, self.kerb)
+            with np.errstate(invalid="ignore"):
+                high_on_road = self.on_road(origin[0] + high * d[0], origin[1] + high * d[1])
+                low_on_road = self.on_road(origin[0] + low * d[0], origin[1] + low * d[1])
+            face = np.flatnonzero(high_on_road & ~low_on_road & np.isfinite(low))
+            low = np.where(high_on_road, low, high)
+            low[face] = self._kerb_hits(d[:, face], origin, high[face], low[face])
+            cosine[face] = np.hypot(d[0, face], d[1, face])
+        return low, cosine
+
+    def _plane_hits(self, d: np.ndarray, origin: np.ndarray, lift: float) -> tuple[np.ndarray, np.ndarray]:
+        best, cosine = np.full(d.shape[1], np.inf, np.float32), np.zeros(d.shape[1], np.float32)
+        for a, b, c in self.planes:
+            fall = np.float32(a) * d[0] + np.float32(b) * d[1] - d[2]
+            height = np.float32(origin[2] - (a * origin[0] + b * origin[1] + c) - lift)
+            reach = np.where(fall > 1e-6, height / np.maximum(fall, np.float32(1e-6)), np.float32(np.inf))
+            nearer = reach < best
+            best[nearer] = reach[nearer]
+            cosine[nearer] = fall[nearer] / np.float32(np.sqrt(1 + a * a + b * b))
+        return best, cosine
+
+    def _kerb_hits(self, d: np.ndarray, origin: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Where rays that pass over the road and would end under the pavement meet the kerb's face."""
+        best = high.copy()
+        for axis, middle, half in ((1, 0.0, self.half_width), (0, self.crossing_x, self.crossing_half_width)):
+            for edge in (middle - half, middle + half):
+                at = (np.float32(edge - origin[axis])) / np.where(d[axis] == 0, np.float32(1e-9), d[axis])
+                ahead = at + np.float32(1e-3)
+                leaves = ~self.on_road(origin[0] + ahead * d[0], origin[1] + ahead * d[1])
+                best = np.where((at >= low) & (at <= high) & leaves, np.minimum(best, at), best)
+        return best
+
+    def albedo(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """How bright the ground is, lane marks included."""
+        road, walk, beyond = self.brightness
+        shade = np.where(self.on_road(x, y), road, np.where(self.on_road(x, y, self.pavement), walk, beyond))
+        off = np.abs(x - self.crossing_x)
+        main = (np.abs(y) < self.half_width) & (off > self.crossing_half_width + 2)
+        lanes = np.minimum(np.abs(y), np.abs(np.abs(y) - 3.5))
+        dashed = (np.abs(y) < 0.5) | (x % 9 < 3)
+        marked = main & dashed & (lanes < _MARK_HALF_M)
+        # A zebra crossing on either side of the junction.
+        zebra = (np.abs(y) < self.half_width) & (np.abs(off - self.crossing_half_width - 3) < 1.5) & (y % 1 < 0.5)
+        return np.where(marked | zebra, 0.35, shade)

@@ -1,0 +1,66 @@
+"""How things move: along a straight line, round one bend, and on, with a steady change of speed."""
+
+import numpy as np
+
+MOTION = np.dtype(
+    [
+        ("x", np.float64),  # where it is at time 0, metres
+        ("y", np.float64),
+        ("yaw", np.float64),  # heading at time 0, radians
+        ("speed", np.float64),  # at time 0, m/s
+        ("acceleration", np.float64),  # m/s^2; one that brakes stays where it comes to rest
+        ("straight", np.float64),  # metres before the bend
+        ("curvature", np.float64),  # of the bend, 1/m, positive to the left; 0 without one
+        ("turn", np.float64),  # of the whole bend, radians
+    ]
+)
+
+
+def travelled(motion: np.ndarray, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Metres gone and speed at a time not before 0.
+
+    >>> braking = np.zeros(1, MOTION)
+    >>> braking["speed"], braking["acceleration"] = 4.0, -2.0
+    >>> [v.tolist() for v in travelled(braking, 10.0)]
+    [[4.0], [0.0]]
+    """
+    speed, change = motion["speed"], motion["acceleration"]
+    rest = np.where(change < 0, speed / np.maximum(-change, 1e-9), np.inf)
+    t = np.minimum(time_s, rest)
+    return speed * t + change * t * t / 2, speed + change * t
+
+
+def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
+    """Positions and headings, f64[..., 3]: x, y, yaw.
+
+    Args:
+        motion: structured array of :data:`MOTION`.
+        time_s: broadcasts with it.
+
+    >>> bend = np.zeros(1, MOTION)
+    >>> bend["speed"], bend["curvature"], bend["turn"] = 1.0, 1.0, np.pi / 2
+    >>> pose_at(bend, np.pi / 2 + 3).round(6).tolist()
+    [[1.0, 4.0, 1.570796]]
+    """
+    way, _ = travelled(motion, time_s)
+    curvature = motion["curvature"]
+    bends = curvature != 0
+    safe = np.where(bends, curvature, 1.0)
+    length = np.where(bends, motion["turn"] / safe, 0.0)
+    before = np.where(bends, np.minimum(way, motion["straight"]), way)
+    angle = curvature * np.clip(way - before, 0, length)
+    after = np.maximum(way - before - length, 0)
+    along = before + np.sin(angle) / safe + after * np.cos(angle)
+    across = (1 - np.cos(angle)) / safe + after * np.sin(angle)
+    c, s = np.cos(motion["yaw"]), np.sin(motion["yaw"])
+    return np.stack(
+        [motion["x"] + c * along - s * across, motion["y"] + s * along + c * across, motion["yaw"] + angle],
+        axis=-1,
+    )
+
+
+def velocity_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
+    """Velocities, f64[..., 2], m/s."""
+    yaw = pose_at(motion, time_s)[..., 2]
+    _, speed = travelled(motion, time_s)
+    return np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], axis=-1)

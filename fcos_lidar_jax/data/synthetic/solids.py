@@ -1,0 +1,100 @@
+"""The primitives of the simulated world, as rows of one structured array.
+
+A solid is a unit shape under a linear map: scaled by half extents, leaned along its own x with height, turned
+about the vertical, moved. Everything opaque or porous in a scene is a row of :data:`SOLID`.
+"""
+
+import numpy as np
+
+BOX, DRUM, BALL, WHEEL = range(4)
+"""Kinds: a cuboid whose top may be smaller than its base, an upright elliptic cylinder whose top may be smaller
+(a cone, at the end), an ellipsoid, and a cylinder that lies across the heading."""
+
+SOLID = np.dtype(
+    [
+        ("kind", np.int8),
+        ("center", np.float64, 3),  # metres
+        ("half", np.float64, 3),  # half extents along its own x, y, z, metres
+        ("yaw", np.float64),  # radians, counter-clockwise from +x
+        ("lean", np.float64),  # metres of its own x a metre of height
+        ("taper", np.float64, 2),  # top over base, along and across; drums use the first
+        ("albedo", np.float64),  # 0-1
+        ("density", np.float64),  # stopped rays a metre of the way through, inf where opaque
+        ("owner", np.int32),  # object it belongs to, -1 for scenery, -2 for the car that carries the sensor
+    ]
+)
+
+SCENERY, OWN_CAR = -1, -2
+
+
+def make_solids(kind: int, center: object, half: object, **fields: object) -> np.ndarray:
+    """Solids of one kind; all fields broadcast.
+
+    Args:
+        kind: one of the kinds above.
+        center: [..., 3].
+        half: [..., 3].
+        **fields: the other fields of :data:`SOLID`; by default upright, untapered, opaque scenery of albedo 0.3.
+
+    Returns:
+        structured array [s].
+
+    >>> make_solids(BALL, [[0, 0, 1], [4, 0, 1]], 0.5, albedo=0.1)["half"].tolist()
+    [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
+    """
+    center = np.atleast_2d(np.asarray(center, np.float64))
+    solids = np.zeros(len(center), SOLID)
+    values = {"lean": 0.0, "taper": 1.0, "albedo": 0.3, "density": np.inf, "owner": SCENERY, **fields}
+    for name, value in {"kind": kind, "center": center, "half": half, **values}.items():
+        solids[name] = value
+    return solids
+
+
+def place_solids(solids: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Solids given in frames of their own, in the world.
+
+    Args:
+        solids: [s].
+        pose: f64[s, 4], ``x, y, z, yaw`` of each solid's frame, or [4] for one frame.
+
+    >>> ball = make_solids(BALL, [1, 0, 0], 1.0)
+    >>> place_solids(ball, np.array([5, 0, 0, np.pi / 2]))["center"].round(6).tolist()
+    [[5.0, 1.0, 0.0]]
+    """
+    pose = np.broadcast_to(pose, (len(solids), 4))
+    placed = solids.copy()
+    c, s = np.cos(pose[:, 3]), np.sin(pose[:, 3])
+    x, y, z = solids["center"].T
+    placed["center"] = np.stack([c * x - s * y, s * x + c * y, z], axis=1) + pose[:, :3]
+    placed["yaw"] = solids["yaw"] + pose[:, 3]
+    return placed
+
+
+def corners(solids: np.ndarray) -> np.ndarray:
+    """Corners of a cuboid around each solid, f64[s, 8, 3]: what it leans or tapers to stays inside.
+
+    >>> corners(make_solids(BOX, [0, 0, 0], [1, 1, 1], lean=0.5))[0, :, 0].max().item()
+    1.5
+    """
+    half = solids["half"].copy()
+    half[:, 0] += np.abs(solids["lean"]) * half[:, 2]
+    signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    local = half[:, None] * signs
+    c, s = np.cos(solids["yaw"])[:, None], np.sin(solids["yaw"])[:, None]
+    turned = np.stack(
+        [c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], axis=-1
+    )
+    return solids["center"][:, None] + turned
+
+
+def unit_map(solids: np.ndarray) -> np.ndarray:
+    """Matrices f64[s, 3, 3] that turn offsets from the centre, in the world's axes, into the unit shape's.
+
+    >>> unit_map(make_solids(BOX, [0, 0, 0], [2, 1, 1]))[0].diagonal().tolist()
+    [0.5, 1.0, 1.0]
+    """
+    c, s = np.cos(solids["yaw"]), np.sin(solids["yaw"])
+    maps = np.zeros((len(solids), 3, 3))
+    maps[:, 0] = np.stack([c, s, -solids["lean"]], axis=1)
+    maps[:, 1, 0], maps[:, 1, 1], maps[:, 2, 2] = -s, c, 1
+    return maps / solids["half"][:, :, None]

@@ -1,0 +1,143 @@
+"""The objects of a world: of which kind, how large, where, and how they move."""
+
+import dataclasses
+
+import numpy as np
+from numpy.random import Generator
+
+from fcos_lidar_jax.data.synthetic.ground import Ground
+from fcos_lidar_jax.data.synthetic.looks import draw_look
+from fcos_lidar_jax.data.synthetic.motion import MOTION, pose_at
+from fcos_lidar_jax.data.synthetic.places import PARKED, Places
+from fcos_lidar_jax.data.synthetic.shapes import Look, draw_size
+from fcos_lidar_jax.types import CLASSES
+
+_CLEARANCE_M = 0.35
+"""Objects keep this from each other, at all times ..."""
+_ROW_CLEARANCE_M = 0.08
+"""... but in a row only this."""
+_TRIES = 25
+CAR_SIZE_M = (4.6, 2.0)
+"""Length and width of the car that carries the sensor."""
+CAR_MIDDLE_M = 1.35
+"""Its middle is this far before its rear axle."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Traffic:
+    """The objects of a world, in the street's frame."""
+
+    labels: np.ndarray
+    """i32[m]: index into ``types.CLASSES``."""
+    looks: tuple[Look, ...]
+    """Variety of each."""
+    sizes: np.ndarray
+    """f64[m, 3]: length, width, height of the annotated boxes."""
+    motions: np.ndarray
+    """[m] of ``motion.MOTION``."""
+    parked: np.ndarray
+    """bool[m]: stands where vehicles are left, rather than in traffic."""
+
+
+def draw_traffic(
+    rng: Generator,
+    ground: Ground,
+    ego: np.ndarray,
+    *,
+    labels: np.ndarray,
+    reach_m: float,
+    duration_s: float,
+    occupied: np.ndarray,
+) -> Traffic:
+    """Objects that never touch each other, the car or what stands already.
+
+    Every object is within reach of the sensor at some moment, at a distance drawn evenly.
+
+    Args:
+        rng: draws all of it.
+        ground: the streets.
+        ego: [1] of ``motion.MOTION``.
+        labels: i32[m], wanted; those without room are left out.
+        reach_m: greatest distance at that moment.
+        duration_s: how long the world lasts.
+        occupied: f64[k, 5], ``x, y, l, w, yaw`` of what stands already.
+    """
+    times = np.arange(0, duration_s + 1e-6, 0.5)
+    room = _Room(times, occupied)
+    car = pose_at(ego, times)
+    car[:, :2] += CAR_MIDDLE_M * np.stack([np.cos(car[:, 2]), np.sin(car[:, 2])], axis=1)
+    room.take(car, CAR_SIZE_M)
+    places = Places(rng, ground, ego, reach_m)
+    found: list[tuple[int, Look, np.ndarray, np.ndarray, bool]] = []
+    for label in labels:
+        name = CLASSES[label]
+        for _ in range(_TRIES):
+            look = draw_look(rng, name)
+            size = draw_size(rng, look)
+            place, moment, clearance = places.draw_place(name, look), rng.uniform(0, duration_s), _CLEARANCE_M
+            if place == "row":
+                row, clearance = places.row_for(name, moment, look, size), _ROW_CLEARANCE_M
+                if row.look is not look and name in ("traffic_cone", "barrier"):  # in a row all are alike
+                    look = row.look
+                    size = draw_size(rng, look)
+                motion = places.in_row(row, size)
+            else:
+                motion = places.draw(place, moment, look, size)
+            if motion is not None and room.free(pose_at(motion, times), size, clearance):
+                room.take(pose_at(motion, times), size)
+                found.append((int(label), look, size, motion, place in PARKED))
+                break
+    return Traffic(
+        np.array([f[0] for f in found], np.int32),
+        tuple(f[1] for f in found),
+        np.array([f[2] for f in found]).reshape(-1, 3),
+        np.concatenate([np.zeros(0, MOTION), *(f[3] for f in found)]),
+        np.array([f[4] for f in found], bool),
+    )
+
+
+class _Room:
+    """Rectangles that are taken, at a few moments."""
+
+    def __init__(self, times: np.ndarray, occupied: np.ndarray) -> None:
+        still = np.repeat(occupied[:, None], len(times), axis=1)
+        self._poses = list(still[..., [0, 1, 4]])
+        self._sizes = [tuple(v) for v in occupied[:, 2:4]]
+
+    def take(self, poses: np.ndarray, size: np.ndarray | tuple[float, float]) -> None:
+        self._poses.append(poses)
+        self._sizes.append((size[0], size[1]))
+
+    def free(self, poses: np.ndarray, size: np.ndarray, clearance: float) -> bool:
+        others, sizes = np.array(self._poses), np.array(self._sizes)
+        reach = np.hypot(sizes[:, 0], sizes[:, 1])[:, None] / 2 + np.hypot(size[0], size[1]) / 2 + clearance
+        which, when = np.nonzero(np.hypot(*(others[..., :2] - poses[:, :2]).transpose(2, 0, 1)) < reach)
+        if not len(which):
+            return True
+        mine = np.broadcast_to(np.array([size[0], size[1]]) + 2 * clearance, (len(when), 2))
+        return not rectangles_meet(poses[when], mine, others[which, when], sizes[which]).any()
+
+
+def rectangles_meet(a: np.ndarray, a_size: np.ndarray, b: np.ndarray, b_size: np.ndarray) -> np.ndarray:
+    """Whether pairs of rectangles overlap, by separating axes, bool[k].
+
+    Args:
+        a: f64[k, 3], x, y, yaw.
+        a_size: f64[k, 2], length and width.
+        b: as ``a``.
+        b_size: as ``a_size``.
+
+    >>> turned, upright = np.array([[0, 0, np.pi / 4]]), np.array([[2.2, 0, 0]])
+    >>> rectangles_meet(turned, np.full((1, 2), 2), upright, np.full((1, 2), 2)).tolist()
+    [True]
+    """
+    apart = np.zeros(len(a), bool)
+    offset = b[:, :2] - a[:, :2]
+    for yaw in (a[:, 2], a[:, 2] + np.pi / 2, b[:, 2], b[:, 2] + np.pi / 2):
+        axis = np.stack([np.cos(yaw), np.sin(yaw)])
+        gap = np.abs((offset.T * axis).sum(0))
+        for pose, size in ((a, a_size), (b, b_size)):
+            gap = gap - size[:, 0] / 2 * np.abs(np.cos(yaw - pose[:, 2]))
+            gap = gap - size[:, 1] / 2 * np.abs(np.sin(yaw - pose[:, 2]))
+        apart |= gap > 0
+    return ~apart

@@ -1,0 +1,115 @@
+"""Synthetic data sets in the official devkit's hands: tables, fused sweeps, evaluation."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fcos_lidar_jax.commands.synthesize import Synthesize, run
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
+
+pytest.importorskip("nuscenes")
+
+VERSION = "v1.0-synthetic"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("devkit") / "data"
+    run(Synthesize(out, scenes=2, seed=2, keyframes=3))
+    return out
+
+
+@pytest.fixture(scope="module")
+def official(root):
+    from nuscenes import NuScenes as Official
+
+    return Official(VERSION, str(root), verbose=False)
+
+
+def test_the_devkit_loads_every_table(official):
+    assert len(official.scene) == len(official.log) == 2
+    assert len(official.sample) == 6
+    assert len(official.sample_data) == 42
+    for annotation in official.sample_annotation:
+        assert annotation["category_name"] in CATEGORY_TO_CLASS
+        box = official.get_box(annotation["token"])
+        assert (box.wlh > 0).all()
+        assert np.isfinite(official.box_velocity(annotation["token"])[:2]).all() or not (
+            annotation["prev"] or annotation["next"]
+        )
+    official.list_scenes()
+    official.get_sample_data_path(official.sample[0]["data"]["LIDAR_TOP"])
+
+
+def test_fused_sweeps_equal_the_devkits(root, official):
+    """``from_file_multisweep`` drops close points of every sweep and keeps the ring where we keep the lag."""
+    from nuscenes.utils.data_classes import LidarPointCloud
+
+    data = NuScenes(root, VERSION)
+    for number in (1, 2, 10):
+        for sample in (data.split("train")[-1], data.split("val")[1]):
+            record = official.get("sample", sample)
+            cloud, times = LidarPointCloud.from_file_multisweep(
+                official, record, "LIDAR_TOP", "LIDAR_TOP", nsweeps=number, min_distance=1.0
+            )
+            ours = data.sweeps(sample, number)
+            assert len(ours) == cloud.points.shape[1]
+            assert len(np.unique(ours[:, 4])) == number
+            np.testing.assert_allclose(ours[:, :3], cloud.points[:3].T, atol=1e-4)
+            np.testing.assert_array_equal(ours[:, 3], cloud.points[3])
+            np.testing.assert_allclose(ours[:, 4], times[0], atol=1e-5)
+
+
+def test_boxes_equal_the_devkits(root, official):
+    data = NuScenes(root, VERSION)
+    for sample in data.sample_tokens:
+        boxes = data.boxes(sample)
+        _, theirs, _ = official.get_sample_data(official.get("sample", sample)["data"]["LIDAR_TOP"])
+        by_token = {box.token: box for box in theirs}
+        assert set(by_token) == set(boxes.tokens)
+        for own, token in zip(boxes.boxes, boxes.tokens, strict=True):
+            np.testing.assert_allclose(own[:3], by_token[token].center, atol=1e-4)
+            np.testing.assert_allclose(own[[4, 3, 5]], by_token[token].wlh, atol=1e-6)
+
+
+def test_the_devkit_evaluates_on_the_splits_of_its_own_file(root, official, tmp_path):
+    """The truth of the split as its own detections, a little off, has the scores that it must have."""
+    from nuscenes.eval.common.config import config_factory
+    from nuscenes.eval.detection.evaluate import DetectionEval
+
+    data, results = NuScenes(root, VERSION), {}
+    for sample in data.split("val"):
+        results[sample] = []
+        for token in data.boxes(sample).tokens:
+            row = official.get("sample_annotation", token)
+            if row["num_lidar_pts"] == 0:  # is no truth to the devkit
+                continue
+            attribute = [official.get("attribute", t)["name"] for t in row["attribute_tokens"]]
+            results[sample].append(
+                {
+                    "sample_token": sample,
+                    "translation": [row["translation"][0] + 0.1, *row["translation"][1:]],
+                    "size": row["size"],
+                    "rotation": row["rotation"],
+                    "velocity": np.nan_to_num(official.box_velocity(token)[:2]).tolist(),
+                    "detection_name": CATEGORY_TO_CLASS[row["category_name"]],
+                    "detection_score": 0.5,
+                    "attribute_name": attribute[0] if attribute else "",
+                }
+            )
+    uses = {f"use_{name}": name == "lidar" for name in ("camera", "lidar", "radar", "map", "external")}
+    file = tmp_path / "results.json"
+    file.write_text(json.dumps({"meta": uses, "results": results}))
+    evaluation = DetectionEval(
+        official, config_factory("detection_cvpr_2019"), str(file), "synthetic_val", str(tmp_path), verbose=False
+    )
+    summary = evaluation.main(plot_examples=0, render_curves=False)
+    present = {name for name, ap in summary["mean_dist_aps"].items() if ap > 0}
+    assert len(present) >= 8
+    assert all(summary["mean_dist_aps"][name] == pytest.approx(1, abs=0.05) for name in present)
+    assert summary["label_tp_errors"]["car"]["trans_err"] == pytest.approx(0.1, abs=1e-3)
+    assert summary["label_tp_errors"]["car"]["scale_err"] == pytest.approx(0, abs=1e-6)
+    assert summary["label_tp_errors"]["car"]["attr_err"] == 0
