@@ -1,11 +1,12 @@
-"""Matching and average precision: values worked out by hand."""
+"""Matching: values worked out by hand."""
 
 import numpy as np
 import pytest
 
 from fcos_lidar_jax.evaluation.matching import (
-    FrameResult,
-    average_precision,
+    Pairs,
+    candidate_pairs,
+    greedy,
     heading_error,
     match_frame,
     nearest_of_class,
@@ -51,7 +52,8 @@ def test_matching_is_strict_and_knows_classes_and_headings():
     ],
 )
 def test_heading_error(label, difference, expected):
-    np.testing.assert_allclose(heading_error(difference, np.zeros(2), label), [expected] * 2, atol=1e-9)
+    error = heading_error(np.full(2, difference), np.zeros(2), np.full(2, label))
+    np.testing.assert_allclose(error, [expected] * 2, atol=1e-9)
 
 
 def test_nearest_of_class():
@@ -60,35 +62,21 @@ def test_nearest_of_class():
     assert found.tolist() == [5.0, np.inf]
 
 
-def frame(found, scores, truth):
-    zeros = np.zeros
-    return FrameResult(
-        np.array(found).reshape(-1, 9),
-        zeros(len(found), int),
-        np.array(scores),
-        np.array(truth).reshape(-1, 9),
-        zeros(len(truth), int),
-    )
+def test_pairs_are_those_of_a_double_loop(monkeypatch):
+    monkeypatch.setattr("fcos_lidar_jax.evaluation.matching._BLOCK", 50)  # many blocks
+    rng = np.random.default_rng(0)
+    group, true_group = rng.integers(0, 6, 90), rng.integers(0, 6, 40)
+    # On a grid, so that distances are equal and at the limit.
+    centres, true_centres = (rng.integers(0, 6, (n, 2)).astype(float) for n in (90, 40))
+    pairs = candidate_pairs(group, centres, true_group, true_centres, max_distance_m=3.0)
+    expected = []
+    for d in range(90):
+        near = [(np.hypot(*(centres[d] - true_centres[t])), t) for t in range(40) if group[d] == true_group[t]]
+        expected += [(d, t, distance) for distance, t in sorted(near) if distance < 3]
+    assert list(zip(pairs.detection.tolist(), pairs.truth.tolist(), strict=True)) == [e[:2] for e in expected]
+    np.testing.assert_allclose(pairs.distance_m, [e[2] for e in expected])
 
 
-def test_average_precision_by_hand():
-    truth = [box(0, 0), box(20, 0)]
-    assert average_precision([frame([box(0, 0), box(20, 0)], [0.9, 0.8], truth)], 0, 2.0) == pytest.approx(1)
-    # One of two found: precision 1 up to recall 0.5, nothing beyond.
-    assert average_precision([frame([box(0, 0)], [0.9], truth)], 0, 2.0) == pytest.approx(0.4 / 0.9)
-    # A false positive ranked first: precision is recall / 2; above 0.1 it counts, at 11..100 %.
-    first_false = frame([box(50, 0), box(0, 0)], [0.9, 0.8], [box(0, 0)])
-    assert average_precision([first_false], 0, 2.0) == pytest.approx(
-        sum(max(r / 200 - 0.1, 0) for r in range(11, 101)) / 90 / 0.9
-    )
-    assert average_precision([frame([], [], truth)], 0, 2.0) == 0
-    assert np.isnan(average_precision([frame([box(0, 0)], [0.9], [])], 0, 2.0))
-
-
-def test_average_precision_pools_frames_by_score():
-    """A false box of a low score in another frame costs less than one of a high score."""
-    good = frame([box(0, 0), box(20, 0)], [0.9, 0.5], [box(0, 0), box(20, 0)])
-    low, high = (frame([box(0, 0)], [score], []) for score in (0.1, 0.95))
-    # At recall 1 the curve ends in the false box: precision 2/3 for the last of 90 samples.
-    assert average_precision([good, low], 0, 2.0) == pytest.approx((89 * 0.9 + 2 / 3 - 0.1) / 90 / 0.9)
-    assert average_precision([good, high], 0, 2.0) < 0.8
+def test_greedy_leaves_a_detection_without_partner_when_all_near_it_are_taken():
+    pairs = Pairs(np.array([0, 1, 2, 2]), np.array([0, 0, 0, 2]), np.array([0.1, 0.1, 0.1, 0.2]))
+    assert greedy(pairs, 4, 3).tolist() == [0, -1, 2, -1]

@@ -1,1 +1,5 @@
 """How good detections are."""
+
+from fcos_lidar_jax.evaluation.summary import evaluate_detections
+
+__all__ = ["evaluate_detections"]

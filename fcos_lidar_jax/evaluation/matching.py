@@ -1,7 +1,6 @@
 """Detections against truth by centre distance in the ground plane."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,6 +11,93 @@ _HALF_TURN = CLASSES.index("barrier")
 """A barrier looks the same from both sides."""
 _NO_HEADING = CLASSES.index("traffic_cone")
 """A cone has no heading."""
+_BLOCK = 1 << 21
+"""Pairs whose distance is computed at once: bounds the memory."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pairs:
+    """Detections and truths that could match: by detection, then by distance, then by truth."""
+
+    detection: Int[np.ndarray, "p"]
+    """Index of the detection."""
+    truth: Int[np.ndarray, "p"]
+    """Index of the truth."""
+    distance_m: Float[np.ndarray, "p"]
+    """Distance of the centres in the ground plane."""
+
+    def nearer(self, limit_m: float) -> "Pairs":
+        """The pairs strictly nearer than a limit."""
+        near = self.distance_m < limit_m
+        return Pairs(self.detection[near], self.truth[near], self.distance_m[near])
+
+
+def candidate_pairs(
+    group: Int[np.ndarray, "d"],
+    centres: Float[np.ndarray, "d 2"],
+    true_group: Int[np.ndarray, "m"],
+    true_centres: Float[np.ndarray, "m 2"],
+    *,
+    max_distance_m: float,
+) -> Pairs:
+    """All pairs of one group that are strictly nearer than a distance.
+
+    Args:
+        group: of every detection, such as a number for every class in every sample.
+        centres: of the detections, metres.
+        true_group: of every truth.
+        true_centres: of the truths.
+        max_distance_m: limit.
+
+    >>> one = np.zeros(1, int)
+    >>> pairs = candidate_pairs(one, np.zeros((1, 2)), one, np.ones((1, 2)), max_distance_m=2)
+    >>> pairs.distance_m.round(3).tolist()
+    [1.414]
+    """
+    by_group = np.argsort(true_group, kind="stable")
+    grouped = true_group[by_group]
+    first = np.searchsorted(grouped, group)
+    count = np.searchsorted(grouped, group, "right") - first
+    ends = np.cumsum(count)
+    x, y, true_x, true_y = (np.ascontiguousarray(column) for c in (centres, true_centres) for column in c.T)
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
+    start = 0
+    while start < len(group):
+        before = int(ends[start - 1]) if start else 0
+        stop = max(start + 1, int(np.searchsorted(ends, before + _BLOCK, "right")))
+        detection = np.repeat(np.arange(start, stop), count[start:stop])
+        nth = np.arange(len(detection)) - np.repeat(
+            ends[start:stop] - count[start:stop] - before, count[start:stop]
+        )
+        truth = by_group[first[detection] + nth]
+        dx, dy = x[detection] - true_x[truth], y[detection] - true_y[truth]
+        distance = np.sqrt(dx * dx + dy * dy)
+        near = distance < max_distance_m
+        parts.append((detection[near], truth[near], distance[near]))
+        start = stop
+    detection, truth, distance = (np.concatenate(column) for column in zip(*parts, strict=True))
+    # Stable: of equal distances the first truth stays first.
+    order = np.lexsort((distance, detection))
+    return Pairs(detection[order], truth[order], distance[order])
+
+
+def greedy(pairs: Pairs, num_detections: int, num_truths: int) -> Int[np.ndarray, "d"]:
+    """The truth of every detection, -1 for none: in their order, each takes the nearest truth that is free.
+
+    Args:
+        pairs: that may match; detections in the order in which they choose.
+        num_detections: of all.
+        num_truths: of all.
+
+    >>> greedy(Pairs(np.array([0, 1, 1]), np.array([1, 1, 0]), np.array([0.2, 0.1, 0.3])), 2, 2).tolist()
+    [1, 0]
+    """
+    partner, taken = [-1] * num_detections, bytearray(num_truths)
+    for detection, truth in zip(pairs.detection.tolist(), pairs.truth.tolist(), strict=True):
+        if partner[detection] < 0 and not taken[truth]:
+            partner[detection] = truth
+            taken[truth] = 1
+    return np.array(partner, np.int64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,29 +105,29 @@ class Match:
     """One-to-one hits of one frame."""
 
     truth: Int[np.ndarray, "p"]
-    """Index of the truth of every hit."""
+    """Index of the truth of every hit, the best detection's first."""
     detection: Int[np.ndarray, "p"]
     """Index of its detection."""
     centre_error_m: Float[np.ndarray, "p"]
     """Distance of the centres in the ground plane."""
 
 
-def heading_error(predicted_rad: float, true_rad: Float[np.ndarray, "n"], label: int) -> Float[np.ndarray, "n"]:
-    """Absolute yaw difference of one prediction to truths: modulo pi for barriers, zero for cones.
+def heading_error(
+    predicted_rad: Float[np.ndarray, "n"], true_rad: Float[np.ndarray, "n"], label: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """Absolute yaw difference of predictions to truths, row by row: modulo pi for barriers, zero for cones.
 
     Args:
-        predicted_rad: yaw.
+        predicted_rad: yaws.
         true_rad: yaws.
-        label: class index of all.
+        label: class indices.
 
-    >>> heading_error(3.2, np.array([0.0]), CLASSES.index("barrier")).round(3).tolist()
+    >>> heading_error(np.array([3.2]), np.array([0.0]), np.array([CLASSES.index("barrier")])).round(3).tolist()
     [0.058]
     """
-    if label == _NO_HEADING:
-        return np.zeros(len(true_rad))
-    period = np.pi if label == _HALF_TURN else 2 * np.pi
-    difference = (predicted_rad - true_rad + period / 2) % period - period / 2
-    return np.abs(difference)
+    period = np.where(label == _HALF_TURN, np.pi, 2 * np.pi)
+    difference = np.abs((true_rad - predicted_rad + period / 2) % period - period / 2)
+    return np.where(label == _NO_HEADING, 0.0, difference)
 
 
 def match_frame(
@@ -70,20 +156,19 @@ def match_frame(
     >>> match_frame(one, car, np.array([0.9]), one, car, max_distance_m=0.5).truth.tolist()
     [0]
     """
-    free = np.ones(len(true_boxes), bool)
-    hits: list[tuple[int, int, float]] = []
-    for index in np.argsort(-scores, kind="stable"):
-        label = int(labels[index])
-        allowed = free & (true_labels == label)
-        allowed &= heading_error(float(boxes[index, 6]), true_boxes[:, 6], label) <= max_heading_error_rad
-        distance = np.hypot(*(true_boxes[:, :2] - boxes[index, :2]).T)
-        distance = np.where(allowed, distance, np.inf)
-        if len(distance) and distance.min() < max_distance_m:
-            nearest = int(distance.argmin())
-            free[nearest] = False
-            hits.append((nearest, int(index), float(distance[nearest])))
-    truth, detection, error = zip(*hits, strict=True) if hits else ((), (), ())
-    return Match(np.array(truth, int), np.array(detection, int), np.array(error, float))
+    order = np.argsort(-scores, kind="stable")
+    boxes, labels = boxes[order].astype(np.float64), labels[order]
+    true_boxes = true_boxes.astype(np.float64)
+    pairs = candidate_pairs(labels, boxes[:, :2], true_labels, true_boxes[:, :2], max_distance_m=max_distance_m)
+    turn = heading_error(boxes[pairs.detection, 6], true_boxes[pairs.truth, 6], labels[pairs.detection])
+    kept = turn <= max_heading_error_rad
+    partner = greedy(
+        Pairs(pairs.detection[kept], pairs.truth[kept], pairs.distance_m[kept]), len(boxes), len(true_boxes)
+    )
+    found = np.flatnonzero(partner >= 0)
+    truth = partner[found]
+    offset = boxes[found, :2] - true_boxes[truth, :2]
+    return Match(truth, order[found], np.sqrt((offset**2).sum(axis=1)))
 
 
 def nearest_of_class(
@@ -101,62 +186,3 @@ def nearest_of_class(
     distance = np.hypot(boxes[:, None, 0] - true_boxes[None, :, 0], boxes[:, None, 1] - true_boxes[None, :, 1])
     distance = np.where(labels[:, None] == true_labels, distance, np.inf)
     return distance.min(axis=1, initial=np.inf)
-
-
-@dataclasses.dataclass(frozen=True)
-class FrameResult:
-    """Detections and truth of one frame."""
-
-    boxes: Float[np.ndarray, "d 9"]
-    labels: Int[np.ndarray, "d"]
-    scores: Float[np.ndarray, "d"]
-    true_boxes: Float[np.ndarray, "m 9"]
-    true_labels: Int[np.ndarray, "m"]
-
-
-def average_precision(frames: Sequence[FrameResult], label: int, max_distance_m: float) -> float:
-    """Area under the precision-recall curve of one class over frames.
-
-    The rule of the nuScenes benchmark: precision at 101 recalls, where recall and precision below 0.1 count
-    nothing. Its official filters (class ranges, racks, points) are not applied.
-
-    Args:
-        frames: detections and truth.
-        label: class index.
-        max_distance_m: a hit is strictly nearer.
-
-    Returns:
-        within [0, 1]; NaN without truth.
-
-    >>> one = np.zeros((1, 9))
-    >>> frame = FrameResult(one, np.array([0]), np.array([0.9]), one, np.array([0]))
-    >>> round(average_precision([frame], 0, 2.0), 9)
-    1.0
-    """
-    scores, hits, num_truth = [], [], 0
-    for frame in frames:
-        mine = frame.labels == label
-        truth = frame.true_labels == label
-        num_truth += int(truth.sum())
-        match = match_frame(
-            frame.boxes[mine],
-            frame.labels[mine],
-            frame.scores[mine],
-            frame.true_boxes[truth],
-            frame.true_labels[truth],
-            max_distance_m=max_distance_m,
-        )
-        hit = np.zeros(mine.sum(), bool)
-        hit[match.detection] = True
-        scores.append(frame.scores[mine])
-        hits.append(hit)
-    if num_truth == 0:
-        return float("nan")
-    order = np.argsort(-np.concatenate(scores), kind="stable")
-    hit = np.concatenate(hits)[order]
-    if not hit.any():
-        return 0.0
-    found = np.cumsum(hit)
-    precision, recall = found / np.arange(1, len(hit) + 1), found / num_truth
-    sampled = np.interp(np.linspace(0, 1, 101), recall, precision, right=0)
-    return float(np.clip(sampled[11:] - 0.1, 0, None).mean() / 0.9)

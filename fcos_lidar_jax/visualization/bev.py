@@ -22,6 +22,7 @@ def draw_bev(
     detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     truth: tuple[np.ndarray, np.ndarray] | None = None,
     title: str | None = None,
+    global_axes: bool = False,
 ) -> None:
     """Draw a cloud from above, x right and y forward, higher points darker.
 
@@ -36,6 +37,7 @@ def draw_bev(
         detections: boxes f32[d, 9], labels i32[d], scores f32[d].
         truth: boxes f32[m, 9], labels i32[m].
         title: above the picture.
+        global_axes: x and y are the directions of the global frame and not the car's.
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
     axis = figure.add_subplot()
@@ -57,8 +59,8 @@ def draw_bev(
     axis.set_xlim(-limit_m, limit_m)
     axis.set_ylim(-limit_m, limit_m)
     axis.set_aspect("equal")
-    axis.set_xlabel("x [m], right")
-    axis.set_ylabel("y [m], forward")
+    axis.set_xlabel("x [m], global" if global_axes else "x [m], right")
+    axis.set_ylabel("y [m], global" if global_axes else "y [m], forward")
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
     if title:

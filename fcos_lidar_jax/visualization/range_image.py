@@ -20,7 +20,12 @@ _BOX = "#ff1f1f"
 
 
 def draw_range_image(
-    image: RangeImage, path: str | Path, *, title: str | None = None, boxes: np.ndarray | None = None
+    image: RangeImage,
+    path: str | Path,
+    *,
+    title: str | None = None,
+    boxes: np.ndarray | None = None,
+    detections: np.ndarray | None = None,
 ) -> None:
     """Draw the range of every round, and below the first round its intensity and time lag.
 
@@ -34,23 +39,31 @@ def draw_range_image(
         title: above the picture.
         boxes: f32[m, >= 7], metres, in the frame of the points; each is outlined in round 1 around the cells
             whose point lies in it, so a box without such a cell does not show.
+        detections: likewise, on a panel of their own below.
     """
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
-    panels = [(_RANGE, 0), (_INTENSITY, 0)]
+    panels: list[tuple[int, int, tuple[str, np.ndarray] | None]] = [
+        (_RANGE, 0, (kind, those))
+        for kind, those in (("boxes", boxes), ("detections", detections))
+        if those is not None
+    ]
+    panels = panels or [(_RANGE, 0, None)]
+    panels.append((_INTENSITY, 0, None))
     if features[:, :, _LAG].any():
-        panels.append((_LAG, 0))
-    panels += [(_RANGE, r) for r in range(1, rounds)]
+        panels.append((_LAG, 0, None))
+    panels += [(_RANGE, r, None) for r in range(1, rounds)]
     figure = new_figure(13, 1.5 * len(panels) + 0.6)
     if title:
         figure.suptitle(title, fontsize=12)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     ticks = np.unique(np.linspace(0, rows - 1, 5).round().astype(int))
     degrees = np.degrees(_row_inclinations(features))[ticks]
-    for axis, (channel, r) in zip(axes, panels, strict=True):
+    for axis, (channel, r, outlined) in zip(axes, panels, strict=True):
         name = _draw_channel(figure, axis, features, channel, r)
-        if r == 0 and channel == _RANGE and boxes is not None:
-            name += f"; {_outline(axis, features, boxes)} of {len(boxes)} boxes have a cell"
+        if outlined is not None:
+            kind, those = outlined
+            name += f"; {_outline(axis, features, those)} of {len(those)} {kind} have a cell"
         axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
         axis.set_ylabel("inclination", fontsize=9)
         axis.set_xlim(180, -180)

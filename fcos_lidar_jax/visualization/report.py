@@ -10,6 +10,8 @@ from fcos_lidar_jax.files import write_beside
 Cell = str | float | int
 Table = tuple[str, Sequence[str], Sequence[Sequence[Cell]]]
 """Caption, header, rows."""
+Picture = tuple[str, str | Path]
+"""Caption and PNG file."""
 
 _STYLE = """
 :root { color-scheme: light dark; }
@@ -24,6 +26,11 @@ thead th { border-bottom-width: 2px; font-weight: 600; }
 th:first-child, td:first-child { text-align: left; }
 figure { margin: 1.5rem 0; }
 img { display: block; max-width: 100%; height: auto; background: white; border-radius: .3rem; }
+.gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)); gap: 1rem; }
+.gallery figure { margin: 0; display: flex; flex-direction: column-reverse; justify-content: flex-end; }
+.wide { overflow-x: auto; }
+.wide img { max-width: none; width: max(100%, 50rem); }
+h2 { font-size: 1.2rem; margin: 2rem 0 .5rem; }
 figcaption { margin-top: .3rem; opacity: .8; font-size: .9rem; }
 """
 
@@ -35,7 +42,9 @@ def write_report(
     summary: Mapping[str, Cell],
     lead: str = "",
     tables: Sequence[Table] = (),
-    pictures: Sequence[tuple[str, str | Path]] = (),
+    galleries: Sequence[tuple[str, Sequence[Picture]]] = (),
+    pictures: Sequence[Picture] = (),
+    wide_pictures: Sequence[Picture] = (),
 ) -> None:
     """Write a self-contained report: one file, no outside address, light or dark as the reader's system is.
 
@@ -45,7 +54,9 @@ def write_report(
         summary: named values; of all numbers, those with a point are shown with three decimals, NaN as a dash.
         lead: one paragraph below the heading.
         tables: caption, header and rows each; the first column names the row.
+        galleries: heading and small pictures each, as many side by side as there is room for.
         pictures: caption and PNG each, curves too; the files are embedded.
+        wide_pictures: more of them, which a narrow screen scrolls sideways instead of shrinking.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "report.html"
@@ -58,12 +69,11 @@ def write_report(
         parts.append(f"<p>{_text(lead)}</p>")
     parts.append(_table("Summary", ("", "value"), list(summary.items())))
     parts += [_table(*table) for table in tables]
-    for caption, file in pictures:
-        data = base64.b64encode(Path(file).read_bytes()).decode("ascii")
-        parts.append(
-            f'<figure><img alt="{_text(caption)}" src="data:image/png;base64,{data}">'
-            f"<figcaption>{_text(caption)}</figcaption></figure>"
-        )
+    for heading, shown in galleries:
+        figures = "".join(_figure(*picture) for picture in shown)
+        parts.append(f'<h2>{_text(heading)}</h2><div class="gallery">{figures}</div>')
+    parts += [_figure(*picture) for picture in pictures]
+    parts += [_figure(*picture, wide=True) for picture in wide_pictures]
     page = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -76,6 +86,14 @@ def _text(value: Cell) -> str:
     if isinstance(value, float):
         return "–" if value != value else f"{value:.3f}"
     return html.escape(str(value))
+
+
+def _figure(caption: str, file: str | Path, *, wide: bool = False) -> str:
+    data = base64.b64encode(Path(file).read_bytes()).decode("ascii")
+    image = f'<img alt="{_text(caption)}" src="data:image/png;base64,{data}">'
+    if wide:
+        image = f'<div class="wide">{image}</div>'
+    return f"<figure>{image}<figcaption>{_text(caption)}</figcaption></figure>"
 
 
 def _table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
