@@ -30,9 +30,9 @@ import tyro
 
 from fcos_lidar_jax.assignment import assign
 from fcos_lidar_jax.coding import decode_oriented
-from fcos_lidar_jax.commands.demo import without_close
 from fcos_lidar_jax.config import NUSCENES, PRESETS
 from fcos_lidar_jax.data.batching import make_batch
+from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.files import write_beside
@@ -49,7 +49,7 @@ from fcos_lidar_jax.models.modality import Stem
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
-from fcos_lidar_jax.training.step import location_owners, sample_losses
+from fcos_lidar_jax.training.objective import location_owners, sample_losses
 
 _PEER = """
 import json, os, runpy, sys, time
@@ -128,7 +128,7 @@ def stages(args: Args) -> dict[str, Any]:
     model, layout = config.model, image_layout(sensor, config.model)
     folder = args.data or os.environ.get("FCOS_LIDAR_REAL_DATA")
     frame = read_keyframe(Path(folder) / "nuscenes_scene0061", sensor) if folder else make_frame(0, sensor)
-    frame = without_close(frame, config, sensor)
+    frame = without_close(frame, sensor)
     batch = jax.tree.map(
         jnp.asarray, make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes)
     )

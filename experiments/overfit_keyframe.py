@@ -26,12 +26,12 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.assignment import owners
-from fcos_lidar_jax.commands.demo import without_close
 from fcos_lidar_jax.commands.detect import confident
 from fcos_lidar_jax.config import QUICKSTART, Config
 from fcos_lidar_jax.data.batching import make_batch
-from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.frame import Frame, without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
+from fcos_lidar_jax.data.pipeline import HostBatch
 from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.evaluation.matching import match_frame, nearest_of_class
 from fcos_lidar_jax.files import write_beside
@@ -40,6 +40,7 @@ from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.training import fit, make_optimizer, make_state, make_train_step
+from fcos_lidar_jax.training.loop import Record
 from fcos_lidar_jax.types import CLASSES
 from fcos_lidar_jax.visualization.bev import draw_bev
 from fcos_lidar_jax.visualization.curves import draw_curves
@@ -105,7 +106,14 @@ def run(frame: Frame, seed: int, args: Args, config: Config = CONFIG) -> dict[st
     optimizer = make_optimizer(config.optimizer, args.steps)
     step = jax.jit(make_train_step(detector, config, sensor, optimizer), donate_argnums=0)
     batch = make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes)
-    state, records = fit(step, make_state(variables, optimizer, key), [batch] * args.steps, num_steps=args.steps)
+    records: list[Record] = []
+    state = fit(
+        step,
+        make_state(variables, optimizer, key),
+        [HostBatch(batch, i, {}, ("the keyframe",)) for i in range(args.steps)],
+        num_steps=args.steps,
+        report=lambda _, record: records.append(record),
+    )
     detect = jax.jit(make_detect(detector, config, sensor))
     found = detect({"params": state.params, "batch_stats": state.batch_stats}, batch.points[0], batch.valid[0])
     minutes = (time.monotonic() - started) / 60
@@ -162,11 +170,10 @@ def main(args: Args) -> None:
         folder = args.data or os.environ.get("FCOS_LIDAR_REAL_DATA")
         if not folder:
             sys.exit("error: --data: missing, expected the folder that holds nuscenes_scene0061/")
-        frame = without_close(
-            read_keyframe(Path(folder) / "nuscenes_scene0061", NUSCENES_HDL32E), CONFIG, NUSCENES_HDL32E
-        )
+        frame = read_keyframe(Path(folder) / "nuscenes_scene0061", NUSCENES_HDL32E)
     else:
-        frame = without_close(make_frame(0, NUSCENES_HDL32E), CONFIG, NUSCENES_HDL32E)
+        frame = make_frame(0, NUSCENES_HDL32E)
+    frame = without_close(frame, NUSCENES_HDL32E)
     args.out.mkdir(parents=True, exist_ok=True)
     counted = frame.labels[owned_cells(frame) >= MIN_CELLS]
     names, counts = np.unique(counted, return_counts=True)

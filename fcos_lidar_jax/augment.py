@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float32, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float32, Int, PRNGKeyArray, UInt32
 
 from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.geometry import wrap_angle
@@ -97,10 +97,14 @@ def augment(
             flipped = flip(points, boxes)
             points, boxes = (jnp.where(drawn, a, b) for a, b in zip(flipped, (points, boxes), strict=True))
         reach = config.max_rotation_rad
-        points, boxes = rotate(points, boxes, jax.random.uniform(keys[2], minval=-reach, maxval=reach))
+        points, boxes = rotate(points, boxes, _draw(keys[2], -reach, reach))
         low, high = config.scale_range
-        points, boxes = scale(points, boxes, jax.random.uniform(keys[3], minval=low, maxval=high))
+        points, boxes = scale(points, boxes, _draw(keys[3], low, high))
         return points.at[:, :3].add(origin), boxes.at[:, :3].add(origin)
+
+
+def _draw(key: Key, low: float, high: float) -> Float32[Array, ""]:
+    return jax.random.uniform(key, (), jnp.float32, low, high)
 
 
 def sample_key(key: Key, step: Int[Array, ""], index: Int[Array, ""]) -> Key:
@@ -111,14 +115,3 @@ def sample_key(key: Key, step: Int[Array, ""], index: Int[Array, ""]) -> Key:
     False
     """
     return jax.random.fold_in(jax.random.fold_in(key, step), index)
-
-
-def copy_paste_active(
-    step: Int[Array, ""], *, steps_per_epoch: int, epochs: int, fade_epochs: int
-) -> Bool[Array, ""]:
-    """Whether objects are pasted at a step: not in the last ``fade_epochs`` (paper, section 4.5).
-
-    >>> [bool(copy_paste_active(jnp.int32(s), steps_per_epoch=10, epochs=3, fade_epochs=1)) for s in (19, 20)]
-    [True, False]
-    """
-    return step < steps_per_epoch * (epochs - fade_epochs)

@@ -2,19 +2,28 @@
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any
 
 import tyro
 
-from fcos_lidar_jax.commands import demo, detect, project
+from fcos_lidar_jax.commands import demo, detect, evaluate, prepare, project, synthesize, train
 
 _DESCRIPTION = "FCOS-LiDAR in JAX: 3D object detection on LiDAR range images."
 
-Command = (
-    Annotated[demo.Demo, tyro.conf.subcommand("demo")]
-    | Annotated[detect.Detect, tyro.conf.subcommand("detect")]
-    | Annotated[project.Project, tyro.conf.subcommand("project")]
-)
+_COMMANDS = {
+    "demo": (demo.Demo, demo.run),
+    "synthesize": (synthesize.Synthesize, synthesize.run),
+    "prepare": (prepare.Prepare, prepare.run),
+    "train": (train.Train, train.run),
+    "evaluate": (evaluate.Evaluate, evaluate.run),
+    "detect": (detect.Detect, detect.run),
+    "project": (project.Project, project.run),
+}
+"""Name -> its options and what it does."""
+
+Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _) in _COMMANDS.items()))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,14 +36,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         exit code: 0, 1 after a failure that one line on standard error explains, 130 when interrupted. Usage
         errors leave with 2.
     """
-    command = tyro.cli(Command, prog="fcos-lidar", description=_DESCRIPTION, args=argv)  # type: ignore[call-overload]
+    command = tyro.cli(
+        Command,
+        prog="fcos-lidar",
+        description=_DESCRIPTION,
+        args=argv,
+        config=(tyro.conf.CascadeSubcommandArgs,),  # a command's options may stand behind its preset
+    )  # type: ignore[call-overload]
     try:
-        if isinstance(command, demo.Demo):
-            demo.run(command)
-        elif isinstance(command, detect.Detect):
-            detect.run(command)
-        else:
-            project.run(command)
+        next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))(command)
     except (ValueError, OSError, ArithmeticError) as error:
         line = " ".join(str(error).split())
         print(f"fcos-lidar: error: {line}", file=sys.stderr)

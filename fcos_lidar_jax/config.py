@@ -93,6 +93,9 @@ class ModelConfig:
     """Foreground classes; the logits have one more, the background, last."""
     stem: StemConfig = StemConfig()
     """Modality-wise convolutions."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the convolutions behind the first layer; geometry, statistics, predictions, assignment and losses are
+    float32 in any case."""
     row_upscale: int = 2
     """Rows are repeated this many times (paper, section 4)."""
     circular_width: bool = False
@@ -137,6 +140,7 @@ class ModelConfig:
             self.channel_scale,
             "nine positive numbers",
         )
+        _check_choices(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,6 +229,22 @@ class AugmentConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CopyPasteConfig:
+    """Objects of other frames pasted into a training frame (paper, section 4, after SECOND)."""
+
+    targets: tuple[int, ...] = (2, 3, 4, 6, 7, 2, 6, 6, 2, 2)
+    """Reading: boxes of each class, in the order of ``types.CLASSES``, that a frame is filled up to, those present
+    included."""
+    min_points: int = 5
+    """Points an object needs, counted over the sweeps that are pasted."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot run."""
+        _check(min(self.targets, default=0) >= 0, "targets", self.targets, "counts of at least 0")
+        _check(self.min_points >= 1, "min_points", self.min_points, "at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
     """One-cycle AdamW (paper, section 4)."""
 
@@ -246,6 +266,10 @@ class OptimizerConfig:
     """Reading: global-norm clipping."""
     batch_size: int = 32
     """Reading: samples a step over all devices."""
+    accumulate: int = 1
+    """Micro-batches a step; gradients and counts are summed and divided once, batch norm sees a micro-batch."""
+    ema_decay: float = 0.0
+    """Decay of the running mean of the weights, which detection then uses; 0 for none (paper)."""
     epochs: int = 40
     """Passes over the training set."""
 
@@ -256,6 +280,9 @@ class OptimizerConfig:
         _check(self.max_gradient_norm > 0, "max_gradient_norm", self.max_gradient_norm, "above 0")
         _check(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
         _check(self.epochs >= 1, "epochs", self.epochs, "at least 1")
+        divides = self.accumulate >= 1 and self.batch_size % self.accumulate == 0
+        _check(divides, "accumulate", self.accumulate, f"a divisor of the batch size {self.batch_size}")
+        _check(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "within [0, 1)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -279,8 +306,11 @@ class Config:
     max_boxes: int = 256
     """Reading: rows the ground truth is padded to."""
     fade_epochs: int = 0
-    """Last epochs without copy-paste (paper, section 4.5: 5 for the test set); see
-    :func:`fcos_lidar_jax.augment.copy_paste_active`."""
+    """Last epochs without copy-paste (paper, section 4.5: 5 for the test set)."""
+    copy_paste: CopyPasteConfig | None = CopyPasteConfig()
+    """Copy-paste from the object database; None for none."""
+    class_balanced: bool = True
+    """Reading: frames are resampled so that every class is drawn for equally often (CBGS)."""
     projection: ProjectionConfig = ProjectionConfig()
     """Points to range image."""
     model: ModelConfig = ModelConfig()
@@ -300,6 +330,9 @@ class Config:
         _check(self.max_points >= 1, "max_points", self.max_points, "at least 1")
         _check(self.max_boxes >= 1, "max_boxes", self.max_boxes, "at least 1")
         _check(self.fade_epochs >= 0, "fade_epochs", self.fade_epochs, "at least 0")
+        if self.copy_paste is not None:
+            targets, classes = self.copy_paste.targets, self.model.num_classes
+            _check(len(targets) == classes, "copy_paste.targets", targets, f"{classes} counts, one a class")
 
 
 NUSCENES = Config()
@@ -323,6 +356,7 @@ QUICKSTART = dataclasses.replace(
     num_sweeps=1,
     max_points=4096,
     max_boxes=32,
+    copy_paste=CopyPasteConfig(targets=(2, 1, 1, 1, 1, 2, 1, 1, 1, 1)),
     projection=ProjectionConfig(num_rounds=1),
     model=dataclasses.replace(
         NUSCENES.model,

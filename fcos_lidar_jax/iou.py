@@ -163,7 +163,8 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
     >>> [float(v) for v in oriented_overlap(box, box, vertical=True)]
     [8.0, 8.0]
     """
-    a, b = jnp.broadcast_arrays(a, b)
+    common = jnp.promote_types(a.dtype, b.dtype)
+    a, b = jnp.broadcast_arrays(a.astype(common), b.astype(common))
     ax, ay, az, al, aw, ah, acos, asin = _columns(a)
     bx, by, bz, bl, bw, bh, bcos, bsin = _columns(b)
     # In the frame of a's centre the numbers stay small wherever the boxes are.

@@ -148,29 +148,38 @@ def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], m
     return _masked(jax.nn.softplus(logits) - iou * logits, mask)
 
 
-def combine(parts: Mapping[str, SumCount], num_positive: Int32[Array, ""], config: LossConfig) -> dict[str, Array]:
+def loss_weights(config: LossConfig) -> dict[str, float]:
+    """Weight of each part of the loss by name.
+
+    >>> loss_weights(LossConfig())
+    {'classification': 1.0, 'l1': 0.25, 'iou': 1.0, 'iou_prediction': 1.0}
+    """
+    return {
+        "classification": config.classification_weight,
+        "l1": config.l1_weight,
+        "iou": config.iou_weight,
+        "iou_prediction": config.iou_prediction_weight,
+    }
+
+
+def combine(
+    sums: Mapping[str, Float[Array, ""]], num_positive: Int32[Array, ""], config: LossConfig
+) -> dict[str, Array]:
     """The weighted total and its parts, each sum divided once by the positives of the global batch.
 
     Args:
-        parts: ``classification``, ``l1``, ``iou`` and ``iou_prediction``, summed over the global batch.
+        sums: ``classification``, ``l1``, ``iou`` and ``iou_prediction``, over the global batch.
         num_positive: positives of the global batch; at least one is assumed in the division.
         config: the weights.
 
     Returns:
         the divided parts, unweighted, and ``total``.
 
-    >>> one = (jnp.float32(3), jnp.int32(1))
-    >>> parts = {"classification": one, "l1": one, "iou": one, "iou_prediction": one}
-    >>> float(combine(parts, jnp.int32(3), LossConfig())["total"])
+    >>> sums = {part: jnp.float32(3) for part in loss_weights(LossConfig())}
+    >>> float(combine(sums, jnp.int32(3), LossConfig())["total"])
     3.25
     """
-    scale = 1 / jnp.maximum(num_positive, 1).astype(jnp.float32)
-    weights = {
-        "classification": config.classification_weight,
-        "l1": config.l1_weight,
-        "iou": config.iou_weight,
-        "iou_prediction": config.iou_prediction_weight,
-    }
-    divided = {name: parts[name][0] * scale for name in weights}
+    weights = loss_weights(config)
+    divided = {name: sums[name] / jnp.maximum(num_positive, 1) for name in weights}
     weighted = [weight * divided[name] for name, weight in weights.items()]
     return {**divided, "total": sum(weighted[1:], weighted[0])}

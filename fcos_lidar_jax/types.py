@@ -134,5 +134,7 @@ class TrainState:
     """Running means and variances of the network's batch norms."""
     opt_state: Any
     """State of the optax optimizer."""
+    ema: Any
+    """Running mean of ``params``, or None."""
     key: Any
     """The run's random key; every draw is ``fold_in(key, step)``, so a resumed run repeats itself."""

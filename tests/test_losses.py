@@ -117,7 +117,7 @@ def test_parts_are_divided_once_and_weighed():
         classification_weight=1, l1_weight=0.25, iou_weight=2, iou_prediction_weight=0.5, velocity_weight=0.2
     )
     names = ("classification", "l1", "iou", "iou_prediction")
-    parts = {n: (f32(v), jnp.int32(99)) for n, v in zip(names, (8.0, 4.0, 2.0, 6.0), strict=True)}
+    parts = {n: f32(v) for n, v in zip(names, (8.0, 4.0, 2.0, 6.0), strict=True)}
     assert float(combine(parts, jnp.int32(4), config)["total"]) == (8 + 1 + 4 + 3) / 4
     assert float(combine(parts, jnp.int32(4), config)["l1"]) == 1.0
     assert float(combine(parts, jnp.int32(0), config)["total"]) == 16

@@ -60,10 +60,10 @@ def expect_points(file: Path, cloud: Cloud, num_dropped: int, sensor: Sensor) ->
     """
     if cloud.num_points - cloud.num_close > num_dropped:
         return
-    finite = int(np.isfinite(cloud.points[: cloud.num_points]).all(axis=1).sum())
+    broken = int((~np.isfinite(cloud.points)).any(axis=1).sum())
     low, high = sensor.limit_z_m
     raise EmptyCloudError(
-        f"{file}: none of its {cloud.num_points} points is usable ({cloud.num_points - finite} not finite, "
+        f"{file}: none of its {cloud.num_points} points is usable ({broken} not finite, "
         f"{cloud.num_close} on the vehicle itself, the others out of range or view), expected some with "
         f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m in the field of view of {sensor.name}"
     )

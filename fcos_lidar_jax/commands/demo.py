@@ -4,54 +4,47 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from fcos_lidar_jax.commands.clouds import make_cloud
 from fcos_lidar_jax.commands.detect import as_records, confident
-from fcos_lidar_jax.config import QUICKSTART, Config
-from fcos_lidar_jax.data.batching import make_batch
-from fcos_lidar_jax.data.frame import Frame
-from fcos_lidar_jax.data.synthetic.frames import make_frame
-from fcos_lidar_jax.evaluation.matching import FrameResult, average_precision
+from fcos_lidar_jax.commands.runs import Plan, Rhythm, Run
+from fcos_lidar_jax.config import QUICKSTART
+from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.data.pipeline import make_batches
+from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
+from fcos_lidar_jax.evaluation.frames import evaluate_frames
+from fcos_lidar_jax.evaluation.metrics import DISTANCES_M
 from fcos_lidar_jax.files import write_beside
-from fcos_lidar_jax.inference import make_detect
-from fcos_lidar_jax.models import Variables, build_detector
-from fcos_lidar_jax.projection import project_points, remove_close
-from fcos_lidar_jax.sensors import Sensor, load_sensor
-from fcos_lidar_jax.training import (
-    Checkpoint,
-    fit,
-    load_checkpoint,
-    make_optimizer,
-    make_state,
-    make_train_step,
-    save_checkpoint,
-)
-from fcos_lidar_jax.training.loop import Record
-from fcos_lidar_jax.types import CLASSES, Batch, Detections, TrainState
+from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.training import load_checkpoint
+from fcos_lidar_jax.training.records import read_records
+from fcos_lidar_jax.training.snapshots import CHECKPOINTS, Snapshots
+from fcos_lidar_jax.types import CLASSES, Detections
 from fcos_lidar_jax.visualization.bev import draw_bev
-from fcos_lidar_jax.visualization.curves import draw_curves
 from fcos_lidar_jax.visualization.range_image import draw_range_image
 from fcos_lidar_jax.visualization.report import write_report
 
 _UNSEEN = 1_000_000
 """Seeds of the test frames start here; training frames never get that far."""
-_THRESHOLDS_M = (0.5, 1.0, 2.0, 4.0)
 _SHOWN_SCORE = 0.2
 """Pictures show detections from here on: after a few minutes of training the scores are still low."""
+_FRAMES_ALONG = 10
+"""Test frames of the evaluations during training."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
     """Train the quickstart detector on simulated LiDAR frames and look at what it finds on unseen ones.
 
-    Needs no data and no GPU. Writes a checkpoint, metrics.json, pictures, report.html, and the unseen clouds with
-    their boxes, which `fcos-lidar detect` reads. Ctrl-C ends the training early and evaluates what there is.
+    Needs no data and no GPU. Writes a run with checkpoints, metrics.json, pictures, report.html, and the unseen
+    clouds with their boxes, which `fcos-lidar detect` reads. Ctrl-C ends the training early and evaluates what
+    there is; the same command goes on where it was stopped.
     """
 
     out: Path = Path("demo_output")
@@ -71,110 +64,89 @@ def run(args: Demo) -> None:
             raise ValueError(f"--{name.replace('_', '-')}: got {getattr(args, name)}, expected at least 1")
     if args.out.exists() and not args.out.is_dir():
         raise ValueError(f"--out: {args.out}: found a file, expected a folder")
-    args.out.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
-    config, sensor = QUICKSTART, load_sensor(QUICKSTART.sensor)
-    tests = [without_close(make_frame(_UNSEEN + i, sensor), config, sensor) for i in range(args.test_frames)]
-    untrained = build_detector(config, sensor).init(jax.random.key(args.seed))
-    state, records = _train(args, config, sensor, untrained)
-    variables = {"params": state.params, "batch_stats": state.batch_stats}
-    save_checkpoint(args.out / "checkpoint", Checkpoint(config, sensor, variables, int(state.step)))
+    training = _make_run(args)
+    tests = SimulatedFrames(training.plan.sensor, args.test_frames, _UNSEEN)
+    untrained = training.detector.init(jax.random.key(args.seed))
+    _train(args, training)
     # What is evaluated is what a user would load.
-    loaded = load_checkpoint(args.out / "checkpoint")
-    detect = jax.jit(make_detect(build_detector(config, sensor), config, sensor))
-
-    def results_of(weights: Variables) -> tuple[list[Detections], list[FrameResult]]:
-        return _detect_all(detect, weights, tests, config, sensor)
-
-    _, before = results_of(untrained)
-    found, after = results_of(loaded.variables)
-    metrics = {"before": summarise(before), "after": summarise(after)}
-    metrics["training"] = {
-        "steps": int(state.step),
-        "frames_seen": int(state.step) * config.optimizer.batch_size,
-        "minutes": round((time.monotonic() - began) / 60, 2),
-        "final_loss": records[-1]["loss/total"],
+    checkpoint = load_checkpoint(Snapshots(training.folder / CHECKPOINTS).paths()[-1])
+    frames = [tests.frame(i) for i in range(len(tests))]
+    print(f"evaluating on {len(frames)} unseen frames", file=sys.stderr)
+    found = [training.detections(checkpoint.variables, frame) for frame in frames]
+    before = [training.detections(untrained, frame) for frame in frames]
+    records = read_records(training.folder)
+    losses = [record["loss/total"] for record in records if "loss/total" in record]
+    metrics = {
+        "before": summarise(before, frames),
+        "after": summarise(found, frames),
+        "training": {
+            "steps": checkpoint.step,
+            "frames_seen": checkpoint.step * checkpoint.config.optimizer.batch_size,
+            "minutes": round((time.monotonic() - began) / 60, 2),
+            "final_loss": losses[-1],
+            "curve": [[r["step"], r["test/mAP"]] for r in records if "test/mAP" in r],
+        },
     }
     write_beside(args.out / "metrics.json", lambda p: p.write_text(json.dumps(_without_nan(metrics), indent=1)))
-    pictures = _pictures(args.out, tests, found, records, sensor)
-    _save_frames(args.out / "unseen", tests, found)
+    pictures = _pictures(args.out, frames, found, training)
+    _save_frames(args.out / "unseen", frames, found)
     _report(args, metrics, pictures)
     after_map, before_map = metrics["after"]["mAP"], metrics["before"]["mAP"]
     print(
         f"mAP on {args.test_frames} unseen frames: {after_map:.3f} (untrained {before_map:.3f}), "
         f"{metrics['training']['minutes']} minutes\n"
         f"look at {args.out / 'report.html'}, or detect by yourself:\n"
-        f"  fcos-lidar detect {args.out / 'unseen' / 'frame_000.npy'} --checkpoint {args.out / 'checkpoint'} "
+        f"  fcos-lidar detect {args.out / 'unseen' / 'frame_000.npy'} --checkpoint {training.folder} "
         f"--out boxes.json --pictures {args.out / 'detected'}"
     )
 
 
-def without_close(frame: Frame, config: Config, sensor: Sensor) -> Frame:
-    """The frame without the points on the vehicle, as the detector is trained."""
-    projection = config.projection
-    everything = np.ones(len(frame.points), bool)
-    kept = remove_close(frame.points, everything, sensor, mode=projection.remove_close, close_m=projection.close_m)
-    return dataclasses.replace(frame, points=frame.points[np.asarray(kept)])
+def _make_run(args: Demo) -> Run:
+    # Every frame is a new street with all classes: nothing to resample, nothing to paste.
+    config = dataclasses.replace(QUICKSTART, copy_paste=None, class_balanced=False)
+    sensor = load_sensor(config.sensor)
+    plan = Plan(config, sensor, args.steps, args.seed, {"simulated": args.steps * config.optimizer.batch_size})
+    along = SimulatedFrames(sensor, min(_FRAMES_ALONG, args.test_frames), _UNSEEN)
+    every = -(-args.steps // 6)
+    return Run(args.out / "run", plan, Rhythm(save_every=every, evaluate_every=every), along)
 
 
-def _batches(args: Demo, config: Config, sensor: Sensor) -> Iterator[Batch]:
-    """Training batches without end; the frames of a step depend on the seed and the step alone."""
-    size = config.optimizer.batch_size
-    first = args.seed * args.steps * size % _UNSEEN
-    for step in range(args.steps):
-        seeds = [(first + step * size + i) % _UNSEEN for i in range(size)]
-        frames = [without_close(make_frame(seed, sensor), config, sensor) for seed in seeds]
-        yield make_batch(frames, max_points=config.max_points, max_boxes=config.max_boxes)
+def _train(args: Demo, training: Run) -> None:
+    plan = training.plan
+    number = plan.num_steps * plan.config.optimizer.batch_size
+    frames: FrameSet = SimulatedFrames(plan.sensor, number, args.seed * number % _UNSEEN)
 
-
-def _train(args: Demo, config: Config, sensor: Sensor, variables: Variables) -> tuple[TrainState, list[Record]]:
-    optimizer = make_optimizer(config.optimizer, args.steps)
-    detector = build_detector(config, sensor)
-    step = jax.jit(make_train_step(detector, config, sensor, optimizer))
-    latest: list[TrainState] = []
-    records: list[Record] = []
-
-    def keep(_: int, state: TrainState, record: Record) -> None:
-        latest[:] = [state]
-        records.append(record)
-
-    print(f"training on {args.steps * config.optimizer.batch_size} simulated frames", file=sys.stderr)
-    start = make_state(variables, optimizer, jax.random.key(args.seed))
-    try:
-        fit(step, start, _batches(args, config, sensor), num_steps=args.steps, report=keep)
-    except KeyboardInterrupt:
-        if not latest:
-            raise
-        print(f"stopped after step {int(latest[0].step)}, evaluating", file=sys.stderr)
-    return latest[0], records
-
-
-def _detect_all(
-    detect: Any, variables: Variables, frames: list[Frame], config: Config, sensor: Sensor
-) -> tuple[list[Detections], list[FrameResult]]:
-    found, results = [], []
-    for frame in frames:
-        cloud = make_cloud(frame.points, sensor, size=config.max_points, remove="none")
-        d = jax.tree.map(np.asarray, detect(variables, cloud.points, cloud.valid))
-        found.append(d)
-        results.append(
-            FrameResult(d.boxes[d.valid], d.labels[d.valid], d.scores[d.valid], frame.boxes, frame.labels)
+    def feed(first_step: int) -> AbstractContextManager[Any]:
+        return make_batches(
+            frames, plan.config, seed=args.seed, num_steps=plan.num_steps, first_step=first_step, threads=1
         )
-    return found, results
+
+    print(f"training on {number} simulated frames", file=sys.stderr)
+    try:
+        training.train(feed, resume=(training.folder / "run.json").exists())
+    except KeyboardInterrupt:
+        if not training.snapshots.paths():
+            raise
+        print("evaluating what there is", file=sys.stderr)
 
 
-def summarise(frames: list[FrameResult]) -> dict[str, Any]:
+def summarise(found: list[Detections], frames: list[Frame]) -> dict[str, Any]:
     """Average precision by class and distance, and their mean over the classes that occur.
 
     Args:
-        frames: detections and truth.
+        found: detections in every frame.
+        frames: the truth.
     """
-    by_class = {
-        name: {f"{t:g}": average_precision(frames, label, t) for t in _THRESHOLDS_M}
-        for label, name in enumerate(CLASSES)
-    }
-    present = [np.mean(list(aps.values())) for aps in by_class.values() if not np.isnan(list(aps.values())).any()]
-    return {"mAP": float(np.mean(present)) if present else float("nan"), "AP": by_class}
+    evaluation = evaluate_frames(found, frames)
+    by_class: dict[str, dict[str, float]] = {}
+    for name, ranking in zip(CLASSES, evaluation.rankings, strict=True):
+        occurs = len(ranking.truth_sample) > 0
+        aps = evaluation.summary["label_aps"][name]
+        by_class[name] = {f"{d:g}": aps[str(d)] if occurs else float("nan") for d in DISTANCES_M}
+    means = np.array([np.mean(list(aps.values())) for aps in by_class.values()])
+    present = means[~np.isnan(means)]
+    return {"mAP": float(present.mean()) if len(present) else float("nan"), "AP": by_class}
 
 
 def _without_nan(value: Any) -> Any:
@@ -184,10 +156,8 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and np.isnan(value) else value
 
 
-def _pictures(
-    out: Path, frames: list[Frame], found: list[Detections], records: list[Record], sensor: Sensor
-) -> list[tuple[str, Path]]:
-    pictures = []
+def _pictures(out: Path, frames: list[Frame], found: list[Detections], training: Run) -> list[tuple[str, Path]]:
+    pictures, sensor = [], training.plan.sensor
     for i, (frame, d) in enumerate(list(zip(frames, found, strict=True))[:3]):
         path = out / f"bev_{i}.png"
         draw_bev(
@@ -203,11 +173,9 @@ def _pictures(
     image = project_points(frames[0].points, np.ones(len(frames[0].points), bool), sensor, num_rounds=1)
     draw_range_image(image, path, title="unseen frame 0 as the network sees it")
     pictures.append(("The range image of unseen frame 0.", path))
-    parts = ("total", "classification", "l1", "iou", "iou_prediction")
-    series = {p: [(i + 1.0, float(r[f"loss/{p}"])) for i, r in enumerate(records)] for p in parts}  # type: ignore[arg-type]
-    path = out / "loss.png"
-    draw_curves(path, series, x_label="step", y_label="loss", title="training", log_y=True)
-    pictures.append(("The parts of the loss through the training.", path))
+    pictures.append(("The parts of the loss through the training.", training.folder / "loss.png"))
+    few = f"{training.tests and len(training.tests)} of the unseen frames"
+    pictures.append((f"Scores through the training, on {few}.", training.folder / "scores.png"))
     return pictures
 
 
@@ -253,7 +221,7 @@ def _report(args: Demo, metrics: dict[str, Any], pictures: list[tuple[str, Path]
         tables=[
             (
                 "Average precision by class and matching distance",
-                ("class", *(f"{t:g} m" for t in _THRESHOLDS_M), "untrained, mean"),
+                ("class", *(f"{t:g} m" for t in DISTANCES_M), "untrained, mean"),
                 rows,
             )
         ],

@@ -18,6 +18,7 @@ from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.training import Checkpoint, load_checkpoint
+from fcos_lidar_jax.training.snapshots import find_checkpoint
 from fcos_lidar_jax.types import CLASSES, Detections
 
 
@@ -32,7 +33,7 @@ class Detect:
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE")]]
     """Point files, one cloud each: .pcd.bin, .bin, .npy, .npz or .pcd."""
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Trained detector."""
+    """Trained detector: a checkpoint, or a run, of which the best is taken."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Where the JSON goes."""
     sweeps: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
@@ -55,7 +56,7 @@ def run(args: Detect) -> None:
     """Do it."""
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected point files or --sweeps, one of the two")
-    checkpoint = load_checkpoint(args.checkpoint)
+    checkpoint = load_checkpoint(find_checkpoint(args.checkpoint))
     config, sensor = checkpoint.config, checkpoint.sensor
     detector = build_detector(config, sensor)
     detect = jax.jit(make_detect(detector, config, sensor))
@@ -95,10 +96,10 @@ def _read(args: Detect, file: Path, checkpoint: Checkpoint) -> Cloud:
     remove, close_m = args.remove_close or config.projection.remove_close, config.projection.close_m
     if args.sweeps is not None:
         # The sweeps' close points are dropped in their own frames, before the poses are applied.
-        points = read_sweeps(file, sensor, remove_close=remove, close_m=close_m)
-        remove = "none"
-    else:
-        points = read_points(file, sensor, columns=args.columns, dtype=args.dtype)
+        points, num_close = read_sweeps(file, sensor, remove_close=remove, close_m=close_m)
+        cloud = make_cloud(points, sensor, size=config.max_points, remove="none")
+        return dataclasses.replace(cloud, num_points=len(points) + num_close, num_close=num_close)
+    points = read_points(file, sensor, columns=args.columns, dtype=args.dtype)
     return make_cloud(points, sensor, size=config.max_points, remove=remove, close_m=close_m)
 
 

@@ -44,7 +44,7 @@ class Network(nn.Module):
     def setup(self) -> None:
         """The four parts; their names are the top level of the parameters."""
         c = self.config
-        self.stem = Stem(c.stem, c.circular_width)
+        self.stem = Stem(c.stem, c.circular_width, c.precision)
         self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width)
         self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
         self.heads = Heads(
@@ -114,7 +114,9 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     def apply(
         variables: Variables, features: Float32[Array, "b h w 9 r"], *, train: bool = False
     ) -> tuple[Outputs, Any]:
+        # The image takes the parameters' type: float64 ones make everything behind it float64.
         image = network_input(features, config.model, layout)
+        image = image.astype(jax.tree.leaves(variables["params"])[0].dtype)
         outputs, updates = network.apply(variables, image, train=train, mutable=["batch_stats"] if train else [])
         return outputs, updates["batch_stats"] if train else variables["batch_stats"]
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from fcos_lidar_jax.models.layers import Conv, GroupNorm, Image, convolve, pieces
+from fcos_lidar_jax.models.layers import Conv, GroupNorm, Image, at_least_float32, convolve, pieces
 from fcos_lidar_jax.types import Outputs
 
 _REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}
@@ -42,6 +42,7 @@ class Predictions(nn.Module):
     @nn.compact
     def __call__(self, x: Image) -> dict[str, Image]:
         """The named outputs."""
+        x = at_least_float32(x)
         kernels, biases = [], []
         for name, size in self.sizes.items():
             shape = (3, 3, x.shape[-1], size)

@@ -1,5 +1,8 @@
 """Convolution and norms as the network needs them.
 
+A convolution computes in the type of its input; norms compute in float32 at least and give the type of their
+input back: mixed precision is one cast behind the first layer and one before the predictions.
+
 Padding is explicit and the same on both sides (``SAME`` at stride 2 would shift the receptive field).
 The norms are written out because XLA is several times slower on the library's forms: a group norm reshaped to
 two channels a group, and a batch norm that would need the stem's groups concatenated.
@@ -35,9 +38,13 @@ def convolve(
         groups: ``feature_group_count`` (static).
         circular: wrap the width instead of padding it (static).
 
+    Returns:
+        images of the type of ``x``.
+
     >>> convolve(jnp.ones((1, 8, 8, 2)), jnp.ones((3, 3, 2, 4)), stride=2).shape
     (1, 4, 4, 4)
     """
+    kernel = kernel.astype(x.dtype)
     high, wide = (size // 2 * dilation for size in kernel.shape[:2])
     if kernel.shape[:2] == (1, 1) and groups == 1:
         # As a matrix product: the weight gradient of a 1x1 convolution is 15 times slower on CPU.
@@ -71,7 +78,9 @@ class Conv(nn.Module):
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", kernel_init, shape)
         y = convolve(x, kernel, stride=self.stride, circular=self.circular)
-        return y + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else y
+        if not self.use_bias:
+            return y
+        return y + self.param("bias", nn.initializers.zeros, (self.features,)).astype(y.dtype)
 
 
 class BatchNorm(nn.Module):
@@ -94,6 +103,7 @@ class BatchNorm(nn.Module):
         running_mean = self.variable("batch_stats", "mean", jnp.zeros, (total,))
         running_var = self.variable("batch_stats", "var", jnp.ones, (total,))
         mean, var = running_mean.value, running_var.value
+        given, parts = parts[0].dtype, [at_least_float32(part) for part in parts]
         if train:
             mean = jnp.concatenate([part.mean((0, 1, 2)) for part in parts])
             var = jnp.concatenate(
@@ -104,7 +114,12 @@ class BatchNorm(nn.Module):
                 running_var.value = self.keep * running_var.value + (1 - self.keep) * var
         gain = scale * lax.rsqrt(var + self.epsilon)
         shift = bias - mean * gain
-        return [part * gain[cut] + shift[cut] for part, cut in zip(parts, cuts, strict=True)]
+        return [(part * gain[cut] + shift[cut]).astype(given) for part, cut in zip(parts, cuts, strict=True)]
+
+
+def at_least_float32(x: Array) -> Array:
+    """The same, in float32 if it was less precise."""
+    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 
 
 def pieces(sizes: Sequence[int]) -> list[slice]:
@@ -141,6 +156,7 @@ class GroupNorm(nn.Module):
     @nn.compact
     def __call__(self, x: Image) -> Image:
         """Normalise every group of channels over its whole image."""
+        given, x = x.dtype, at_least_float32(x)
         channels = x.shape[-1]
         groups = max(1, min(32, channels // 2))
         scale = self.param("scale", nn.initializers.ones, (channels,))
@@ -153,4 +169,4 @@ class GroupNorm(nn.Module):
         mean = of_group(x.mean((1, 2)))
         var = of_group(jnp.square(x - mean).mean((1, 2)))
         gain = scale * lax.rsqrt(var + self.epsilon)
-        return x * gain + (bias - mean * gain)
+        return (x * gain + (bias - mean * gain)).astype(given)

@@ -57,6 +57,7 @@ class ModalityBranch(nn.Module):
     widths: tuple[int, ...]
     dilation: int
     circular: bool = False
+    precision: str = "float32"
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
@@ -70,6 +71,8 @@ class ModalityBranch(nn.Module):
                 parts, kernels, dilation=self.dilation, circular=self.circular, form=self.config.form
             )
             parts = [jax.nn.relu(x) for x in BatchNorm(name=f"norm{layer}")(parts, train=train)]
+            if self.precision == "bfloat16":  # only behind the first layer: metres need more bits
+                parts = [x.astype(jnp.bfloat16) for x in parts]
         return list(parts)
 
 
@@ -78,6 +81,7 @@ class Stem(nn.Module):
 
     config: StemConfig
     circular: bool = False
+    precision: str = "float32"
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
@@ -92,15 +96,16 @@ class Stem(nn.Module):
         groups = channel_groups(config, num_rounds)
         parts = [image[..., cut] for cut in pieces([size for size, _ in groups])]
         widths = tuple(out for _, out in groups)
-        merged = jnp.zeros((*image.shape[:3], config.out_channels), image.dtype)
+        merged = jnp.zeros((), image.dtype)
         shape = (sum(widths), config.out_channels)
         num_kernels = len(config.dilations) if config.merge == "per_branch" else 1
         kernels = [self.param(f"merge{i}", nn.initializers.he_normal(), shape) for i in range(num_kernels)]
         for index, dilation in enumerate(config.dilations):
-            branch = ModalityBranch(config, widths, dilation, self.circular, name=f"branch{index}")
+            branch = ModalityBranch(config, widths, dilation, self.circular, self.precision, name=f"branch{index}")
             features = branch(parts, train=train)
             # Accumulated group by group: no concatenation of all features is ever written.
             for feature, rows in zip(features, pieces(widths), strict=True):
-                merged = merged + jnp.einsum("bhwc,co->bhwo", feature, kernels[index % num_kernels][rows])
+                kernel = kernels[index % num_kernels][rows].astype(feature.dtype)
+                merged = merged.astype(feature.dtype) + jnp.einsum("bhwc,co->bhwo", feature, kernel)
         (merged,) = BatchNorm(name="norm")([merged], train=train)
         return jax.nn.relu(merged)

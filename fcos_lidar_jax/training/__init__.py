@@ -2,13 +2,15 @@
 
 from fcos_lidar_jax.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.loop import NonFiniteLossError, fit
+from fcos_lidar_jax.training.objective import make_loss
 from fcos_lidar_jax.training.optimizer import make_optimizer
-from fcos_lidar_jax.training.step import make_loss, make_state, make_train_step
+from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 
 __all__ = [
     "Checkpoint",
     "CheckpointError",
     "NonFiniteLossError",
+    "detection_variables",
     "fit",
     "load_checkpoint",
     "make_loss",

@@ -1,6 +1,11 @@
-"""Checkpoints that explain themselves: orbax arrays beside the configuration and the sensor as JSON."""
+"""Checkpoints that explain themselves: orbax arrays beside the configuration and the sensor as JSON.
+
+A checkpoint is a folder: ``checkpoint.json`` says what it is and lists every file with its hash, ``variables`` is
+what detection needs, ``state`` is there where training can go on from it.
+"""
 
 import dataclasses
+import hashlib
 import json
 import os
 import shutil
@@ -9,15 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
+from fcos_lidar_jax.types import TrainState
 
-_FORMAT = 1
+_FORMAT = 2
 _DESCRIPTION = "checkpoint.json"
-_ARRAYS = "variables"
+_VARIABLES = "variables"
+_STATE = "state"
 
 
 class CheckpointError(ValueError):
@@ -36,32 +44,44 @@ class Checkpoint:
     """``params`` and ``batch_stats``."""
     step: int
     """Updates done."""
+    data: str = ""
+    """What it was trained on, as text; a run goes on with the same alone."""
+    score: float | None = None
+    """Mean average precision when it was evaluated; None where it was not."""
 
 
-def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
+def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainState | None = None) -> None:
     """Write a checkpoint, whole or not at all.
 
-    It is written beside the folder and renamed; a checkpoint that was there before is kept until then.
+    It is written beside the folder and renamed; a checkpoint that was there before is kept until then. Where there
+    are several processes, one of them calls.
 
     Args:
         folder: where; its parent must exist.
         checkpoint: what.
-    """
-    import orbax.checkpoint as ocp
+        state: to go on from; None for detection alone.
 
+    Raises:
+        OSError: it cannot be written; in one line.
+    """
     folder = Path(folder).absolute()
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
+        _save_arrays(beside / _VARIABLES, checkpoint.variables)
+        if state is not None:
+            _save_arrays(beside / _STATE, _as_arrays(state))
         description = {
             "format": _FORMAT,
             "written_by": f"fcos_lidar_jax {__version__}, jax {jax.__version__}",
             "step": checkpoint.step,
+            "data": checkpoint.data,
+            "score": checkpoint.score,
             "config": config_to_json(checkpoint.config),
             "sensor": sensor_to_json(checkpoint.sensor),
+            "files": _hashes(beside),
         }
+        description["hash"] = _hash(_canonical(description))
         (beside / _DESCRIPTION).write_text(json.dumps(description, indent=1), encoding="utf-8")
-        with ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save(beside / _ARRAYS, checkpoint.variables)
         os.chmod(beside, 0o755)
         old = beside.with_name(beside.name + ".old")
         if folder.exists():
@@ -73,37 +93,137 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
-    """Read a checkpoint and check that its arrays are those of its configuration.
+    """Read a checkpoint, and check that its files are as written and its arrays those of its configuration.
+
+    Args:
+        folder: of a checkpoint.
 
     Raises:
         CheckpointError: naming the folder, what was found and what was expected.
     """
-    import orbax.checkpoint as ocp
-
     folder = Path(folder).absolute()
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        raise CheckpointError(f"{folder}: found {found}, expected a checkpoint folder")
-    description = _read_description(folder)
+    description = _verify(folder)
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     sensor = sensor_from_json(description["sensor"], f"{folder / _DESCRIPTION}: sensor")
     expected = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
+    variables = _load_arrays(folder / _VARIABLES, expected, config)
+    return Checkpoint(
+        config, sensor, variables, description["step"], description.get("data", ""), description.get("score")
+    )
+
+
+def load_state(folder: str | Path, like: TrainState) -> TrainState:
+    """Read what a run needs to go on: the same arrays, bit for bit.
+
+    Args:
+        folder: of a checkpoint that was saved with its state.
+        like: any state of the same run.
+
+    Raises:
+        CheckpointError: as :func:`load_checkpoint`, or there is no state.
+    """
+    folder = Path(folder).absolute()
+    description = _verify(folder)
+    if not (folder / _STATE).is_dir():
+        raise CheckpointError(f"{folder}: found a detector, expected a training state beside it")
+    config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
+    loaded = _load_arrays(folder / _STATE, jax.eval_shape(_as_arrays, like), config)
+    state = jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _names(like)])
+    return dataclasses.replace(state, key=jax.random.wrap_key_data(state.key))
+
+
+def _names(state: TrainState) -> list[str]:
+    """Of the state's leaves, in their order."""
+    paths = jax.tree_util.tree_flatten_with_path(state)[0]
+    return [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths]
+
+
+def _as_arrays(state: TrainState) -> dict[str, Any]:
+    """The state's leaves by name; the random key as numbers."""
+    leaves = jax.tree.leaves(dataclasses.replace(state, key=jax.random.key_data(state.key)))
+    return dict(zip(_names(state), leaves, strict=True))
+
+
+def _alone() -> Any:
+    """Orbax in one process, whatever others there are."""
+    import orbax.checkpoint as ocp
+
+    own = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+    )
+    return ocp.StandardCheckpointer(multiprocessing_options=options)
+
+
+def _save_arrays(folder: Path, tree: Any) -> None:
+    # Replicated arrays are whole on every device.
+    tree = jax.tree.map(
+        lambda leaf: np.asarray(leaf.addressable_data(0)) if isinstance(leaf, jax.Array) else leaf, tree
+    )
+    try:
+        with _alone() as checkpointer:
+            checkpointer.save(folder, tree)
+    except Exception as error:  # orbax and its storage raise what they like on a full disk
+        reason = " ".join(str(error).split())[:200]
+        raise OSError(f"{folder}: cannot be written: {reason}") from error
+
+
+def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
     where = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     target = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where), expected)
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            metadata: Any = checkpointer.metadata(folder / _ARRAYS).item_metadata
+        with _alone() as checkpointer:
+            metadata: Any = checkpointer.metadata(folder).item_metadata
             _compare(folder, config, expected, metadata.tree)
-            variables = checkpointer.restore(folder / _ARRAYS, target)
+            return checkpointer.restore(folder, target)
     except CheckpointError:
         raise
-    except Exception as error:  # orbax and its storage raise what they like on damaged files
+    except Exception as error:  # likewise on damaged files
         reason = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"{folder / _ARRAYS}: cannot be read: {reason}") from error
-    return Checkpoint(config, sensor, variables, description["step"])
+        raise CheckpointError(f"{folder}: cannot be read: {reason}") from error
 
 
-def _read_description(folder: Path) -> dict[str, Any]:
+def _hash(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
+
+
+def _canonical(description: dict[str, Any]) -> bytes:
+    """The description without its own hash, the same for the same content."""
+    return json.dumps({k: v for k, v in description.items() if k != "hash"}, sort_keys=True).encode()
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    """blake2b of every file below a folder but the description."""
+    return {
+        file.relative_to(folder).as_posix(): _hash(file.read_bytes())
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.name != _DESCRIPTION
+    }
+
+
+def _verify(folder: Path) -> dict[str, Any]:
+    """The description of a checkpoint whose files are all as written."""
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing"
+        raise CheckpointError(f"{folder}: found {found}, expected a checkpoint folder")
+    description = read_description(folder)
+    written, found = description["files"], _hashes(folder)
+    for name in sorted(written.keys() | found.keys()):
+        if name not in found:
+            raise CheckpointError(f"{folder / name}: found nothing, expected a file of the checkpoint")
+        if name not in written:
+            raise CheckpointError(f"{folder / name}: found a file that is not of the checkpoint")
+        if written[name] != found[name]:
+            raise CheckpointError(f"{folder / name}: hash {found[name]}, expected {written[name]}: damaged")
+    return description
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """What a checkpoint says of itself; its arrays are not looked at.
+
+    Raises:
+        CheckpointError: it is not one, or not as it was written.
+    """
     file = folder / _DESCRIPTION
     if not file.is_file():
         raise CheckpointError(f"{folder}: no {_DESCRIPTION} in it, expected a checkpoint folder")
@@ -114,7 +234,9 @@ def _read_description(folder: Path) -> dict[str, Any]:
     if not isinstance(description, dict) or description.get("format") != _FORMAT:
         found = description.get("format") if isinstance(description, dict) else type(description).__name__
         raise CheckpointError(f"{file}: format: got {found!r}, expected {_FORMAT}")
-    for name, kind in (("step", int), ("config", dict), ("sensor", dict)):
+    if description.get("hash") != _hash(_canonical(description)):
+        raise CheckpointError(f"{file}: not as it was written: its hash does not match its content")
+    for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
         if not isinstance(description.get(name), kind):
             raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
     return description
@@ -131,7 +253,7 @@ def _compare(folder: Path, config: Config, expected: Any, found: Any) -> None:
     for name in sorted(wanted.keys() | there.keys()):
         if wanted.get(name) != there.get(name):
             raise CheckpointError(
-                f"{folder}: {name}: got {there.get(name, 'nothing')}, "
+                f"{folder.parent}: {name}: got {there.get(name, 'nothing')}, "
                 f"expected {wanted.get(name, 'nothing')}: "
                 f"the arrays are not of the configuration {config.name!r} beside them"
             )

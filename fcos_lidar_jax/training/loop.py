@@ -1,7 +1,9 @@
-"""The Python loop around the step: progress, finite checks, a clean stop."""
+"""The Python loop around the step: progress, finite checks, pauses, a clean stop."""
 
 import math
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -13,63 +15,109 @@ from fcos_lidar_jax.types import Batch, TrainState
 Record = dict[str, float | list[float]]
 
 
+@runtime_checkable
+class Fed(Protocol):
+    """A batch with what is to be told about it."""
+
+    @property
+    def batch(self) -> Batch:
+        """For the step."""
+        ...
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """To be recorded beside the metrics."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of the samples, for messages."""
+        ...
+
+
 class NonFiniteLossError(ArithmeticError):
-    """The loss stopped being a number; the message names the step and the parts."""
+    """Loss or gradient stopped being a number; the message names the step, the parts and the samples."""
 
 
 def fit(
     step: TrainStep,
     state: TrainState,
-    batches: Iterable[Batch],
+    batches: Iterable[Fed],
     *,
     num_steps: int,
-    report: Callable[[int, TrainState, Record], None] | None = None,
+    report: Callable[[int, Record], None] | None = None,
+    pause_at: Callable[[int], bool] = lambda _: False,
+    pause: Callable[[int, TrainState], None] | None = None,
+    stopping: Callable[[int], bool] = lambda _: False,
     log_every_s: float = 10.0,
-) -> tuple[TrainState, list[Record]]:
+) -> TrainState:
     """Run the step over batches.
 
-    Metrics are read one step late, so that the host never waits for the device.
+    Metrics are read one step late, so that the host never waits for the device; at a pause, and at the end, all
+    have been read, so what is saved there has been found finite.
 
     Args:
-        step: jitted ``(state, batch) -> (state, metrics)``.
+        step: compiled ``(state, batch) -> (state, metrics)``; it may take the state's buffers.
         state: where to begin; the run ends when ``state.step`` is ``num_steps``.
         batches: at least as many as there are steps left.
         num_steps: of the whole run.
-        report: called with (steps done, state, metrics of the last of them) after every step.
+        report: called with (steps done, metrics of the last of them) after every step.
+        pause_at: whether to pause after so many steps.
+        pause: called with (steps done, state) at a pause; the state is on loan.
+        stopping: asked after every step; True ends the run.
         log_every_s: seconds between two progress lines on standard error.
 
     Returns:
-        the last state and the metrics of every step.
+        the last state.
 
     Raises:
-        NonFiniteLossError: with the step's number and the parts of the loss.
+        NonFiniteLossError: with the step's number, the parts of the loss and the samples.
     """
     done = int(state.step)
     progress = Progress("steps", num_steps, every_s=log_every_s)
-    records: list[Record] = []
-    waiting: tuple[int, TrainState, dict[str, jax.Array]] | None = None
+    unread: tuple[int, Fed, dict[str, jax.Array], float] | None = None
+    before = time.monotonic()
 
     def read() -> None:
-        assert waiting is not None
-        number, at, metrics = waiting
+        nonlocal unread, before
+        if unread is None:
+            return
+        number, fed, metrics, waited = unread
+        unread = None
         record: Record = {name: np.asarray(value).tolist() for name, value in metrics.items()}
-        total = record["loss/total"]
-        if not isinstance(total, float) or not math.isfinite(total):
-            parts = ", ".join(f"{k[5:]} {v}" for k, v in record.items() if k.startswith("loss/"))
-            raise NonFiniteLossError(f"step {number}: the loss is not finite ({parts})")
-        records.append(record)
-        progress.show(number, f"loss {total:.3f}  IoU {record['positive_iou']:.2f}")
+        now = time.monotonic()
+        record |= {"seconds": now - before, "waiting_seconds": waited, **fed.counts}
+        before = now
+        _check_finite(number, record, fed.names)
+        total, iou = record["loss/total"], record["positive_iou"]
+        progress.show(number, f"loss {total:.3f}  IoU {iou:.2f}")
         if report is not None:
-            report(number, at, record)
+            report(number, record)
 
-    for batch in batches:
-        if done >= num_steps:
-            break
-        state, metrics = step(state, batch)
+    iterator = iter(batches)
+    while done < num_steps:
+        began = time.monotonic()
+        fed = next(iterator)
+        waited = time.monotonic() - began
+        state, metrics = step(state, fed.batch)
         done += 1
-        if waiting is not None:
-            read()
-        waiting = (done, state, metrics)
-    if waiting is not None:
         read()
-    return state, records
+        unread = done, fed, metrics, waited
+        stop = stopping(done)
+        if stop or done == num_steps or pause_at(done):
+            read()
+        if pause is not None and pause_at(done):
+            pause(done, state)
+            before = time.monotonic()
+        if stop:
+            break
+    return state
+
+
+def _check_finite(number: int, record: Record, names: Sequence[str]) -> None:
+    """Loss and gradient are numbers, or there is a line about it."""
+    told = {k: v for k, v in record.items() if k.startswith("loss/") or k == "gradient_norm"}
+    broken = {k: v for k, v in told.items() if not isinstance(v, float) or not math.isfinite(v)}
+    if broken:
+        parts = ", ".join(f"{name.removeprefix('loss/')} {value}" for name, value in broken.items())
+        raise NonFiniteLossError(f"step {number}: not finite: {parts}; samples: {', '.join(names)}")

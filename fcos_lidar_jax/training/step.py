@@ -5,48 +5,39 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax import lax
 from jaxtyping import Array
 
-from fcos_lidar_jax.assignment import assign, owners
 from fcos_lidar_jax.augment import augment, sample_key
-from fcos_lidar_jax.coding import decode_oriented, encode
-from fcos_lidar_jax.config import Config, LossConfig
-from fcos_lidar_jax.iou import oriented, oriented_iou_3d
-from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, look
-from fcos_lidar_jax.losses import (
-    classification_loss,
-    combine,
-    cross_entropy,
-    iou_loss,
-    iou_prediction_loss,
-    l1_loss,
-)
+from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.models import Detector
-from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.training.objective import Metrics, finish, make_sums
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
-from fcos_lidar_jax.types import Batch, Locations, Outputs, RangeImage, Targets, TrainState
+from fcos_lidar_jax.types import Batch, TrainState
 
-Metrics = dict[str, Array]
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
-def make_state(variables: dict[str, Any], optimizer: optax.GradientTransformation, key: jax.Array) -> TrainState:
+def make_state(
+    variables: dict[str, Any], optimizer: optax.GradientTransformation, key: jax.Array, *, ema: bool = False
+) -> TrainState:
     """The state before the first step.
 
     Args:
         variables: ``params`` and ``batch_stats`` of a detector.
         optimizer: whose state to begin.
         key: the run's random key.
+        ema: keep a running mean of the weights.
     """
     state = TrainState(
         step=jnp.zeros((), jnp.int32),
         params=variables["params"],
         batch_stats=variables["batch_stats"],
         opt_state=optimizer.init(variables["params"]),
+        # A copy: the step gives its input's buffers away, and none twice.
+        ema=jax.tree.map(jnp.copy, variables["params"]) if ema else None,
         key=key,
     )
     # Strong types throughout: a weakly typed leaf would compile the step a second time.
@@ -57,105 +48,13 @@ def _numeric(leaf: Any) -> bool:
     return not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def location_owners(image: RangeImage, locations: Locations, boxes: Array, box_valid: Array) -> Array:
-    """The box of every location of one sample, -1 for none.
-
-    Tested once for each cell of the sensor's image: repeated rows and coarser levels see the same points.
-
-    Args:
-        image: of one sample.
-        locations: of the same.
-        boxes: f32[m, 9].
-        box_valid: bool[m].
-    """
-    first = image.features[..., 0].reshape(-1, 9)
-    cell_owner = owners(first[:, :3], first[:, 7] > 0, boxes, box_valid)
-    owner = cell_owner[jnp.maximum(locations.cell, 0)]
-    return jnp.where(locations.occupied, owner, -1)
-
-
-def sample_losses(
-    outputs: Outputs,
-    image: RangeImage,
-    boxes: Array,
-    labels: Array,
-    box_valid: Array,
-    *,
-    config: LossConfig,
-    layout: ImageLayout,
-) -> tuple[dict[str, tuple[Array, Array]], Targets, Metrics]:
-    """Assignment and losses of one sample (paper, section 3.4).
-
-    Args:
-        outputs: of one sample.
-        image: likewise.
-        boxes: f32[m, 9]; NaN velocities are unknown.
-        labels: i32[m].
-        box_valid: bool[m].
-        config: weights and choices (static).
-        layout: sizes (static).
-
-    Returns:
-        the four losses as (sum, count), the targets, and counts to be summed over the batch.
-    """
-    background = outputs.logits.shape[-1] - 1
-    locations = look(image, layout)
-    owner = location_owners(image, locations, boxes, box_valid)
-    owned = jnp.maximum(owner, 0)
-    box, label = boxes[owned], labels[owned]
-
-    regression = jnp.take_along_axis(outputs.regression, label[:, None, None], axis=2)[..., 0]
-    iou_logit = jnp.take_along_axis(outputs.iou_logits, label[:, None], axis=1)[:, 0]
-    # What has no owner gets a harmless box, so that nothing overflows on the way to being masked.
-    box = jnp.where((owner >= 0)[:, None], box, jnp.array([0, 0, 0, 1, 1, 1, 0, 0, 0], jnp.float32))
-    predicted = decode_oriented(regression, locations.points, locations.azimuth_rad)
-    truth = oriented(box)
-    iou = oriented_iou_3d(lax.stop_gradient(predicted), truth)
-    targets = assign(
-        owner,
-        cross_entropy(lax.stop_gradient(outputs.logits), label),
-        iou,
-        num_boxes=boxes.shape[0],
-        top_q=config.top_q,
-    )
-    positive = targets.positive
-    regressed = positive if config.regress_on == "positives" else owner >= 0
-    with jax.named_scope("losses"):
-        parts = {
-            "classification": classification_loss(
-                outputs.logits, jnp.where(positive, label, background), locations.occupied
-            ),
-            "l1": l1_loss(
-                regression,
-                encode(box, locations.points, locations.azimuth_rad),
-                regressed,
-                velocity_weight=config.velocity_weight,
-            ),
-            "iou": iou_loss(predicted, truth, regressed, kind=config.iou_loss),
-            "iou_prediction": iou_prediction_loss(iou_logit, iou, regressed),
-        }
-    cells = jnp.zeros(layout.rows * layout.columns + 1, bool)
-    cells = cells.at[jnp.where(positive, locations.cell, -1)].set(True)
-    counts = {
-        "positives": positive.sum(dtype=jnp.int32),
-        "unique_positives": cells[:-1].sum(dtype=jnp.int32),
-        "candidates": (owner >= 0).sum(dtype=jnp.int32),
-        "owned_boxes": (targets.num_positive > 0).sum(dtype=jnp.int32),
-        "iou_sum": jnp.where(positive, iou, 0.0).sum(),
-        "positives_per_level": _per_level(positive, layout),
-    }
-    return parts, targets, counts
-
-
-def _per_level(positive: Array, layout: ImageLayout) -> Array:
-    ends = np.cumsum(layout.level_sizes)
-    return jnp.stack([part.sum(dtype=jnp.int32) for part in jnp.split(positive, ends[:-1])])
-
-
-def make_loss(
+def make_gradient(
     detector: Detector, config: Config, sensor: Sensor
-) -> Callable[[Any, Any, Batch], tuple[Array, tuple[Any, Metrics]]]:
-    """The loss of a batch of raw points as a pure function.
+) -> Callable[[Any, Any, Batch], tuple[Any, Any, Metrics]]:
+    """The gradient of the loss of a batch, in ``config.optimizer.accumulate`` micro-batches.
+
+    The gradients of the sums are summed and divided once by the positives of all micro-batches, so their number
+    does not change what is weighed how; only batch norm sees smaller batches.
 
     Args:
         detector: the network.
@@ -163,40 +62,35 @@ def make_loss(
         sensor: the image's geometry.
 
     Returns:
-        ``(params, batch_stats, batch) -> (loss, (batch_stats, metrics))``.
+        pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``.
     """
-    binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
-    projection = config.projection
+    of_sums = jax.value_and_grad(make_sums(detector, config, sensor), has_aux=True)
+    pieces = config.optimizer.accumulate
 
-    def project(points: Array, valid: Array) -> RangeImage:
-        return project_points(
-            points,
-            valid,
-            binned,
-            num_rounds=projection.num_rounds,
-            prioritize_current=projection.prioritize_current,
-        )
+    def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
+        def visit(batch_stats: Any, micro: Batch) -> tuple[Any, tuple[Any, Metrics, Metrics]]:
+            (_, (batch_stats, parts, counts)), grads = of_sums(params, batch_stats, micro)
+            return batch_stats, (grads, parts, counts)
 
-    def losses_of(outputs: Outputs, image: RangeImage, boxes: Array, labels: Array, box_valid: Array) -> Any:
-        return sample_losses(outputs, image, boxes, labels, box_valid, config=config.loss, layout=layout)
+        if pieces == 1:
+            batch_stats, (grads, parts, counts) = visit(batch_stats, batch)
+        else:
 
-    def loss(params: Any, batch_stats: Any, batch: Batch) -> tuple[Array, tuple[Any, Metrics]]:
-        with jax.named_scope("mrv"):
-            image = jax.vmap(project)(batch.points, batch.valid)
-        variables = {"params": params, "batch_stats": batch_stats}
-        outputs, batch_stats = detector.apply(variables, image.features, train=True)
-        parts, _, counts = jax.vmap(losses_of)(outputs, image, batch.boxes, batch.labels, batch.box_valid)
-        # Sums over the global batch, one division at the end.
-        parts, counts = jax.tree.map(lambda leaf: leaf.sum(axis=0), (parts, counts))
-        losses = combine(parts, counts["positives"], config.loss)
-        metrics = {f"loss/{name}": value for name, value in losses.items()}
-        positives = jnp.maximum(counts["positives"], 1)
-        metrics["positive_iou"] = counts.pop("iou_sum") / positives
-        metrics["mean_k"] = counts["positives"] / jnp.maximum(counts["owned_boxes"], 1)
-        metrics["dropped_points"] = image.num_dropped.sum()
-        return losses["total"], (batch_stats, {**metrics, **counts})
+            def add(carry: Any, micro: Batch) -> tuple[Any, None]:
+                batch_stats, summed = carry
+                batch_stats, new = visit(batch_stats, micro)
+                return (batch_stats, jax.tree.map(jnp.add, summed, new)), None
 
-    return loss
+            # Strided, so that every device has its share of every micro-batch.
+            micros = jax.tree.map(lambda leaf: leaf.reshape(-1, pieces, *leaf.shape[1:]).swapaxes(0, 1), batch)
+            shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
+            nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+            (batch_stats, (grads, parts, counts)), _ = lax.scan(add, (batch_stats, nothing), micros)
+        scale = 1 / jnp.maximum(counts["positives"], 1)
+        grads = jax.tree.map(lambda leaf: leaf * scale.astype(leaf.dtype), grads)
+        return grads, batch_stats, finish(parts, counts, config)
+
+    return gradient
 
 
 def make_train_step(
@@ -214,7 +108,8 @@ def make_train_step(
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. The metrics are scalars but
         for ``positives_per_level`` i32[6].
     """
-    loss = make_loss(detector, config, sensor)
+    gradient = make_gradient(detector, config, sensor)
+    decay = config.optimizer.ema_decay
 
     def augmented(state: TrainState, batch: Batch) -> Batch:
         if config.augment is None:
@@ -230,18 +125,29 @@ def make_train_step(
         return Batch(points, batch.valid, boxes, batch.labels, batch.box_valid)
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        gradient = jax.value_and_grad(loss, has_aux=True)
-        (_, (batch_stats, metrics)), grads = gradient(state.params, state.batch_stats, augmented(state, batch))
+        grads, batch_stats, metrics = gradient(state.params, state.batch_stats, augmented(state, batch))
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, updates)
         metrics["gradient_norm"] = optax.tree.norm(grads)
         metrics.update(current_hyperparameters(opt_state))
+        ema = state.ema
+        if ema is not None:
+            # Young means follow faster, or they would remember the random start.
+            kept = jnp.minimum(decay, (1 + state.step) / (10 + state.step)).astype(jnp.float32)
+            ema = jax.tree.map(lambda old, new: old + (1 - kept.astype(old.dtype)) * (new - old), ema, params)
         new_state = TrainState(
             step=state.step + 1,
-            params=optax.apply_updates(state.params, updates),
+            params=params,
             batch_stats=batch_stats,
             opt_state=opt_state,
+            ema=ema,
             key=state.key,
         )
         return new_state, metrics
 
     return step
+
+
+def detection_variables(state: TrainState) -> dict[str, Any]:
+    """What to detect with: the running mean of the weights where there is one, and the batch statistics."""
+    return {"params": state.params if state.ema is None else state.ema, "batch_stats": state.batch_stats}

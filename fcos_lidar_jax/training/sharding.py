@@ -1,0 +1,97 @@
+"""Data parallelism: the batch is split over a mesh of devices, the state is on all of them.
+
+The step is written for the global batch; under ``jit`` sums and batch statistics then run over all devices, so
+results do not depend on how many there are, but for rounding.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from fcos_lidar_jax.training.step import TrainStep
+
+Tree = TypeVar("Tree")
+
+_AXIS = "data"
+
+
+def make_mesh(devices: Sequence[Any] | None = None) -> Mesh:
+    """A mesh of one axis, over all devices of all processes unless told otherwise.
+
+    >>> make_mesh().axis_names
+    ('data',)
+    """
+    devices = jax.devices() if devices is None else devices
+    return jax.make_mesh((len(devices),), (_AXIS,), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def replicate(tree: Tree, mesh: Mesh) -> Tree:
+    """The same arrays on every device; every process gives the same values.
+
+    The arrays are copies: what is given may be donated or kept.
+    """
+    everywhere = NamedSharding(mesh, PartitionSpec())
+
+    def place(leaf: Any) -> jax.Array:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(place(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
+        host = np.asarray(leaf)
+        # A copy for every device, or devices that are this process's memory would share one.
+        return jax.make_array_from_callback(host.shape, everywhere, lambda index: host[index].copy())
+
+    return jax.tree.map(place, tree)
+
+
+def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
+    """A batch split along its first axis; every process gives its own rows of the global batch, in its order.
+
+    Args:
+        batch: NumPy arrays.
+        mesh: whose number of devices divides the global batch.
+
+    >>> shard_batch(np.zeros((4, 3)), make_mesh(jax.devices()[:1])).shape
+    (4, 3)
+    """
+    sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), batch)
+
+
+def check_batch_size(batch_size: int, mesh: Mesh) -> None:
+    """Refuse a global batch that the devices cannot share evenly.
+
+    Raises:
+        ValueError: with both numbers.
+    """
+    if batch_size % mesh.size:
+        raise ValueError(f"batch_size: got {batch_size}, expected a multiple of the {mesh.size} devices")
+
+
+def jit_step(step: TrainStep, mesh: Mesh) -> TrainStep:
+    """The step compiled for a mesh; the state's buffers are given away."""
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    return jax.jit(step, donate_argnums=0, out_shardings=(everywhere, everywhere))
+
+
+def pmap_step(step: TrainStep, mesh: Mesh) -> Callable[[Any, Any], Any]:
+    """The step for callers of ``pmap``, with a leading device axis on state and batch.
+
+    A thin wrapper: it drops the state's axis, joins the batch's axes and runs :func:`jit_step`; a real ``pmap``
+    would need the collectives written into the network.
+
+    Args:
+        step: pure ``(state, batch) -> (state, metrics)``.
+        mesh: its devices are the leading axis.
+    """
+    compiled = jit_step(step, mesh)
+
+    def stacked(state: Any, batch: Any) -> Any:
+        joined = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), batch)
+        first = jax.tree.map(lambda leaf: leaf[0], state)
+        results = compiled(replicate(first, mesh), shard_batch(joined, mesh))
+        return jax.tree.map(lambda leaf: jax.numpy.broadcast_to(leaf, (mesh.size, *leaf.shape)), results)
+
+    return stacked

@@ -1,0 +1,44 @@
+"""Signals that ask a run to stop."""
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopRequest:
+    """Whether a run has been asked to stop, and by what."""
+
+    signal: int | None = None
+    """SIGINT (Ctrl-C) or SIGTERM; None as long as the run is to go on."""
+
+
+@contextlib.contextmanager
+def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
+    """Turn the first Ctrl-C or SIGTERM into a request that the run sees between two steps; the second one ends it.
+
+    To be entered in the main thread.
+
+    Args:
+        active: False leaves the signals alone.
+
+    Yields:
+        the request.
+    """
+    request = StopRequest()
+    before = {number: signal.getsignal(number) for number in _SIGNALS if active}
+
+    def ask(number: int, _: FrameType | None) -> None:
+        request.signal = number
+        for again, handler in before.items():
+            signal.signal(again, handler)
+
+    for number in before:
+        signal.signal(number, ask)
+    try:
+        yield request
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
