@@ -23,6 +23,7 @@ from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.training import load_checkpoint
+from fcos_lidar_jax.training.snapshots import find_checkpoint
 from fcos_lidar_jax.visualization.bev import draw_bev
 from fcos_lidar_jax.visualization.metrics import draw_class_curves, write_evaluation_report
 from fcos_lidar_jax.visualization.range_image import draw_range_image
@@ -51,7 +52,7 @@ class Evaluate:
     split: str | None = None
     """Split to evaluate on, such as val."""
     checkpoint: Path | None = None
-    """Trained detector to run."""
+    """Trained detector to run: a checkpoint, or a run, of which the best is taken."""
     results: Path | None = None
     """Official results file to evaluate."""
     ground_truth: Path | None = None
@@ -135,7 +136,7 @@ def _check(args: Evaluate) -> None:
 def _detect(args: Evaluate, data: NuScenes, tokens: tuple[str, ...], file: Path) -> Sensor:
     """Run the detector over the split; returns its sensor."""
     assert args.checkpoint is not None
-    checkpoint = load_checkpoint(args.checkpoint)
+    checkpoint = load_checkpoint(find_checkpoint(args.checkpoint))
     progress = Progress("keyframes", len(tokens))
     lost = detect_samples(checkpoint, data, tokens, file, batch_size=args.batch_size, report=progress.show)
     if lost:
