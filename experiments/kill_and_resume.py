@@ -31,34 +31,20 @@ def train(folder: Path, threads: int) -> None:
     """Begin the run, or go on with it, and write the hash of its last state."""
     import jax
     import numpy as np
+    from device_equivalence import CONFIG, SENSOR
 
     from fcos_lidar_jax.commands.runs import Plan, Rhythm, Run
-    from fcos_lidar_jax.config import QUICKSTART, StemConfig
     from fcos_lidar_jax.data.pipeline import make_batches
     from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
-    from fcos_lidar_jax.sensors import TINY
 
-    sensor = dataclasses.replace(TINY, num_columns=64)
-    model = dataclasses.replace(
-        QUICKSTART.model,
-        row_upscale=1,
-        stem=StemConfig(channels_per_type=2, out_channels=8, dilations=(1,)),
-        backbone_blocks=(1, 1, 1, 1),
-        backbone_widths=(8, 8, 8, 8),
-        fpn_channels=8,
-        head_channels=8,
-        head_convs=1,
-    )
     config = dataclasses.replace(
-        QUICKSTART,
-        max_points=1024,
+        CONFIG,
         copy_paste=None,
         class_balanced=False,
-        model=model,
-        optimizer=dataclasses.replace(QUICKSTART.optimizer, batch_size=2, ema_decay=0.9),
+        optimizer=dataclasses.replace(CONFIG.optimizer, batch_size=2),
     )
-    run = Run(folder, Plan(config, sensor, STEPS, 0, {}), Rhythm(save_every=1, evaluate_every=STEPS + 1), None)
-    frames = SimulatedFrames(sensor, 12)
+    run = Run(folder, Plan(config, SENSOR, STEPS, 0, {}), Rhythm(save_every=1, evaluate_every=STEPS + 1), None)
+    frames = SimulatedFrames(SENSOR, 12)
     state = run.train(
         lambda first: make_batches(
             frames, config, seed=0, num_steps=STEPS, first_step=first, threads=threads, workers=0

@@ -114,8 +114,8 @@ def _make_run(args: Demo) -> Run:
 
 def _train(args: Demo, training: Run) -> None:
     plan = training.plan
-    number = plan.num_steps * plan.config.optimizer.batch_size
-    frames: FrameSet = SimulatedFrames(plan.sensor, number, args.seed * number % _UNSEEN)
+    number = min(plan.num_steps * plan.config.optimizer.batch_size, _UNSEEN // 2)
+    frames: FrameSet = SimulatedFrames(plan.sensor, number, args.seed * number % (_UNSEEN - number))
 
     def feed(first_step: int) -> AbstractContextManager[Any]:
         return make_batches(

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.commands.clouds import make_cloud
 from fcos_lidar_jax.commands.detect import confident
@@ -79,8 +80,8 @@ class Run:
     """A run in a folder.
 
     ``run.json`` is the plan, ``metrics.jsonl`` and ``tensorboard/`` are the records, ``checkpoints/`` holds the
-    newest checkpoints and the best one, ``pictures/`` some test frames at every evaluation, ``curves.png`` the
-    losses and the mean average precision.
+    newest checkpoints and the best one, ``pictures/`` some test frames at every evaluation, ``loss.png`` and
+    ``scores.png`` the curves.
 
     Args:
         folder: of the run.
@@ -117,7 +118,10 @@ class Run:
         """
         mesh = make_mesh()
         check_batch_size(self.plan.config.optimizer.batch_size, mesh)
-        self._claim(resume)
+        self.check_folder(resume=resume)
+        several = jax.process_count() > 1
+        if several:  # nobody writes before all have looked
+            multihost_utils.sync_global_devices("looked")
         start = self._start(resume, weights)
         first = int(start.step)
         if first == self.plan.num_steps:
@@ -130,7 +134,6 @@ class Run:
         step = jit_step(make_train_step(self.detector, self.plan.config, self.plan.sensor, self.optimizer), mesh)
         records = Records(self.folder, first_step=first) if self.leads else None
         saved = first if resume else -1
-        several = jax.process_count() > 1
 
         def report(number: int, record: Record) -> None:
             if records is not None:
@@ -141,10 +144,11 @@ class Run:
             nonlocal saved
             if not self.leads:
                 return
+            assert records is not None
             score = None
             if self.tests is not None and self._evaluates_at(number):
-                assert records is not None
                 score = self._evaluate(number, state, records)
+            records.flush()
             self._save(state, score)
             saved = number
 
@@ -152,9 +156,7 @@ class Run:
 
             def stopping(done: int) -> bool:
                 if several:  # all stop after the same step, whichever of them was asked to
-                    from jax.experimental.multihost_utils import reached_preemption_sync_point
-
-                    return reached_preemption_sync_point(done)
+                    return multihost_utils.reached_preemption_sync_point(done)
                 return request.signal is not None
 
             try:
@@ -187,6 +189,33 @@ class Run:
                 raise KeyboardInterrupt
             raise SystemExit(128 + signal.SIGTERM)
         return state
+
+    def check_folder(self, *, resume: bool) -> None:
+        """The folder is free for this run, or holds it.
+
+        Args:
+            resume: it is to go on.
+
+        Raises:
+            ValueError: neither; for another plan with the first field that differs.
+        """
+        file = self.folder / _PLAN
+        if self.folder.exists() and not self.folder.is_dir():
+            raise ValueError(f"{self.folder}: found a file, expected a folder")
+        if not file.is_file():
+            if resume:
+                raise ValueError(f"{file}: found nothing, expected the run to go on with")
+            return
+        if not resume:
+            raise ValueError(f"{self.folder}: holds a run, expected --resume or another folder")
+        try:
+            found = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError:
+            raise ValueError(f"{file}: not JSON, expected the plan of a run") from None
+        for name, (was, wanted) in _differences(found, self._as_json()):
+            raise ValueError(
+                f"{file}: {name}: was {was!r}, got {wanted!r}: a run goes on with the same plan alone"
+            )
 
     def evaluate(self, variables: Variables, frames: FrameSet) -> dict[str, Any]:
         """The official summary over some frames, without attributes; ranges count from the sensor."""
@@ -234,26 +263,6 @@ class Run:
             "data": plan.data,
         }
         return json.loads(json.dumps(whole))
-
-    def _claim(self, resume: bool) -> None:
-        """The folder is free for this run, or holds it."""
-        file = self.folder / _PLAN
-        if self.folder.exists() and not self.folder.is_dir():
-            raise ValueError(f"{self.folder}: found a file, expected a folder")
-        if not file.is_file():
-            if resume:
-                raise ValueError(f"{file}: found nothing, expected the run to go on with")
-            return
-        if not resume:
-            raise ValueError(f"{self.folder}: holds a run, expected --resume or another folder")
-        try:
-            found = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError:
-            raise ValueError(f"{file}: not JSON, expected the plan of a run") from None
-        for name, (was, wanted) in _differences(found, self._as_json()):
-            raise ValueError(
-                f"{file}: {name}: was {was!r}, got {wanted!r}: a run goes on with the same plan alone"
-            )
 
     def _start(self, resume: bool, weights: Variables | None) -> TrainState:
         key = jax.random.key(self.plan.seed)

@@ -10,17 +10,21 @@ from typing import Annotated, Any
 
 import jax
 import tyro
+from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.commands.prepare import default_train_split, fingerprint, objects_folder
 from fcos_lidar_jax.commands.runs import Feed, Plan, Rhythm, Run
 from fcos_lidar_jax.config import PRESETS, Config, CopyPasteConfig
 from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames, default_index
 from fcos_lidar_jax.data.object_builder import build_objects
 from fcos_lidar_jax.data.objects import ObjectDatabase, open_objects, read_manifest
 from fcos_lidar_jax.data.pipeline import epoch_frames, make_batches, steps_per_epoch
+from fcos_lidar_jax.models import Variables
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.training import load_checkpoint
+from fcos_lidar_jax.training.checkpoint import check_arrays
 from fcos_lidar_jax.training.snapshots import find_checkpoint
 
 _ABOUT = {
@@ -120,6 +124,8 @@ def run(args: Train) -> None:
     )
     sensor = load_sensor(config.sensor)
     index = args.index or default_index(args.data_root, args.version)
+    if (args.data_root / args.version).is_dir() and not has_index(index):
+        raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     data = NuScenes(args.data_root, args.version, index=index, allow_missing_sweeps=args.allow_missing_sweeps)
     split = args.train_split or default_train_split(args.version)
     frames = _frames(data, config, split, args.samples, args)
@@ -140,10 +146,9 @@ def run(args: Train) -> None:
     }
     plan = Plan(config, sensor, num_steps, args.seed, about)
     rhythm = Rhythm(args.save_every or -(-num_steps // 50), args.evaluate_every or -(-num_steps // 10), args.keep)
-    weights = None
-    if args.weights is not None and not args.resume:
-        weights = load_checkpoint(find_checkpoint(args.weights)).variables
     training = Run(args.out, plan, rhythm, tests)
+    training.check_folder(resume=args.resume)
+    weights = None if args.weights is None or args.resume else _weights(args.weights, training)
     objects = None if config.copy_paste is None else _objects(config.copy_paste, frames, index, split, args)
     state = training.train(_feed(args, config, frames, objects, num_steps), resume=args.resume, weights=weights)
     if jax.process_index() == 0:
@@ -162,6 +167,8 @@ def _check(args: Train) -> None:
     given = [args.coordinator is not None, args.num_processes is not None, args.process_index is not None]
     if any(given) and not all(given):
         raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
+    if args.process_index is not None and not 0 <= args.process_index < (args.num_processes or 0):
+        raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
 
 
 def _frames(data: NuScenes, config: Config, split: str, samples: str | None, args: Train) -> NuScenesFrames:
@@ -214,6 +221,11 @@ def _objects(
     """The prepared objects of the split, or, for a part of it, objects of that part alone."""
     if args.samples is None:
         folder = objects_folder(index, split)
+        if not folder.is_dir():
+            raise ValueError(
+                f"{folder}: no objects here, expected those of split {split!r}: "
+                f"run fcos-lidar prepare --train-split {split}, or train with --no-copy-paste"
+            )
         source = read_manifest(folder).source
         # Objects of more sweeps than are fused will do: those too many are left out.
         whole = dataclasses.replace(frames, remove_close="all", close_m=1.0)
@@ -224,13 +236,30 @@ def _objects(
                 f"{frames.num_sweeps}, expected these: run fcos-lidar prepare again"
             )
         return open_objects(folder)
-    return build_objects(
-        frames,
-        args.out / "objects",
-        shards=[("chosen", list(range(len(frames))))],
-        fingerprint=fingerprint(index, frames),
-        min_points=recipe.min_points,
-    )
+
+    def cut() -> ObjectDatabase:
+        return build_objects(
+            frames,
+            args.out / "objects",
+            shards=[("chosen", list(range(len(frames))))],
+            fingerprint=fingerprint(index, frames),
+            min_points=recipe.min_points,
+        )
+
+    if jax.process_count() > 1:  # one cuts, the others find it done
+        if jax.process_index() == 0:
+            cut()
+        multihost_utils.sync_global_devices("objects")
+    return cut()
+
+
+def _weights(folder: Path, training: Run) -> Variables:
+    """The weights of a checkpoint of the same network."""
+    folder = find_checkpoint(folder)
+    variables = load_checkpoint(folder).variables
+    expected = jax.eval_shape(training.detector.init, jax.random.key(0))
+    check_arrays(folder, expected, variables, whose="the network that is to be trained")
+    return variables
 
 
 def _feed(

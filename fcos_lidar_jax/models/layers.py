@@ -15,9 +15,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float32
+from jaxtyping import Array, Float, Float32
 
-Image = Float32[Array, "b _ _ _"]
+Image = Float[Array, "b _ _ _"]
 """Height, width and channels change from layer to layer."""
 Kernel = Float32[Array, "_ _ _ _"]
 

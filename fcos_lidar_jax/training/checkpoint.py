@@ -26,6 +26,8 @@ _FORMAT = 2
 _DESCRIPTION = "checkpoint.json"
 _VARIABLES = "variables"
 _STATE = "state"
+_ROOM_FOR_NAMES = 2**20
+"""Bytes on disk for what describes the arrays."""
 
 
 class CheckpointError(ValueError):
@@ -65,11 +67,12 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
         OSError: it cannot be written; in one line.
     """
     folder = Path(folder).absolute()
+    parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
+    _check_room(folder, parts)
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        _save_arrays(beside / _VARIABLES, checkpoint.variables)
-        if state is not None:
-            _save_arrays(beside / _STATE, _as_arrays(state))
+        for name, tree in parts.items():
+            _save_arrays(beside / name, tree)
         description = {
             "format": _FORMAT,
             "written_by": f"fcos_lidar_jax {__version__}, jax {jax.__version__}",
@@ -155,6 +158,17 @@ def _alone() -> Any:
     return ocp.StandardCheckpointer(multiprocessing_options=options)
 
 
+def _check_room(folder: Path, tree: Any) -> None:
+    """A disk that is full ends orbax's threads with a page of tracebacks: ask before."""
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) * 9 // 8 + _ROOM_FOR_NAMES
+    free = shutil.disk_usage(folder.parent).free
+    if free < needed:
+        raise OSError(
+            f"{folder}: cannot be written: no space left on device: "
+            f"{free >> 10} KiB are free, expected {needed >> 10} KiB"
+        )
+
+
 def _save_arrays(folder: Path, tree: Any) -> None:
     # Replicated arrays are whole on every device.
     tree = jax.tree.map(
@@ -174,7 +188,8 @@ def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
     try:
         with _alone() as checkpointer:
             metadata: Any = checkpointer.metadata(folder).item_metadata
-            _compare(folder, config, expected, metadata.tree)
+            whose = f"the configuration {config.name!r} beside them"
+            check_arrays(folder.parent, expected, metadata.tree, whose=whose)
             return checkpointer.restore(folder, target)
     except CheckpointError:
         raise
@@ -242,8 +257,18 @@ def read_description(folder: Path) -> dict[str, Any]:
     return description
 
 
-def _compare(folder: Path, config: Config, expected: Any, found: Any) -> None:
-    """Same names and shapes, or a line that names the first difference."""
+def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:
+    """Same names and shapes.
+
+    Args:
+        where: the arrays were found.
+        expected: arrays, or their shapes.
+        found: likewise.
+        whose: shapes are expected.
+
+    Raises:
+        CheckpointError: naming the first array that differs.
+    """
 
     def shapes(tree: Any) -> dict[str, tuple[int, ...]]:
         leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
@@ -253,7 +278,6 @@ def _compare(folder: Path, config: Config, expected: Any, found: Any) -> None:
     for name in sorted(wanted.keys() | there.keys()):
         if wanted.get(name) != there.get(name):
             raise CheckpointError(
-                f"{folder.parent}: {name}: got {there.get(name, 'nothing')}, "
-                f"expected {wanted.get(name, 'nothing')}: "
-                f"the arrays are not of the configuration {config.name!r} beside them"
+                f"{where}: {name}: got {there.get(name, 'nothing')}, "
+                f"expected {wanted.get(name, 'nothing')}: the arrays are not of {whose}"
             )

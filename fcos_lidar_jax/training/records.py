@@ -39,6 +39,10 @@ class Records:
             for suffix, number in _numbers(value):
                 self._events.add_scalar(name + suffix, number, step)
 
+    def flush(self) -> None:
+        """Write what is waiting, so that a checkpoint never knows of more steps than the records."""
+        self._events.flush()
+
     def close(self) -> None:
         """Write what is waiting."""
         self._lines.close()
