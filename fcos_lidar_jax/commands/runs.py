@@ -146,7 +146,7 @@ class Run:
                 return
             assert records is not None
             score = None
-            if self.tests is not None and self._evaluates_at(number):
+            if self._evaluates_at(number):
                 score = self._evaluate(number, state, records)
             records.flush()
             self._save(state, score)
@@ -251,7 +251,9 @@ class Run:
         return number % self.rhythm.save_every == 0 or self._evaluates_at(number)
 
     def _evaluates_at(self, number: int) -> bool:
-        return number % self.rhythm.evaluate_every == 0 or number == self.plan.num_steps
+        return self.tests is not None and (
+            number % self.rhythm.evaluate_every == 0 or number == self.plan.num_steps
+        )
 
     def _as_json(self) -> dict[str, Any]:
         plan = self.plan

@@ -92,9 +92,9 @@ class Train:
     """Steps between two checkpoints; default: a fiftieth of the run."""
     keep: int = 2
     """Newest checkpoints that are kept beside the best."""
-    no_augment: bool = False
+    no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Without flips, rotations and scales."""
-    no_copy_paste: bool = False
+    no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Without objects of other frames."""
     threads: int = 2
     """That prepare batches."""
@@ -128,9 +128,11 @@ def run(args: Train) -> None:
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     data = NuScenes(args.data_root, args.version, index=index, allow_missing_sweeps=args.allow_missing_sweeps)
     split = args.train_split or default_train_split(args.version)
-    frames = _frames(data, config, split, args.samples, args)
+    frames = _frames(data, config, split, args.samples, "--samples", args)
     val_split = args.val_split or ("mini_val" if args.version.endswith("mini") else "val")
-    tests = None if val_split == "none" else _frames(data, config, val_split, args.val_samples, args)
+    tests = (
+        None if val_split == "none" else _frames(data, config, val_split, args.val_samples, "--val-samples", args)
+    )
     num_steps = args.steps or config.optimizer.epochs * steps_per_epoch(
         len(epoch_frames(frames, config, seed=args.seed)), config.optimizer.batch_size
     )
@@ -171,9 +173,11 @@ def _check(args: Train) -> None:
         raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
 
 
-def _frames(data: NuScenes, config: Config, split: str, samples: str | None, args: Train) -> NuScenesFrames:
+def _frames(
+    data: NuScenes, config: Config, split: str, samples: str | None, option: str, args: Train
+) -> NuScenesFrames:
     tokens = data.split(split, file=args.splits)
-    chosen = range(len(tokens)) if samples is None else parse_ranges(samples, len(tokens))
+    chosen = range(len(tokens)) if samples is None else parse_ranges(samples, len(tokens), option)
     tokens = [tokens[i] for i in chosen]
     missing = data.missing_sweeps(tokens, config.num_sweeps)
     if missing:
@@ -188,12 +192,13 @@ def _frames(data: NuScenes, config: Config, split: str, samples: str | None, arg
     )
 
 
-def parse_ranges(text: str, number: int) -> list[int]:
+def parse_ranges(text: str, number: int, option: str = "samples") -> list[int]:
     """Indices of ``FIRST:LAST[,FIRST:LAST...]``, each range without its end.
 
     Args:
         text: ranges in any order that do not overlap.
         number: of what is counted.
+        option: where the text is from, for messages.
 
     Raises:
         ValueError: with the range that cannot be.
@@ -205,12 +210,12 @@ def parse_ranges(text: str, number: int) -> list[int]:
     for part in text.split(","):
         first, colon, last = part.partition(":")
         if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
-            raise ValueError(f"samples: got {part!r}, expected FIRST:LAST")
+            raise ValueError(f"{option}: got {part!r}, expected FIRST:LAST")
         indices = range(int(first), int(last))
         if not indices or int(last) > number:
-            raise ValueError(f"samples: got {part!r}, expected FIRST < LAST within the {number} keyframes")
+            raise ValueError(f"{option}: got {part!r}, expected FIRST < LAST within the {number} keyframes")
         if set(indices) & set(found):
-            raise ValueError(f"samples: {part!r} overlaps with another range of {text!r}")
+            raise ValueError(f"{option}: {part!r} overlaps with another range of {text!r}")
         found += indices
     return found
 

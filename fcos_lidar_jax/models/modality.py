@@ -96,16 +96,18 @@ class Stem(nn.Module):
         groups = channel_groups(config, num_rounds)
         parts = [image[..., cut] for cut in pieces([size for size, _ in groups])]
         widths = tuple(out for _, out in groups)
-        merged = jnp.zeros((), image.dtype)
+        merged = jnp.zeros((), image.dtype)  # the sum over all groups keeps the image's precision
+        computed = image.dtype
         shape = (sum(widths), config.out_channels)
         num_kernels = len(config.dilations) if config.merge == "per_branch" else 1
         kernels = [self.param(f"merge{i}", nn.initializers.he_normal(), shape) for i in range(num_kernels)]
         for index, dilation in enumerate(config.dilations):
             branch = ModalityBranch(config, widths, dilation, self.circular, self.precision, name=f"branch{index}")
             features = branch(parts, train=train)
+            computed = features[0].dtype
             # Accumulated group by group: no concatenation of all features is ever written.
             for feature, rows in zip(features, pieces(widths), strict=True):
                 kernel = kernels[index % num_kernels][rows].astype(feature.dtype)
-                merged = merged.astype(feature.dtype) + jnp.einsum("bhwc,co->bhwo", feature, kernel)
+                merged = merged + jnp.einsum("bhwc,co->bhwo", feature, kernel, preferred_element_type=image.dtype)
         (merged,) = BatchNorm(name="norm")([merged], train=train)
-        return jax.nn.relu(merged)
+        return jax.nn.relu(merged).astype(computed)

@@ -40,9 +40,8 @@ def replicate(tree: Tree, mesh: Mesh) -> Tree:
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(place(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
         host = np.asarray(leaf)
-        # A copy for every device: CPU devices would share the host's memory, and give it away twice.
-        copies = [jax.device_put(host, device, may_alias=False) for device in mesh.local_devices]
-        return jax.make_array_from_single_device_arrays(host.shape, everywhere, copies)
+        # Fresh memory: the step may take it, what was given stays the caller's.
+        return jax.make_array_from_callback(host.shape, everywhere, lambda index: host[index].copy())
 
     return jax.tree.map(place, tree)
 

@@ -1,0 +1,17 @@
+"""A killed and resumed run ends where the one left alone ends, to the bit: the short form of the experiment."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).parents[2] / "experiments" / "kill_and_resume.py"
+
+
+def test_a_killed_run_ends_in_the_same_bits(tmp_path):
+    out = tmp_path / "result.json"
+    subprocess.run([sys.executable, SCRIPT, "--runs", "1", "--out", out], check=True, timeout=1000)
+    result = json.loads(out.read_text())
+    assert (result["runs"], result["ended_the_same"]) == (1, 1)
+    # It was killed after its first checkpoint and before its last.
+    assert all(1 <= run["newest_checkpoint"] < result["steps"] for run in result["each"])
