@@ -9,7 +9,7 @@ one without points, one with a single box. Differences are those of the worst le
 Expected: owners, labels and K identical; one gradient within 1e-5 in float32; five steps within 1e-9 in float64.
 In float32 the five steps are told only: AdamW turns a rounding difference of a gradient near zero into a full
 step.
-About five minutes on two cores, nearly all of it compilation.
+Six minutes on two cores, nearly all of it compilation.
 """
 
 import argparse
