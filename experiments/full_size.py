@@ -4,8 +4,7 @@
     python experiments/full_size.py                               # on a simulated frame
     python experiments/full_size.py --peer net_jax.py             # also the forward pass against another program
 
-A peer is a Python file that defines ``FNS``, name -> function that runs once and waits; its ``fwd`` is timed in a
-process of its own, turn by turn with ours, because the speed of a machine drifts.
+Of a peer (see ``peers.py``), ``fwd`` is timed; it is told the channels of the pyramid by the variable ``FPN``.
 
 Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameters; the network is 99 % of the path.
 """
@@ -16,8 +15,6 @@ import os
 import platform
 import resource
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,10 +24,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from peers import Peer, turn_by_turn
 
 from fcos_lidar_jax.assignment import assign
 from fcos_lidar_jax.coding import decode_oriented
-from fcos_lidar_jax.config import NUSCENES, PRESETS
+from fcos_lidar_jax.config import PRESETS
 from fcos_lidar_jax.data.batching import make_batch
 from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
@@ -50,19 +48,6 @@ from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 from fcos_lidar_jax.training.objective import location_owners, sample_losses
-
-_PEER = """
-import json, os, runpy, sys, time
-real = os.fdopen(os.dup(1), "w")
-os.dup2(2, 1)
-run = runpy.run_path(sys.argv[1])["FNS"]["fwd"]
-run()
-print("ready", file=real, flush=True)
-for _ in sys.stdin:
-    began = time.perf_counter()
-    run()
-    print(json.dumps(time.perf_counter() - began), file=real, flush=True)
-"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,35 +75,6 @@ def timed(function: Callable[[], Any], repeats: int) -> float:
         jax.block_until_ready(function())
         times.append(time.perf_counter() - began)
     return statistics.median(times)
-
-
-def against_peer(ours: Callable[[], Any], peer: Path, repeats: int) -> dict[str, float]:
-    """Medians of our forward pass and a peer's, measured turn by turn."""
-    environment = {**os.environ, "FPN": str(NUSCENES.model.fpn_channels)}
-    with subprocess.Popen(
-        [sys.executable, "-c", _PEER, str(peer)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-        env=environment,
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        if process.stdout.readline().strip() != "ready":
-            raise SystemExit(f"error: {peer}: found no FNS['fwd'] that runs")
-        jax.block_until_ready(ours())
-        times: dict[str, list[float]] = {"ours": [], "peer": []}
-        for _ in range(repeats):
-            began = time.perf_counter()
-            jax.block_until_ready(ours())
-            times["ours"].append(time.perf_counter() - began)
-            process.stdin.write("go\n")
-            process.stdin.flush()
-            times["peer"].append(json.loads(process.stdout.readline()))
-        process.stdin.close()
-    medians = {name: round(statistics.median(values), 4) for name, values in times.items()}
-    return {**medians, "ratio": round(medians["ours"] / medians["peer"], 3), "repeats": repeats}
 
 
 def stages(args: Args) -> dict[str, Any]:
@@ -204,7 +160,8 @@ def stages(args: Args) -> dict[str, Any]:
         record["milliseconds"][name] = round(1e3 * timed(call, args.repeats), 2)
         print(f"{name:24s}{record['milliseconds'][name]:10.2f} ms", flush=True)
     if args.peer is not None:
-        record["forward_against_peer_s"] = against_peer(calls["forward"], args.peer, args.repeats)
+        with Peer(args.peer, "fwd", {"FPN": str(model.fpn_channels)}) as peer:
+            record["forward_against_peer_s"] = turn_by_turn(calls["forward"], peer, args.repeats)
         print(json.dumps(record["forward_against_peer_s"]), flush=True)
 
     key = jax.random.key(0)

@@ -63,9 +63,9 @@ class StemConfig:
     """Channels after the 1x1 merge."""
     merge: Literal["per_branch", "shared"] = "per_branch"
     """Reading: every branch has its own 1x1 merge, or one is shared."""
-    form: Literal["split", "grouped"] = "split"
-    """The same function in two formulations: independent chains (fast on CPU), or
-    ``feature_group_count``. Parameters are interchangeable."""
+    form: Literal["split", "dense", "grouped"] = "split"
+    """The same function in three formulations: independent chains (fast on CPU for wide groups), one
+    block-diagonal kernel (fast for narrow groups), or ``feature_group_count``. Parameters are interchangeable."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot run."""
@@ -352,15 +352,16 @@ NUSCENES_TEST = dataclasses.replace(
 QUICKSTART = dataclasses.replace(
     NUSCENES,
     name="quickstart",
-    sensor="tiny",
+    sensor="short_range",
     num_sweeps=1,
-    max_points=4096,
+    max_points=8192,
     max_boxes=32,
     copy_paste=CopyPasteConfig(targets=(2, 1, 1, 1, 1, 2, 1, 1, 1, 1)),
     projection=ProjectionConfig(num_rounds=1),
     model=dataclasses.replace(
         NUSCENES.model,
-        stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3)),
+        row_upscale=1,
+        stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3), form="dense"),
         backbone_blocks=(2, 2, 1, 1),
         backbone_widths=(16, 32, 32, 32),
         fpn_channels=32,

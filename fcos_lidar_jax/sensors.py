@@ -135,9 +135,14 @@ ARGOVERSE2 = Sensor(
 """Argoverse 2: two stacked 32-beam sensors whose inclinations overlap; the row is the laser number 0-63."""
 
 TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, limit_xy_m=25.0)
-"""A 16-beam sensor with a short reach, for tests and the quickstart."""
+"""A 16-beam sensor with a short reach, for tests."""
 
-PRESETS: dict[str, Sensor] = {s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY)}
+SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 256, limit_xy_m=15.0)
+"""A 32-beam sensor of few columns that looks at what is near: the quickstart's."""
+
+PRESETS: dict[str, Sensor] = {
+    s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY, SHORT_RANGE)
+}
 """Name -> sensor."""
 
 

@@ -33,12 +33,20 @@ def fill(tree, seed: int = 0):
 SMALL_STEM = StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2))
 
 
-@pytest.mark.parametrize("group_rounds", [True, False])
-@pytest.mark.parametrize("num_convs", [1, 2])
-def test_split_stem_equals_grouped_convolution_in_values_and_gradients(group_rounds, num_convs):
-    config = dataclasses.replace(SMALL_STEM, group_rounds=group_rounds, num_convs=num_convs)
+@pytest.mark.parametrize("form", ["grouped", "dense"])
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"num_convs": 2},
+        {"num_convs": 1, "group_rounds": False},
+        {"num_convs": 2, "groups": "modalities"},
+        {"num_convs": 2, "groups": "all"},
+    ],
+)
+def test_forms_of_the_stem_are_equal_in_values_and_gradients(form, choices):
+    config = dataclasses.replace(SMALL_STEM, **choices)
     image = normal(0, 2, 8, 12, 27)
-    stems = {form: Stem(dataclasses.replace(config, form=form)) for form in ("split", "grouped")}
+    stems = {f: Stem(dataclasses.replace(config, form=f)) for f in ("split", form)}
     variables = fill(stems["split"].init(jax.random.key(0), image, train=True)["params"])
     weights = normal(1, 2, 8, 12, 8)
 
@@ -46,13 +54,11 @@ def test_split_stem_equals_grouped_convolution_in_values_and_gradients(group_rou
         out, _ = stems[form].apply({"params": params}, image, train=True, mutable=["batch_stats"])
         return (out * weights).sum(), out
 
-    results = {
-        form: jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(variables, image, form) for form in stems
-    }
+    results = {f: jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(variables, image, f) for f in stems}
     (_, split), split_grads = results["split"]
-    (_, grouped), grouped_grads = results["grouped"]
-    np.testing.assert_allclose(split, grouped, atol=2e-5)
-    for a, b in zip(jax.tree.leaves(split_grads), jax.tree.leaves(grouped_grads), strict=True):
+    (_, other), other_grads = results[form]
+    np.testing.assert_allclose(split, other, atol=2e-5)
+    for a, b in zip(jax.tree.leaves(split_grads), jax.tree.leaves(other_grads), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-4 * float(jnp.abs(b).max() + 1))
 
 

@@ -33,7 +33,7 @@ class Detect:
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE")]]
     """Point files, one cloud each: .pcd.bin, .bin, .npy, .npz or .pcd."""
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Trained detector: a checkpoint, or a run, of which the best is taken."""
+    """Trained detector: a checkpoint, a run, of which the best is taken, or `quickstart`, which is shipped."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Where the JSON goes."""
     sweeps: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None

@@ -52,7 +52,8 @@ class Evaluate:
     split: str | None = None
     """Split to evaluate on, such as val."""
     checkpoint: Path | None = None
-    """Trained detector to run: a checkpoint, or a run, of which the best is taken."""
+    """Trained detector to run: a checkpoint, a run, of which the best is taken, or `quickstart`, which comes
+    along."""
     results: Path | None = None
     """Official results file to evaluate."""
     ground_truth: Path | None = None

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -99,13 +99,21 @@ class Run:
         self.detect = jax.jit(make_detect(self.detector, plan.config, plan.sensor))
         self.leads = jax.process_index() == 0
 
-    def train(self, feed: Feed, *, resume: bool = False, weights: Variables | None = None) -> TrainState:
+    def train(
+        self,
+        feed: Feed,
+        *,
+        resume: bool = False,
+        weights: Variables | None = None,
+        devices: Sequence[Any] | None = None,
+    ) -> TrainState:
         """Train to the end, or until Ctrl-C or SIGTERM, which save a checkpoint first.
 
         Args:
             feed: the batches.
             resume: go on from the newest whole checkpoint, if there is one.
             weights: to begin with, instead of random ones.
+            devices: to share each batch; default: all.
 
         Returns:
             the last state.
@@ -116,7 +124,7 @@ class Run:
             KeyboardInterrupt: after Ctrl-C, when all is saved.
             SystemExit: after SIGTERM, likewise.
         """
-        mesh = make_mesh()
+        mesh = make_mesh(devices)
         check_batch_size(self.plan.config.optimizer.batch_size, mesh)
         self.check_folder(resume=resume)
         several = jax.process_count() > 1

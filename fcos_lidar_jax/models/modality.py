@@ -26,46 +26,69 @@ def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]
     return [(count * num_rounds, count * width) for count in types]
 
 
+def block_diagonal(kernels: Sequence[Kernel]) -> Kernel:
+    """One kernel of all channels that lets no group see another.
+
+    >>> block_diagonal([jnp.ones((3, 3, 1, 2)), jnp.ones((3, 3, 2, 4))])[0, 0].sum(axis=1).tolist()
+    [2.0, 4.0, 4.0]
+    """
+    columns = pieces([kernel.shape[-1] for kernel in kernels])
+    total = columns[-1].stop
+    rows = [
+        jnp.pad(kernel, [(0, 0)] * 3 + [(cut.start, total - cut.stop)])
+        for kernel, cut in zip(kernels, columns, strict=True)
+    ]
+    return jnp.concatenate(rows, axis=2)
+
+
 def modality_convolve(
     parts: Sequence[Image], kernels: Sequence[Kernel], *, dilation: int, circular: bool, form: str
 ) -> list[Image]:
     """One 3x3 convolution for each group of channels.
 
     Args:
-        parts: the groups' channels.
+        parts: the groups' channels, group by group or already joined into one image.
         kernels: one a group.
         dilation: of both axes (static).
         circular: wrap the width (static).
-        form: ``"split"``, one convolution a group, or ``"grouped"``, a single grouped convolution, far slower
-            on CPU (static). Groups of different sizes are always split.
+        form: how it is computed (static), see :class:`fcos_lidar_jax.config.StemConfig`. Groups of different
+            sizes cannot be ``"grouped"`` and are ``"dense"`` then.
+
+    Returns:
+        the groups' features, group by group for ``"split"``, else joined into one image.
 
     >>> parts, kernels = [jnp.ones((1, 4, 4, 2))] * 3, [jnp.ones((3, 3, 2, 5))] * 3
-    >>> len(modality_convolve(parts, kernels, dilation=1, circular=False, form="split"))
-    3
+    >>> [len(modality_convolve(parts, kernels, dilation=1, circular=False, form=f)) for f in ("split", "dense")]
+    [3, 1]
     """
-    if form == "split" or len({k.shape for k in kernels}) > 1:
+    if form == "split":
         return [convolve(x, k, dilation=dilation, circular=circular) for x, k in zip(parts, kernels, strict=True)]
-    x, kernel = jnp.concatenate(parts, axis=-1), jnp.concatenate(kernels, axis=-1)
-    y = convolve(x, kernel, dilation=dilation, groups=len(parts), circular=circular)
-    return [y[..., cut] for cut in pieces([k.shape[-1] for k in kernels])]
+    x = parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
+    if form == "grouped" and len({k.shape for k in kernels}) == 1:
+        kernel, groups = jnp.concatenate(kernels, axis=-1), len(kernels)
+    else:
+        kernel, groups = block_diagonal(kernels), 1
+    return [convolve(x, kernel, dilation=dilation, groups=groups, circular=circular)]
 
 
 class ModalityBranch(nn.Module):
     """The grouped convolutions of one dilation rate, each with batch norm and ReLU."""
 
     config: StemConfig
-    widths: tuple[int, ...]
+    groups: tuple[tuple[int, int], ...]
     dilation: int
     circular: bool = False
     precision: str = "float32"
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
-        """Features of every group, ``widths`` channels each."""
+        """Features of the groups, in as many parts as :func:`modality_convolve` gives."""
+        sizes = [size for size, _ in self.groups]
+        widths = [width for _, width in self.groups]
         for layer in range(self.config.num_convs):
             kernels = [
-                self.param(f"conv{layer}_group{g}", kernel_init, (3, 3, x.shape[-1], size))
-                for g, (x, size) in enumerate(zip(parts, self.widths, strict=True))
+                self.param(f"conv{layer}_group{g}", kernel_init, (3, 3, size, width))
+                for g, (size, width) in enumerate(zip(sizes, widths, strict=True))
             ]
             parts = modality_convolve(
                 parts, kernels, dilation=self.dilation, circular=self.circular, form=self.config.form
@@ -73,6 +96,7 @@ class ModalityBranch(nn.Module):
             parts = [jax.nn.relu(x) for x in BatchNorm(name=f"norm{layer}")(parts, train=train)]
             if self.precision == "bfloat16":  # only behind the first layer: metres need more bits
                 parts = [x.astype(jnp.bfloat16) for x in parts]
+            sizes = widths
         return list(parts)
 
 
@@ -94,19 +118,22 @@ class Stem(nn.Module):
         config = self.config
         num_rounds = image.shape[-1] // 9
         groups = channel_groups(config, num_rounds)
-        parts = [image[..., cut] for cut in pieces([size for size, _ in groups])]
-        widths = tuple(out for _, out in groups)
+        parts = [image]
+        if config.form == "split":
+            parts = [image[..., cut] for cut in pieces([size for size, _ in groups])]
         merged = jnp.zeros((), image.dtype)  # the sum over all groups keeps the image's precision
         computed = image.dtype
-        shape = (sum(widths), config.out_channels)
+        shape = (sum(width for _, width in groups), config.out_channels)
         num_kernels = len(config.dilations) if config.merge == "per_branch" else 1
         kernels = [self.param(f"merge{i}", nn.initializers.he_normal(), shape) for i in range(num_kernels)]
         for index, dilation in enumerate(config.dilations):
-            branch = ModalityBranch(config, widths, dilation, self.circular, self.precision, name=f"branch{index}")
+            branch = ModalityBranch(
+                config, tuple(groups), dilation, self.circular, self.precision, name=f"branch{index}"
+            )
             features = branch(parts, train=train)
             computed = features[0].dtype
             # Accumulated group by group: no concatenation of all features is ever written.
-            for feature, rows in zip(features, pieces(widths), strict=True):
+            for feature, rows in zip(features, pieces([f.shape[-1] for f in features]), strict=True):
                 kernel = kernels[index % num_kernels][rows].astype(feature.dtype)
                 merged = merged + jnp.einsum("bhwc,co->bhwo", feature, kernel, preferred_element_type=image.dtype)
         (merged,) = BatchNorm(name="norm")([merged], train=train)

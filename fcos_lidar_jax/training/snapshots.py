@@ -12,6 +12,7 @@ from fcos_lidar_jax.training.checkpoint import (
     read_description,
     save_checkpoint,
 )
+from fcos_lidar_jax.training.shipped import shipped_checkpoints
 from fcos_lidar_jax.types import TrainState
 
 
@@ -86,11 +87,13 @@ def find_checkpoint(folder: Path) -> Path:
     """The checkpoint that a folder stands for: itself, or the best, else the newest, of a run.
 
     Args:
-        folder: of a checkpoint or of a run.
+        folder: of a checkpoint or of a run; where there is no such folder, the name of one that is shipped.
 
     >>> find_checkpoint(Path("nowhere"))
     PosixPath('nowhere')
     """
+    if not folder.exists():
+        return shipped_checkpoints().get(str(folder), folder)
     paths = Snapshots(folder / CHECKPOINTS).paths()
     return best_of(paths) or paths[-1] if paths else folder
 

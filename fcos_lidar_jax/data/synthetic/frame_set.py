@@ -25,6 +25,8 @@ class SimulatedFrames:
     """Of frames."""
     first_seed: int = 0
     """Of the first frame; the others follow."""
+    num_objects: int = 16
+    """Of a street; fewer where there is no room."""
     close_m: float = 1.0
     """Half the side of the square around the sensor that is emptied."""
 
@@ -34,7 +36,8 @@ class SimulatedFrames:
 
     def frame(self, index: int) -> Frame:
         """One frame, simulated anew."""
-        return without_close(make_frame(self.first_seed + index, self.sensor), self.sensor, close_m=self.close_m)
+        frame = make_frame(self.first_seed + index, self.sensor, num_objects=self.num_objects)
+        return without_close(frame, self.sensor, close_m=self.close_m)
 
     def labels(self, index: int) -> np.ndarray:
         """Labels of a frame's boxes; the frame is simulated for it."""

@@ -1,0 +1,122 @@
+"""The same network in PyTorch, as a peer for timings: what its users would write.
+
+Modality-wise stem by ``groups=9``, LiDAR-Net, feature pyramid, heads with group norm, 1x1 merges per branch. Sizes
+come from the environment: ``HEIGHT`` and ``WIDTH`` of the image, ``WIDTHS_OVER`` (divides the channels), ``FPN``
+(channels before the division), ``BATCH``. ``FNS["train"]`` is a forward and a backward pass in ``channels_last``;
+there is no assignment, no optimizer and no projection in it. Needs torch, which the project itself does not.
+"""
+
+import os
+
+import torch  # type: ignore[import-not-found]
+import torch.nn.functional as F  # type: ignore[import-not-found]
+from torch import nn  # type: ignore[import-not-found]
+
+HEIGHT, WIDTH = int(os.environ.get("HEIGHT", "64")), int(os.environ.get("WIDTH", "1088"))
+OVER, BATCH = int(os.environ.get("WIDTHS_OVER", "1")), int(os.environ.get("BATCH", "1"))
+FPN = int(os.environ.get("FPN", "256")) // OVER
+TYPE, STEM, HEAD = 32 // OVER, 64 // OVER, 64 // OVER
+BLOCKS, WIDTHS, STRIDES = (4, 4, 1, 1), tuple(w // OVER for w in (64, 128, 128, 128)), (1, 2, 2, 2)
+
+
+def conv(inputs: int, outputs: int, size: int, **options: int) -> nn.Conv2d:
+    """Without bias, padded to keep the size."""
+    return nn.Conv2d(
+        inputs, outputs, size, padding=options.get("dilation", 1) * (size // 2), bias=False, **options
+    )
+
+
+def normed(*args: int, **options: int) -> nn.Sequential:
+    """Convolution, batch norm, ReLU."""
+    layer = conv(*args, **options)
+    return nn.Sequential(layer, nn.BatchNorm2d(layer.out_channels), nn.ReLU(inplace=True))
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1 with a shortcut."""
+
+    def __init__(self, inputs: int, width: int, stride: int, project: bool) -> None:
+        """Its layers."""
+        super().__init__()
+        wide = 4 * width
+        self.body = nn.Sequential(
+            normed(inputs, width, 1),
+            normed(width, width, 3, stride=stride),
+            conv(width, wide, 1),
+            nn.BatchNorm2d(wide),
+        )
+        shortcut = nn.Sequential(conv(inputs, wide, 1, stride=stride), nn.BatchNorm2d(wide))
+        self.shortcut = shortcut if project else nn.Identity()
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Apply it."""
+        return F.relu(self.body(x) + self.shortcut(x))
+
+
+def tower() -> nn.Sequential:
+    """Four convolutions with group norm."""
+    layers = []
+    for i in range(4):
+        layers += [conv(FPN if i == 0 else HEAD, HEAD, 3), nn.GroupNorm(min(32, HEAD // 2), HEAD), nn.ReLU(True)]
+    return nn.Sequential(*layers)
+
+
+class Network(nn.Module):
+    """Stem, backbone, pyramid and heads."""
+
+    def __init__(self) -> None:
+        """Its layers."""
+        super().__init__()
+        self.branches = nn.ModuleList(
+            nn.Sequential(
+                normed(45, 9 * TYPE, 3, dilation=d, groups=9),
+                normed(9 * TYPE, 9 * TYPE, 3, dilation=d, groups=9),
+                conv(9 * TYPE, STEM, 1),
+            )
+            for d in (1, 3, 6)
+        )
+        self.merged, self.first = nn.Sequential(nn.BatchNorm2d(STEM), nn.ReLU(True)), normed(STEM, STEM, 7)
+        self.stages, inputs = nn.ModuleList(), STEM
+        for count, width, stride in zip(BLOCKS, WIDTHS, STRIDES, strict=True):
+            blocks = []
+            for i in range(count):
+                blocks.append(Bottleneck(inputs, width, stride if i == 0 else 1, i == 0))
+                inputs = 4 * width
+            self.stages.append(nn.Sequential(*blocks))
+        self.laterals = nn.ModuleList(nn.Conv2d(4 * w, FPN, 1) for w in WIDTHS)
+        self.outputs = nn.ModuleList(nn.Conv2d(FPN, FPN, 3, 1 if i < 4 else 2, 1) for i in range(6))
+        self.heads = nn.ModuleList(
+            nn.ModuleList([tower(), nn.Conv2d(HEAD, 11, 3, 1, 1), tower(), nn.Conv2d(HEAD, 110, 3, 1, 1)])
+            for _ in range(6)
+        )
+
+    def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
+        """Logits and numbers of every level."""
+        x, levels = self.first(self.merged(sum(branch(image) for branch in self.branches))), []
+        for stage in self.stages:
+            x = stage(x)
+            levels.append(x)
+        laterals = [lateral(x) for lateral, x in zip(self.laterals, levels, strict=True)]
+        for i in (2, 1, 0):
+            laterals[i] = laterals[i] + F.interpolate(laterals[i + 1], scale_factor=2, mode="nearest")
+        pyramid = [output(x) for output, x in zip(self.outputs[:4], laterals, strict=True)]
+        pyramid.append(self.outputs[4](pyramid[-1]))
+        pyramid.append(self.outputs[5](F.relu(pyramid[-1])))
+        found = []
+        for x, (classify, logits, regress, numbers) in zip(pyramid, self.heads, strict=True):
+            found += [logits(classify(x)), numbers(regress(x))]
+        return found
+
+
+network = Network().to(memory_format=torch.channels_last)
+images = torch.randn(BATCH, 45, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
+
+
+def train() -> None:
+    """One forward and one backward pass."""
+    network.zero_grad(set_to_none=True)
+    loss = torch.stack([y.abs().mean() for y in network(images)]).sum()
+    loss.backward()
+
+
+FNS = {"train": train}
