@@ -38,7 +38,7 @@ _DEMO_FRAMES = 40
 class Args:
     """How long, and where to."""
 
-    steps: int = 12_000
+    steps: int = 15_000
     """Of training."""
     seed: int = 1
     """Of weights and streets; the demo trains with 0."""

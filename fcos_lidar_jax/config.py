@@ -354,7 +354,7 @@ QUICKSTART = dataclasses.replace(
     name="quickstart",
     sensor="short_range",
     num_sweeps=1,
-    max_points=8192,
+    max_points=4096,
     max_boxes=32,
     copy_paste=CopyPasteConfig(targets=(2, 1, 1, 1, 1, 2, 1, 1, 1, 1)),
     projection=ProjectionConfig(num_rounds=1),
@@ -368,7 +368,7 @@ QUICKSTART = dataclasses.replace(
         head_channels=32,
         head_convs=2,
     ),
-    optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=4),
+    optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=2),
 )
 """Small enough to train on two CPU cores: the same code, other numbers."""
 

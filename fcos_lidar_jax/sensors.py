@@ -137,8 +137,8 @@ ARGOVERSE2 = Sensor(
 TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, limit_xy_m=25.0)
 """A 16-beam sensor with a short reach, for tests."""
 
-SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 256, limit_xy_m=15.0)
-"""A 32-beam sensor of few columns that looks at what is near: the quickstart's."""
+SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 128, limit_xy_m=25.0)
+"""A 32-beam sensor of few columns for what is near: the quickstart's."""
 
 PRESETS: dict[str, Sensor] = {
     s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY, SHORT_RANGE)

@@ -198,7 +198,7 @@ BAD = {
     ),
     "project into a folder": (["project", "{home}/good.npy", "--out", "{home}"], "found a folder"),
     "demo into a file": (["demo", "--out", "{home}/good.npy"], "--out: .*: found a file"),
-    "demo without steps": (["demo", "--out", "{out}", "--steps", "0"], "--steps: got 0"),
+    "demo with fewer than no steps": (["demo", "--out", "{out}", "--steps", "-1"], "--steps: got -1"),
 }
 
 
@@ -243,9 +243,10 @@ def test_demo_from_nothing_to_report(tmp_path, capsys):
     assert main(["demo", "--out", str(out), "--steps", "2", "--test-frames", "3"]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["training"]["steps"] == 2
-    assert set(metrics["after"]["AP"]) == set(CLASSES)
+    for model in ("shipped", "before", "after"):
+        assert set(metrics[model]["AP"]) == set(CLASSES)
     report = (out / "report.html").read_text()
-    assert report.count("data:image/png;base64,") == 6
+    assert report.count("data:image/png;base64,") == 9
     assert "http" not in report
     unseen = np.load(out / "unseen" / "frame_000.npy")
     boxes = tmp_path / "boxes.json"

@@ -50,6 +50,7 @@ def test_small_preset_differs_in_numbers_only():
     small, full = kinds(QUICKSTART), kinds(NUSCENES)
     for record in (small, full):
         del record["name"], record["sensor"]
+        del record["model"]["stem"]["form"]  # another formulation of the same function
     assert small == full
 
 

@@ -6,6 +6,7 @@ import pytest
 import oracles
 from fcos_lidar_jax.data.batching import make_batch
 from fcos_lidar_jax.data.frame import count_inside
+from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
 from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.projection import image_cells
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY, WAYMO_TOP
@@ -72,3 +73,22 @@ def test_batches_pad_and_refuse_to_drop():
         make_batch(frames, max_points=100, max_boxes=16)
     with pytest.raises(ValueError, match=r"boxes: got \d+, expected at most 2"):
         make_batch(frames, max_points=4096, max_boxes=2)
+
+
+def test_simulated_frames_are_near_and_annotated_where_enough_points_show():
+    near, all_of_them = SimulatedFrames(TINY, 6, reach_m=8.0), SimulatedFrames(TINY, 6, reach_m=8.0, min_points=1)
+    far = SimulatedFrames(TINY, 6, reach_m=20.0, min_points=1)
+    hidden = 0
+    for i in range(6):
+        frame, whole = near.frame(i), all_of_them.frame(i)
+        np.testing.assert_array_equal(frame.points, whole.points)
+        np.testing.assert_array_equal(frame.boxes, whole.boxes[whole.num_points >= 5])
+        np.testing.assert_array_equal(near.labels(i), frame.labels)
+        hidden += len(whole.boxes) - len(frame.boxes)
+        assert not (np.abs(frame.points[:, :2]) < 1).all(axis=1).any()  # the car itself
+    assert hidden > 0
+
+    def median_distance(frames):
+        return np.median(np.concatenate([np.hypot(*frames.frame(i).boxes[:, :2].T) for i in range(6)]))
+
+    assert median_distance(all_of_them) < 0.8 * median_distance(far)

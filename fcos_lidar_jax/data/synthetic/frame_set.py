@@ -13,6 +13,8 @@ from fcos_lidar_jax.sensors import Sensor
 class SimulatedFrames:
     """So many frames of :func:`make_frame`, each of another street, without the points on the carrying vehicle.
 
+    The objects are near, and only those that enough points show are annotated: what a small detector can learn.
+
     >>> from fcos_lidar_jax.sensors import TINY
     >>> frames = SimulatedFrames(TINY, number=2)
     >>> len(frames), frames.frame(1).points.shape[1]
@@ -25,8 +27,12 @@ class SimulatedFrames:
     """Of frames."""
     first_seed: int = 0
     """Of the first frame; the others follow."""
-    num_objects: int = 16
+    num_objects: int = 14
     """Of a street; fewer where there is no room."""
+    reach_m: float = 10.0
+    """They are placed along the street within this distance."""
+    min_points: int = 5
+    """Objects that fewer points show are not annotated."""
     close_m: float = 1.0
     """Half the side of the square around the sensor that is emptied."""
 
@@ -36,7 +42,10 @@ class SimulatedFrames:
 
     def frame(self, index: int) -> Frame:
         """One frame, simulated anew."""
-        frame = make_frame(self.first_seed + index, self.sensor, num_objects=self.num_objects)
+        seed = self.first_seed + index
+        frame = make_frame(seed, self.sensor, num_objects=self.num_objects, reach_m=self.reach_m)
+        shown = frame.num_points >= self.min_points
+        frame = Frame(frame.points, frame.boxes[shown], frame.labels[shown], frame.num_points[shown])
         return without_close(frame, self.sensor, close_m=self.close_m)
 
     def labels(self, index: int) -> np.ndarray:

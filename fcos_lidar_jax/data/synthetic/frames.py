@@ -10,7 +10,7 @@ from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CLASSES
 
 
-def make_frame(seed: int, sensor: Sensor, *, num_objects: int = 12) -> Frame:
+def make_frame(seed: int, sensor: Sensor, *, num_objects: int = 12, reach_m: float | None = None) -> Frame:
     """A simulated frame of a level street; the same seed gives the same bytes, in whatever order frames are made.
 
     All ten classes occur equally often. Only objects that a point shows are annotated, and rays without a return
@@ -20,6 +20,7 @@ def make_frame(seed: int, sensor: Sensor, *, num_objects: int = 12) -> Frame:
         seed: any non-negative integer.
         sensor: who looks.
         num_objects: to place; fewer where there is no room.
+        reach_m: greatest distance along the street at which they are placed; default: four fifths of the sensor's.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> a, b = make_frame(3, TINY), make_frame(3, TINY)
@@ -28,7 +29,7 @@ def make_frame(seed: int, sensor: Sensor, *, num_objects: int = 12) -> Frame:
     """
     rng = np.random.default_rng([seed, 0xF0C5])
     labels = rng.permutation(np.resize(rng.permutation(len(CLASSES)), num_objects))
-    reach = 0.8 * sensor.limit_xy_m
+    reach = 0.8 * sensor.limit_xy_m if reach_m is None else reach_m
     world = draw_world(rng, reach_m=reach, beyond_m=2 * reach, duration_s=0.0, labels=labels, level=True)
     mount = draw_mount(rng, sensor, level=True)
     sweep = scan(world, sensor, mount, 0.0, rng)

@@ -1,0 +1,52 @@
+"""The weights that come with the package are whole, small, of today's preset, and find what they should."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from fcos_lidar_jax.cli import main
+from fcos_lidar_jax.commands.clouds import make_cloud
+from fcos_lidar_jax.commands.demo import summarise
+from fcos_lidar_jax.commands.simulated import on_fresh_streets, unseen_frames
+from fcos_lidar_jax.config import QUICKSTART
+from fcos_lidar_jax.inference import make_detect
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.training import load_checkpoint
+from fcos_lidar_jax.training.shipped import shipped_checkpoints
+from fcos_lidar_jax.training.snapshots import find_checkpoint
+
+FRAMES = 12
+
+
+def test_shipped_weights_are_small_and_of_todays_preset():
+    folder = shipped_checkpoints()["quickstart"]
+    assert sum(path.stat().st_size for path in folder.rglob("*")) < 4 * 2**20
+    shipped, preset = load_checkpoint(folder), on_fresh_streets(QUICKSTART)
+    assert shipped.sensor == load_sensor(QUICKSTART.sensor)
+    same_training = dataclasses.replace(shipped.config, optimizer=preset.optimizer)
+    assert same_training == preset
+
+
+def test_shipped_weights_detect_on_unseen_streets():
+    shipped = load_checkpoint(shipped_checkpoints()["quickstart"])
+    config, sensor = shipped.config, shipped.sensor
+    detect = jax.jit(make_detect(build_detector(config, sensor), config, sensor))
+    tests = unseen_frames(sensor, FRAMES)
+    frames = [tests.frame(i) for i in range(FRAMES)]
+    clouds = [make_cloud(frame.points, sensor, size=config.max_points, remove="none") for frame in frames]
+    found = [jax.tree.map(np.asarray, detect(shipped.variables, c.points, c.valid)) for c in clouds]
+    assert summarise(found, frames)["mAP"] > 0.4
+
+
+def test_a_name_stands_for_shipped_weights_where_no_folder_has_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert find_checkpoint(Path("quickstart")) == shipped_checkpoints()["quickstart"]
+    (tmp_path / "quickstart").mkdir()
+    assert find_checkpoint(Path("quickstart")) == Path("quickstart")
+    np.save(tmp_path / "cloud.npy", np.ones((20, 4), np.float32))
+    args = ["detect", str(tmp_path / "cloud.npy"), "--out", str(tmp_path / "boxes.json")]
+    assert main([*args, "--checkpoint", "quickstart"]) == 1
+    assert "quickstart" in capsys.readouterr().err
