@@ -28,7 +28,7 @@ from peers import Peer, turn_by_turn
 
 from fcos_lidar_jax.assignment import assign
 from fcos_lidar_jax.coding import decode_oriented
-from fcos_lidar_jax.config import PRESETS
+from fcos_lidar_jax.config import PRESETS, Config
 from fcos_lidar_jax.data.batching import make_batch
 from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
@@ -36,16 +36,16 @@ from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.inference import make_detect, postprocess
 from fcos_lidar_jax.iou import oriented, oriented_iou_3d
-from fcos_lidar_jax.locations import image_layout, look
+from fcos_lidar_jax.locations import image_layout, image_sensor, look
 from fcos_lidar_jax.losses import cross_entropy
-from fcos_lidar_jax.models import build_detector, count_parameters
+from fcos_lidar_jax.models import Variables, build_detector, count_parameters
 from fcos_lidar_jax.models.detector import network_input
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
 from fcos_lidar_jax.models.lidar_net import Backbone
 from fcos_lidar_jax.models.modality import Stem
 from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 from fcos_lidar_jax.training.objective import location_owners, sample_losses
 
@@ -66,6 +66,59 @@ class Args:
     """Where the figures go."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Stages:
+    """The parts of the detector as jitted functions; those of the network take all its variables."""
+
+    project: Callable[..., Any]
+    """Points and their validity to a range image."""
+    door: Callable[..., Any]
+    """Features f32[b, h, w, 9, r] to the network's input."""
+    stem: Callable[..., Any]
+    backbone: Callable[..., Any]
+    fpn: Callable[..., Any]
+    heads: Callable[..., Any]
+    finish: Callable[..., Any]
+    """Outputs of one sample and its range image to boxes."""
+
+
+def make_stages(config: Config, sensor: Sensor) -> Stages:
+    """The parts of a configuration's detector."""
+    model, binned, layout = config.model, image_sensor(sensor, config.model), image_layout(sensor, config.model)
+    circular, projection = model.circular_width, config.projection
+    rounds, current = projection.num_rounds, projection.prioritize_current
+    stem = Stem(model.stem, circular, model.precision)
+    backbone = Backbone(model.backbone_blocks, model.backbone_widths, circular)
+    fpn = FeaturePyramid(model.fpn_channels, circular)
+    heads = Heads(
+        model.num_classes,
+        model.head_channels,
+        model.head_convs,
+        model.background_prior,
+        model.tied_heads,
+        circular,
+    )
+
+    def of(part: str, v: Variables) -> Variables:
+        return {kind: tree[part] for kind, tree in v.items() if part in tree}
+
+    return Stages(
+        project=jax.jit(
+            lambda p, valid: project_points(p, valid, binned, num_rounds=rounds, prioritize_current=current)
+        ),
+        door=jax.jit(lambda features: network_input(features, model, layout)),
+        stem=jax.jit(lambda v, x: stem.apply(of("stem", v), x, train=False)),
+        backbone=jax.jit(lambda v, x: backbone.apply(of("backbone", v), x, train=False)),
+        fpn=jax.jit(lambda v, x: fpn.apply(of("fpn", v), x)),
+        heads=jax.jit(lambda v, x: heads.apply(of("heads", v), x)),
+        finish=jax.jit(
+            lambda outputs, image: postprocess(
+                outputs, look(image, layout), config=config.inference, layout=layout
+            )
+        ),
+    )
+
+
 def timed(function: Callable[[], Any], repeats: int) -> float:
     """Median seconds of a call, after one that compiles."""
     jax.block_until_ready(function())
@@ -77,11 +130,11 @@ def timed(function: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times)
 
 
-def stages(args: Args) -> dict[str, Any]:
+def measure(args: Args) -> dict[str, Any]:
     """All figures of the preset on one frame."""
     config = PRESETS[args.preset]
     sensor = load_sensor(config.sensor)
-    model, layout = config.model, image_layout(sensor, config.model)
+    layout = image_layout(sensor, config.model)
     folder = args.data or os.environ.get("FCOS_LIDAR_REAL_DATA")
     frame = read_keyframe(Path(folder) / "nuscenes_scene0061", sensor) if folder else make_frame(0, sensor)
     frame = without_close(frame, sensor)
@@ -90,37 +143,22 @@ def stages(args: Args) -> dict[str, Any]:
     )
     detector = build_detector(config, sensor)
     variables = detector.init(jax.random.key(0))
-    params, stats = variables["params"], variables["batch_stats"]
     record: dict[str, Any] = {
         "preset": config.name,
         "frame": "scene-0061, real" if folder else "simulated",
-        "parameters": count_parameters(params),
+        "parameters": count_parameters(variables["params"]),
         "locations": layout.num_locations,
         "boxes": len(frame.boxes),
     }
     print(json.dumps(record), flush=True)
 
-    def of(part: str) -> dict[str, Any]:
-        return {"params": params[part], **({"batch_stats": stats[part]} if part in stats else {})}
-
-    project = jax.jit(lambda p, v: project_points(p, v, sensor, num_rounds=config.projection.num_rounds))
-    image = project(batch.points[0], batch.valid[0])
-    entrance = jax.jit(lambda f: network_input(f, model, layout))
-    seen = entrance(image.features[None])
-    stem = jax.jit(lambda v, x: Stem(model.stem).apply(v, x, train=False))
-    after_stem = stem(of("stem"), seen)
-    backbone = jax.jit(
-        lambda v, x: Backbone(model.backbone_blocks, model.backbone_widths).apply(v, x, train=False)
-    )
-    levels = backbone(of("backbone"), after_stem)
-    fpn = jax.jit(lambda v, x: FeaturePyramid(model.fpn_channels).apply(v, x))
-    pyramid = fpn(of("fpn"), levels)
-    heads = jax.jit(
-        lambda v, x: Heads(
-            model.num_classes, model.head_channels, model.head_convs, model.background_prior, model.tied_heads
-        ).apply(v, x)
-    )
-    outputs = jax.tree.map(lambda leaf: leaf[0], heads(of("heads"), pyramid))
+    stages = make_stages(config, sensor)
+    image = stages.project(batch.points[0], batch.valid[0])
+    seen = stages.door(image.features[None])
+    after_stem = stages.stem(variables, seen)
+    levels = stages.backbone(variables, after_stem)
+    pyramid = stages.fpn(variables, levels)
+    outputs = jax.tree.map(lambda leaf: leaf[0], stages.heads(variables, pyramid))
     locations = jax.jit(lambda i: look(i, layout))(image)
     boxes, labels, box_valid = batch.boxes[0], batch.labels[0], batch.box_valid[0]
 
@@ -138,20 +176,19 @@ def stages(args: Args) -> dict[str, Any]:
     losses = jax.jit(
         lambda o, i: sample_losses(o, i, boxes, labels, box_valid, config=config.loss, layout=layout)[0]
     )
-    finish = jax.jit(lambda o, at: postprocess(o, at, config=config.inference, layout=layout))
     # A trained detector is sure of little: as many candidates as the threshold lets through is the worst case.
     eager = dataclasses.replace(outputs, logits=outputs.logits.at[:, -1].add(-4.0))
     detect = jax.jit(make_detect(detector, config, sensor))
     forward = jax.jit(lambda v, f: detector.apply(v, f, train=False)[0])
     calls: dict[str, Callable[[], Any]] = {
-        "mrv": lambda: project(batch.points[0], batch.valid[0]),
-        "stem": lambda: stem(of("stem"), seen),
-        "backbone": lambda: backbone(of("backbone"), after_stem),
-        "fpn": lambda: fpn(of("fpn"), levels),
-        "heads": lambda: heads(of("heads"), pyramid),
+        "mrv": lambda: stages.project(batch.points[0], batch.valid[0]),
+        "stem": lambda: stages.stem(variables, seen),
+        "backbone": lambda: stages.backbone(variables, after_stem),
+        "fpn": lambda: stages.fpn(variables, levels),
+        "heads": lambda: stages.heads(variables, pyramid),
         "assignment": lambda: assignment(outputs, image),
         "assignment and losses": lambda: losses(outputs, image),
-        "candidates and nms": lambda: finish(eager, locations),
+        "candidates and nms": lambda: stages.finish(eager, image),
         "forward": lambda: forward(variables, image.features[None]),
         "points to boxes": lambda: detect(variables, batch.points[0], batch.valid[0]),
     }
@@ -160,7 +197,7 @@ def stages(args: Args) -> dict[str, Any]:
         record["milliseconds"][name] = round(1e3 * timed(call, args.repeats), 2)
         print(f"{name:24s}{record['milliseconds'][name]:10.2f} ms", flush=True)
     if args.peer is not None:
-        with Peer(args.peer, "fwd", {"FPN": str(model.fpn_channels)}) as peer:
+        with Peer(args.peer, "fwd", {"FPN": str(config.model.fpn_channels)}) as peer:
             record["forward_against_peer_s"] = turn_by_turn(calls["forward"], peer, args.repeats)
         print(json.dumps(record["forward_against_peer_s"]), flush=True)
 
@@ -183,7 +220,7 @@ def main(args: Args) -> None:
     if args.preset not in PRESETS:
         raise SystemExit(f"error: --preset: got {args.preset!r}, expected one of {', '.join(PRESETS)}")
     record = {
-        **stages(args),
+        **measure(args),
         "jax": jax.__version__,
         "python": platform.python_version(),
         "device": jax.devices()[0].device_kind,

@@ -15,14 +15,13 @@ Cost: a quarter of an hour on two CPU cores. Expected: every "off" is worse than
 
 import dataclasses
 import json
-import os
-import platform
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import tyro
+from hardware import hardware
 
 from fcos_lidar_jax.commands.clouds import make_cloud
 from fcos_lidar_jax.commands.simulated import on_fresh_streets
@@ -125,10 +124,7 @@ def main(args: Args) -> None:
     record: dict[str, Any] = {
         **{k: v for k, v in dataclasses.asdict(args).items() if k != "out"},
         "parts": verdicts,
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
+        **hardware(),
     }
     write_beside(args.out, lambda path: path.write_text(json.dumps(record, indent=1)))
 

@@ -20,15 +20,14 @@ hour on two CPU cores.
 import dataclasses
 import json
 import os
-import platform
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import tyro
+from hardware import hardware
 
 from fcos_lidar_jax.commands.demo import summarise
 from fcos_lidar_jax.commands.runs import Plan, Rhythm, Run
@@ -189,16 +188,6 @@ def run_all(args: Args, frames: NuScenesFrames) -> None:
         print(f"{name}: {json.dumps(short)}", flush=True)
         text = json.dumps(record, indent=1)
         write_beside(args.out, lambda path, text=text: path.write_text(text))
-
-
-def hardware() -> dict[str, Any]:
-    """Where this runs."""
-    return {
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
-    }
 
 
 if __name__ == "__main__":

@@ -9,15 +9,13 @@ it was stopped. Cost: hours on two CPU cores. Expected: mAP of at least 0.6 on t
 
 import dataclasses
 import json
-import os
-import platform
 import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import tyro
+from hardware import hardware
 
 from fcos_lidar_jax.commands.demo import summarise
 from fcos_lidar_jax.commands.runs import Rhythm
@@ -89,10 +87,7 @@ def main(args: Args) -> None:
         "interval of it": intervals["mean_ap"],
         "AP": {name: round(float(np.mean(list(aps.values()))), 4) for name, aps in of_rest["AP"].items()},
         "curve, demo's frames": [[r["step"], round(r["test/mAP"], 4)] for r in records if "test/mAP" in r],
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
+        **hardware(),
     }
     print(json.dumps(record, indent=1))
     args.weights.parent.mkdir(parents=True, exist_ok=True)

@@ -13,14 +13,13 @@ the reduced one.
 
 import dataclasses
 import json
-import os
-import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import tyro
+from hardware import hardware
 from peers import Peer, turn_by_turn
 
 from fcos_lidar_jax.config import NUSCENES, Config
@@ -101,13 +100,7 @@ def main(args: Args) -> None:
             figures = turn_by_turn(step_of(config, sensor), peer, args.repeats * (1 if over == 1 else 10))
         record[f"{height}x{width}, channels / {over}, pyramid {fpn // over}"] = figures
         print(height, width, f"channels / {over}, pyramid {fpn // over}:", json.dumps(figures), flush=True)
-    record |= {
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-    }
+    record |= hardware()
     write_beside(args.out, lambda path: path.write_text(json.dumps(record, indent=1)))
 
 

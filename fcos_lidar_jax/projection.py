@@ -155,15 +155,16 @@ def winners(cell: Int32[Array, "n"], keys: Array, *, num_cells: int, num_rounds:
     with jax.enable_x64(True):
         word = (keys.astype(jnp.uint64) << 32) | lax.iota(jnp.uint64, cell.shape[0])
         empty = jnp.uint64(np.iinfo(np.uint64).max)
-        left, kept = word, []
-        for round_index in range(num_rounds):
+
+        def one_round(left: Array, _: None) -> tuple[Array, Array]:
             best = jnp.full(num_cells + 1, empty).at[cell].min(left, mode="promise_in_bounds")
-            kept.append(best[:num_cells])
-            if round_index + 1 < num_rounds:
-                left = jnp.where(best[cell] >= word, empty, word)
-        word = jnp.stack(kept, axis=-1)
-        index = (word & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
-        return jnp.where(word == empty, jnp.int32(-1), index)
+            return jnp.where(best[cell] >= left, empty, left), best[:num_cells]
+
+        # A loop, because unrolled rounds make XLA compute every point's cell anew in each of them.
+        _, kept = lax.scan(one_round, word, length=num_rounds)
+        kept = kept.T
+        index = (kept & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
+        return jnp.where(kept == empty, jnp.int32(-1), index)
 
 
 @functools.partial(jax.jit, static_argnames=("sensor", "num_rounds", "prioritize_current"))
@@ -221,7 +222,8 @@ def _gather_channels(
 ) -> Float32[Array, "s 9 r"]:
     """The nine channels of the winners, in the order of ``types.CHANNELS``; zero where empty."""
     x, y, z, intensity, lag = (points[:, i] for i in range(5))
-    channels = jnp.stack([x, y, z, *angles, intensity, jnp.ones_like(x), lag], axis=-1)
     filled = index >= 0
-    gathered = channels[jnp.where(filled, index, 0)]
-    return jnp.where(filled[..., None], gathered, 0.0).transpose(0, 2, 1)
+    chosen = jnp.where(filled, index, 0)
+    # One by one: side by side they would be written out for all points first.
+    channels = (x, y, z, *angles, intensity, jnp.ones_like(x), lag)
+    return jnp.stack([jnp.where(filled, channel[chosen], 0.0) for channel in channels], axis=1)

@@ -1,0 +1,29 @@
+"""Where an experiment ran, and with what: kept beside its figures."""
+
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from fcos_lidar_jax import __version__
+
+
+def hardware() -> dict[str, Any]:
+    """Device, processor, cores, versions and revision, as JSON."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    git = ["git", "describe", "--always", "--dirty"]
+    told = subprocess.run(git, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    return {
+        "device": jax.devices()[0].device_kind,
+        "processor": names[0] if names else platform.machine(),
+        "cores": os.cpu_count(),
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+        "fcos_lidar_jax": __version__,
+        "git": told.stdout.strip() or "unknown",
+    }

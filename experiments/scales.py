@@ -1,0 +1,216 @@
+"""Where and how long the cells of a table are trained.
+
+- ``smoke``: a toy network and a few steps on a few simulated frames: that everything runs, in minutes, on two
+  cores. Its scores mean nothing.
+- ``simulated``: the quickstart's network on ten sweeps of hurried simulated streets. One GPU, or a long CPU run.
+- ``nuscenes``: the paper's detector on a data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+
+from fcos_lidar_jax.commands import evaluate as evaluate_command
+from fcos_lidar_jax.commands import train as train_command
+from fcos_lidar_jax.commands.runs import Plan, Rhythm, Run
+from fcos_lidar_jax.config import NUSCENES, QUICKSTART, Config, InferenceConfig, StemConfig
+from fcos_lidar_jax.data.cached import CachedFrames
+from fcos_lidar_jax.data.object_builder import build_objects
+from fcos_lidar_jax.data.objects import ObjectDatabase
+from fcos_lidar_jax.data.pipeline import make_batches, steps_per_epoch
+from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
+from fcos_lidar_jax.evaluation.frames import evaluate_frames
+from fcos_lidar_jax.sensors import SHORT_RANGE, TINY, Sensor
+from fcos_lidar_jax.training import load_checkpoint
+from fcos_lidar_jax.training.snapshots import CHECKPOINTS, Snapshots
+
+_UNSEEN = 1_000_000
+"""Seeds of test streets start here."""
+
+
+class Scale(Protocol):
+    """Where and how long cells are trained."""
+
+    @property
+    def name(self) -> str:
+        """As on the command line."""
+        ...
+
+    @property
+    def base(self) -> Config:
+        """What the tables' rows are changes of."""
+        ...
+
+    def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
+        """Train and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``. The run's folder stays until it is scored."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """What of the scale decides a cell's result, as JSON."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulated:
+    """Hurried streets, ten sweeps a frame, the same frames for every cell."""
+
+    name: str
+    base: Config
+    sensor: Sensor
+    train_frames: int
+    test_frames: int
+    cache: Path
+    """Frames are simulated once and kept here."""
+
+    def describe(self) -> dict[str, Any]:
+        """Sizes and sensor."""
+        return {
+            "scale": self.name,
+            "sensor": dataclasses.asdict(self.sensor),
+            "train_frames": self.train_frames,
+            "test_frames": self.test_frames,
+        }
+
+    def frames(self, split: str, num_sweeps: int) -> CachedFrames:
+        """Training or test streets, seen by so many sweeps."""
+        number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, _UNSEEN)}[split]
+        made = SimulatedFrames(self.sensor, number, first, num_sweeps=num_sweeps, hurry=True)
+        return CachedFrames(made, self.cache / f"{self.sensor.name}_{split}_{number}_{num_sweeps}_sweeps")
+
+    def objects(self, num_sweeps: int) -> ObjectDatabase:
+        """For copy-paste."""
+        frames = self.frames("train", num_sweeps)
+        folder = self.cache / f"{self.sensor.name}_objects_{self.train_frames}_{num_sweeps}_sweeps"
+        everything = list(range(len(frames)))
+        return build_objects(frames, folder, shards=[("all", everything)], fingerprint=repr(frames.frames))
+
+    def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
+        """Train on the training streets, evaluate on the test streets."""
+        frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
+        objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
+        steps = config.optimizer.epochs * steps_per_epoch(len(frames), config.optimizer.batch_size)
+        plan = Plan(config, self.sensor, steps, seed, self.describe())
+        run = Run(folder, plan, Rhythm(save_every=-(-steps // 5), evaluate_every=steps), tests=None)
+
+        def feed(first_step: int) -> Any:
+            return make_batches(
+                frames,
+                config,
+                seed=seed,
+                num_steps=steps,
+                first_step=first_step,
+                objects=objects,
+                threads=1,
+            )
+
+        run.train(feed, resume=(folder / "run.json").exists(), devices=jax.devices()[:1])
+        variables = load_checkpoint(Snapshots(folder / CHECKPOINTS).paths()[-1]).variables
+        read = [tests.frame(i) for i in range(len(tests))]
+        summary = evaluate_frames([run.detections(variables, frame) for frame in read], read).summary
+        return _scores(summary)
+
+
+@dataclasses.dataclass(frozen=True)
+class NuScenesLayout:
+    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen, by the commands themselves."""
+
+    name: str
+    base: Config
+    data_root: Path
+    version: str
+    train_split: str | None = None
+    val_split: str = "val"
+    index: Path | None = None
+    steps: int | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """Data set and splits."""
+        return {
+            "scale": self.name,
+            "version": self.version,
+            "train_split": self.train_split,
+            "val_split": self.val_split,
+            "steps": self.steps,
+        }
+
+    def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
+        """``fcos-lidar train`` and ``fcos-lidar evaluate``; the results file stays in the folder."""
+        train_command.run(
+            train_command.Train(
+                config,
+                data_root=self.data_root,
+                version=self.version,
+                out=folder,
+                index=self.index,
+                train_split=self.train_split,
+                val_split="none",
+                resume=(folder / "run.json").exists(),
+                seed=seed,
+                steps=self.steps,
+            )
+        )
+        out = folder / f"evaluation_{self.val_split}"
+        evaluate_command.run(
+            evaluate_command.Evaluate(
+                out=out,
+                data_root=self.data_root,
+                version=self.version,
+                split=self.val_split,
+                checkpoint=folder,
+                index=self.index,
+                report=False,
+            )
+        )
+        return _scores(json.loads((out / "metrics_summary.json").read_text()))
+
+
+def _scores(summary: dict[str, Any]) -> dict[str, Any]:
+    aps = {name: round(ap, 5) for name, ap in summary["mean_dist_aps"].items()}
+    return {"mAP": round(summary["mean_ap"], 5), "NDS": round(summary["nd_score"], 5), "AP": aps}
+
+
+_TEN_SWEEPS = dataclasses.replace(
+    QUICKSTART,
+    name="small",
+    num_sweeps=10,
+    max_points=40_960,
+    copy_paste=None,
+    class_balanced=False,
+    augment=None,
+    projection=NUSCENES.projection,
+    model=dataclasses.replace(
+        QUICKSTART.model,
+        # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
+        stem=StemConfig(channels_per_type=5, out_channels=16, form="dense"),
+    ),
+    optimizer=dataclasses.replace(QUICKSTART.optimizer, epochs=2),
+)
+_TOY = dataclasses.replace(
+    _TEN_SWEEPS,
+    name="toy",
+    max_points=10_240,
+    model=dataclasses.replace(
+        _TEN_SWEEPS.model,
+        stem=StemConfig(channels_per_type=5, out_channels=8, form="dense"),
+        backbone_blocks=(1, 1, 1, 1),
+        backbone_widths=(8, 8, 8, 8),
+        fpn_channels=8,
+        head_channels=8,
+        head_convs=1,
+    ),
+    inference=InferenceConfig(max_detections=50, candidates_per_level=100),
+)
+
+
+def smoke(cache: Path) -> Simulated:
+    """A toy that runs in seconds; its scores mean nothing."""
+    sensor = dataclasses.replace(TINY, name="toy", num_columns=64)
+    return Simulated("smoke", _TOY, sensor, train_frames=16, test_frames=6, cache=cache)
+
+
+def simulated(cache: Path) -> Simulated:
+    """The quickstart's network on ten sweeps of what is near."""
+    return Simulated("simulated", _TEN_SWEEPS, SHORT_RANGE, train_frames=2000, test_frames=200, cache=cache)
