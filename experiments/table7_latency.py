@@ -5,8 +5,8 @@
     python experiments/table7_latency.py --scale nuscenes --data-root DIR
 
 The times need no training (``--only-figures``) and are those of ``latency.py``, which says how the stages are cut.
-The paper's are of a 3090Ti: on other hardware only the shares compare. Expected of the paper: the projection is 2 % of
-the time, and ten sweeps cost no more than one.
+The paper's are of a 3090Ti: on other hardware only the shares compare. Expected of the paper: the projection is a
+fiftieth of the time, and ten sweeps cost no more than one.
 """
 
 from typing import Any

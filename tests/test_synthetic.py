@@ -1,15 +1,15 @@
-"""Simulated frames: the same bytes for the same seed, exact counts, one cell a beam, all classes."""
+"""Simulated frames: the same bytes for the same seed, exact counts, one cell a beam, all classes, fused sweeps."""
 
 import numpy as np
 import pytest
 
 import oracles
 from fcos_lidar_jax.data.batching import make_batch
-from fcos_lidar_jax.data.frame import count_inside
+from fcos_lidar_jax.data.frame import Frame, count_inside
 from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
 from fcos_lidar_jax.data.synthetic.frames import make_frame
 from fcos_lidar_jax.projection import image_cells
-from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY, WAYMO_TOP
+from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, SHORT_RANGE, TINY, WAYMO_TOP
 from fcos_lidar_jax.types import CLASSES
 
 
@@ -92,3 +92,88 @@ def test_simulated_frames_are_near_and_annotated_where_enough_points_show():
         return np.median(np.concatenate([np.hypot(*frames.frame(i).boxes[:, :2].T) for i in range(6)]))
 
     assert median_distance(all_of_them) < 0.8 * median_distance(far)
+
+
+LAGS = (np.arange(10) * 0.05).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def hurried() -> list[Frame]:
+    return [make_frame(seed, SHORT_RANGE, num_objects=14, reach_m=10.0, num_sweeps=10, hurry=True)
+            for seed in range(12)]  # fmt: skip
+
+
+def test_fused_frames_repeat_and_are_annotated_as_the_current_sweep_shows(hurried):
+    again = make_frame(3, SHORT_RANGE, num_objects=14, reach_m=10.0, num_sweeps=10, hurry=True)
+    for a, b in zip(vars(hurried[3]).values(), vars(again).values(), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for frame in hurried:
+        lags = frame.points[:, 4]
+        assert (np.diff(lags) >= 0).all()  # the current sweep first, then by age
+        np.testing.assert_array_equal(np.unique(lags), LAGS)
+        now = frame.points[lags == 0]
+        assert (frame.num_points >= 1).all()
+        np.testing.assert_array_equal(frame.num_points, count_inside(now, frame.boxes))
+        assert (np.bincount(np.searchsorted(LAGS, lags)) > 0.8 * len(now)).all()
+    assert any((count_inside(f.points, f.boxes) > 5 * f.num_points).any() for f in hurried)
+    laser = make_frame(0, ARGOVERSE2, num_sweeps=2)
+    assert laser.points.shape[1] == 6
+    assert set(np.unique(laser.points[:, 5])) <= set(range(64))
+    with pytest.raises(ValueError, match="num_sweeps: got 0, expected at least 1"):
+        make_frame(0, TINY, num_sweeps=0)
+
+
+def test_most_of_a_hurried_street_moves_and_moves_fast(hurried):
+    boxes, labels = (np.concatenate([getattr(f, name) for f in hurried]) for name in ("boxes", "labels"))
+    names, speed = np.array(CLASSES)[labels], np.hypot(boxes[:, 7], boxes[:, 8])
+    moving = speed > 0.5
+    calm = [make_frame(seed, SHORT_RANGE, num_objects=14, reach_m=10.0) for seed in range(12)]
+    calm_speed = np.concatenate([np.hypot(*f.boxes[:, 7:].T) for f in calm])
+    assert 0.5 < moving.mean() < 0.9
+    assert moving.mean() > 1.5 * (calm_speed > 0.5).mean()
+    assert np.median(speed[moving]) > 1.3 * np.median(calm_speed[calm_speed > 0.5])
+    assert (speed > 8).mean() > 0.4
+    driven = moving & np.isin(names, ["car", "truck", "bus", "trailer", "construction_vehicle", "motorcycle"])
+    assert speed[driven].min() >= 7.99
+    assert speed[driven].max() <= 20.01
+    assert moving[np.isin(names, ["pedestrian", "motorcycle", "bicycle"])].all()
+    assert not moving[np.isin(names, ["traffic_cone", "barrier"])].any()
+    assert min((boxes[driven, 8] > 0).sum(), (boxes[driven, 8] < 0).sum()) > 5  # the car's way, and oncoming
+
+
+def test_moving_objects_trail_behind_their_boxes_by_speed_times_lag_and_the_rest_stays(hurried):
+    """Boxes put back by velocity x lag hold more of a sweep's points than a twentieth of a second to either side;
+    those of what stands hold more than half a metre before and behind."""
+    trails, stays = np.zeros((10, 3), int), np.zeros((10, 3), int)
+    around = np.array([-1.0, 0, 1])
+    for frame in hurried:
+        for box in frame.boxes.astype(np.float64):
+            speed = np.hypot(box[7], box[8])
+            if 0 < speed < 6:
+                continue
+            for k, lag in enumerate(LAGS):
+                points = frame.points[frame.points[:, 4] == lag]
+                moves = -(lag + 0.05 * around)[:, None] * box[7:] if speed else around[:, None] * [0, 0.5]
+                moved = box + np.pad(moves, ((0, 0), (0, 7)))
+                (trails if speed else stays)[k] += count_inside(points, moved)
+    for counts in (trails, stays):
+        assert counts.min() > 500
+        np.testing.assert_array_equal(counts.argmax(axis=1), np.ones(10))
+
+
+def test_sets_of_fused_frames_drop_close_points_in_each_sweeps_own_frame():
+    frames = SimulatedFrames(SHORT_RANGE, 3, 5, num_sweeps=10, hurry=True)
+    passed = 0
+    for i in range(3):
+        frame = frames.frame(i)
+        whole = make_frame(5 + i, SHORT_RANGE, num_objects=14, reach_m=10.0, num_sweeps=10, hurry=True)
+        shown = whole.num_points >= 5
+        np.testing.assert_array_equal(frame.boxes, whole.boxes[shown])
+        np.testing.assert_array_equal(frame.num_points, whole.num_points[shown])
+        np.testing.assert_array_equal(frames.labels(i), whole.labels[shown])
+        dropped = [(whole.points[:, 4] == lag).sum() - (frame.points[:, 4] == lag).sum() for lag in LAGS]
+        assert 0 < 0.9 * max(dropped) < min(dropped)  # the car looks the same from each sweep
+        close, old = (np.abs(frame.points[:, :2]) < 1).all(axis=1), frame.points[:, 4] > 0
+        assert not (close & ~old).any()
+        passed += (close & old).sum()  # what stood before the car is under it now
+    assert passed > 20

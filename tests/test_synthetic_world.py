@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from shapely.geometry import Polygon
 
+from fcos_lidar_jax.data.synthetic.frames import fuse_sweeps
 from fcos_lidar_jax.data.synthetic.ground import Ground
 from fcos_lidar_jax.data.synthetic.lidar import SWEEP_S, Mount, draw_mount, scan, sensor_pose
 from fcos_lidar_jax.data.synthetic.looks import LOOKS
@@ -86,16 +87,61 @@ def footprint(pose, size):
     )  # fmt: skip
 
 
+def assert_nothing_touches(world, time_s):
+    poses = world.object_poses(time_s)[:, [0, 1, 3]]
+    car = pose_at(world.ego, time_s)[0]
+    car[:2] += CAR_MIDDLE_M * np.array([np.cos(car[2]), np.sin(car[2])])
+    shapes = [footprint(p, s) for p, s in zip(poses, world.traffic.sizes, strict=True)]
+    shapes.append(footprint(car, CAR_SIZE_M))
+    for i, shape in enumerate(shapes):
+        assert all(shape.disjoint(other) for other in shapes[:i]), time_s
+
+
 def test_objects_never_touch_each_other_or_the_car(worlds):
     for world in worlds:
         for time_s in (0.0, 2.5, 6.0):
-            poses = world.object_poses(time_s)[:, [0, 1, 3]]
-            car = pose_at(world.ego, time_s)[0]
-            car[:2] += CAR_MIDDLE_M * np.array([np.cos(car[2]), np.sin(car[2])])
-            shapes = [footprint(p, s) for p, s in zip(poses, world.traffic.sizes, strict=True)]
-            shapes.append(footprint(car, CAR_SIZE_M))
-            for i, shape in enumerate(shapes):
-                assert all(shape.disjoint(other) for other in shapes[:i])
+            assert_nothing_touches(world, time_s)
+
+
+@pytest.fixture(scope="module")
+def hurried() -> list[World]:
+    """Streets of ten sweeps, the last half of them with a crossing within reach."""
+    return [
+        draw_world(
+            np.random.default_rng(seed),
+            reach_m=12 if seed < 10 else 50,
+            beyond_m=20,
+            duration_s=0.45,
+            labels=np.tile(np.arange(10), 2 if seed < 10 else 6),
+            fused=True,
+            hurry=True,
+        )
+        for seed in range(14)
+    ]
+
+
+def test_hurried_objects_never_touch_between_two_sweeps_either(hurried):
+    for world in hurried:
+        for time_s in np.linspace(0, 0.45, 24):
+            assert_nothing_touches(world, time_s)
+
+
+def test_hurried_cars_drive_straight_every_lane_flows_and_objects_are_near_at_the_end(hurried):
+    speeds = np.array([np.linalg.norm(pose_at(w.ego, 0.45) - pose_at(w.ego, 0.0)) / 0.45 for w in hurried])
+    assert ((speeds >= 10) & (speeds <= 20)).all()
+    assert np.ptp(speeds) > 4
+    crossing = 0
+    for world in hurried:
+        moves = world.traffic.motions
+        assert pose_at(world.ego, 9.0)[0, 1] == world.ego["y"][0]
+        fast = moves[np.isin(world.traffic.labels, [0, 1, 2, 3, 4, 6]) & (moves["speed"] > 0)]
+        assert ((fast["speed"] >= 8) & (fast["speed"] <= 20)).all()
+        assert (fast["acceleration"] == 0).all()
+        crossing += (np.abs(np.sin(fast["yaw"])) > 0.9).sum()
+        singles = world.object_poses(0.45)[~np.isin(world.traffic.labels, [0, 3, 8, 9])]  # others stand in rows
+        away = np.hypot(*(singles[:, :2] - pose_at(world.ego, 0.45)[0, :2]).T)
+        assert (away < (12 if len(world.traffic.labels) <= 20 else 50) + 30).all()
+    assert crossing > 5
 
 
 def test_streets_hold_all_classes_moving_and_parked_cars_and_every_manoeuvre(worlds):
@@ -147,7 +193,7 @@ def test_a_truck_is_not_a_big_car():
             solids = object_solids(look, size, 0.2)
             solids = solids[(solids["kind"] == BOX) & np.isinf(solids["density"])]
             inside = (
-                (np.abs(fan[:, None] - solids["center"][:, [0, 2]]) <= solids["half"][:, [0, 2]]).all(-1).any(1)
+                (np.abs(fan[:, None] - solids["center"][:, [0, 2]]) <= solids["half"][:, [0, 2]]).all(-1).any(-1)
             )
             per_look.append(inside.reshape(60, 40))
         fills[name] = per_look
@@ -225,6 +271,35 @@ def test_points_of_moving_objects_trail_behind_and_static_ones_line_up():
     np.testing.assert_allclose(np.array(fronts).mean(axis=1), 8 + 8 * (1.0 - lags), atol=0.12)
     assert all(abs(np.mean(w) - 29.5) < 0.005 and np.abs(w - 29.5).max() < 0.08 for w in walls)
     assert min(map(len, walls)) > 500
+
+
+def test_fused_sweeps_meet_at_what_stands_and_begin_with_the_current_one():
+    wall = make_solids(BOX, [10, 30, 4], [60, 0.5, 6], albedo=0.8)
+    ego = motion(speed=14.0, straight=4, curvature=1 / 30, turn=np.pi / 2)
+    world, mount = made_by_hand(ego, [(8, 12, 0.0, 8.0, (4, 2, 3))], wall), level_mount()
+    points = fuse_sweeps(world, FINE, mount, 1.0, np.random.default_rng(7), num_sweeps=10)
+    lags = (np.arange(10) * SWEEP_S).astype(np.float32)
+    np.testing.assert_array_equal(points[np.r_[True, np.diff(points[:, 4]) != 0], 4], lags)
+    current = scan(world, FINE, mount, 1.0, np.random.default_rng(7))
+    alone = current.points[current.returned][:, :4]
+    np.testing.assert_array_equal(points[points[:, 4] == 0, :4], alone)
+    now = sensor_pose(world, mount, 1.0)
+    off = []
+    for age, lag in enumerate(lags):
+        local = points[points[:, 4] == lag, :3].astype(float)
+        there = local @ now[:3, :3].T + now[:3, 3]
+        on_wall = there[(there[:, 1] > 28) & (there[:, 2] > 0.5), 1]
+        assert len(on_wall) > 500
+        assert abs(on_wall.mean() - 29.5) < 0.005
+        assert np.abs(on_wall - 29.5).max() < 0.08
+        moved = there[(there[:, 2] > 0.5) & (there[:, 1] < 14) & (there[:, 1] > 10), 0]
+        assert (moved.min() + moved.max()) / 2 == pytest.approx(8 + 8 * (1 - lag), abs=0.12)
+        then = sensor_pose(world, mount, 1.0 - age * SWEEP_S)
+        own = (there - then[:3, 3]) @ then[:3, :3]
+        unmoved = own @ now[:3, :3].T + now[:3, 3]  # as a fusion without poses has it
+        off.append(np.median(np.abs(unmoved[there[:, 1] > 28] - there[there[:, 1] > 28]).max(axis=1)))
+    assert off[0] < 1e-3
+    assert off[-1] > 4  # metres: the poses decide
 
 
 @pytest.mark.parametrize("speed", [0.0, 10.0])

@@ -1,47 +1,124 @@
-"""Simulated frames: one sweep with its boxes."""
+"""Simulated frames: a sweep, or several fused, with the boxes of the current moment."""
 
 import numpy as np
 
 from fcos_lidar_jax.data.frame import Frame, count_inside
-from fcos_lidar_jax.data.synthetic.lidar import draw_mount, scan, sensor_pose
+from fcos_lidar_jax.data.synthetic.lidar import SWEEP_S, Mount, Sweep, draw_mount, scan, sensor_pose
 from fcos_lidar_jax.data.synthetic.motion import velocity_at
 from fcos_lidar_jax.data.synthetic.world import World, draw_world
+from fcos_lidar_jax.projection import close_to_sensor
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CLASSES
 
 
-def make_frame(seed: int, sensor: Sensor, *, num_objects: int = 12, reach_m: float | None = None) -> Frame:
+def make_frame(
+    seed: int,
+    sensor: Sensor,
+    *,
+    num_objects: int = 12,
+    reach_m: float | None = None,
+    num_sweeps: int = 1,
+    hurry: bool = False,
+    close_m: float = 0.0,
+) -> Frame:
     """A simulated frame of a level street; the same seed gives the same bytes, in whatever order frames are made.
 
-    All ten classes occur equally often. Only objects that a point shows are annotated, and rays without a return
-    are left out.
+    All ten classes occur equally often. Only objects that a point of the current sweep shows are annotated, and
+    rays without a return are left out.
 
     Args:
         seed: any non-negative integer.
         sensor: who looks.
         num_objects: to place; fewer where there is no room.
         reach_m: greatest distance along the street at which they are placed; default: four fifths of the sensor's.
+        num_sweeps: fused, the current one included; with more than one the world moves.
+        hurry: the car and most of the objects move fast, as in :func:`~.world.draw_world`.
+        close_m: as in :func:`fuse_sweeps`.
+
+    Raises:
+        ValueError: fewer than one sweep.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> a, b = make_frame(3, TINY), make_frame(3, TINY)
     >>> bool((a.points == b.points).all()), bool((a.num_points >= 1).all())
     (True, True)
     """
+    if num_sweeps < 1:
+        raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
     rng = np.random.default_rng([seed, 0xF0C5])
     labels = rng.permutation(np.resize(rng.permutation(len(CLASSES)), num_objects))
     reach = 0.8 * sensor.limit_xy_m if reach_m is None else reach_m
-    world = draw_world(rng, reach_m=reach, beyond_m=2 * reach, duration_s=0.0, labels=labels, level=True)
+    now_s = (num_sweeps - 1) * SWEEP_S
+    world = draw_world(
+        rng,
+        reach_m=reach,
+        beyond_m=2 * reach,
+        duration_s=now_s,
+        labels=labels,
+        level=True,
+        fused=True,
+        hurry=hurry,
+    )
     mount = draw_mount(rng, sensor, level=True)
-    sweep = scan(world, sensor, mount, 0.0, rng)
-    points = sweep.points[sweep.returned]
-    columns = [points[:, :4], np.zeros((len(points), 1), np.float32)]
-    if sensor.row_source == "laser":
-        columns.append(sensor.num_rows - 1 - points[:, 4:])
-    points = np.concatenate(columns, axis=1)
-    boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, 0.0), 0.0).astype(np.float32)
-    counts = count_inside(points, boxes)
+    points = fuse_sweeps(world, sensor, mount, now_s, rng, num_sweeps=num_sweeps, close_m=close_m)
+    boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, now_s), now_s).astype(np.float32)
+    counts = count_inside(points[points[:, 4] == 0], boxes)
     shown = counts > 0
     return Frame(points, boxes[shown], world.traffic.labels[shown], counts[shown])
+
+
+def fuse_sweeps(
+    world: World,
+    sensor: Sensor,
+    mount: Mount,
+    time_s: float,
+    rng: np.random.Generator,
+    *,
+    num_sweeps: int,
+    close_m: float = 0.0,
+) -> np.ndarray:
+    """The sweeps up to a moment in the sensor's frame of that moment, the current one first, then by age.
+
+    Args:
+        world: what there is.
+        sensor: whose beams.
+        mount: where it sits.
+        time_s: of the current sweep; the others are ``SWEEP_S`` apart.
+        rng: noise and dropout.
+        num_sweeps: how many, the current one included.
+        close_m: points with ``|x|, |y|`` below it around the sensor, in their own sweep's frame, are left out.
+
+    Returns:
+        f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, the lag exactly 0 for the current sweep.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> rng = np.random.default_rng(0)
+    >>> world = draw_world(rng, reach_m=20, beyond_m=30, duration_s=0.1, labels=np.arange(10), level=True)
+    >>> points = fuse_sweeps(world, TINY, draw_mount(rng, TINY, level=True), 0.1, rng, num_sweeps=3)
+    >>> (np.unique(points[:, 4]) / SWEEP_S).round().tolist()
+    [0.0, 1.0, 2.0]
+    """
+    to_now = np.linalg.inv(sensor_pose(world, mount, time_s))
+    parts = []
+    for age in range(num_sweeps):
+        then_s = time_s - age * SWEEP_S
+        sweep = scan(world, sensor, mount, then_s, rng)
+        points = _as_cloud(sweep, sensor, age * SWEEP_S)
+        points = points[~close_to_sensor(points, sensor, close_m)]
+        if age:  # the current sweep keeps its very bits
+            motion = to_now @ sensor_pose(world, mount, then_s)
+            points[:, :3] = points[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
+        parts.append(points)
+    return np.concatenate(parts)
+
+
+def _as_cloud(sweep: Sweep, sensor: Sensor, lag_s: float) -> np.ndarray:
+    """What came back, in the columns of :class:`fcos_lidar_jax.data.frame.Frame`."""
+    points = sweep.points[sweep.returned]
+    columns = [points[:, :4], np.full((len(points), 1), lag_s, np.float32)]
+    if sensor.row_source == "laser":
+        columns.append(sensor.num_rows - 1 - points[:, 4:])
+    return np.concatenate(columns, axis=1)
 
 
 def boxes_in_sensor_frame(world: World, pose: np.ndarray, time_s: float) -> np.ndarray:

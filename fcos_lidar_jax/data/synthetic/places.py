@@ -14,6 +14,8 @@ PARKED = ("row", "kerb", "yard")
 """Places where vehicles are left."""
 _ROW_LENGTH = {"car": 8, "trailer": 5, "traffic_cone": 8, "barrier": 14}
 """Objects in a row, at most."""
+_HURRIED = 0.7
+"""Of the objects of a hurried world that get the first of their class's places, where they move."""
 _FLOWING = {0: 0.8, 1: 0.4}
 """How often traffic moves in a lane of the main street and of the other."""
 
@@ -63,6 +65,8 @@ class Places:
     """[1] of ``motion.MOTION``: the car that carries the sensor."""
     reach_m: float
     """Greatest distance from it, at the moment of a draw."""
+    hurry: bool = False
+    """Every lane flows, fast and steadily, and few stand."""
     rows: dict[str, Row] = dataclasses.field(default_factory=dict)
     """Class -> the row that is being filled."""
     flows: dict[tuple[int, int, int], tuple[float, float]] = dataclasses.field(default_factory=dict)
@@ -73,6 +77,8 @@ class Places:
         names, shares = zip(*_PLACES[name], strict=True)
         if name in ("motorcycle", "bicycle"):
             return names[0] if look.rider else names[1]
+        if self.hurry and self.rng.random() < _HURRIED:
+            return names[0]
         drawn = np.searchsorted(np.cumsum(shares), self.rng.random(), side="right")
         return names[min(int(drawn), len(names) - 1)]
 
@@ -118,7 +124,7 @@ class Places:
             speed = rng.uniform(*look.speed_mps)
         else:  # pavement
             beside = side * (half + rng.uniform(1.6, max(ground.pavement - 0.4, 1.7)))
-            moves = look.speed_mps[1] > 0 and rng.random() < 0.75
+            moves = look.speed_mps[1] > 0 and (self.hurry or rng.random() < 0.75)
             speed = rng.uniform(*look.speed_mps) if moves else 0.0
             turn = rng.choice([0.0, np.pi]) + rng.normal(0, 0.15) if moves else rng.uniform(-np.pi, np.pi)
         motion = self._motion(along, s, beside, turn, speed, change)
@@ -136,10 +142,13 @@ class Places:
         """Speed and its change in a lane; in the car's own lane they are the car's."""
         if (along, side, lane) not in self.flows:
             rng = self.rng
-            flow = (rng.uniform(3, 12), rng.choice([0.0, 0.0, 0.0, -0.5, -1.5, 0.5]))
+            if self.hurry:
+                flow = (rng.uniform(8, 18), 0.0)
+            else:
+                flow = (rng.uniform(3, 12), rng.choice([0.0, 0.0, 0.0, -0.5, -1.5, 0.5]))
             if along == 0 and np.isclose(side * LANE_M * (lane + 0.5), self.ego["y"][0]):
                 flow = (self.ego["speed"][0], self.ego["acceleration"][0])
-            elif rng.random() > _FLOWING[along]:
+            elif not self.hurry and rng.random() > _FLOWING[along]:
                 flow = (0.0, 0.0)
             self.flows[along, side, lane] = float(flow[0]), float(flow[1])
         return self.flows[along, side, lane]

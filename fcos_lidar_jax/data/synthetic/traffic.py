@@ -6,7 +6,7 @@ import numpy as np
 from numpy.random import Generator
 
 from fcos_lidar_jax.data.synthetic.ground import Ground
-from fcos_lidar_jax.data.synthetic.looks import draw_look
+from fcos_lidar_jax.data.synthetic.looks import LOOKS, draw_look
 from fcos_lidar_jax.data.synthetic.motion import MOTION, pose_at
 from fcos_lidar_jax.data.synthetic.places import PARKED, Places
 from fcos_lidar_jax.data.synthetic.shapes import Look, draw_size
@@ -16,6 +16,10 @@ _CLEARANCE_M = 0.35
 """Objects keep this from each other, at all times ..."""
 _ROW_CLEARANCE_M = 0.08
 """... but in a row only this."""
+_STEP_S = 0.5
+"""They are compared at moments so far apart ..."""
+_FUSED_STEP_S = 0.025
+"""... but in worlds of a few sweeps so often that nothing slips through anything between two sweeps."""
 _TRIES = 25
 CAR_SIZE_M = (4.6, 2.0)
 """Length and width of the car that carries the sensor."""
@@ -48,6 +52,8 @@ def draw_traffic(
     reach_m: float,
     duration_s: float,
     occupied: np.ndarray,
+    fused: bool = False,
+    hurry: bool = False,
 ) -> Traffic:
     """Objects that never touch each other, the car or what stands already.
 
@@ -61,20 +67,23 @@ def draw_traffic(
         reach_m: greatest distance at that moment.
         duration_s: how long the world lasts.
         occupied: f64[k, 5], ``x, y, l, w, yaw`` of what stands already.
+        fused: seen at the end alone: that is the moment at which every object is within reach.
+        hurry: nearly all that can move does.
     """
-    times = np.arange(0, duration_s + 1e-6, 0.5)
+    times = np.arange(0, duration_s + 1e-6, _FUSED_STEP_S if fused else _STEP_S)
     room = _Room(times, occupied)
     car = pose_at(ego, times)
     car[:, :2] += CAR_MIDDLE_M * np.stack([np.cos(car[:, 2]), np.sin(car[:, 2])], axis=1)
     room.take(car, CAR_SIZE_M)
-    places = Places(rng, ground, ego, reach_m)
+    places = Places(rng, ground, ego, reach_m, hurry)
     found: list[tuple[int, Look, np.ndarray, np.ndarray, bool]] = []
     for label in labels:
         name = CLASSES[label]
         for _ in range(_TRIES):
-            look = draw_look(rng, name)
+            look = _draw_mover(rng, name) if hurry else draw_look(rng, name)
             size = draw_size(rng, look)
-            place, moment, clearance = places.draw_place(name, look), rng.uniform(0, duration_s), _CLEARANCE_M
+            place, clearance = places.draw_place(name, look), _CLEARANCE_M
+            moment = rng.uniform(duration_s if fused else 0.0, duration_s)
             if place == "row":
                 row, clearance = places.row_for(name, moment, look, size), _ROW_CLEARANCE_M
                 if row.look is not look and name in ("traffic_cone", "barrier"):  # in a row all are alike
@@ -94,6 +103,14 @@ def draw_traffic(
         np.concatenate([np.zeros(0, MOTION), *(f[3] for f in found)]),
         np.array([f[4] for f in found], bool),
     )
+
+
+def _draw_mover(rng: Generator, name: str) -> Look:
+    """A variety that moves, of a class that has one."""
+    look = draw_look(rng, name)
+    while look.speed_mps[1] == 0 and any(other.speed_mps[1] > 0 for other in LOOKS[name]):
+        look = draw_look(rng, name)
+    return look
 
 
 class _Room:

@@ -61,7 +61,15 @@ class World:
 
 
 def draw_world(
-    rng: Generator, *, reach_m: float, beyond_m: float, duration_s: float, labels: np.ndarray, level: bool = False
+    rng: Generator,
+    *,
+    reach_m: float,
+    beyond_m: float,
+    duration_s: float,
+    labels: np.ndarray,
+    level: bool = False,
+    fused: bool = False,
+    hurry: bool = False,
 ) -> World:
     """A random world.
 
@@ -72,6 +80,8 @@ def draw_world(
         duration_s: how long it lasts.
         labels: i32[m], objects wanted; those without room are left out.
         level: without slopes.
+        fused: seen at its end alone, in a few sweeps before: every object is within reach then.
+        hurry: the car drives straight on at 10 to 20 m/s, every lane flows, and nearly all that can move does.
 
     >>> labels = np.arange(10)
     >>> world = draw_world(np.random.default_rng(0), reach_m=30, beyond_m=40, duration_s=0.0, labels=labels)
@@ -79,7 +89,7 @@ def draw_world(
     (True, 4)
     """
     ground = _draw_ground(rng, level)
-    ego = _draw_ego(rng, ground, duration_s)
+    ego = _draw_ego(rng, ground, duration_s, hurry)
     path = pose_at(ego, np.arange(0, duration_s + 0.1, 0.5))[:, :2]
     scenery = draw_scenery(rng, ground, path.min(axis=0), path.max(axis=0), beyond_m=beyond_m)
     standing = scenery["center"][:, 2] - scenery["half"][:, 2] < 2 + ground.height(*scenery["center"][:, :2].T)
@@ -87,7 +97,15 @@ def draw_world(
     occupied = np.concatenate(columns, axis=1)[standing]
     largest_first = np.array(sorted(labels, key=lambda k: -np.prod(LOOKS[CLASSES[k]][0].size_m)), np.int32)
     traffic = draw_traffic(
-        rng, ground, ego, labels=largest_first, reach_m=reach_m, duration_s=duration_s, occupied=occupied
+        rng,
+        ground,
+        ego,
+        labels=largest_first,
+        reach_m=reach_m,
+        duration_s=duration_s,
+        occupied=occupied,
+        fused=fused,
+        hurry=hurry,
     )
     parts = [np.zeros(0, SOLID)]
     for index, (look, size) in enumerate(zip(traffic.looks, traffic.sizes, strict=True)):
@@ -132,9 +150,12 @@ def _draw_ground(rng: Generator, level: bool) -> Ground:
     )
 
 
-def _draw_ego(rng: Generator, ground: Ground, duration_s: float) -> np.ndarray:
+def _draw_ego(rng: Generator, ground: Ground, duration_s: float, hurry: bool) -> np.ndarray:
     ego = np.zeros(1, MOTION)
     ego["y"] = -LANE_M / 2 if rng.random() < 0.6 else -(ground.half_width - 2.5 - LANE_M / 2)
+    if hurry:
+        ego["speed"] = rng.uniform(10, 20)
+        return ego
     manoeuvre = rng.choice(_MANOEUVRES)
     ego["speed"] = rng.uniform(4, 11)
     if manoeuvre == "stopped":

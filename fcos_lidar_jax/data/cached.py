@@ -1,0 +1,124 @@
+"""Frames that are slow to make, kept on disk from the first time on."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax import __version__
+from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.files import write_beside
+
+_DESCRIPTION = "frames.json"
+_FIELDS = tuple(field.name for field in dataclasses.fields(Frame))
+
+
+class CacheError(ValueError):
+    """A folder that cannot keep these frames; one line that says why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CachedFrames:
+    """A frame set that makes every frame once: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
+
+    The folder holds ``frames.json``, which says whose frames they are, and an archive of NumPy arrays for every
+    frame that was asked for. Threads and processes may share it: files appear whole, and whoever makes a frame
+    twice makes the same one. A damaged file is made anew, and a line on standard error says so.
+
+    What the description cannot tell, such as changed code of the same version, goes unnoticed: the folder is then
+    to be deleted.
+
+    Raises:
+        CacheError: at construction, where the folder holds the frames of another set.
+        OSError: a file that cannot be written.
+
+    >>> import tempfile
+    >>> from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> frames = CachedFrames(SimulatedFrames(TINY, number=2), folder)
+    >>> len(frames), bool((frames.frame(1).points == frames.frame(1).points).all())
+    (2, True)
+    >>> sorted(file.name for file in folder.iterdir())
+    ['000001.npz', 'frames.json']
+    """
+
+    frames: FrameSet
+    """What is kept: a dataclass whose fields JSON can hold."""
+    folder: Path
+    """New, empty, or begun with the same frames."""
+
+    def __post_init__(self) -> None:
+        """Make the folder this set's, or check that it is."""
+        wanted, file = _description(self.frames), self.folder / _DESCRIPTION
+        if self.folder.exists() and not self.folder.is_dir():
+            raise CacheError(f"{self.folder}: found a file, expected a folder")
+        # In this order: another process may begin the same cache at this moment.
+        stray = sorted(p.name for p in self.folder.glob("*.npz") if not p.name.startswith("."))
+        if not file.is_file():
+            if stray:
+                raise CacheError(f"{self.folder}: found {stray[0]} without {_DESCRIPTION}, expected a new folder")
+            write_beside(file, lambda path: path.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8"))
+        _compare(file, wanted)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frames)
+
+    def frame(self, index: int) -> Frame:
+        """One frame, read from its file; made and written where there is none."""
+        file = self.folder / f"{index:06d}.npz"
+        try:
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+                return Frame(**{name: archive[name] for name in _FIELDS})
+        except FileNotFoundError:
+            pass
+        except Exception as error:  # wrong bytes in an archive raise nearly anything
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            print(f"warning: {file}: damaged ({reason}): made anew", file=sys.stderr, flush=True)
+        frame = self.frames.frame(index)
+        arrays = {name: getattr(frame, name) for name in _FIELDS}
+        write_beside(file, lambda path: np.savez(path, **arrays))
+        return frame
+
+    def labels(self, index: int) -> np.ndarray:
+        """Labels of a frame's boxes; the frame is made for it where it is not there yet."""
+        return self.frame(index).labels
+
+    def name(self, index: int) -> str:
+        """What messages call a frame."""
+        return self.frames.name(index)
+
+
+def _description(frames: FrameSet) -> dict[str, Any]:
+    """What decides every byte of the frames, as JSON returns it."""
+    kind = type(frames)
+    if not dataclasses.is_dataclass(frames):
+        raise CacheError(f"frames: got {kind.__name__}, expected a dataclass")
+    try:
+        fields = json.loads(json.dumps(dataclasses.asdict(frames)))
+    except TypeError as error:
+        raise CacheError(f"frames: {kind.__name__}: expected fields that JSON can hold: {error}") from None
+    return {"version": __version__, "kind": kind.__qualname__, **fields}
+
+
+def _compare(file: Path, wanted: dict[str, Any]) -> None:
+    """Refuse the folder of another frame set."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError:
+        raise CacheError(f"{file}: not JSON, expected the description of the frames there") from None
+    if not isinstance(found, dict):
+        raise CacheError(f"{file}: got {type(found).__name__}, expected a JSON object")
+    for name in [*wanted, *(set(found) - set(wanted))]:
+        if name not in found or name not in wanted or found[name] != wanted[name]:
+            there, got = (_shown(record.get(name, "nothing")) for record in (found, wanted))
+            raise CacheError(f"{file}: {name}: found {there}, expected {got}: this folder keeps other frames")
+
+
+def _shown(value: Any) -> Any:
+    """A sensor by its name."""
+    return value["name"] if isinstance(value, dict) and "name" in value else value
