@@ -11,13 +11,6 @@ padding, with those on the zeros of a block-diagonal kernel. Every convolution o
 itself: what a variant's convolutions take one by one explains its place.
 
 Cost: 15 turns take about eight minutes on two CPU cores.
-
-Result, on two busy CPU cores (3 turns; only ratios count): one group 4.6 times the nine types, five modalities 1.4
-to 1.6, one convolution 0.8, three 1.4: the paper's order. Not so nine types with the rounds apart: 3.8 to 4.3
-times instead of 1.2, behind the five modalities, with the fewest operations of all. They are 135 groups of six
-channels; timed one by one, 90 % of the variant's time, their convolutions run at 1 to 5 GFLOP/s, 1.75 s, and
-adding six channels to the merged image takes as long as adding 32, 2.1 s. Nine chains of 5 to 30 to 30 channels,
-what it would be with zeros between the rounds of a type, take 1.2 times the nine types.
 """
 
 import dataclasses
@@ -199,7 +192,10 @@ def pieces_of(stem: StemConfig) -> Counter[Piece]:
     >>> pieces_of(StemConfig())[Piece(5, 32, 6)], pieces_of(StemConfig())[Piece(32, 64, 0)]
     (9, 27)
     """
-    groups = channel_groups(stem, SHAPE[-1] // 9)
+    rounds = SHAPE[-1] // 9
+    groups = channel_groups(stem, rounds)
+    if not stem.group_rounds:  # the rounds of a type share a convolution
+        groups = [(rounds * size, rounds * out) for size, out in groups[::rounds]]
     layers = [*groups, *[(out, out) for _, out in groups] * (stem.num_convs - 1)]
     spatial = [Piece(*channels, dilation) for dilation in stem.dilations for channels in layers]
     return Counter(spatial + [Piece(out, stem.out_channels, 0) for _, out in groups] * len(stem.dilations))

@@ -39,6 +39,7 @@ SMALL_STEM = StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2))
     [
         {"num_convs": 2},
         {"num_convs": 1, "group_rounds": False},
+        {"num_convs": 2, "group_rounds": False},
         {"num_convs": 2, "groups": "modalities"},
         {"num_convs": 2, "groups": "all"},
     ],

@@ -1,5 +1,6 @@
 """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import flax.linen as nn
@@ -42,33 +43,32 @@ def block_diagonal(kernels: Sequence[Kernel]) -> Kernel:
 
 
 def modality_convolve(
-    parts: Sequence[Image], kernels: Sequence[Kernel], *, dilation: int, circular: bool, form: str
+    parts: Sequence[Image], kernels: Sequence[Kernel], *, dilation: int, circular: bool, grouped: bool = False
 ) -> list[Image]:
     """One 3x3 convolution for each group of channels.
 
     Args:
-        parts: the groups' channels, group by group or already joined into one image.
+        parts: the channels, in as many images as there are to be convolutions; each holds as many whole groups.
         kernels: one a group.
         dilation: of both axes (static).
         circular: wrap the width (static).
-        form: how it is computed (static), see :class:`fcos_lidar_jax.config.StemConfig`. Groups of different
-            sizes cannot be ``"grouped"`` and are ``"dense"`` then.
+        grouped: a single part is convolved by ``feature_group_count``, where the groups are of one size, instead
+            of a block-diagonal kernel (static).
 
     Returns:
-        the groups' features, group by group for ``"split"``, else joined into one image.
+        the groups' features, in as many parts.
 
-    >>> parts, kernels = [jnp.ones((1, 4, 4, 2))] * 3, [jnp.ones((3, 3, 2, 5))] * 3
-    >>> [len(modality_convolve(parts, kernels, dilation=1, circular=False, form=f)) for f in ("split", "dense")]
-    [3, 1]
+    >>> kernels = [jnp.ones((3, 3, 2, 5))] * 4
+    >>> parts = modality_convolve([jnp.ones((1, 4, 4, 4))] * 2, kernels, dilation=1, circular=False)
+    >>> [part.shape for part in parts]
+    [(1, 4, 4, 10), (1, 4, 4, 10)]
     """
-    if form == "split":
-        return [convolve(x, k, dilation=dilation, circular=circular) for x, k in zip(parts, kernels, strict=True)]
-    x = parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
-    if form == "grouped" and len({k.shape for k in kernels}) == 1:
-        kernel, groups = jnp.concatenate(kernels, axis=-1), len(kernels)
-    else:
-        kernel, groups = block_diagonal(kernels), 1
-    return [convolve(x, kernel, dilation=dilation, groups=groups, circular=circular)]
+    if grouped and len(parts) == 1 and len({k.shape for k in kernels}) == 1:
+        kernel = jnp.concatenate(kernels, axis=-1)
+        return [convolve(parts[0], kernel, dilation=dilation, groups=len(kernels), circular=circular)]
+    each = len(kernels) // len(parts)
+    bundles = [block_diagonal(kernels[i * each : (i + 1) * each]) for i in range(len(parts))]
+    return [convolve(x, k, dilation=dilation, circular=circular) for x, k in zip(parts, bundles, strict=True)]
 
 
 class ModalityBranch(nn.Module):
@@ -90,8 +90,9 @@ class ModalityBranch(nn.Module):
                 self.param(f"conv{layer}_group{g}", kernel_init, (3, 3, size, width))
                 for g, (size, width) in enumerate(zip(sizes, widths, strict=True))
             ]
+            grouped = self.config.form == "grouped"
             parts = modality_convolve(
-                parts, kernels, dilation=self.dilation, circular=self.circular, form=self.config.form
+                parts, kernels, dilation=self.dilation, circular=self.circular, grouped=grouped
             )
             parts = [jax.nn.relu(x) for x in BatchNorm(name=f"norm{layer}")(parts, train=train)]
             if self.precision == "bfloat16":  # only behind the first layer: metres need more bits
@@ -119,8 +120,9 @@ class Stem(nn.Module):
         num_rounds = image.shape[-1] // 9
         groups = channel_groups(config, num_rounds)
         parts = [image]
-        if config.form == "split":
-            parts = [image[..., cut] for cut in pieces([size for size, _ in groups])]
+        if config.form == "split":  # rounds that are not grouped still share a convolution: narrow ones are slow
+            together = channel_groups(dataclasses.replace(config, group_rounds=True), num_rounds)
+            parts = [image[..., cut] for cut in pieces([size for size, _ in together])]
         merged = jnp.zeros((), image.dtype)  # the sum over all groups keeps the image's precision
         computed = image.dtype
         shape = (sum(width for _, width in groups), config.out_channels)
