@@ -31,6 +31,10 @@ _UNSEEN = 1_000_000
 """Seeds of test streets start here."""
 
 
+_BONNET_M = 2.1
+"""Nearer points are on the own bonnet, which would leave a trail when sweeps are fused."""
+
+
 class Scale(Protocol):
     """Where and how long cells are trained."""
 
@@ -77,7 +81,7 @@ class Simulated:
     def frames(self, split: str, num_sweeps: int) -> CachedFrames:
         """Training or test streets, seen by so many sweeps."""
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, _UNSEEN)}[split]
-        made = SimulatedFrames(self.sensor, number, first, num_sweeps=num_sweeps, hurry=True)
+        made = SimulatedFrames(self.sensor, number, first, num_sweeps=num_sweeps, hurry=True, close_m=_BONNET_M)
         return CachedFrames(made, self.cache / f"{self.sensor.name}_{split}_{number}_{num_sweeps}_sweeps")
 
     def objects(self, num_sweeps: int) -> ObjectDatabase:
