@@ -123,7 +123,7 @@ from toy_frames import ToyFrames
 if __name__ == "__main__":
     plan = [(f"scene-{i}", (i, i + 1)) for i in range(40)]
     print("began", flush=True)
-    build_objects(ToyFrames(99, 0.005), sys.argv[1], shards=plan, fingerprint="f", workers=int(sys.argv[2]))
+    build_objects(ToyFrames(99, 0.03), sys.argv[1], shards=plan, fingerprint="f", workers=int(sys.argv[2]))
 """
 
 
