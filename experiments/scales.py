@@ -49,7 +49,7 @@ class Scale(Protocol):
         ...
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``. The run's folder stays until it is scored."""
+        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``."""
         ...
 
     def describe(self) -> dict[str, Any]:
