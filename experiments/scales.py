@@ -188,7 +188,7 @@ _TEN_SWEEPS = dataclasses.replace(
     model=dataclasses.replace(
         QUICKSTART.model,
         # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
-        stem=StemConfig(channels_per_type=5, out_channels=16, form="dense"),
+        stem=StemConfig(channels_per_type=5, out_channels=16),
     ),
     optimizer=dataclasses.replace(QUICKSTART.optimizer, epochs=2),
 )
@@ -198,7 +198,7 @@ _TOY = dataclasses.replace(
     max_points=10_240,
     model=dataclasses.replace(
         _TEN_SWEEPS.model,
-        stem=StemConfig(channels_per_type=5, out_channels=8, form="dense"),
+        stem=StemConfig(channels_per_type=5, out_channels=8),
         backbone_blocks=(1, 1, 1, 1),
         backbone_widths=(8, 8, 8, 8),
         fpn_channels=8,

@@ -64,8 +64,6 @@ def of_size(over: int, fpn: int) -> tuple[Config, Sensor]:
         fpn_channels=fpn // over,
         head_channels=model.head_channels // over,
     )
-    if over > 1:  # narrow groups
-        model = dataclasses.replace(model, stem=dataclasses.replace(model.stem, form="dense"))
     sensor = dataclasses.replace(NUSCENES_HDL32E, num_columns=width)
     return dataclasses.replace(NUSCENES, model=model, num_sweeps=1, max_points=40_000), sensor
 

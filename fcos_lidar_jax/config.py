@@ -64,8 +64,8 @@ class StemConfig:
     merge: Literal["per_branch", "shared"] = "per_branch"
     """Reading: every branch has its own 1x1 merge, or one is shared."""
     form: Literal["split", "dense", "grouped"] = "split"
-    """The same function in three formulations: independent chains (fast on CPU for wide groups), one
-    block-diagonal kernel (fast for narrow groups), or ``feature_group_count``. Parameters are interchangeable."""
+    """The same function in three formulations: independent chains (narrow groups are joined to what a CPU does
+    well), one block-diagonal kernel, or ``feature_group_count``. Parameters are interchangeable."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot run."""
@@ -361,7 +361,7 @@ QUICKSTART = dataclasses.replace(
     model=dataclasses.replace(
         NUSCENES.model,
         row_upscale=1,
-        stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3), form="dense"),
+        stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3)),
         backbone_blocks=(2, 2, 1, 1),
         backbone_widths=(16, 32, 32, 32),
         fpn_channels=32,

@@ -1,6 +1,6 @@
 """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
 
-import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import flax.linen as nn
@@ -12,6 +12,8 @@ from fcos_lidar_jax.models.layers import BatchNorm, Image, Kernel, convolve, ker
 
 _MODALITIES = (3, 3, 1, 1, 1)
 """Channel types a modality: (x, y, z), (range, azimuth, inclination), intensity, existence, time lag."""
+_WIDE = 24
+"""Output channels below which a convolution on CPU costs more than the block-diagonal one of several groups."""
 
 
 def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]:
@@ -25,6 +27,24 @@ def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]
         return [(1, width // num_rounds)] * (9 * num_rounds)
     types = {"types": (1,) * 9, "modalities": _MODALITIES, "all": (9,)}[config.groups]
     return [(count * num_rounds, count * width) for count in types]
+
+
+def bundles(groups: Sequence[tuple[int, int]], form: str) -> list[slice]:
+    """The groups that each convolution computes: all, or as few as make it wide enough.
+
+    >>> bundles([(5, 8)] * 9, "split")
+    [slice(0, 3, None), slice(3, 6, None), slice(6, 9, None)]
+    >>> bundles([(5, 4)] * 9, "split") == bundles([(5, 8)] * 9, "dense") == [slice(0, 9)]
+    True
+    """
+    cuts, width = [0], 0
+    for end, (_, outputs) in enumerate(groups, 1):
+        width += outputs
+        if form == "split" and width >= _WIDE:
+            cuts.append(end)
+            width = 0
+    # Narrow groups that are left over join the last bundle.
+    return [slice(*ends) for ends in itertools.pairwise([*cuts[: max(1, len(cuts) - 1)], len(groups)])]
 
 
 def block_diagonal(kernels: Sequence[Kernel]) -> Kernel:
@@ -43,32 +63,39 @@ def block_diagonal(kernels: Sequence[Kernel]) -> Kernel:
 
 
 def modality_convolve(
-    parts: Sequence[Image], kernels: Sequence[Kernel], *, dilation: int, circular: bool, grouped: bool = False
+    parts: Sequence[Image],
+    kernels: Sequence[Sequence[Kernel]],
+    *,
+    dilation: int,
+    circular: bool,
+    grouped: bool = False,
 ) -> list[Image]:
     """One 3x3 convolution for each group of channels.
 
     Args:
-        parts: the channels, in as many images as there are to be convolutions; each holds as many whole groups.
-        kernels: one a group.
+        parts: the channels, in as many images as there are to be convolutions; each holds whole groups.
+        kernels: those of each part's groups.
         dilation: of both axes (static).
         circular: wrap the width (static).
-        grouped: a single part is convolved by ``feature_group_count``, where the groups are of one size, instead
-            of a block-diagonal kernel (static).
+        grouped: groups of one size are convolved by ``feature_group_count`` instead of a block-diagonal kernel
+            (static).
 
     Returns:
         the groups' features, in as many parts.
 
-    >>> kernels = [jnp.ones((3, 3, 2, 5))] * 4
+    >>> kernels = [[jnp.ones((3, 3, 2, 5))] * 2] * 2
     >>> parts = modality_convolve([jnp.ones((1, 4, 4, 4))] * 2, kernels, dilation=1, circular=False)
     >>> [part.shape for part in parts]
     [(1, 4, 4, 10), (1, 4, 4, 10)]
     """
-    if grouped and len(parts) == 1 and len({k.shape for k in kernels}) == 1:
-        kernel = jnp.concatenate(kernels, axis=-1)
-        return [convolve(parts[0], kernel, dilation=dilation, groups=len(kernels), circular=circular)]
-    each = len(kernels) // len(parts)
-    bundles = [block_diagonal(kernels[i * each : (i + 1) * each]) for i in range(len(parts))]
-    return [convolve(x, k, dilation=dilation, circular=circular) for x, k in zip(parts, bundles, strict=True)]
+
+    def one(x: Image, own: Sequence[Kernel]) -> Image:
+        if grouped and len({kernel.shape for kernel in own}) == 1:
+            kernel = jnp.concatenate(own, axis=-1)
+            return convolve(x, kernel, dilation=dilation, groups=len(own), circular=circular)
+        return convolve(x, block_diagonal(own), dilation=dilation, circular=circular)
+
+    return [one(x, own) for x, own in zip(parts, kernels, strict=True)]
 
 
 class ModalityBranch(nn.Module):
@@ -82,7 +109,8 @@ class ModalityBranch(nn.Module):
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
-        """Features of the groups, in as many parts as :func:`modality_convolve` gives."""
+        """Features of the groups, in as many parts as are given."""
+        together = bundles(self.groups, self.config.form)
         sizes = [size for size, _ in self.groups]
         widths = [width for _, width in self.groups]
         for layer in range(self.config.num_convs):
@@ -92,7 +120,11 @@ class ModalityBranch(nn.Module):
             ]
             grouped = self.config.form == "grouped"
             parts = modality_convolve(
-                parts, kernels, dilation=self.dilation, circular=self.circular, grouped=grouped
+                parts,
+                [kernels[cut] for cut in together],
+                dilation=self.dilation,
+                circular=self.circular,
+                grouped=grouped,
             )
             parts = [jax.nn.relu(x) for x in BatchNorm(name=f"norm{layer}")(parts, train=train)]
             if self.precision == "bfloat16":  # only behind the first layer: metres need more bits
@@ -119,10 +151,8 @@ class Stem(nn.Module):
         config = self.config
         num_rounds = image.shape[-1] // 9
         groups = channel_groups(config, num_rounds)
-        parts = [image]
-        if config.form == "split":  # rounds that are not grouped still share a convolution: narrow ones are slow
-            together = channel_groups(dataclasses.replace(config, group_rounds=True), num_rounds)
-            parts = [image[..., cut] for cut in pieces([size for size, _ in together])]
+        sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups, config.form)]
+        parts = [image[..., cut] for cut in pieces(sizes)]
         merged = jnp.zeros((), image.dtype)  # the sum over all groups keeps the image's precision
         computed = image.dtype
         shape = (sum(width for _, width in groups), config.out_channels)
