@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -139,20 +140,28 @@ def checkpoints(out: Path) -> list[str]:
     return sorted(path.name for path in (out / "checkpoints").glob("*"))
 
 
+def wait_for_a_step(process: subprocess.Popen[str], out: Path, beyond: int = 0) -> None:
+    """Until the run has done more steps, or is over."""
+    until = time.monotonic() + 200
+    while process.poll() is None and time.monotonic() < until:
+        if (out / "metrics.jsonl").exists() and len(read_records(out)) > beyond:
+            return
+        time.sleep(0.01)
+
+
+def long(root: Path) -> list[str]:
+    """Options of a run that is to be stopped."""
+    more = ["--weights", str(root.parent / "start"), "--no-copy-paste", "--steps", "2000", "--val-split", "none"]
+    return [*more, "--save-every", "2000", "--evaluate-every", "2000"]
+
+
 def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, tmp_path, child):
     """A run is asked to stop as soon as it has done a step, twice; where it then ends, test_runs tells."""
     out = tmp_path / "run"
-    more = ["--weights", str(root.parent / "start"), "--no-copy-paste", "--steps", "2000", "--val-split", "none"]
-    more += ["--save-every", "2000", "--evaluate-every", "2000"]
     stops = []
     for number, code, resume in ((signal.SIGINT, 130, []), (signal.SIGTERM, 143, ["--resume"])):
-        done = len(read_records(out)) if resume else 0
-        process = child(train(root, out, *more, *resume))
-        until = time.monotonic() + 200
-        while process.poll() is None and time.monotonic() < until:
-            if (out / "metrics.jsonl").exists() and len(read_records(out)) > done:
-                break
-            time.sleep(0.01)
+        process = child(train(root, out, *long(root), *resume))
+        wait_for_a_step(process, out, len(read_records(out)) if resume else 0)
         process.send_signal(number)
         _, errors = process.communicate(timeout=200)
         assert process.returncode == code, errors
@@ -163,6 +172,32 @@ def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, tmp_pat
     assert 0 < stops[0] < stops[1] < 2000
     # Nothing was done twice or left out.
     assert [line["step"] for line in read_records(out)] == list(range(1, stops[1] + 1))
+
+
+def test_two_processes_are_one_run_and_stop_together(root, tmp_path, child):
+    """Each reads its half of the batch; the first step is that of one process, and asking the second to stop stops
+    both after the same step, saved once."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    assert cli.main(train(root, alone, *long(root), "--steps", "1")) == 0
+    cluster = ["--coordinator", f"localhost:{port}", "--num-processes", "2"]
+    both = [child(train(root, together, *long(root), *cluster, "--process-index", str(i))) for i in range(2)]
+    wait_for_a_step(both[0], together)
+    both[1].send_signal(signal.SIGTERM)
+    for process in both:
+        _, errors = process.communicate(timeout=200)
+        assert process.returncode == 143, errors
+        assert "Traceback" not in errors
+    records = read_records(together)
+    assert 0 < len(records) < 2000
+    assert checkpoints(together) == [f"{len(records):08d}"]
+    expected, found = read_records(alone)[0], records[0]
+    for name in ("positives", "unique_positives", "positives_per_level", "candidates"):
+        assert found[name] == expected[name], name
+    for name in ("loss/total", "loss/classification", "loss/l1", "loss/iou", "loss/iou_prediction"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-5), name
 
 
 BAD = {
