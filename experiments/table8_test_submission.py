@@ -84,9 +84,9 @@ TABLE = Table(
     "Table 8: the test-set model",
     (
         Row("base", pasting),
-        Row("fade", faded),
-        Row("c128", lambda config: wide(pasting(config))),
-        Row("c128 and fade", lambda config: wide(faded(config)), "FCOS-LiDAR (c128)"),
+        Row("fade", faded, gain="gain_of_fade"),
+        Row("c128", lambda config: wide(pasting(config)), gain="gain_of_c128"),
+        Row("c128 and fade", lambda config: wide(faded(config))),
     ),
     reference="base",
     figures=figures,

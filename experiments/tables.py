@@ -57,6 +57,8 @@ class Row:
     """What it changes in the scale's base."""
     paper: str | None = None
     """Key of the paper's row."""
+    gain: str | None = None
+    """Key among the paper's texts of a gain in mAP that it states without a row."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +128,8 @@ def _row_record(table: Table, row: Row, scores: dict[str, list[dict[str, Any]]])
     record["paper_difference"] = {
         s: round(theirs[s] - base_of_theirs[s], 2) for s in SCORES if s in theirs and s in base_of_theirs
     }
+    if row.gain is not None:
+        record["paper_difference"] = {"mAP": PAPER["text"][row.gain]["value"]}
     if row.label in scores:
         mine, base = scores[row.label], scores[table.reference]
         record["scores"] = mine

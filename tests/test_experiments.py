@@ -133,6 +133,21 @@ def test_every_row_of_the_tables_has_its_paper_figures(experiments):
         assert NUSCENES in configs  # the paper's detector is a row of every table
 
 
+def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(experiments, tmp_path, monkeypatch):
+    import tables
+    from table8_test_submission import TABLE
+
+    base, fade, c128, both = (row.change(NUSCENES) for row in TABLE.rows)
+    assert base == NUSCENES
+    assert (fade.fade_epochs, c128.fade_epochs, both.fade_epochs) == (5, 0, 5)
+    assert [c.model.head_channels for c in (fade, c128, both)] == [64, 128, 128]
+    monkeypatch.setattr(tables, "make_scale", lambda _: Pretended())
+    table = dataclasses.replace(TABLE, figures=None)
+    record = tables.run_table(table, tables.Args(seeds=(0,), out=tmp_path, runs=tmp_path))
+    gains = [row["paper_difference"] for row in record["rows"]]
+    assert gains == [{}, {"mAP": 2}, {"mAP": 0.6}, {}]
+
+
 def test_the_variant_of_the_readme_runs(experiments, tmp_path, monkeypatch, capsys):
     text = (EXPERIMENTS / "README.md").read_text()
     code = re.search(r"## Your own variant\n\n```python\n(.*?)```", text, re.DOTALL)
