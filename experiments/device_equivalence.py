@@ -25,6 +25,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from hardware import hardware
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from fcos_lidar_jax.config import QUICKSTART, StemConfig
@@ -213,7 +214,7 @@ def main() -> None:
             if devices != "1":
                 records.append(compare(folder, int(devices), int(processes), dtype))
                 print(json.dumps(records[-1]), flush=True)
-    result = {"command": "python experiments/device_equivalence.py", "jax": jax.__version__, "meshes": records}
+    result = {"command": "python experiments/device_equivalence.py", "meshes": records, **hardware()}
     write_beside(args.out, lambda path: path.write_text(json.dumps(result, indent=1) + "\n"))
 
 

@@ -12,7 +12,6 @@ Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameter
 import dataclasses
 import json
 import os
-import platform
 import resource
 import statistics
 import time
@@ -24,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from hardware import hardware
 from peers import Peer, turn_by_turn
 
 from fcos_lidar_jax.assignment import assign
@@ -221,11 +221,7 @@ def main(args: Args) -> None:
         raise SystemExit(f"error: --preset: got {args.preset!r}, expected one of {', '.join(PRESETS)}")
     record = {
         **measure(args),
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "device": jax.devices()[0].device_kind,
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
+        **hardware(),
     }
     write_beside(args.out, lambda path: path.write_text(json.dumps(record, indent=1)))
 

@@ -13,7 +13,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import platform
 import random
 import shutil
 import signal
@@ -22,6 +21,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+from hardware import hardware
 
 RESULT = Path(__file__).parent / "results" / "kill_and_resume.json"
 STEPS = 8
@@ -131,7 +132,7 @@ def main() -> None:
         "killed_while_saving": sum(run["unfinished_checkpoints"] > 0 for run in runs),
         "ended_the_same": sum(run["same"] for run in runs),
         "each": runs,
-        "python": platform.python_version(),
+        **hardware(),
     }
     args.out.write_text(json.dumps(result, indent=1) + "\n")
     print(f"{result['ended_the_same']} of {len(runs)} ended in exactly the state of the run that was left alone")

@@ -19,7 +19,6 @@ import dataclasses
 import json
 import multiprocessing
 import os
-import platform
 import statistics
 import sys
 import tempfile
@@ -31,6 +30,7 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
+from hardware import hardware
 
 from fcos_lidar_jax.config import NUSCENES, QUICKSTART, Config
 from fcos_lidar_jax.data.batching import empty_batch, fill_boxes, fill_points, make_batch
@@ -221,10 +221,7 @@ def main(args: Args) -> None:
     frames = NuScenesFrames(nuscenes, tuple(nuscenes.split(args.split)), config.num_sweeps)
     record: dict[str, Any] = {
         "data": args.version,
-        "cores": os.cpu_count(),
         "load_before": round(os.getloadavg()[0], 1),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
     }
     with tempfile.TemporaryDirectory() as folder:
         plan = [(f"{i:04d}", range(i, min(i + SHARD, len(frames)))) for i in range(0, len(frames), SHARD)]
@@ -239,6 +236,7 @@ def main(args: Args) -> None:
             name: throughput(frames, config, objects, args.samples, **how) for name, how in WAYS.items()
         }
     record["needed_samples_per_s"] = needs(args.train_step)
+    record |= hardware()
     text = json.dumps(record, indent=1)
     print(text)
     write_beside(args.out, lambda path: path.write_text(text))

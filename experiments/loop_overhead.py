@@ -9,8 +9,6 @@ medians of both and the time spent waiting for data. Expected: less than 3 % mor
 
 import dataclasses
 import json
-import os
-import platform
 import statistics
 import tempfile
 import time
@@ -19,6 +17,7 @@ from typing import Any
 
 import jax
 import tyro
+from hardware import hardware
 
 from fcos_lidar_jax.config import QUICKSTART
 from fcos_lidar_jax.data.frame import Frame
@@ -117,9 +116,7 @@ def main(args: Args) -> None:
             2,
         ),
         "each": {name: [round(v, 4) for v in values] for name, values in seconds.items()},
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "cores": os.cpu_count(),
+        **hardware(),
     }
     print(json.dumps(result, indent=1))
     write_beside(args.result, lambda path: path.write_text(json.dumps(result, indent=1) + "\n"))

@@ -24,6 +24,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 import tyro
+from hardware import hardware
 
 from fcos_lidar_jax.assignment import owners
 from fcos_lidar_jax.commands.detect import confident
@@ -187,9 +188,7 @@ def main(args: Args) -> None:
     record = {
         "source": args.source,
         "steps": args.steps,
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
+        **hardware(),
         "seeds": results,
     }
     write_beside(args.out / "result.json", lambda path: path.write_text(json.dumps(record, indent=1)))
