@@ -32,7 +32,7 @@ from fcos_lidar_jax.config import NUSCENES, StemConfig
 from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models.layers import convolve
-from fcos_lidar_jax.models.modality import Stem, channel_groups
+from fcos_lidar_jax.models.modality import Stem, bundles, channel_groups
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
 BASE = NUSCENES.model.stem
@@ -192,10 +192,9 @@ def pieces_of(stem: StemConfig) -> Counter[Piece]:
     >>> pieces_of(StemConfig())[Piece(5, 32, 6)], pieces_of(StemConfig())[Piece(32, 64, 0)]
     (9, 27)
     """
-    rounds = SHAPE[-1] // 9
-    groups = channel_groups(stem, rounds)
-    if not stem.group_rounds:  # the rounds of a type share a convolution
-        groups = [(rounds * size, rounds * out) for size, out in groups[::rounds]]
+    groups = channel_groups(stem, SHAPE[-1] // 9)
+    together = [groups[cut] for cut in bundles(groups, "split")]
+    groups = [(sum(size for size, _ in some), sum(out for _, out in some)) for some in together]
     layers = [*groups, *[(out, out) for _, out in groups] * (stem.num_convs - 1)]
     spatial = [Piece(*channels, dilation) for dilation in stem.dilations for channels in layers]
     return Counter(spatial + [Piece(out, stem.out_channels, 0) for _, out in groups] * len(stem.dilations))
