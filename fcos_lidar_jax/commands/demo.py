@@ -54,7 +54,7 @@ class Demo:
 
     out: Path = Path("demo_output")
     """Folder for the results."""
-    steps: int = 1500
+    steps: int = 2000
     """Training steps; 0 for none."""
     test_frames: int = 40
     """Unseen frames to evaluate on."""
