@@ -217,4 +217,4 @@ def smoke(cache: Path) -> Simulated:
 
 def simulated(cache: Path) -> Simulated:
     """The quickstart's network on ten sweeps of what is near."""
-    return Simulated("simulated", _TEN_SWEEPS, SHORT_RANGE, train_frames=2000, test_frames=200, cache=cache)
+    return Simulated("simulated", _TEN_SWEEPS, SHORT_RANGE, train_frames=1200, test_frames=200, cache=cache)
