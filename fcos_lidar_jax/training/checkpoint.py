@@ -177,6 +177,8 @@ def _save_arrays(folder: Path, tree: Any) -> None:
     try:
         with _alone() as checkpointer:
             checkpointer.save(folder, tree)
+        # It tells a path of this machine; that the checkpoint is whole is told by its hashes.
+        (folder / "commit_success.txt").unlink(missing_ok=True)
     except Exception as error:  # orbax and its storage raise what they like on a full disk
         reason = " ".join(str(error).split())[:200]
         raise OSError(f"{folder}: cannot be written: {reason}") from error
