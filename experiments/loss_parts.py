@@ -10,7 +10,7 @@ same frames. Per part one figure, from three seeds each:
 - IoU: the mean IoU of the positives, over the last steps;
 - IoU prediction: the cross-entropy between the predicted and the true IoU of the positives, over the last steps.
 
-Cost: a quarter of an hour on two CPU cores. Expected: every "off" is worse than "all parts" in its own figure.
+Cost: about half an hour on one CPU core. Expected: every "off" is worse than "all parts" in its own figure.
 """
 
 import dataclasses

@@ -25,9 +25,8 @@ kernel_init = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 """He's, over the outputs, as in ResNet."""
 
 _NARROW = range(9, 17)
-"""Convolutions of so many outputs get zeros up to 32: a step is a fifth faster on CPU. Their weight gradients are
-then summed as those of wide ones, less exactly (1e-6 of the largest, not 3e-7); the smallest networks, those of
-tests, do without."""
+"""Convolutions of so many outputs get zeros up to 32, which makes their gradients faster on CPU. Their weight
+gradients are then summed as those of wide ones, less exactly; the smallest networks, those of tests, do without."""
 _PADDED = 32
 
 
