@@ -45,9 +45,9 @@ from fcos_lidar_jax.types import Batch, TrainState
 RESULT = Path(__file__).parent / "results" / "device_equivalence.json"
 SIZE, STEPS, POINTS = 8, 5, 2048
 WEIGHTS = 1
-"""Seed of weights. Chosen, as is the grouped stem, so that float32 can tell: no activation near ReLU's kink, where a
-whole gradient may differ, and gradients that hardly cancel. Other seeds, and wide convolutions, whose sums XLA makes
-less exactly on a CPU, can differ by more than 1e-5 by rounding alone. In float64 none of this matters."""
+"""Seed of weights. Chosen, as is the grouped stem, so that float32 can tell: no activation near ReLU's kink, where
+a whole gradient may differ, and gradients that hardly cancel. Other seeds, and wide convolutions, whose sums XLA
+makes less exactly on a CPU, can differ by more than 1e-5 by rounding alone. In float64 none of this matters."""
 SENSOR = dataclasses.replace(TINY, num_columns=64)
 CONFIG = dataclasses.replace(
     QUICKSTART,

@@ -26,7 +26,7 @@ kernel_init = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 _NARROW = range(9, 17)
 """Convolutions of so many outputs get zeros up to 32, which makes their gradients faster on CPU. Their weight
-gradients are then summed as those of wide ones, less exactly; the smallest networks, those of tests, do without."""
+gradients are then summed as those of wide ones, less exactly; the smallest networks do without."""
 _PADDED = 32
 
 
