@@ -49,6 +49,7 @@ TABLE = Table(
             label(setting, rounds),
             change(num_sweeps=sweeps, projection__num_rounds=rounds),
             f"{setting}, {rounds}",
+            reference=label(setting, 1),
         )
         for setting, sweeps in SETTINGS.items()
         for rounds in mrv_figures.ROUNDS

@@ -59,6 +59,8 @@ class Row:
     """Key of the paper's row."""
     gain: str | None = None
     """Key among the paper's texts of a gain in mAP that it states without a row."""
+    reference: str | None = None
+    """Label of the row that its differences are taken from; default: the table's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +74,7 @@ class Table:
     rows: tuple[Row, ...]
     """In the paper's order."""
     reference: str
-    """Label of the row that differences are taken from."""
+    """Label of the row that differences are taken from, unless a row names its own."""
     figures: Callable[[Args], dict[str, Any]] | None = None
     """Measured without training: ``{"columns": {label: {column: value}}, "lines": [text], ...}``."""
 
@@ -122,16 +124,16 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
 def _row_record(table: Table, row: Row, scores: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Scores of a row, their difference to the reference, seed by seed, and the paper's."""
     paper = PAPER["tables"].get(table.name, {"rows": {}})["rows"]
-    reference = next(r for r in table.rows if r.label == table.reference)
+    reference = next(r for r in table.rows if r.label == (row.reference or table.reference))
     theirs, base_of_theirs = paper.get(row.paper, {}), paper.get(reference.paper, {})
-    record: dict[str, Any] = {"label": row.label, "paper": theirs}
+    record: dict[str, Any] = {"label": row.label, "reference": reference.label, "paper": theirs}
     record["paper_difference"] = {
         s: round(theirs[s] - base_of_theirs[s], 2) for s in SCORES if s in theirs and s in base_of_theirs
     }
     if row.gain is not None:
         record["paper_difference"] = {"mAP": PAPER["text"][row.gain]["value"]}
     if row.label in scores:
-        mine, base = scores[row.label], scores[table.reference]
+        mine, base = scores[row.label], scores[reference.label]
         record["scores"] = mine
         for s in SCORES:
             values = [100 * cell[s] for cell in mine]
@@ -165,6 +167,10 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     lines += ["", f'Differences are to "{table.reference}", seed by seed; 95 % intervals of Student\'s t.', ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
+
+
+def _references(record: dict[str, Any]) -> list[str]:
+    return list(dict.fromkeys(row["reference"] for row in record["rows"]))
 
 
 def _number(value: Any, sign: bool = False) -> str:
@@ -204,7 +210,7 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     axis.axvline(0, color="#888888", linewidth=0.8)
     axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
     axis.invert_yaxis()
-    axis.set_xlabel(f'mAP, points more than "{table.reference}"')
+    axis.set_xlabel("mAP, points more than " + " or ".join(f'"{name}"' for name in _references(record)))
     axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds)", fontsize=11)
     axis.legend(fontsize=9, frameon=False)
     axis.spines[["top", "right"]].set_visible(False)

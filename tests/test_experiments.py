@@ -109,6 +109,10 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(experiments, tmp
     assert row["mAP_difference"]["mean"] == pytest.approx(40.0)
     np.testing.assert_allclose(row["mAP_difference"]["interval"], [40.0] * 3)
     assert row["paper_difference"] == {"mAP": 2.06, "NDS": 1.88}
+    single = next(row for row in record["rows"] if row["label"] == "single, 5 rounds")
+    assert single["reference"] == "single, 1 round"
+    assert single["mAP_difference"]["mean"] == pytest.approx(40.0)
+    assert single["paper_difference"] == {"mAP": 0.28, "NDS": 1.88}
     text = (tmp_path / "smoke" / "table1.md").read_text()
     assert text in capsys.readouterr().out
     assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+40.00, +40.00] | 57.08 | +2.06 |" in text
