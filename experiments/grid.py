@@ -2,6 +2,7 @@
 
 A cell is a configuration, a scale and a seed. Its result is one JSON file named by their hash, so that a finished
 cell is never run again, a cell that several tables share is run once, and a stopped one goes on where it was.
+Processes that share the folders, one a GPU or a core, share the cells.
 """
 
 import dataclasses
@@ -14,11 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from claim import claim
 from hardware import hardware
 from scales import Scale
 
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.files import write_beside
+
+_PATIENCE_S = 5.0
+"""Between looks at what other processes train."""
 
 
 def cell_name(config: Config, scale: Scale, seed: int) -> str:
@@ -36,8 +41,33 @@ def cell_name(config: Config, scale: Scale, seed: int) -> str:
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Path) -> dict[str, Any]:
-    """The scores of a cell, from its file or by training it.
+def run_cells(
+    cells: Sequence[tuple[Config, int]], scale: Scale, *, results: Path, runs: Path
+) -> list[dict[str, Any]]:
+    """The scores of configurations with seeds, each from its file or by training it.
+
+    A cell that another process trains is left to it and looked at again when the others are done.
+
+    Args:
+        cells: configuration and seed of each.
+        scale: where and how long.
+        results: folder of the cells' files.
+        runs: folder of the training runs.
+    """
+    found: dict[int, dict[str, Any]] = {}
+    while len(found) < len(cells):
+        known = len(found)
+        for i, (config, seed) in enumerate(cells):
+            scores = None if i in found else run_cell(config, scale, seed, results=results, runs=runs)
+            if scores is not None:
+                found[i] = scores
+        if len(found) == known:
+            time.sleep(_PATIENCE_S)
+    return [found[i] for i in range(len(cells))]
+
+
+def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Path) -> dict[str, Any] | None:
+    """The scores of a cell, from its file or by training it; None while another process trains it.
 
     Args:
         config: of the row.
@@ -48,21 +78,24 @@ def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Pa
     """
     name = cell_name(config, scale, seed)
     file = results / f"{name}.json"
-    if file.is_file():
-        return json.loads(file.read_text(encoding="utf-8"))["scores"]
-    began = time.monotonic()
-    scores = scale.score(config, seed, runs / name)
-    record = {
-        "scores": scores,
-        "seed": seed,
-        "scale": scale.describe(),
-        "config": config_to_json(config),
-        "minutes": round((time.monotonic() - began) / 60, 2),
-        **hardware(),
-    }
-    text = json.dumps(record, indent=1)
-    write_beside(file, lambda path: path.write_text(text, encoding="utf-8"))
-    return scores
+    with claim(runs / f"{name}.lock") as mine:
+        if file.is_file():
+            return json.loads(file.read_text(encoding="utf-8"))["scores"]
+        if not mine:
+            return None
+        began = time.monotonic()
+        scores = scale.score(config, seed, runs / name)
+        record = {
+            "scores": scores,
+            "seed": seed,
+            "scale": scale.describe(),
+            "config": config_to_json(config),
+            "minutes": round((time.monotonic() - began) / 60, 2),
+            **hardware(),
+        }
+        text = json.dumps(record, indent=1)
+        write_beside(file, lambda path: path.write_text(text, encoding="utf-8"))
+        return scores
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float] | None:

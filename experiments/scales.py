@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import jax
+from claim import claim
 
 from fcos_lidar_jax.commands import evaluate as evaluate_command
 from fcos_lidar_jax.commands import train as train_command
@@ -89,7 +90,9 @@ class Simulated:
         frames = self.frames("train", num_sweeps)
         folder = self.cache / f"{self.sensor.name}_objects_{self.train_frames}_{num_sweeps}_sweeps"
         everything = list(range(len(frames)))
-        return build_objects(frames, folder, shards=[("all", everything)], fingerprint=repr(frames.frames))
+        # Two builders would sweep away each other's files.
+        with claim(folder.with_suffix(".lock"), wait=True):
+            return build_objects(frames, folder, shards=[("all", everything)], fingerprint=repr(frames.frames))
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """Train on the training streets, evaluate on the test streets."""

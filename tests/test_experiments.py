@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -57,6 +58,36 @@ def test_a_finished_cell_is_never_run_again(experiments, tmp_path):
     record = json.loads(next(iter(sorted(tmp_path.glob("*.json")))).read_text())
     assert record["config"]["projection"]["num_rounds"] == 3
     assert {"jax", "git", "device", "minutes", "seed"} <= set(record)
+
+
+_HOLDER = """
+import sys
+from pathlib import Path
+from claim import claim
+with claim(Path(sys.argv[1])) as mine:
+    print(mine, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_cell_that_another_process_trains_is_left_to_it(experiments, tmp_path, monkeypatch):
+    import grid
+
+    held, free = (grid.change(projection__num_rounds=n)(QUICKSTART) for n in (3, 5))
+    scale, folders = Pretended(), {"results": tmp_path / "cells", "runs": tmp_path}
+    lock = tmp_path / f"{grid.cell_name(held, scale, 0)}.lock"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", _HOLDER, str(lock)], cwd=EXPERIMENTS, **pipes) as other:
+        try:
+            assert other.stdout.readline() == "True\n"
+            assert grid.run_cell(held, scale, 0, **folders) is None
+            # The other is killed while this one waits: its cell is free again.
+            monkeypatch.setattr(grid.time, "sleep", lambda _: (other.kill(), other.wait()))
+            scores = grid.run_cells([(held, 0), (free, 0)], scale, **folders)
+        finally:
+            other.kill()
+    assert [score["mAP"] for score in scores] == pytest.approx([0.3, 0.5])
+    assert scale.asked == 2
 
 
 def test_cells_are_told_apart_by_what_decides_them(experiments):
