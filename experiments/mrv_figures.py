@@ -87,6 +87,24 @@ def kept_by_rounds(
     return found
 
 
+def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[str, dict[str, float]]]:
+    """Means of :func:`kept_by_rounds` over clouds.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
+    >>> mean_kept([cloud, cloud[:1]], TINY)["prioritized"]["percent"]["1"]
+    75.0
+    """
+    found = [kept_by_rounds(cloud, sensor) for cloud in clouds]
+    return {
+        name: {
+            what: {r: round(float(np.mean([f[name][what][r] for f in found])), 2) for r in map(str, ROUNDS)}
+            for what in ("kept", "percent", "current")
+        }
+        for name in ("prioritized", "not prioritized")
+    }
+
+
 def mrv_times(
     cloud: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, repeats: int = 100
 ) -> dict[str, Any]:

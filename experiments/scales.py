@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import jax
+import numpy as np
 from claim import claim
 
 from fcos_lidar_jax.commands import evaluate as evaluate_command
@@ -84,6 +85,11 @@ class Simulated:
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, _UNSEEN)}[split]
         made = SimulatedFrames(self.sensor, number, first, num_sweeps=num_sweeps, hurry=True, close_m=_BONNET_M)
         return CachedFrames(made, self.cache / f"{self.sensor.name}_{split}_{number}_{num_sweeps}_sweeps")
+
+    def clouds(self, num_sweeps: int, number: int = 20) -> list[np.ndarray]:
+        """The first test clouds, f32[n, 5], for figures that need no training."""
+        frames = self.frames("test", num_sweeps)
+        return [frames.frame(i).points for i in range(min(number, len(frames)))]
 
     def objects(self, num_sweeps: int) -> ObjectDatabase:
         """For copy-paste."""

@@ -80,12 +80,17 @@ class Table:
     """Measured without training: ``{"columns": {label: {column: value}}, "lines": [text], ...}``."""
 
 
+def simulated_scale(args: Args) -> Simulated | None:
+    """The scale that is asked for, if its frames are simulated."""
+    make = {"smoke": smoke, "simulated": simulated}.get(args.scale)
+    return make(args.runs / "frames") if make else None
+
+
 def make_scale(args: Args) -> Simulated | NuScenesLayout:
     """The scale that is asked for."""
-    if args.scale == "smoke":
-        return smoke(args.runs / "frames")
-    if args.scale == "simulated":
-        return simulated(args.runs / "frames")
+    scale = simulated_scale(args)
+    if scale is not None:
+        return scale
     if args.data_root is None:
         raise SystemExit("error: --data-root: missing, expected the data set for --scale nuscenes")
     return NuScenesLayout("nuscenes", NUSCENES, args.data_root, args.version)
@@ -163,7 +168,9 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
             cells += [_number(row["paper"].get(s)), _number(row["paper_difference"].get(s), sign=True)]
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         lines.append("| " + " | ".join(cells) + " |")
-    lines += ["", f'Differences are to "{table.reference}", seed by seed; 95 % intervals of Student\'s t.', ""]
+    references = " or ".join(f'"{name}"' for name in _references(record))
+    drawn = ", seed by seed; 95 % intervals of Student's t" if trained else ""
+    lines += ["", f"Differences are to {references}{drawn}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
 
 
