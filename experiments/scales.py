@@ -20,10 +20,12 @@ from fcos_lidar_jax.commands import train as train_command
 from fcos_lidar_jax.commands.runs import Plan, Rhythm, Run
 from fcos_lidar_jax.config import NUSCENES, QUICKSTART, Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.data.cached import CachedFrames
+from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.object_builder import build_objects
 from fcos_lidar_jax.data.objects import ObjectDatabase
 from fcos_lidar_jax.data.pipeline import make_batches, steps_per_epoch
 from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
+from fcos_lidar_jax.data.synthetic.lidar import SWEEP_S
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.sensors import SHORT_RANGE, TINY, Sensor
 from fcos_lidar_jax.training import load_checkpoint
@@ -60,6 +62,32 @@ class Scale(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
+class NewestSweeps:
+    """Simulated frames of which only the newest sweeps are kept; what is annotated, the current sweep decides."""
+
+    frames: CachedFrames
+    num_sweeps: int
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frames)
+
+    def frame(self, index: int) -> Frame:
+        """One frame without the older sweeps."""
+        frame = self.frames.frame(index)
+        newest = frame.points[:, 4] < (self.num_sweeps - 0.5) * SWEEP_S
+        return dataclasses.replace(frame, points=frame.points[newest])
+
+    def labels(self, index: int) -> np.ndarray:
+        """Of the frame's boxes."""
+        return self.frames.labels(index)
+
+    def name(self, index: int) -> str:
+        """As without the choice."""
+        return self.frames.name(index)
+
+
+@dataclasses.dataclass(frozen=True)
 class Simulated:
     """Hurried streets, ten sweeps a frame, the same frames for every cell."""
 
@@ -80,11 +108,13 @@ class Simulated:
             "test_frames": self.test_frames,
         }
 
-    def frames(self, split: str, num_sweeps: int) -> CachedFrames:
-        """Training or test streets, seen by so many sweeps."""
+    def frames(self, split: str, num_sweeps: int) -> "NewestSweeps":
+        """Training or test streets; the same, and the same sweeps, however many of them are fused."""
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, _UNSEEN)}[split]
-        made = SimulatedFrames(self.sensor, number, first, num_sweeps=num_sweeps, hurry=True, close_m=_BONNET_M)
-        return CachedFrames(made, self.cache / f"{self.sensor.name}_{split}_{number}_{num_sweeps}_sweeps")
+        sweeps = self.base.num_sweeps
+        made = SimulatedFrames(self.sensor, number, first, num_sweeps=sweeps, hurry=True, close_m=_BONNET_M)
+        cache = self.cache / f"{self.sensor.name}_{split}_{number}_{sweeps}_sweeps"
+        return NewestSweeps(CachedFrames(made, cache), num_sweeps)
 
     def clouds(self, num_sweeps: int, number: int = 20) -> list[np.ndarray]:
         """The first test clouds, f32[n, 5], for figures that need no training."""
@@ -98,7 +128,9 @@ class Simulated:
         everything = list(range(len(frames)))
         # Two builders would sweep away each other's files.
         with claim(folder.with_suffix(".lock"), wait=True):
-            return build_objects(frames, folder, shards=[("all", everything)], fingerprint=repr(frames.frames))
+            return build_objects(
+                frames, folder, shards=[("all", everything)], fingerprint=repr(frames.frames.frames)
+            )
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """Train on the training streets, evaluate on the test streets."""

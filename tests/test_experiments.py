@@ -1,6 +1,8 @@
 """The runner beneath the tables: cells, intervals, changes; and the ten lines of the README of experiments/."""
 
 import dataclasses
+import doctest
+import importlib
 import json
 import math
 import re
@@ -103,6 +105,26 @@ def test_cells_are_told_apart_by_what_decides_them(experiments):
     formed = change(model__stem__form="grouped")(QUICKSTART)
     assert cell_name(formed, scale, 0) == cell_name(QUICKSTART, scale, 0)
     assert cell_name(QUICKSTART, Pretended("elsewhere"), 0) not in names
+
+
+def test_one_sweep_and_ten_see_the_same_streets(experiments, tmp_path):
+    from scales import smoke
+
+    scale = smoke(tmp_path)
+    one, three, ten = (scale.frames("test", n).frame(0) for n in (1, 3, 10))
+    for frame in (one, three):
+        np.testing.assert_array_equal(frame.boxes, ten.boxes)
+        np.testing.assert_array_equal(frame.labels, ten.labels)
+    np.testing.assert_array_equal(one.points, ten.points[ten.points[:, 4] == 0])
+    assert np.unique(three.points[:, 4]).tolist() == np.unique(ten.points[:, 4]).tolist()[:3]
+    assert len(one.points) < len(three.points) < len(ten.points)
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in EXPERIMENTS.glob("*.py") if ">>> " in p.read_text()))
+def test_the_examples_in_the_docstrings_hold(experiments, name):
+    result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert result.attempted > 0
+    assert result.failed == 0
 
 
 def test_intervals_are_students(experiments):
