@@ -2,7 +2,8 @@
 
 A cell is a configuration, a scale and a seed. Its result is one JSON file named by their hash, so that a finished
 cell is never run again, a cell that several tables share is run once, and a stopped one goes on where it was.
-Processes that share the folders, one a GPU or a core, share the cells.
+Processes that share the folders, one a GPU or a core, share the cells. The code's revision is no part of the name;
+it stands in the file.
 """
 
 import dataclasses
@@ -21,13 +22,14 @@ from scales import Scale
 
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.files import write_beside
+from fcos_lidar_jax.training import NonFiniteLossError
 
 _PATIENCE_S = 5.0
 """Between looks at what other processes train."""
 
 
 def cell_name(config: Config, scale: Scale, seed: int) -> str:
-    """Hash of all that decides a cell's result; not of names, nor of how the same function is computed.
+    """Hash of what is trained, where, how long and from which seed; not of names, nor of equal formulations.
 
     >>> from scales import smoke
     >>> scale = smoke(Path("cache"))
@@ -35,16 +37,15 @@ def cell_name(config: Config, scale: Scale, seed: int) -> str:
     >>> cell_name(scale.base, scale, 0) == cell_name(other, scale, 0) != cell_name(scale.base, scale, 1)
     True
     """
-    stem = dataclasses.replace(config.model.stem, form="split")
-    config = dataclasses.replace(config, name="", model=dataclasses.replace(config.model, stem=stem))
-    text = json.dumps([config_to_json(config), scale.describe(), seed], sort_keys=True)
+    same = change(name="", model__stem__form="split", inference__nms_form="rows")(config)
+    text = json.dumps([config_to_json(same), scale.describe(), seed], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def run_cells(
     cells: Sequence[tuple[Config, int]], scale: Scale, *, results: Path, runs: Path
 ) -> list[dict[str, Any]]:
-    """The scores of configurations with seeds, each from its file or by training it.
+    """The records of configurations with seeds, each from its file or by training it.
 
     A cell that another process trains is left to it and looked at again when the others are done.
 
@@ -58,16 +59,18 @@ def run_cells(
     while len(found) < len(cells):
         known = len(found)
         for i, (config, seed) in enumerate(cells):
-            scores = None if i in found else run_cell(config, scale, seed, results=results, runs=runs)
-            if scores is not None:
-                found[i] = scores
+            record = None if i in found else run_cell(config, scale, seed, results=results, runs=runs)
+            if record is not None:
+                found[i] = record
         if len(found) == known:
             time.sleep(_PATIENCE_S)
     return [found[i] for i in range(len(cells))]
 
 
 def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Path) -> dict[str, Any] | None:
-    """The scores of a cell, from its file or by training it; None while another process trains it.
+    """The record of a cell, from its file or by training it; None while another process trains it.
+
+    A run whose loss stopped being finite is a result too: ``diverged`` in place of ``scores``, and what was said.
 
     Args:
         config: of the row.
@@ -80,22 +83,23 @@ def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Pa
     file = results / f"{name}.json"
     with claim(runs / f"{name}.lock") as mine:
         if file.is_file():
-            return json.loads(file.read_text(encoding="utf-8"))["scores"]
+            return json.loads(file.read_text(encoding="utf-8"))
         if not mine:
             return None
-        began = time.monotonic()
-        scores = scale.score(config, seed, runs / name)
+        try:
+            outcome: dict[str, Any] = {"scores": scale.score(config, seed, runs / name)}
+        except NonFiniteLossError as error:
+            outcome = {"diverged": str(error)}
         record = {
-            "scores": scores,
+            **outcome,
             "seed": seed,
             "scale": scale.describe(),
             "config": config_to_json(config),
-            "minutes": round((time.monotonic() - began) / 60, 2),
             **hardware(),
         }
         text = json.dumps(record, indent=1)
         write_beside(file, lambda path: path.write_text(text, encoding="utf-8"))
-        return scores
+        return json.loads(text)
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float] | None:

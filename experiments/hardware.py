@@ -1,5 +1,6 @@
 """Where an experiment ran, and with what: kept beside its figures."""
 
+import functools
 import os
 import platform
 import subprocess
@@ -11,8 +12,9 @@ import jax
 from fcos_lidar_jax import __version__
 
 
+@functools.cache
 def hardware() -> dict[str, Any]:
-    """Device, processor, cores, versions and revision, as JSON."""
+    """Device, processor, cores, versions and revision, as JSON; as they were at the process's first call."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]

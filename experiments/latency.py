@@ -20,6 +20,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -32,6 +33,7 @@ import tyro
 from full_size import make_stages
 from hardware import hardware
 
+from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.commands.clouds import Cloud, make_cloud
 from fcos_lidar_jax.config import NUSCENES, NUSCENES_SINGLE, PRESETS, Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -271,4 +273,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    sys.exit(exit_code("latency.py", lambda: main(tyro.cli(Args, description=__doc__))))

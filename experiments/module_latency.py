@@ -21,6 +21,7 @@ multiplications; on a CPU they cost time, on the paper's GPU evidently less than
 import dataclasses
 import functools
 import json
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -33,6 +34,7 @@ from hardware import hardware
 from latency import PAPER, STEM_FORMS, interleaved
 from tables import Args as TableArgs
 
+from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.config import NUSCENES, StemConfig
 from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.locations import image_layout
@@ -342,4 +344,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    sys.exit(exit_code("module_latency.py", lambda: main(tyro.cli(Args, description=__doc__))))

@@ -15,6 +15,7 @@ round, more than 50 % by five; seven rounds hardly slower than one (0.76 and 0.6
 
 import dataclasses
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ import tyro
 from hardware import hardware
 from latency import PAPER, ROWS, fused_cloud, interleaved, padded
 
+from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.files import write_beside
 from fcos_lidar_jax.projection import project_points, remove_close
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
@@ -202,4 +204,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    sys.exit(exit_code("mrv_figures.py", lambda: main(tyro.cli(Args, description=__doc__))))

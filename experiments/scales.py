@@ -7,9 +7,10 @@
 """
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import jax
 import numpy as np
@@ -17,13 +18,17 @@ from claim import claim
 
 from fcos_lidar_jax.commands import evaluate as evaluate_command
 from fcos_lidar_jax.commands import train as train_command
+from fcos_lidar_jax.commands.prepare import default_train_split, fingerprint
 from fcos_lidar_jax.commands.runs import Plan, Rhythm, Run
 from fcos_lidar_jax.config import NUSCENES, QUICKSTART, Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.data.nuscenes.index import has_index
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames, default_index
 from fcos_lidar_jax.data.object_builder import build_objects
 from fcos_lidar_jax.data.objects import ObjectDatabase
-from fcos_lidar_jax.data.pipeline import make_batches, steps_per_epoch
+from fcos_lidar_jax.data.pipeline import epoch_frames, make_batches, steps_per_epoch
 from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
 from fcos_lidar_jax.data.synthetic.lidar import SWEEP_S
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
@@ -50,6 +55,10 @@ class Scale(Protocol):
     @property
     def base(self) -> Config:
         """What the tables' rows are changes of."""
+        ...
+
+    def check(self, config: Config) -> None:
+        """Refuse a row that cannot be trained here, or that would change nothing: ValueError."""
         ...
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
@@ -100,13 +109,34 @@ class Simulated:
     """Frames are simulated once and kept here."""
 
     def describe(self) -> dict[str, Any]:
-        """Sizes and sensor."""
+        """Streets and sensor."""
         return {
             "scale": self.name,
             "sensor": dataclasses.asdict(self.sensor),
             "train_frames": self.train_frames,
             "test_frames": self.test_frames,
+            "sweeps": self.base.num_sweeps,
+            "hurry": True,
+            "close_m": _BONNET_M,
         }
+
+    def check(self, config: Config) -> None:
+        """The streets' sensor, sweeps and close points are those of the base."""
+        if not 1 <= config.num_sweeps <= self.base.num_sweeps:
+            raise ValueError(
+                f"num_sweeps: got {config.num_sweeps}, expected 1 to {self.base.num_sweeps} at scale {self.name}"
+            )
+        ours, base = (
+            {
+                "sensor": c.sensor,
+                "projection.remove_close": c.projection.remove_close,
+                "projection.close_m": c.projection.close_m,
+            }
+            for c in (config, self.base)
+        )
+        for field, value in ours.items():
+            if value != base[field]:
+                raise ValueError(f"{field}: got {value!r}, expected {base[field]!r} at scale {self.name}")
 
     def frames(self, split: str, num_sweeps: int) -> "NewestSweeps":
         """Training or test streets; the same, and the same sweeps, however many of them are fused."""
@@ -136,7 +166,8 @@ class Simulated:
         """Train on the training streets, evaluate on the test streets."""
         frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
-        steps = config.optimizer.epochs * steps_per_epoch(len(frames), config.optimizer.batch_size)
+        an_epoch = len(epoch_frames(frames, config, seed=seed))
+        steps = config.optimizer.epochs * steps_per_epoch(an_epoch, config.optimizer.batch_size)
         plan = Plan(config, self.sensor, steps, seed, self.describe())
         run = Run(folder, plan, Rhythm(save_every=-(-steps // 5), evaluate_every=steps), tests=None)
 
@@ -159,54 +190,135 @@ class Simulated:
 
 
 @dataclasses.dataclass(frozen=True)
-class NuScenesLayout:
-    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen, by the commands themselves."""
+class Layout:
+    """Options of --scale nuscenes."""
 
-    name: str
-    base: Config
-    data_root: Path
-    version: str
-    train_split: str | None = None
-    val_split: str = "val"
+    data_root: Path | None = None
+    """Folder of a data set in the nuScenes layout that fcos-lidar prepare has seen."""
+    version: str = "v1.0-trainval"
+    """Folder of its tables."""
     index: Path | None = None
+    """Where fcos-lidar prepare has put the index; default: DATA_ROOT/.fcos_lidar/VERSION."""
+    splits: Path | None = None
+    """File {name: [scene, ...]} with own splits."""
+    train_split: str | None = None
+    """Default: mini_train for a version that ends in mini, else train."""
+    val_split: str | None = None
+    """Default: mini_val or val."""
+    test_version: str | None = None
+    """Version whose split test table 8 writes a results file for, such as v1.0-test."""
+    allow_missing_sweeps: bool = False
+    """Go on with fewer sweeps where files of older sweeps are missing."""
     steps: int | None = None
+    """Updates of every cell, instead of the preset's epochs."""
+    accumulate: int = 1
+    """Parts that a batch is cut into where it does not fit; changes batch norm alone."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the convolutions behind the first."""
+    threads: int = 2
+    """That prepare batches."""
+    workers: int = 0
+    """Processes that prepare batches, beside the threads."""
 
+
+@dataclasses.dataclass(frozen=True)
+class NuScenesLayout:
+    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen, by the commands themselves.
+
+    Raises:
+        ValueError: at construction, where data, index or splits are not there.
+    """
+
+    layout: Layout
+    name: str = "nuscenes"
+
+    def __post_init__(self) -> None:
+        """Look before anything is trained."""
+        if self.layout.data_root is None:
+            raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")
+        if self.layout.test_version is not None:
+            tables = self.layout.data_root / self.layout.test_version
+            if not tables.is_dir():
+                raise ValueError(f"--test-version: {tables}: no such folder, expected the version's tables")
+        self.describe()
+
+    @property
+    def data_root(self) -> Path:
+        """Of the data set."""
+        assert self.layout.data_root is not None
+        return self.layout.data_root
+
+    @property
+    def splits(self) -> tuple[str, str]:
+        """To train and to evaluate on."""
+        layout = self.layout
+        val = "mini_val" if layout.version.endswith("mini") else "val"
+        return layout.train_split or default_train_split(layout.version), layout.val_split or val
+
+    @property
+    def base(self) -> Config:
+        """The paper's detector."""
+        return dataclasses.replace(
+            NUSCENES,
+            model=dataclasses.replace(NUSCENES.model, precision=self.layout.precision),
+            optimizer=dataclasses.replace(NUSCENES.optimizer, accumulate=self.layout.accumulate),
+        )
+
+    @functools.cache  # noqa: B019 - a handful of scales a process
     def describe(self) -> dict[str, Any]:
-        """Data set and splits."""
+        """Data, splits and steps."""
+        layout = self.layout
+        index = layout.index or default_index(self.data_root, layout.version)
+        if (self.data_root / layout.version).is_dir() and not has_index(index):
+            raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
+        data = NuScenes(
+            self.data_root, layout.version, index=index, allow_missing_sweeps=layout.allow_missing_sweeps
+        )
+        tokens = {split: data.split(split, file=layout.splits) for split in self.splits}
         return {
             "scale": self.name,
-            "version": self.version,
-            "train_split": self.train_split,
-            "val_split": self.val_split,
-            "steps": self.steps,
+            "version": layout.version,
+            "splits": list(self.splits),
+            "fingerprints": [fingerprint(index, NuScenesFrames(data, tuple(tokens[s]))) for s in self.splits],
+            "steps": layout.steps,
         }
+
+    def check(self, config: Config) -> None:
+        """All can be trained here."""
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """``fcos-lidar train`` and ``fcos-lidar evaluate``; the results file stays in the folder."""
+        layout, (train_split, val_split) = self.layout, self.splits
         train_command.run(
             train_command.Train(
                 config,
                 data_root=self.data_root,
-                version=self.version,
+                version=layout.version,
                 out=folder,
-                index=self.index,
-                train_split=self.train_split,
+                index=layout.index,
+                train_split=train_split,
                 val_split="none",
+                splits=layout.splits,
                 resume=(folder / "run.json").exists(),
                 seed=seed,
-                steps=self.steps,
+                steps=layout.steps,
+                threads=layout.threads,
+                workers=layout.workers,
+                allow_missing_sweeps=layout.allow_missing_sweeps,
             )
         )
-        out = folder / f"evaluation_{self.val_split}"
+        out = folder / f"evaluation_{val_split}"
         evaluate_command.run(
             evaluate_command.Evaluate(
                 out=out,
                 data_root=self.data_root,
-                version=self.version,
-                split=self.val_split,
+                version=layout.version,
+                split=val_split,
                 checkpoint=folder,
-                index=self.index,
+                index=layout.index,
+                splits=layout.splits,
                 report=False,
+                allow_missing_sweeps=layout.allow_missing_sweeps,
             )
         )
         return _scores(json.loads((out / "metrics_summary.json").read_text()))

@@ -11,9 +11,8 @@ How many points of the current sweep are kept, of the scale's simulated clouds, 
 from typing import Any
 
 import mrv_figures
-import tyro
 from grid import change
-from tables import Args, Row, Table, run_table, simulated_scale
+from tables import Args, Row, Table, command, run_table, simulated_scale
 
 
 def figures(args: Args) -> dict[str, Any]:
@@ -44,4 +43,4 @@ TABLE = Table(
 
 
 if __name__ == "__main__":
-    run_table(TABLE, tyro.cli(Args, description=__doc__))
+    command(lambda args: run_table(TABLE, args), __doc__)

@@ -11,9 +11,8 @@ one by 0.7 points of mAP at half the time; leaving the rounds ungrouped costs 0.
 from functools import partial
 
 import module_latency
-import tyro
 from grid import change
-from tables import Args, Row, Table, run_table
+from tables import Row, Table, command, run_table
 
 TABLE = Table(
     "table3",
@@ -38,4 +37,4 @@ TABLE = Table(
 
 
 if __name__ == "__main__":
-    run_table(TABLE, tyro.cli(Args, description=__doc__))
+    command(lambda args: run_table(TABLE, args), __doc__)

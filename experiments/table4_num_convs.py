@@ -11,9 +11,8 @@ The latency of the module by variant needs no training: ``--only-figures``. Expe
 from functools import partial
 
 import module_latency
-import tyro
 from grid import change
-from tables import Args, Row, Table, run_table
+from tables import Row, Table, command, run_table
 
 TABLE = Table(
     "table4",
@@ -25,4 +24,4 @@ TABLE = Table(
 
 
 if __name__ == "__main__":
-    run_table(TABLE, tyro.cli(Args, description=__doc__))
+    command(lambda args: run_table(TABLE, args), __doc__)

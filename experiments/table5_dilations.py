@@ -7,9 +7,8 @@
 Expected of the paper: (1, 3, 6) beats (1,) by 1.2 points of mAP, and three equal branches by 0.45.
 """
 
-import tyro
 from grid import change
-from tables import Args, Row, Table, run_table
+from tables import Row, Table, command, run_table
 
 TABLE = Table(
     "table5",
@@ -23,4 +22,4 @@ TABLE = Table(
 
 
 if __name__ == "__main__":
-    run_table(TABLE, tyro.cli(Args, description=__doc__))
+    command(lambda args: run_table(TABLE, args), __doc__)

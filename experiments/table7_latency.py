@@ -12,9 +12,8 @@ fiftieth of the time, and ten sweeps cost no more than one.
 from typing import Any
 
 import latency
-import tyro
 from grid import change
-from tables import Args, Row, Table, run_table
+from tables import Args, Row, Table, command, run_table
 
 
 def figures(args: Args) -> dict[str, Any]:
@@ -43,4 +42,4 @@ TABLE = Table(
 
 
 if __name__ == "__main__":
-    run_table(TABLE, tyro.cli(Args, description=__doc__))
+    command(lambda args: run_table(TABLE, args), __doc__)

@@ -12,10 +12,9 @@ validation set: c128 is worth about 0.6 points of mAP, fade about 2.
 import dataclasses
 from typing import Any
 
-import tyro
 from grid import cell_name, change
 from scales import NuScenesLayout
-from tables import PAPER, Args, Row, Table, make_scale, run_table
+from tables import PAPER, Args, Row, Table, command, make_scale, run_table
 
 from fcos_lidar_jax.commands import evaluate as evaluate_command
 from fcos_lidar_jax.config import QUICKSTART, Config
@@ -51,9 +50,9 @@ def submission(args: Args) -> list[str]:
         return [f"No results file: {run} is not there, the cell was trained elsewhere."]
     out = args.out / args.scale / "submission"
     if isinstance(scale, NuScenesLayout):
-        if args.test_version is None:
+        if scale.layout.test_version is None:
             return ["No results file: no --test-version."]
-        root, version, split = scale.data_root, args.test_version, "test"
+        root, version, split = scale.data_root, scale.layout.test_version, "test"
     else:
         root, version, split = args.runs / "frames" / f"{scale.sensor.name}_submission", "v1.0-synthetic", "val"
         write_dataset(Order(2, 0, 3, scale.sensor, False, version), root, workers=1, report=lambda _: None)
@@ -94,4 +93,4 @@ TABLE = Table(
 
 
 if __name__ == "__main__":
-    run_table(TABLE, tyro.cli(Args, description=__doc__))
+    command(lambda args: run_table(TABLE, args), __doc__)

@@ -1,22 +1,29 @@
 """The paper's tables, one after the other or all: ``python experiments/tables.py --scale smoke``.
 
 Every table prints our figure beside the paper's, writes Markdown, JSON and a picture below ``--out``, and can be
-stopped and started again; the same command in several processes shares their cells. On two CPU cores ``--scale
-smoke`` takes a quarter of an hour. ``--scale simulated`` wants a GPU or a night, ``--scale nuscenes`` the data.
+stopped and started again. The same command in several processes shares the cells: one a GPU, by
+
+    for i in 0 1 2 3; do CUDA_VISIBLE_DEVICES=$i python experiments/tables.py --scale simulated & done
+
+Times want a machine that does nothing else: once all cells are there, the command again measures them anew.
+On two CPU cores ``--scale smoke`` takes a quarter of an hour. ``--scale simulated`` has 66 cells of 1200 steps for
+all tables, ``--scale nuscenes`` needs the data.
 """
 
 import dataclasses
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+from claim import claim
 from grid import Change, interval, run_cells
 from hardware import hardware
-from scales import NuScenesLayout, Simulated, simulated, smoke
+from scales import Layout, NuScenesLayout, Scale, Simulated, simulated, smoke
 
-from fcos_lidar_jax.config import NUSCENES
+from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.files import write_beside
 
 PAPER = json.loads(Path(__file__).with_name("paper.json").read_text(encoding="utf-8"))
@@ -36,16 +43,12 @@ class Args:
     runs: Path = Path("outputs/runs")
     """Folder of the training runs and of the simulated frames."""
     data: Path | None = None
-    """Folder with ten_sweep_cloud/ for the figures of a real cloud; default: the environment's
-    FCOS_LIDAR_REAL_DATA, else a simulated one."""
-    data_root: Path | None = None
-    """Of --scale nuscenes."""
-    version: str = "v1.0-trainval"
-    """Of --scale nuscenes."""
-    test_version: str | None = None
-    """Of --scale nuscenes: version whose split test table 8 writes a results file for, such as v1.0-test."""
+    """Folder with ten_sweep_cloud/ for the figures of a real cloud (not those of table 7 at scale smoke, which has
+    another sensor); default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated one."""
     only_figures: bool = False
-    """Without training."""
+    """What needs no training alone, in files of its own."""
+    nuscenes: tyro.conf.OmitArgPrefixes[Layout] = dataclasses.field(default_factory=Layout)
+    """Data set and training of --scale nuscenes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +82,21 @@ class Table:
     figures: Callable[[Args], dict[str, Any]] | None = None
     """Measured without training: ``{"columns": {label: {column: value}}, "lines": [text], ...}``."""
 
+    def __post_init__(self) -> None:
+        """Refuse names that would be missed after hours of training."""
+        labels = [row.label for row in self.rows]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise ValueError(f"table {self.name}: got two rows {label!r}, expected different labels")
+        for reference in (self.reference, *(row.reference for row in self.rows)):
+            if reference is not None and reference not in labels:
+                raise ValueError(f"table {self.name}: reference: got {reference!r}, expected one of {labels}")
+        theirs, gains = PAPER["tables"].get(self.name, {"rows": {}})["rows"], PAPER["text"]
+        for row in self.rows:
+            for field, key, known in (("paper", row.paper, theirs), ("gain", row.gain, gains)):
+                if key is not None and key not in known:
+                    raise ValueError(f"row {row.label!r}: {field}: got {key!r}, expected one of {list(known)}")
+
 
 def simulated_scale(args: Args) -> Simulated | None:
     """The scale that is asked for, if its frames are simulated."""
@@ -88,43 +106,63 @@ def simulated_scale(args: Args) -> Simulated | None:
 
 def make_scale(args: Args) -> Simulated | NuScenesLayout:
     """The scale that is asked for."""
-    scale = simulated_scale(args)
-    if scale is not None:
-        return scale
-    if args.data_root is None:
-        raise SystemExit("error: --data-root: missing, expected the data set for --scale nuscenes")
-    return NuScenesLayout("nuscenes", NUSCENES, args.data_root, args.version)
+    return simulated_scale(args) or NuScenesLayout(args.nuscenes)
 
 
 def run_table(table: Table, args: Args) -> dict[str, Any]:
     """Train what is missing, measure, print, write; the record."""
-    folder = args.out / args.scale
+    _check(args)
+    here, folder = hardware(), args.out / args.scale
     seeds = args.seeds or ((0,) if args.scale == "smoke" else (0, 1, 2))
-    scores: dict[str, list[dict[str, Any]]] = {}
-    if not args.only_figures:
-        scale = make_scale(args)
-        cells = [(row.change(scale.base), seed) for row in table.rows for seed in seeds]
-        found = iter(run_cells(cells, scale, results=folder / "cells", runs=args.runs / args.scale))
-        scores = {row.label: [next(found) for _ in seeds] for row in table.rows}
-    figures = table.figures(args) if table.figures else {}
-    record = {
-        "table": table.name,
-        "scale": args.scale,
-        "seeds": list(seeds) if scores else [],
-        "rows": [_row_record(table, row, scores) for row in table.rows],
-        "figures": figures,
-        **hardware(),
-    }
-    text = as_markdown(table, record)
-    print(text, flush=True)
-    write_beside(folder / f"{table.name}.json", lambda path: path.write_text(json.dumps(record, indent=1)))
-    write_beside(folder / f"{table.name}.md", lambda path: path.write_text(text, encoding="utf-8"))
-    if len(seeds) > 1 and scores:
-        draw(table, record, folder / f"{table.name}.png")
+    cells = {} if args.only_figures else _cells(table, make_scale(args), seeds, folder / "cells", args)
+    file = folder / f"{table.name}{'_figures' if args.only_figures else ''}"
+    # One process at a time: what is timed is not to be disturbed by the others of the same table.
+    with claim(file.with_suffix(".lock"), wait=True):
+        figures = table.figures(args) if table.figures else {}
+        record = {
+            "table": table.name,
+            "scale": args.scale,
+            "seeds": list(seeds) if cells else [],
+            "rows": [_row_record(table, row, cells) for row in table.rows],
+            "figures": figures,
+            "cells_of": _cells_of(cells),
+            **here,
+        }
+        text = as_markdown(table, record)
+        print(text, flush=True)
+        write_beside(file.with_suffix(".json"), lambda path: path.write_text(json.dumps(record, indent=1)))
+        write_beside(file.with_suffix(".md"), lambda path: path.write_text(text, encoding="utf-8"))
+        if len(seeds) > 1 and cells:
+            draw(table, record, file.with_suffix(".png"))
     return record
 
 
-def _row_record(table: Table, row: Row, scores: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+def _check(args: Args) -> None:
+    for seed in args.seeds:
+        if seed < 0 or args.seeds.count(seed) > 1:
+            raise ValueError(f"--seeds: got {args.seeds}, expected different ones, none below 0")
+    if args.data is not None and not (args.data / "ten_sweep_cloud").is_dir():
+        raise ValueError(f"--data: {args.data}: no ten_sweep_cloud/ there")
+
+
+def _cells(
+    table: Table, scale: Scale, seeds: tuple[int, ...], results: Path, args: Args
+) -> dict[str, list[dict[str, Any]]]:
+    """The records of every row's cells, by seed."""
+    configs = {row.label: row.change(scale.base) for row in table.rows}
+    for config in configs.values():
+        scale.check(config)
+    wanted = [(config, seed) for config in configs.values() for seed in seeds]
+    found = iter(run_cells(wanted, scale, results=results, runs=args.runs / args.scale))
+    return {label: [next(found) for _ in seeds] for label in configs}
+
+
+def _cells_of(cells: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """Revisions and devices that trained the cells."""
+    return sorted({f"{cell['git']} on {cell['device']}" for row in cells.values() for cell in row})
+
+
+def _row_record(table: Table, row: Row, cells: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Scores of a row, their difference to the reference, seed by seed, and the paper's."""
     paper = PAPER["tables"].get(table.name, {"rows": {}})["rows"]
     reference = next(r for r in table.rows if r.label == (row.reference or table.reference))
@@ -135,25 +173,26 @@ def _row_record(table: Table, row: Row, scores: dict[str, list[dict[str, Any]]])
     }
     if row.gain is not None:
         record["paper_difference"] = {"mAP": PAPER["text"][row.gain]["value"]}
-    if row.label in scores:
-        mine, base = scores[row.label], scores[reference.label]
+    if row.label in cells:
+        mine, base = ([cell.get("scores") for cell in cells[label]] for label in (row.label, reference.label))
         record["scores"] = mine
+        record["diverged"] = [cell["diverged"] for cell in cells[row.label] if "diverged" in cell]
         for s in SCORES:
-            values = [100 * cell[s] for cell in mine]
-            differences = [v - 100 * cell[s] for v, cell in zip(values, base, strict=True)]
-            record[s] = {"mean": sum(values) / len(values), "interval": interval(values)}
-            record[f"{s}_difference"] = {
-                "mean": sum(differences) / len(differences),
-                "interval": interval(differences),
-            }
+            record[s] = _summary([100 * cell[s] for cell in mine if cell])
+            pairs = [(cell, other) for cell, other in zip(mine, base, strict=True) if cell and other]
+            record[f"{s}_difference"] = _summary([100 * (cell[s] - other[s]) for cell, other in pairs])
     return record
+
+
+def _summary(values: list[float]) -> dict[str, Any] | None:
+    return {"mean": sum(values) / len(values), "interval": interval(values)} if values else None
 
 
 def as_markdown(table: Table, record: dict[str, Any]) -> str:
     """The table, ours beside the paper's."""
     columns = record["figures"].get("columns", {})
     extra = list(dict.fromkeys(name for values in columns.values() for name in values))
-    trained = any("mAP" in row for row in record["rows"])
+    trained = bool(record["seeds"])
     header = [""]
     for s in SCORES:
         header += [f"{s}, ours", "difference, ours"] if trained else []
@@ -171,6 +210,9 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     references = " or ".join(f'"{name}"' for name in _references(record))
     drawn = ", seed by seed; 95 % intervals of Student's t" if trained else ""
     lines += ["", f"Differences are to {references}{drawn}.", ""]
+    lines += [f"{row['label']}: {told}" for row in record["rows"] for told in row.get("diverged", ())]
+    if trained:
+        lines += [f"Trained by revision {', '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
 
 
@@ -204,22 +246,33 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     figure = new_figure(7.5, 1.2 + 0.45 * len(rows))
     axis = figure.add_subplot()
     for i, row in enumerate(rows):
-        ours = row["mAP_difference"]
-        if ours["interval"] is not None:
+        ours, theirs = row["mAP_difference"], row["paper_difference"].get("mAP")
+        if ours is not None and ours["interval"] is not None:
             _, low, high = ours["interval"]
             axis.plot([low, high], [i, i], color="#0072b2", linewidth=2, solid_capstyle="butt")
-        axis.plot(ours["mean"], i, "o", color="#0072b2", label="ours, 95 % interval" if i == 0 else None)
-        if "mAP" in row["paper_difference"]:
-            theirs = row["paper_difference"]["mAP"]
-            axis.plot(theirs, i, "D", color="#d55e00", markersize=5, label="paper" if i == 0 else None)
+        if ours is not None:
+            axis.plot(ours["mean"], i, "o", color="#0072b2", label="ours, 95 % interval")
+        if theirs is not None:
+            axis.plot(theirs, i, "D", color="#d55e00", markersize=5, label="paper")
     axis.axvline(0, color="#888888", linewidth=0.8)
     axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
     axis.invert_yaxis()
     axis.set_xlabel("mAP, points more than " + " or ".join(f'"{name}"' for name in _references(record)))
     axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds)", fontsize=11)
-    axis.legend(fontsize=9, frameon=False)
+    handles, labels = axis.get_legend_handles_labels()
+    kinds = dict(zip(labels, handles, strict=True))
+    axis.legend(kinds.values(), kinds.keys(), fontsize=9, frameon=False)
     axis.spines[["top", "right"]].set_visible(False)
     save_png(figure, path)
+
+
+def command(work: Callable[[Args], object], description: str | None) -> None:
+    """Parse the options, do the work, and leave with the exit code; a failure is one line."""
+
+    def run() -> None:
+        work(tyro.cli(Args, description=description))
+
+    sys.exit(exit_code(Path(sys.argv[0]).name, run))
 
 
 def main(args: Args) -> None:
@@ -238,4 +291,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    command(main, __doc__)

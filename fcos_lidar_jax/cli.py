@@ -1,7 +1,7 @@
 """The command line: parse, run, and turn every foreseeable failure into one line."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import or_
 from typing import Annotated, Any
@@ -43,14 +43,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         args=argv,
         config=(tyro.conf.CascadeSubcommandArgs,),  # a command's options may stand behind its preset
     )  # type: ignore[call-overload]
+    run = next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))
+    return exit_code("fcos-lidar", lambda: run(command))
+
+
+def exit_code(program: str, work: Callable[[], object]) -> int:
+    """Do the work; one line on standard error, from the program of that name, tells why it failed.
+
+    Args:
+        program: name for the line.
+        work: what to do; its result is dropped.
+
+    Returns:
+        0, 1 after a foreseeable failure, 130 when interrupted.
+
+    >>> exit_code("example", lambda: 0)
+    0
+    """
     try:
-        next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))(command)
+        work()
     except (ValueError, OSError, ArithmeticError) as error:
         line = " ".join(str(error).split())
-        print(f"fcos-lidar: error: {line}", file=sys.stderr)
+        print(f"{program}: error: {line}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("fcos-lidar: interrupted", file=sys.stderr)
+        print(f"{program}: interrupted", file=sys.stderr)
         return 130
     return 0
 

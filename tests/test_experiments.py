@@ -13,7 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fcos_lidar_jax.commands import prepare
 from fcos_lidar_jax.config import NUSCENES, QUICKSTART
+from fcos_lidar_jax.data.synthetic.dataset import write_dataset
+from fcos_lidar_jax.data.synthetic.render import Order
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.training import NonFiniteLossError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
@@ -36,12 +41,18 @@ class Pretended:
     name: str = "pretended"
     base: object = QUICKSTART
     asked: int = 0
+    diverges: tuple = ()
 
     def describe(self):
         return {"scale": self.name}
 
+    def check(self, config):
+        pass
+
     def score(self, config, seed, folder):
         self.asked += 1
+        if (config.projection.num_rounds, seed) in self.diverges:
+            raise NonFiniteLossError("step 7: loss/l1 is not finite")
         score = 0.1 * config.projection.num_rounds + 0.01 * seed
         return {"mAP": score, "NDS": score / 2, "AP": {}}
 
@@ -59,7 +70,7 @@ def test_a_finished_cell_is_never_run_again(experiments, tmp_path):
     assert scale.asked == 2
     record = json.loads(next(iter(sorted(tmp_path.glob("*.json")))).read_text())
     assert record["config"]["projection"]["num_rounds"] == 3
-    assert {"jax", "git", "device", "minutes", "seed"} <= set(record)
+    assert {"jax", "git", "device", "seed"} <= set(record)
 
 
 _HOLDER = """
@@ -85,10 +96,10 @@ def test_a_cell_that_another_process_trains_is_left_to_it(experiments, tmp_path,
             assert grid.run_cell(held, scale, 0, **folders) is None
             # The other is killed while this one waits: its cell is free again.
             monkeypatch.setattr(grid.time, "sleep", lambda _: (other.kill(), other.wait()))
-            scores = grid.run_cells([(held, 0), (free, 0)], scale, **folders)
+            records = grid.run_cells([(held, 0), (free, 0)], scale, **folders)
         finally:
             other.kill()
-    assert [score["mAP"] for score in scores] == pytest.approx([0.3, 0.5])
+    assert [record["scores"]["mAP"] for record in records] == pytest.approx([0.3, 0.5])
     assert scale.asked == 2
 
 
@@ -104,6 +115,8 @@ def test_cells_are_told_apart_by_what_decides_them(experiments):
     assert len(names) == 6
     formed = change(model__stem__form="grouped")(QUICKSTART)
     assert cell_name(formed, scale, 0) == cell_name(QUICKSTART, scale, 0)
+    suppressed = change(inference__nms_form="matrix")(QUICKSTART)
+    assert cell_name(suppressed, scale, 0) == cell_name(QUICKSTART, scale, 0)
     assert cell_name(QUICKSTART, Pretended("elsewhere"), 0) not in names
 
 
@@ -170,6 +183,140 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(experiments, tmp
     assert text in capsys.readouterr().out
     assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+40.00, +40.00] | 57.08 | +2.06 |" in text
     assert (tmp_path / "smoke" / "table1.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_diverged_cell_is_told_and_the_others_are_shown(experiments, tmp_path, monkeypatch):
+    import tables
+    from table1_mrv_rounds import TABLE
+
+    scale = Pretended(diverges=((1, 0), (3, 0), (3, 1)))
+    monkeypatch.setattr(tables, "make_scale", lambda _: scale)
+    table = dataclasses.replace(TABLE, figures=None)
+    args = tables.Args(seeds=(0, 1, 2), out=tmp_path, runs=tmp_path)
+    rows = {row["label"]: row for row in tables.run_table(table, args)["rows"]}
+    # Seeds 1 and 2 are left of one round, seed 2 of three, all of five.
+    assert rows["multi, 1 round"]["mAP"]["mean"] == pytest.approx(11.5)
+    assert rows["multi, 3 rounds"]["mAP"] == {"mean": pytest.approx(32.0), "interval": None}
+    assert rows["multi, 5 rounds"]["mAP"]["mean"] == pytest.approx(51.0)
+    assert rows["multi, 5 rounds"]["mAP_difference"]["mean"] == pytest.approx(40.0)
+    assert rows["multi, 3 rounds"]["diverged"] == ["step 7: loss/l1 is not finite"] * 2
+    assert "multi, 3 rounds: step 7: loss/l1 is not finite" in (tmp_path / "smoke" / "table1.md").read_text()
+    asked = scale.asked
+    tables.run_table(table, args)
+    assert scale.asked == asked
+    gone = dataclasses.replace(scale, diverges=tuple((n, 0) for n in (1, 3, 5, 7)))
+    monkeypatch.setattr(tables, "make_scale", lambda _: gone)
+    args = tables.Args(seeds=(0,), out=tmp_path / "gone", runs=tmp_path / "gone")
+    assert all(row["mAP"] is None for row in tables.run_table(table, args)["rows"])
+
+
+def test_only_figures_leaves_the_finished_table_alone(experiments, tmp_path, monkeypatch):
+    import tables
+    from table2_priority import TABLE
+
+    monkeypatch.setattr(tables, "make_scale", lambda _: Pretended())
+    table = dataclasses.replace(TABLE, figures=lambda _: {"columns": {"with priority": {"kept": 3.0}}})
+    args = tables.Args(seeds=(0,), out=tmp_path, runs=tmp_path)
+    tables.run_table(table, args)
+    before = (tmp_path / "smoke" / "table2.md").read_text()
+    tables.run_table(table, dataclasses.replace(args, only_figures=True))
+    assert (tmp_path / "smoke" / "table2.md").read_text() == before
+    assert "3.00" in (tmp_path / "smoke" / "table2_figures.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"reference": "Tied"}, "got 'Tied', expected one of"),
+        ({"rows": ("tied", "tied")}, "got two rows 'tied'"),
+        ({"rows": ("tied", "untied"), "paper": "Untied"}, "paper: got 'Untied', expected one of"),
+        ({"rows": ("tied", "untied"), "gain": "of_it"}, "gain: got 'of_it', expected one of"),
+    ],
+)
+def test_a_table_that_cannot_be_printed_is_refused_before_training(experiments, change, message):
+    import grid
+    from table6_untied_heads import TABLE
+    from tables import Row
+
+    kinds = {key: change.pop(key) for key in ("paper", "gain") if key in change}
+    if "rows" in change:
+        change["rows"] = tuple(Row(label, grid.change(), **kinds) for label in change["rows"])
+    with pytest.raises(ValueError, match=re.escape(message)):
+        dataclasses.replace(TABLE, **change)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"num_sweeps": 11}, "num_sweeps: got 11, expected 1 to 10"),
+        ({"sensor": "kitti_hdl64e"}, "sensor: got 'kitti_hdl64e'"),
+        ({"projection__close_m": 2.0}, "projection.close_m: got 2.0, expected 1.0"),
+    ],
+)
+def test_a_simulated_row_that_would_change_nothing_is_refused(experiments, tmp_path, fields, message):
+    from grid import change
+    from scales import smoke
+
+    scale = smoke(tmp_path)
+    scale.check(scale.base)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        scale.check(change(**fields)(scale.base))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different ones, none below 0"),
+        (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/ there"),
+        (["--scale", "nuscenes"], "--data-root: missing, expected the data set for --scale nuscenes"),
+        (["--scale", "nuscenes", "--data-root", "nowhere"], "nowhere: no such folder, expected a data root"),
+    ],
+)
+def test_a_users_mistake_is_one_line_before_training(experiments, monkeypatch, capsys, tmp_path, options, message):
+    import tables
+    from table6_untied_heads import TABLE
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["table6_untied_heads.py", *options])
+    with pytest.raises(SystemExit, match="1"):
+        tables.command(lambda args: tables.run_table(TABLE, args), None)
+    assert capsys.readouterr().err == f"table6_untied_heads.py: error: {message}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_full_scale_trains_and_evaluates_by_the_commands(experiments, tmp_path, monkeypatch):
+    import scales
+
+    splits = tmp_path / "splits.json"
+    splits.write_text('{"mini_train": ["scene-0001"], "mini_val": ["scene-0002"]}')
+    order = Order(2, 1, 3, dataclasses.replace(TINY, name="toy", num_columns=64), False, "v1.0-mini")
+    for root in ("one", "two"):
+        one = order if root == "one" else dataclasses.replace(order, seed=2)
+        write_dataset(one, tmp_path / root, workers=1, report=lambda _: None)
+        prepare.run(prepare.Prepare(tmp_path / root, "v1.0-mini", splits=splits))
+    asked = []
+    monkeypatch.setattr(scales.train_command, "run", asked.append)
+
+    def evaluate(args):
+        asked.append(args)
+        args.out.mkdir(parents=True)
+        summary = {"mean_ap": 0.5, "nd_score": 0.25, "mean_dist_aps": {"car": 0.125}}
+        (args.out / "metrics_summary.json").write_text(json.dumps(summary))
+
+    monkeypatch.setattr(scales.evaluate_command, "run", evaluate)
+    layout = scales.Layout(tmp_path / "one", "v1.0-mini", splits=splits, steps=5, accumulate=4, workers=2)
+    layout = dataclasses.replace(layout, precision="bfloat16")
+    scale = scales.NuScenesLayout(layout)
+    assert (scale.base.optimizer.accumulate, scale.base.model.precision) == (4, "bfloat16")
+    assert scale.score(scale.base, 3, tmp_path / "run") == {"mAP": 0.5, "NDS": 0.25, "AP": {"car": 0.125}}
+    trained, evaluated = asked
+    assert (trained.train_split, trained.steps, trained.workers, trained.seed) == ("mini_train", 5, 2, 3)
+    assert (evaluated.split, evaluated.checkpoint) == ("mini_val", tmp_path / "run")
+    # Another data set of the same version is another scale.
+    other = scales.NuScenesLayout(dataclasses.replace(layout, data_root=tmp_path / "two"))
+    assert other.describe()["fingerprints"] != scale.describe()["fingerprints"]
+    with pytest.raises(ValueError, match="wrong"):
+        scales.NuScenesLayout(dataclasses.replace(layout, val_split="wrong"))
 
 
 def test_every_row_of_the_tables_has_its_paper_figures(experiments):
