@@ -117,7 +117,7 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
     cells = {} if args.only_figures else _cells(table, make_scale(args), seeds, folder / "cells", args)
     file = folder / f"{table.name}{'_figures' if args.only_figures else ''}"
     # One process at a time: what is timed is not to be disturbed by the others of the same table.
-    with claim(file.with_suffix(".lock"), wait=True):
+    with claim(args.runs / args.scale / f"{file.name}.lock", wait=True):
         figures = table.figures(args) if table.figures else {}
         record = {
             "table": table.name,
@@ -212,7 +212,7 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     lines += ["", f"Differences are to {references}{drawn}.", ""]
     lines += [f"{row['label']}: {told}" for row in record["rows"] for told in row.get("diverged", ())]
     if trained:
-        lines += [f"Trained by revision {', '.join(record['cells_of'])}.", ""]
+        lines += [f"Trained by revision {'; '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
 
 
@@ -256,7 +256,7 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
             axis.plot(theirs, i, "D", color="#d55e00", markersize=5, label="paper")
     axis.axvline(0, color="#888888", linewidth=0.8)
     axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
-    axis.invert_yaxis()
+    axis.set_ylim(len(rows) - 0.5, -0.5)
     axis.set_xlabel("mAP, points more than " + " or ".join(f'"{name}"' for name in _references(record)))
     axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds)", fontsize=11)
     handles, labels = axis.get_legend_handles_labels()
