@@ -14,7 +14,7 @@ Cost: 15 turns take about six minutes on two CPU cores.
 
 Result (``results/module_latency.json``, two CPU cores): the paper's order and nearly its ratios, but for one pair.
 Rounds that are not grouped are faster here and slower in the paper. Grouping the rounds triples the
-multiplications; on a CPU they cost time, on the paper's GPU evidently less than many narrow groups do. The merging
+multiplications; on a CPU they cost time; why less on the paper's GPU was not measured. The merging
 1x1 reads more channels when rounds are apart; it costs more here as well, and eats most of what the 3x3 save.
 """
 
