@@ -3,6 +3,7 @@
 - ``smoke``: a toy network and a few steps on a few simulated frames: that everything runs, in minutes, on two
   cores. Its scores mean nothing.
 - ``simulated``: the quickstart's network on ten sweeps of hurried simulated streets. One GPU, or a long CPU run.
+- ``calm``: the same with ordinary traffic, to tell what the hurry does.
 - ``nuscenes``: the paper's detector on a data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
 """
 
@@ -98,7 +99,7 @@ class NewestSweeps:
 
 @dataclasses.dataclass(frozen=True)
 class Simulated:
-    """Hurried streets, ten sweeps a frame, the same frames for every cell."""
+    """Simulated streets, ten sweeps a frame, the same frames for every cell."""
 
     name: str
     base: Config
@@ -107,6 +108,8 @@ class Simulated:
     test_frames: int
     cache: Path
     """Frames are simulated once and kept here."""
+    hurry: bool = True
+    """The car is fast, and nearly all that can move does."""
 
     def describe(self) -> dict[str, Any]:
         """Streets and sensor."""
@@ -116,7 +119,7 @@ class Simulated:
             "train_frames": self.train_frames,
             "test_frames": self.test_frames,
             "sweeps": self.base.num_sweeps,
-            "hurry": True,
+            "hurry": self.hurry,
             "close_m": _BONNET_M,
         }
 
@@ -142,9 +145,12 @@ class Simulated:
         """Training or test streets; the same, and the same sweeps, however many of them are fused."""
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, _UNSEEN)}[split]
         sweeps = self.base.num_sweeps
-        made = SimulatedFrames(self.sensor, number, first, num_sweeps=sweeps, hurry=True, close_m=_BONNET_M)
-        cache = self.cache / f"{self.sensor.name}_{split}_{number}_{sweeps}_sweeps"
-        return NewestSweeps(CachedFrames(made, cache), num_sweeps)
+        made = SimulatedFrames(self.sensor, number, first, num_sweeps=sweeps, hurry=self.hurry, close_m=_BONNET_M)
+        return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
+
+    def _folder(self, what: str, num_sweeps: int) -> Path:
+        calm = "" if self.hurry else "_calm"
+        return self.cache / f"{self.sensor.name}_{what}_{num_sweeps}_sweeps{calm}"
 
     def clouds(self, num_sweeps: int, number: int = 20) -> list[np.ndarray]:
         """The first test clouds, f32[n, 5], for figures that need no training."""
@@ -154,7 +160,7 @@ class Simulated:
     def objects(self, num_sweeps: int) -> ObjectDatabase:
         """For copy-paste."""
         frames = self.frames("train", num_sweeps)
-        folder = self.cache / f"{self.sensor.name}_objects_{self.train_frames}_{num_sweeps}_sweeps"
+        folder = self._folder(f"objects_{self.train_frames}", num_sweeps)
         everything = list(range(len(frames)))
         # Two builders would sweep away each other's files.
         with claim(folder.with_suffix(".lock"), wait=True):
@@ -371,3 +377,8 @@ def smoke(cache: Path) -> Simulated:
 def simulated(cache: Path) -> Simulated:
     """The quickstart's network on ten sweeps of what is near."""
     return Simulated("simulated", _TEN_SWEEPS, SHORT_RANGE, train_frames=1200, test_frames=200, cache=cache)
+
+
+def calm(cache: Path) -> Simulated:
+    """As simulated, in ordinary traffic."""
+    return dataclasses.replace(simulated(cache), name="calm", hurry=False)

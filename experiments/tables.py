@@ -21,7 +21,7 @@ import tyro
 from claim import claim
 from grid import Change, interval, run_cells
 from hardware import hardware
-from scales import Layout, NuScenesLayout, Scale, Simulated, simulated, smoke
+from scales import Layout, NuScenesLayout, Scale, Simulated, calm, simulated, smoke
 
 from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.files import write_beside
@@ -34,8 +34,8 @@ SCORES = ("mAP", "NDS")
 class Args:
     """At which scale, and where the results go."""
 
-    scale: Literal["smoke", "simulated", "nuscenes"] = "smoke"
-    """Minutes on a toy; the quickstart on hurried simulated streets; the real thing."""
+    scale: Literal["smoke", "simulated", "calm", "nuscenes"] = "smoke"
+    """Minutes on a toy; the quickstart on hurried simulated streets, or on calm ones; the real thing."""
     seeds: tuple[int, ...] = ()
     """Of every cell; default: 0 for smoke, else 0, 1 and 2."""
     out: Path = Path("outputs/tables")
@@ -100,7 +100,7 @@ class Table:
 
 def simulated_scale(args: Args) -> Simulated | None:
     """The scale that is asked for, if its frames are simulated."""
-    make = {"smoke": smoke, "simulated": simulated}.get(args.scale)
+    make = {"smoke": smoke, "simulated": simulated, "calm": calm}.get(args.scale)
     return make(args.runs / "frames") if make else None
 
 
@@ -200,11 +200,12 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}.", ""]
     lines += ["| " + " | ".join([*header, *extra]) + " |", "|---" * (len(header) + len(extra)) + "|"]
     for row in record["rows"]:
-        cells = [row["label"]]
+        cells, itself = [row["label"]], row["label"] == row["reference"]
         for s in SCORES:
+            ours, theirs = row.get(f"{s}_difference"), row["paper_difference"].get(s)
             if trained:
-                cells += [_told(row.get(s)), _told(row.get(f"{s}_difference"), sign=True)]
-            cells += [_number(row["paper"].get(s)), _number(row["paper_difference"].get(s), sign=True)]
+                cells += [_told(row.get(s)), "-" if itself else _told(ours, sign=True)]
+            cells += [_number(row["paper"].get(s)), "-" if itself else _number(theirs, sign=True)]
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         lines.append("| " + " | ".join(cells) + " |")
     references = " or ".join(f'"{name}"' for name in _references(record))

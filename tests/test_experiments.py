@@ -182,7 +182,38 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(experiments, tmp
     text = (tmp_path / "smoke" / "table1.md").read_text()
     assert text in capsys.readouterr().out
     assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+40.00, +40.00] | 57.08 | +2.06 |" in text
+    assert "| multi, 1 round | 10.50 [4.15, 16.85] | - | 55.02 | - |" in text, "no difference to itself"
     assert (tmp_path / "smoke" / "table1.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_more_rounds_changes_the_traffic_or_the_epochs_alone(experiments, tmp_path, monkeypatch):
+    import more_rounds
+    import scales
+    import tables
+
+    asked = []
+    monkeypatch.setattr(more_rounds, "run_table", lambda table, args: asked.append((table.name, args.scale)))
+    more_rounds.main(tables.Args(scale="simulated"))
+    more_rounds.main(tables.Args(scale="smoke"))
+    assert asked == [
+        ("rounds_and_traffic", "calm"),
+        ("rounds_and_length", "simulated"),
+        ("rounds_and_traffic", "smoke"),
+        ("rounds_and_length", "smoke"),
+    ]
+    hurried, calm = (make(tmp_path) for make in (scales.simulated, scales.calm))
+    assert calm == dataclasses.replace(hurried, name="calm", hurry=False)
+    cached, quiet = (scale.frames("train", 10).frames for scale in (hurried, calm))
+    assert quiet.frames == dataclasses.replace(cached.frames, hurry=False)
+    assert quiet.folder != cached.folder
+    base = hurried.base
+    by_label = {row.label: row.change(base) for row in more_rounds.LENGTH.rows}
+    longer = dataclasses.replace(base, optimizer=dataclasses.replace(base.optimizer, epochs=6))
+    assert base.optimizer.epochs == 2
+    assert by_label["5 rounds, 3 x epochs"] == longer
+    assert by_label["1 round, 3 x epochs"].projection.num_rounds == 1
+    with pytest.raises(ValueError, match="--scale: got nuscenes, expected smoke or simulated"):
+        more_rounds.main(tables.Args(scale="nuscenes"))
 
 
 def test_a_diverged_cell_is_told_and_the_others_are_shown(experiments, tmp_path, monkeypatch):

@@ -158,7 +158,7 @@ def test_stopped_failed_and_gone_on_with_it_ends_where_the_run_left_alone_ended(
 
     with pytest.raises(KeyboardInterrupt):
         train(0, signalled(signal.SIGINT), weights=weights())
-    assert "stopped after step 1; saved: go on with --resume" in capsys.readouterr().err
+    assert "stopped after step 1, which is saved" in capsys.readouterr().err
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["00000001"]
     with pytest.raises(SystemExit) as stopped:
         train(2, signalled(signal.SIGTERM), resume=True)

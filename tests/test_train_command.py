@@ -166,7 +166,7 @@ def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, tmp_pat
         _, errors = process.communicate(timeout=200)
         assert process.returncode == code, errors
         assert "Traceback" not in errors
-        assert "saved: go on with --resume" in errors
+        assert "which is saved\nthe same command with --resume goes on\n" in errors
         stops.append(len(read_records(out)))
         assert checkpoints(out)[-1] == f"{stops[-1]:08d}"
     assert 0 < stops[0] < stops[1] < 2000

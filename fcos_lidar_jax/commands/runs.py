@@ -192,7 +192,7 @@ class Run:
         if self.leads:
             self.draw_curves()
         if done < self.plan.num_steps:
-            print(f"stopped after step {done}; saved: go on with --resume", file=sys.stderr)
+            print(f"stopped after step {done}, which is saved", file=sys.stderr)
             if request.signal == signal.SIGINT:
                 raise KeyboardInterrupt
             raise SystemExit(128 + signal.SIGTERM)

@@ -152,7 +152,13 @@ def run(args: Train) -> None:
     training.check_folder(resume=args.resume)
     weights = None if args.weights is None or args.resume else _weights(args.weights, training)
     objects = None if config.copy_paste is None else _objects(config.copy_paste, frames, index, split, args)
-    state = training.train(_feed(args, config, frames, objects, num_steps), resume=args.resume, weights=weights)
+    feed = _feed(args, config, frames, objects, num_steps)
+    try:
+        state = training.train(feed, resume=args.resume, weights=weights)
+    except (KeyboardInterrupt, SystemExit):
+        if training.leads and training.snapshots.paths():
+            print("the same command with --resume goes on", file=sys.stderr)
+        raise
     if jax.process_index() == 0:
         best = find_checkpoint(args.out)
         print(json.dumps({"run": str(args.out), "steps": int(state.step), "checkpoint": str(best)}))
