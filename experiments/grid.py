@@ -71,6 +71,7 @@ def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Pa
     """The record of a cell, from its file or by training it; None while another process trains it.
 
     A run whose loss stopped being finite is a result too: ``diverged`` in place of ``scores``, and what was said.
+    ``git`` names the revisions of all processes that took part, in their order.
 
     Args:
         config: of the row.
@@ -78,14 +79,18 @@ def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Pa
         seed: of weights, order and augmentation.
         results: folder of the cells' files.
         runs: folder of the training runs.
+
+    Returns:
+        what its file holds, and its ``name``.
     """
     name = cell_name(config, scale, seed)
     file = results / f"{name}.json"
     with claim(runs / f"{name}.lock") as mine:
         if file.is_file():
-            return json.loads(file.read_text(encoding="utf-8"))
+            return {"name": name, **json.loads(file.read_text(encoding="utf-8"))}
         if not mine:
             return None
+        revisions = _join(runs / name, hardware()["git"])
         try:
             outcome: dict[str, Any] = {"scores": scale.score(config, seed, runs / name)}
         except NonFiniteLossError as error:
@@ -96,10 +101,20 @@ def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Pa
             "scale": scale.describe(),
             "config": config_to_json(config),
             **hardware(),
+            "git": ", then ".join(revisions),
         }
         text = json.dumps(record, indent=1)
         write_beside(file, lambda path: path.write_text(text, encoding="utf-8"))
-        return json.loads(text)
+        return {"name": name, **json.loads(text)}
+
+
+def _join(folder: Path, revision: str) -> list[str]:
+    """Note in a run's folder who works on it now; all who did."""
+    file = folder / "revisions.txt"
+    before = file.read_text(encoding="utf-8").split() if file.is_file() else []
+    revisions = before if before[-1:] == [revision] else [*before, revision]
+    write_beside(file, lambda path: path.write_text("\n".join(revisions), encoding="utf-8"))
+    return revisions
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float] | None:

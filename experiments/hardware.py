@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from fcos_lidar_jax import __version__
+import fcos_lidar_jax
 
 
 @functools.cache
@@ -19,13 +19,15 @@ def hardware() -> dict[str, Any]:
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     git = ["git", "describe", "--always", "--dirty"]
-    told = subprocess.run(git, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    told = subprocess.run(
+        git, cwd=Path(fcos_lidar_jax.__file__).parent, capture_output=True, text=True, check=False
+    )
     return {
         "device": jax.devices()[0].device_kind,
         "processor": names[0] if names else platform.machine(),
         "cores": os.cpu_count(),
         "jax": jax.__version__,
         "python": platform.python_version(),
-        "fcos_lidar_jax": __version__,
+        "fcos_lidar_jax": fcos_lidar_jax.__version__,
         "git": told.stdout.strip() or "unknown",
     }

@@ -13,9 +13,10 @@ itself: what a variant's convolutions take one by one explains its place.
 Cost: 15 turns take about six minutes on two CPU cores.
 
 Result (``results/module_latency.json``, two CPU cores): the paper's order and nearly its ratios, but for one pair.
-Rounds that are not grouped are faster here and slower in the paper. Grouping the rounds triples the
-multiplications; on a CPU they cost time; why less on the paper's GPU was not measured. The merging
-1x1 reads more channels when rounds are apart; it costs more here as well, and eats most of what the 3x3 save.
+Rounds that are not grouped are faster here and slower in the paper. Grouping the rounds needs three times the
+multiplications, and executes 1.3 times as many; on a CPU they cost time; why less on the paper's GPU was not
+measured. The merging 1x1 reads no more channels when rounds are apart, but in more and narrower pieces; it takes
+longer, and eats most of what the 3x3 save.
 """
 
 import dataclasses
@@ -319,7 +320,7 @@ def figures(args: TableArgs, *, names: Mapping[str, str]) -> dict[str, Any]:
         names: label of a row -> its variant.
     """
     repeats = 2 if args.scale == "smoke" else 15
-    measured = measure(Args(only=tuple(names.values()), repeats=repeats))
+    measured = measure(Args(only=tuple(names.values()), repeats=repeats, precision=args.nuscenes.precision))
     columns: dict[str, dict[str, float]] = {}
     for label, name in names.items():
         found = measured["variants"][name]

@@ -1,7 +1,7 @@
 """What do five rounds need to be worth more than one? Traffic and length of the training, of table 1's rows.
 
     python experiments/more_rounds.py                    # smoke: minutes, a toy
-    python experiments/more_rounds.py --scale simulated  # 9 cells beside those of tables 1 and 2, of three seeds
+    python experiments/more_rounds.py --scale simulated  # 5 cells, two of them three times as long, three seeds
 
 On hurried streets and after two epochs, five rounds of ten sweeps score less than one (table 1 at scale
 simulated), where the paper gains 2.1 points. The first table asks the same of calm streets, the second after three
@@ -31,7 +31,7 @@ def _longer(rounds: int) -> Row:
 _ONE = Row("1 round", change(projection__num_rounds=1))
 _FIVE = Row("5 rounds", change(projection__num_rounds=5))
 _MIXED = Row("5 rounds, no priority", change(projection__prioritize_current=False), reference="5 rounds")
-TRAFFIC = Table("rounds_and_traffic", "Rounds on calm streets", (_ONE, _FIVE, _MIXED), reference="1 round")
+TRAFFIC = Table("rounds_and_traffic", "Rounds and traffic", (_ONE, _FIVE, _MIXED), reference="1 round")
 LENGTH = Table(
     "rounds_and_length",
     "Rounds and length of the training",

@@ -101,7 +101,7 @@ def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[st
     return {
         name: {
             what: {r: round(float(np.mean([f[name][what][r] for f in found])), 2) for r in map(str, ROUNDS)}
-            for what in ("kept", "percent", "current")
+            for what in ("percent", "current")
         }
         for name in ("prioritized", "not prioritized")
     }
@@ -166,9 +166,7 @@ def as_text(record: dict[str, Any]) -> str:
     for r, theirs in record["paper_times"].items():
         ours = "".join(
             f"{t['median_ms']:10.2f} p99{t['p99_ms']:7.2f}{'(' + format(t['ratio'], '.2f') + ')':>8s}"
-            if (t := record["times"][setting][r])
-            else ""
-            for setting in ROWS
+            for t in (record["times"][setting][r] for setting in ROWS)
         )
         lines.append(f"{r:>8s}{ours}{theirs['median_ms']:11.2f} ({theirs['ratio']:.2f})")
     lines.append(f"paper's times: {PAPER['times']}; elsewhere only the ratios can be compared")

@@ -287,6 +287,8 @@ class NuScenesLayout:
             "splits": list(self.splits),
             "fingerprints": [fingerprint(index, NuScenesFrames(data, tuple(tokens[s]))) for s in self.splits],
             "steps": layout.steps,
+            # Where it is not set, it cannot have changed a thing.
+            **({"allow_missing_sweeps": True} if layout.allow_missing_sweeps else {}),
         }
 
     def check(self, config: Config) -> None:

@@ -20,7 +20,12 @@ def figures(args: Args) -> dict[str, Any]:
     """Times of the stages."""
     small = args.scale == "smoke"
     measured = latency.measure(
-        latency.Args(preset="quickstart" if small else "nuscenes", data=args.data, repeats=3 if small else 15)
+        latency.Args(
+            preset="quickstart" if small else "nuscenes",
+            precision=args.nuscenes.precision,
+            data=args.data,
+            repeats=3 if small else 15,
+        )
     )
     columns = {
         f"{setting}-frame": {f"{stage}, ms": times["median_ms"] for stage, times in of_setting.items()}

@@ -21,9 +21,11 @@ import tyro
 from claim import claim
 from grid import Change, interval, run_cells
 from hardware import hardware
+from latency import real_cloud
 from scales import Layout, NuScenesLayout, Scale, Simulated, calm, simulated, smoke
 
 from fcos_lidar_jax.cli import exit_code
+from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import write_beside
 
 PAPER = json.loads(Path(__file__).with_name("paper.json").read_text(encoding="utf-8"))
@@ -114,7 +116,8 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
     _check(args)
     here, folder = hardware(), args.out / args.scale
     seeds = args.seeds or ((0,) if args.scale == "smoke" else (0, 1, 2))
-    cells = {} if args.only_figures else _cells(table, make_scale(args), seeds, folder / "cells", args)
+    scale = None if args.only_figures else make_scale(args)
+    cells = {} if scale is None else _cells(table, scale, seeds, folder / "cells", args)
     file = folder / f"{table.name}{'_figures' if args.only_figures else ''}"
     # One process at a time: what is timed is not to be disturbed by the others of the same table.
     with claim(args.runs / args.scale / f"{file.name}.lock", wait=True):
@@ -123,6 +126,7 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
             "table": table.name,
             "scale": args.scale,
             "seeds": list(seeds) if cells else [],
+            "trained_on": None if scale is None else {**scale.describe(), "base": config_to_json(scale.base)},
             "rows": [_row_record(table, row, cells) for row in table.rows],
             "figures": figures,
             "cells_of": _cells_of(cells),
@@ -132,8 +136,11 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
         print(text, flush=True)
         write_beside(file.with_suffix(".json"), lambda path: path.write_text(json.dumps(record, indent=1)))
         write_beside(file.with_suffix(".md"), lambda path: path.write_text(text, encoding="utf-8"))
+        picture = file.with_suffix(".png")
         if len(seeds) > 1 and cells:
-            draw(table, record, file.with_suffix(".png"))
+            draw(table, record, picture)
+        else:
+            picture.unlink(missing_ok=True)  # of other seeds
     return record
 
 
@@ -141,8 +148,12 @@ def _check(args: Args) -> None:
     for seed in args.seeds:
         if seed < 0 or args.seeds.count(seed) > 1:
             raise ValueError(f"--seeds: got {args.seeds}, expected different ones, none below 0")
-    if args.data is not None and not (args.data / "ten_sweep_cloud").is_dir():
-        raise ValueError(f"--data: {args.data}: no ten_sweep_cloud/ there")
+    real_cloud(args.data)
+    if args.scale != "nuscenes":
+        for field in dataclasses.fields(Layout):
+            if getattr(args.nuscenes, field.name) != getattr(Layout(), field.name):
+                option = field.name.replace("_", "-")
+                raise ValueError(f"--{option}: is of --scale nuscenes, got --scale {args.scale}")
 
 
 def _cells(
@@ -174,9 +185,12 @@ def _row_record(table: Table, row: Row, cells: dict[str, list[dict[str, Any]]]) 
     if row.gain is not None:
         record["paper_difference"] = {"mAP": PAPER["text"][row.gain]["value"]}
     if row.label in cells:
+        record["cells"] = [cell["name"] for cell in cells[row.label]]
         mine, base = ([cell.get("scores") for cell in cells[label]] for label in (row.label, reference.label))
         record["scores"] = mine
-        record["diverged"] = [cell["diverged"] for cell in cells[row.label] if "diverged" in cell]
+        record["diverged"] = [
+            f"seed {cell['seed']}: {cell['diverged']}" for cell in cells[row.label] if "diverged" in cell
+        ]
         for s in SCORES:
             record[s] = _summary([100 * cell[s] for cell in mine if cell])
             pairs = [(cell, other) for cell, other in zip(mine, base, strict=True) if cell and other]
@@ -197,7 +211,8 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     for s in SCORES:
         header += [f"{s}, ours", "difference, ours"] if trained else []
         header += [f"{s}, paper", "difference, paper"]
-    lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}.", ""]
+    told = f"; {_told_scale(record['trained_on'])}" if trained else ""
+    lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}{told}.", ""]
     lines += ["| " + " | ".join([*header, *extra]) + " |", "|---" * (len(header) + len(extra)) + "|"]
     for row in record["rows"]:
         cells, itself = [row["label"]], row["label"] == row["reference"]
@@ -209,12 +224,30 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         lines.append("| " + " | ".join(cells) + " |")
     references = " or ".join(f'"{name}"' for name in _references(record))
-    drawn = ", seed by seed; 95 % intervals of Student's t" if trained else ""
+    drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
     lines += ["", f"Differences are to {references}{drawn}.", ""]
     lines += [f"{row['label']}: {told}" for row in record["rows"] for told in row.get("diverged", ())]
     if trained:
         lines += [f"Trained by revision {'; '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
+
+
+def _told_scale(trained_on: dict[str, Any]) -> str:
+    """What a row that changes nothing is trained on, and how long."""
+    base = trained_on["base"]
+    told = {
+        **{name: value for name, value in trained_on.items() if isinstance(value, int | float | str)},
+        "splits": " and ".join(trained_on.get("splits", ())) or None,
+        "epochs": None if trained_on.get("steps") else base["optimizer"]["epochs"],
+        "batch_size": base["optimizer"]["batch_size"],
+        "accumulate": base["optimizer"]["accumulate"],
+        "precision": base["model"]["precision"],
+    }
+    return "; ".join(
+        f"{name.replace('_', ' ')} {str(value).lower()}"
+        for name, value in told.items()
+        if value is not None and name != "scale"
+    )
 
 
 def _references(record: dict[str, Any]) -> list[str]:
@@ -224,8 +257,6 @@ def _references(record: dict[str, Any]) -> list[str]:
 def _number(value: Any, sign: bool = False) -> str:
     if value is None:
         return "-"
-    if isinstance(value, str):
-        return value
     return f"{value:+.2f}" if sign else f"{value:.2f}"
 
 

@@ -73,6 +73,27 @@ def test_a_finished_cell_is_never_run_again(experiments, tmp_path):
     assert {"jax", "git", "device", "seed"} <= set(record)
 
 
+def test_a_cell_names_the_revisions_of_all_who_trained_it(experiments, tmp_path, monkeypatch):
+    import grid
+
+    class Interrupted(Pretended):
+        def score(self, config, seed, folder):
+            if self.asked < 3:
+                self.asked += 1
+                raise KeyboardInterrupt
+            return super().score(config, seed, folder)
+
+    scale = Interrupted()
+    for revision in ("a1", "a1", "b2"):
+        monkeypatch.setattr(grid, "hardware", lambda revision=revision: {"git": revision})
+        with pytest.raises(KeyboardInterrupt):
+            grid.run_cell(QUICKSTART, scale, 0, results=tmp_path / "cells", runs=tmp_path)
+    record = grid.run_cell(QUICKSTART, scale, 0, results=tmp_path / "cells", runs=tmp_path)
+    assert record["git"] == "a1, then b2"
+    assert record == grid.run_cell(QUICKSTART, scale, 0, results=tmp_path / "cells", runs=tmp_path)
+    assert record["name"] == grid.cell_name(QUICKSTART, scale, 0)
+
+
 _HOLDER = """
 import sys
 from pathlib import Path
@@ -230,8 +251,11 @@ def test_a_diverged_cell_is_told_and_the_others_are_shown(experiments, tmp_path,
     assert rows["multi, 3 rounds"]["mAP"] == {"mean": pytest.approx(32.0), "interval": None}
     assert rows["multi, 5 rounds"]["mAP"]["mean"] == pytest.approx(51.0)
     assert rows["multi, 5 rounds"]["mAP_difference"]["mean"] == pytest.approx(40.0)
-    assert rows["multi, 3 rounds"]["diverged"] == ["step 7: loss/l1 is not finite"] * 2
-    assert "multi, 3 rounds: step 7: loss/l1 is not finite" in (tmp_path / "smoke" / "table1.md").read_text()
+    told = [f"seed {seed}: step 7: loss/l1 is not finite" for seed in (0, 1)]
+    assert rows["multi, 3 rounds"]["diverged"] == told
+    assert (
+        "multi, 3 rounds: seed 1: step 7: loss/l1 is not finite" in (tmp_path / "smoke" / "table1.md").read_text()
+    )
     asked = scale.asked
     tables.run_table(table, args)
     assert scale.asked == asked
@@ -250,9 +274,23 @@ def test_only_figures_leaves_the_finished_table_alone(experiments, tmp_path, mon
     args = tables.Args(seeds=(0,), out=tmp_path, runs=tmp_path)
     tables.run_table(table, args)
     before = (tmp_path / "smoke" / "table2.md").read_text()
+    assert "seeds [0]; epochs 40; batch size 2; accumulate 1; precision float32.\n" in before
+    assert "interval" not in before, "one seed has none"
     tables.run_table(table, dataclasses.replace(args, only_figures=True))
     assert (tmp_path / "smoke" / "table2.md").read_text() == before
     assert "3.00" in (tmp_path / "smoke" / "table2_figures.md").read_text()
+
+
+def test_a_picture_of_other_seeds_does_not_stay(experiments, tmp_path, monkeypatch):
+    import tables
+    from table6_untied_heads import TABLE
+
+    monkeypatch.setattr(tables, "make_scale", lambda _: Pretended())
+    picture = tmp_path / "smoke" / "table6.png"
+    tables.run_table(TABLE, tables.Args(seeds=(0, 1), out=tmp_path, runs=tmp_path))
+    assert picture.exists()
+    tables.run_table(TABLE, tables.Args(seeds=(0,), out=tmp_path, runs=tmp_path))
+    assert not picture.exists()
 
 
 @pytest.mark.parametrize(
@@ -298,7 +336,9 @@ def test_a_simulated_row_that_would_change_nothing_is_refused(experiments, tmp_p
     ("options", "message"),
     [
         (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different ones, none below 0"),
-        (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/ there"),
+        (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/cloud.f16.bin there"),
+        (["--data-root", "nowhere"], "--data-root: is of --scale nuscenes, got --scale smoke"),
+        (["--scale", "calm", "--steps", "5"], "--steps: is of --scale nuscenes, got --scale calm"),
         (["--scale", "nuscenes"], "--data-root: missing, expected the data set for --scale nuscenes"),
         (["--scale", "nuscenes", "--data-root", "nowhere"], "nowhere: no such folder, expected a data root"),
     ],
@@ -381,6 +421,28 @@ def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(e
     record = tables.run_table(table, tables.Args(seeds=(0,), out=tmp_path, runs=tmp_path))
     gains = [row["paper_difference"] for row in record["rows"]]
     assert gains == [{}, {"mAP": 2}, {"mAP": 0.6}, {}]
+
+
+def test_table_8_submits_nothing_of_a_run_that_did_not_end(experiments, tmp_path, monkeypatch):
+    import table8_test_submission as table8
+    from grid import cell_name, run_cell
+
+    config = table8.wide(table8.faded(QUICKSTART))
+    args = table8.Args(seeds=(0,), out=tmp_path, runs=tmp_path / "runs")
+    folders = {"results": tmp_path / "smoke" / "cells", "runs": args.runs / "smoke"}
+    scale = Pretended()
+    monkeypatch.setattr(table8, "make_scale", lambda _: scale)
+    run_cell(config, scale, 0, **folders)
+    run = folders["runs"] / cell_name(config, scale, 0)
+    assert table8.submission(args) == [
+        f"No results file: no finished run in {run}, the cell was trained elsewhere."
+    ]
+    (run / "run.json").write_text('{"num_steps": 20}')
+    for step, ended in (("00000010", False), ("00000020", True)):
+        (run / "checkpoints" / step).mkdir(parents=True)
+        assert table8.finished(run) is ended
+    next(folders["results"].iterdir()).write_text('{"seed": 0, "diverged": "step 7: loss/l1 is not finite"}')
+    assert table8.submission(args) == ["No results file: the training of seed 0 diverged."]
 
 
 def test_the_variant_of_the_readme_runs(experiments, tmp_path, monkeypatch, capsys):

@@ -133,9 +133,7 @@ def run(args: Train) -> None:
     tests = (
         None if val_split == "none" else _frames(data, config, val_split, args.val_samples, "--val-samples", args)
     )
-    num_steps = args.steps or config.optimizer.epochs * steps_per_epoch(
-        len(epoch_frames(frames, config, seed=args.seed)), config.optimizer.batch_size
-    )
+    num_steps = _num_steps(args, config, frames)
     about = {
         "version": args.version,
         "split": split,
@@ -177,6 +175,17 @@ def _check(args: Train) -> None:
         raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
     if args.process_index is not None and not 0 <= args.process_index < (args.num_processes or 0):
         raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
+
+
+def _num_steps(args: Train, config: Config, frames: NuScenesFrames) -> int:
+    an_epoch = steps_per_epoch(len(epoch_frames(frames, config, seed=args.seed)), config.optimizer.batch_size)
+    num_steps = args.steps or config.optimizer.epochs * an_epoch
+    if config.copy_paste is not None and config.fade_epochs * an_epoch >= num_steps:
+        raise ValueError(
+            f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
+            f"{num_steps} steps: nothing would ever be pasted"
+        )
+    return num_steps
 
 
 def _frames(
