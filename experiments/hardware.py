@@ -31,3 +31,9 @@ def hardware() -> dict[str, Any]:
         "fcos_lidar_jax": fcos_lidar_jax.__version__,
         "git": told.stdout.strip() or "unknown",
     }
+
+
+def hardware_line() -> str:
+    """Device, processor and cores in a few words."""
+    here = hardware()
+    return f"{here['device']} ({here['processor']}, {here['cores']} cores)"

@@ -1,3 +1,34 @@
-"""FCOS-LiDAR in JAX: 3D object detection on LiDAR range images, from pure functions."""
+"""FCOS-LiDAR in JAX: 3D object detection on LiDAR range images, from pure functions.
+
+>>> import numpy as np
+>>> import fcos_lidar_jax as fcos
+>>> detector = fcos.load_detector("quickstart")
+>>> detector(np.ones((100, 4), np.float32)).boxes.shape
+(500, 9)
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fcos_lidar_jax.inference import load_detector
+    from fcos_lidar_jax.input_pipeline import open_frames
+    from fcos_lidar_jax.presets import PRESETS
+    from fcos_lidar_jax.sensors import load_sensor
 
 __version__ = "0.1.0"
+__all__ = ["PRESETS", "load_detector", "load_sensor", "open_frames"]
+
+_HOME = {
+    "PRESETS": "presets",
+    "load_detector": "inference",
+    "load_sensor": "sensors",
+    "open_frames": "input_pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # Imported when first used: importing the package alone must not load JAX.
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

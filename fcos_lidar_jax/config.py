@@ -9,6 +9,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
+
 
 def _check(condition: bool, field: str, got: object, expected: str) -> None:
     if not condition:
@@ -32,9 +34,9 @@ class ProjectionConfig:
     """Rounds of the multi-round projection."""
     prioritize_current: bool = True
     """Points of the current sweep win every collision with older ones (table 2)."""
-    remove_close: Literal["all", "sweeps", "none"] = "all"
-    """Reading: drop the points on the car itself, ``|x|, |y| < close_m``, of all sweeps, of the older sweeps
-    only, or not at all."""
+    remove_close: Literal["all", "sweeps", "none"] = "sweeps"
+    """Reading: drop the points on the ego vehicle, ``|x|, |y| < close_m``, of all sweeps, of the older sweeps only
+    (which gives the paper's numbers of points), or not at all."""
     close_m: float = 1.0
     """Reading: half the side of the square that ``remove_close`` empties, metres."""
 
@@ -63,9 +65,6 @@ class StemConfig:
     """Channels after the 1x1 merge."""
     merge: Literal["per_branch", "shared"] = "per_branch"
     """Reading: every branch has its own 1x1 merge, or one is shared."""
-    form: Literal["split", "dense", "grouped"] = "split"
-    """The same function in three formulations: independent chains (narrow groups are joined to what a CPU does
-    well), one block-diagonal kernel, or ``feature_group_count``. Parameters are interchangeable."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot run."""
@@ -89,8 +88,6 @@ class StemConfig:
 class ModelConfig:
     """LiDAR-Net, feature pyramid and heads (paper, section 3.4)."""
 
-    num_classes: int = 10
-    """Foreground classes; the logits have one more, the background, last."""
     stem: StemConfig = StemConfig()
     """Modality-wise convolutions."""
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -116,13 +113,12 @@ class ModelConfig:
     background_prior: float = 0.99
     """Reading: the background's probability at the start."""
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
-    """Reading: subtracted from the nine channels at the network's door."""
+    """Reading: subtracted from the nine channels in the preprocessing."""
     channel_scale: tuple[float, ...] = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
     """Reading: the nine channels are divided by it."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot run."""
-        _check(self.num_classes >= 1, "num_classes", self.num_classes, "at least 1")
         _check(self.row_upscale >= 1, "row_upscale", self.row_upscale, "at least 1")
         _check(len(self.backbone_blocks) == 4, "backbone_blocks", self.backbone_blocks, "four stages")
         _check(len(self.backbone_widths) == 4, "backbone_widths", self.backbone_widths, "four stages")
@@ -150,7 +146,7 @@ class LossConfig:
     top_q: int = 20
     """Q: K of a box is the rounded sum of its Q highest IoUs."""
     regress_on: Literal["positives", "candidates"] = "positives"
-    """Reading: box and IoU losses act on the positives, or on all locations inside a box."""
+    """Reading: box and IoU losses act on, and are divided by, the positives, or all locations inside a box."""
     iou_loss: Literal["iou", "log_iou", "giou", "diou"] = "iou"
     """Reading: 1 - IoU, UnitBox's -ln IoU, or the generalised and distance forms."""
     classification_weight: float = 1.0
@@ -193,9 +189,6 @@ class InferenceConfig:
     """Reading: (location, class) pairs that enter NMS from each level."""
     nms_overlap: Literal["bev", "3d"] = "bev"
     """Reading: rotated IoU in the ground plane, or of the boxes."""
-    nms_form: Literal["rows", "matrix"] = "rows"
-    """The same NMS in two formulations: one row of IoUs per kept box (fast on CPU), or the whole matrix and a
-    fixed point (for GPUs)."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot run."""
@@ -232,9 +225,9 @@ class AugmentConfig:
 class CopyPasteConfig:
     """Objects of other frames pasted into a training frame (paper, section 4, after SECOND)."""
 
-    targets: tuple[int, ...] = (2, 3, 4, 6, 7, 2, 6, 6, 2, 2)
-    """Reading: boxes of each class, in the order of ``types.CLASSES``, that a frame is filled up to, those present
-    included."""
+    targets: tuple[int, ...] = ()
+    """Reading: boxes of each class that a frame is filled up to, those present included; (): by the class's name,
+    see ``classes.PASTE_TARGETS``."""
     min_points: int = 5
     """Points an object needs, counted over the sweeps that are pasted."""
 
@@ -290,8 +283,9 @@ class Config:
     """All that defines a detector and its training, but for the data.
 
     >>> from dataclasses import replace
-    >>> variant = replace(NUSCENES, projection=replace(NUSCENES.projection, num_rounds=3))
-    >>> variant.projection.num_rounds, variant == NUSCENES
+    >>> paper = Config()
+    >>> variant = replace(paper, projection=replace(paper.projection, num_rounds=3))
+    >>> variant.projection.num_rounds, variant == paper
     (3, False)
     """
 
@@ -299,6 +293,10 @@ class Config:
     """Preset it started from."""
     sensor: str = "nuscenes_hdl32e"
     """Sensor preset, or the path of a sensor file."""
+    classes: tuple[str, ...] = NUSCENES_CLASSES
+    """Names of the classes that are detected, one logit each and one more, last, for the background."""
+    class_ranges_m: tuple[float, ...] = ()
+    """Greatest distance at which each class is evaluated; (): by the class's name, see ``classes.RANGES_M``."""
     num_sweeps: int = 10
     """Sweeps fused into one cloud, the current one included."""
     max_points: int = 300_000
@@ -308,7 +306,7 @@ class Config:
     fade_epochs: int = 0
     """Last epochs without copy-paste (paper, section 4.5: 5 for the test set)."""
     copy_paste: CopyPasteConfig | None = CopyPasteConfig()
-    """Copy-paste from the object database; None for none."""
+    """Copy-paste from the ground-truth database; None for none."""
     class_balanced: bool = True
     """Reading: frames are resampled so that every class is drawn for equally often (CBGS)."""
     projection: ProjectionConfig = ProjectionConfig()
@@ -330,56 +328,33 @@ class Config:
         _check(self.max_points >= 1, "max_points", self.max_points, "at least 1")
         _check(self.max_boxes >= 1, "max_boxes", self.max_boxes, "at least 1")
         _check(self.fade_epochs >= 0, "fade_epochs", self.fade_epochs, "at least 0")
-        if self.copy_paste is not None:
-            targets, classes = self.copy_paste.targets, self.model.num_classes
-            _check(len(targets) == classes, "copy_paste.targets", targets, f"{classes} counts, one a class")
+        names = self.classes
+        _check(len(names) >= 1 and all(names), "classes", names, "one or more names")
+        _check(len(set(names)) == len(names), "classes", names, "different names")
+        targets = self.copy_paste.targets if self.copy_paste else ()
+        for field, values in (("class_ranges_m", self.class_ranges_m), ("copy_paste.targets", targets)):
+            _check(len(values) in (0, len(names)), field, values, f"{len(names)} values, one a class, or none")
+        _check(all(v > 0 for v in self.class_ranges_m), "class_ranges_m", self.class_ranges_m, "values above 0")
 
+    @property
+    def ranges_m(self) -> dict[str, float]:
+        """Class -> greatest distance at which it is evaluated, in metres."""
+        given = self.class_ranges_m or [RANGES_M.get(name, DEFAULT_RANGE_M) for name in self.classes]
+        return dict(zip(self.classes, given, strict=True))
 
-NUSCENES = Config()
-"""The paper's detector: ten sweeps, five rounds."""
-
-NUSCENES_SINGLE = dataclasses.replace(NUSCENES, name="nuscenes_single", num_sweeps=1, max_points=40_000)
-"""The paper's single-frame detector: the same network on one sweep, five rounds too."""
-
-NUSCENES_TEST = dataclasses.replace(
-    NUSCENES,
-    name="nuscenes_test",
-    fade_epochs=5,
-    model=dataclasses.replace(NUSCENES.model, head_channels=128),
-)
-"""The paper's test-set model "c128" (section 4.5): wider heads, fade strategy."""
-
-QUICKSTART = dataclasses.replace(
-    NUSCENES,
-    name="quickstart",
-    sensor="short_range",
-    num_sweeps=1,
-    max_points=4096,
-    max_boxes=32,
-    copy_paste=CopyPasteConfig(targets=(2, 1, 1, 1, 1, 2, 1, 1, 1, 1)),
-    projection=ProjectionConfig(num_rounds=1),
-    model=dataclasses.replace(
-        NUSCENES.model,
-        row_upscale=1,
-        stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3)),
-        backbone_blocks=(2, 2, 1, 1),
-        backbone_widths=(16, 32, 32, 32),
-        fpn_channels=32,
-        head_channels=32,
-        head_convs=2,
-    ),
-    optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=2),
-)
-"""Small enough to train on two CPU cores: the same code, other numbers."""
-
-PRESETS: dict[str, Config] = {c.name: c for c in (NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, QUICKSTART)}
-"""Name -> configuration."""
+    @property
+    def paste_targets(self) -> tuple[int, ...]:
+        """Boxes of each class that copy-paste fills a frame up to; nothing without copy-paste."""
+        if self.copy_paste is None:
+            return (0,) * len(self.classes)
+        by_name = tuple(PASTE_TARGETS.get(name, DEFAULT_PASTE_TARGET) for name in self.classes)
+        return self.copy_paste.targets or by_name
 
 
 def config_to_json(config: Config) -> dict[str, Any]:
     """The configuration as a JSON object.
 
-    >>> config_from_json(config_to_json(QUICKSTART)) == QUICKSTART
+    >>> config_from_json(config_to_json(Config())) == Config()
     True
     """
     return dataclasses.asdict(config)

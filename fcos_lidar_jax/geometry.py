@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Float64
 
 # Coefficients of atan(t) / t in t^2 on [0, 1]: minimax in the relative error, 1.2e-9 in exact arithmetic.
 _ATAN = (
@@ -69,15 +69,49 @@ def spherical(
     return safe_norm(x, y, z), atan2(y, x), atan2(z, safe_norm(x, y))
 
 
-def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The same direction in [-pi, pi).
+def wrap_angle(angle: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarray, "*n"]:
+    """The same direction in [-pi, pi); NumPy or JAX, as is the answer.
 
     >>> round(float(wrap_angle(jnp.float32(3.5))), 4)
     -2.7832
     """
-    wrapped = angle - 2 * np.pi * jnp.floor((angle + np.pi) / (2 * np.pi))
+    xp = jnp if isinstance(angle, Array) else np
+    wrapped = angle - 2 * np.pi * xp.floor((angle + np.pi) / (2 * np.pi))
     # Rounding can land on the open end.
-    return jnp.where(wrapped >= np.pi, -np.pi, wrapped)
+    return xp.where(wrapped >= np.pi, -np.pi, wrapped)
+
+
+def rotation_matrix(rotation: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n 3 3"]:
+    """Rotations on column vectors from quaternions w, x, y, z of any length above 0, on the host.
+
+    >>> rotation_matrix(np.array([1.0, 0, 0, 1])).round(6).tolist()
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    w, x, y, z = np.moveaxis(rotation, -1, 0)
+    w, x, y, z = np.stack([w, x, y, z]) / np.sqrt(x * x + y * y + z * z + w * w)
+    rows = (
+        (x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def pose_matrix(
+    rotation: Float64[np.ndarray, "*n 4"], translation: Float64[np.ndarray, "*n 3"]
+) -> Float64[np.ndarray, "*n 4 4"]:
+    """Poses on homogeneous column vectors, on the host.
+
+    Args:
+        rotation: quaternions w, x, y, z.
+        translation: metres.
+
+    >>> pose_matrix(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]))[:3, 3].tolist()
+    [1.0, 2.0, 3.0]
+    """
+    matrix = np.zeros((*rotation.shape[:-1], 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation_matrix(rotation), translation, 1
+    return matrix
 
 
 def box_corners(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8 3"]:
@@ -107,8 +141,10 @@ def box_corners(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8 3"]:
     )
 
 
-def points_in_box(points: Float[Array, "*n 3"], box: Float[Array, "*m c"]) -> Bool[Array, "*o"]:
-    """Whether points lie in boxes, boundary included; elementwise with broadcasting.
+def points_in_box(
+    points: Float[Array | np.ndarray, "*n 3"], box: Float[Array | np.ndarray, "*m c"]
+) -> Bool[Array | np.ndarray, "*o"]:
+    """Whether points lie in boxes, boundary included; elementwise with broadcasting; NumPy or JAX.
 
     Args:
         points: metres.
@@ -117,10 +153,11 @@ def points_in_box(points: Float[Array, "*n 3"], box: Float[Array, "*m c"]) -> Bo
     >>> bool(points_in_box(jnp.array([2.0, 1.0, 0.0]), jnp.array([0, 0, 0, 4, 2, 2, 0.0])))
     True
     """
+    xp = jnp if isinstance(points, Array) else np
     dx, dy, dz = (points[..., i] - box[..., i] for i in range(3))
-    cos, sin = jnp.cos(box[..., 6]), jnp.sin(box[..., 6])
+    cos, sin = xp.cos(box[..., 6]), xp.sin(box[..., 6])
     return (
-        (jnp.abs(cos * dx + sin * dy) <= box[..., 3] / 2)
-        & (jnp.abs(cos * dy - sin * dx) <= box[..., 4] / 2)
-        & (jnp.abs(dz) <= box[..., 5] / 2)
+        (abs(cos * dx + sin * dy) <= box[..., 3] / 2)
+        & (abs(cos * dy - sin * dx) <= box[..., 4] / 2)
+        & (abs(dz) <= box[..., 5] / 2)
     )

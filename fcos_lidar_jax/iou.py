@@ -3,12 +3,16 @@
 The intersection area follows from Green's theorem: in one rectangle's frame, sum over the other's four edges
 the integral of the clamped abscissa. There is no polygon clipping, sorting or branching, and the form is
 continuous through every degeneracy. The gradient is analytic: a boundary of the intersection moves the area
-by its length along its normal, so it is the clipped edges times their normals.
+by its length along its normal, so it is the clipped edges times their normals. It is given as a tangent, from
+which JAX transposes the reverse mode.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 _TINY = 1e-7
@@ -60,6 +64,7 @@ def _slack(step: Array) -> Array:
     return jnp.where(jnp.abs(step) < _COINCIDENT_M, _COINCIDENT_M, 0.0)
 
 
+@jax.custom_jvp
 def _area(a: Rectangle, b: Rectangle) -> Array:
     """Area of the intersection, by Green's theorem in the frame of ``a``."""
     half_l, half_w = 0.5 * a[2], 0.5 * a[3]
@@ -115,24 +120,19 @@ def _area_gradient(moving: Rectangle, fixed: Rectangle) -> Rectangle:
     )
 
 
-@jax.custom_vjp
-def _intersection_area(a: Rectangle, b: Rectangle) -> Array:
-    return _area(a, b)
+def _area_tangent(rectangles: tuple[Rectangle, Rectangle], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    """The area and its tangent; of what is constant no derivative is computed."""
+    a, b = rectangles
+    products = [
+        slope * tangent
+        for (moving, fixed), along in zip(((a, b), (b, a)), tangents, strict=True)
+        for slope, tangent in zip(_area_gradient(moving, fixed), along, strict=True)
+        if not isinstance(tangent, SymbolicZero)
+    ]
+    return _area(a, b), sum(products, jnp.zeros_like(a[0]))
 
 
-def _intersection_forward(a: Rectangle, b: Rectangle) -> tuple[Array, tuple[Rectangle, Rectangle]]:
-    return _area(a, b), (a, b)
-
-
-def _intersection_backward(saved: tuple[Rectangle, Rectangle], cotangent: Array) -> tuple[Rectangle, Rectangle]:
-    a, b = saved
-    return (
-        tuple(cotangent * g for g in _area_gradient(a, b)),
-        tuple(cotangent * g for g in _area_gradient(b, a)),
-    )  # type: ignore[return-value]
-
-
-_intersection_area.defvjp(_intersection_forward, _intersection_backward)
+_area.defjvp(_area_tangent, symbolic_zeros=True)
 
 
 def _columns(boxes: Float[Array, "*m c"]) -> list[Array]:
@@ -169,7 +169,7 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
     bx, by, bz, bl, bw, bh, bcos, bsin = _columns(b)
     # In the frame of a's centre the numbers stay small wherever the boxes are.
     zero = jnp.zeros_like(ax)
-    intersection = _intersection_area((zero, zero, al, aw, acos, asin), (bx - ax, by - ay, bl, bw, bcos, bsin))
+    intersection = _area((zero, zero, al, aw, acos, asin), (bx - ax, by - ay, bl, bw, bcos, bsin))
     size_a, size_b = al * aw, bl * bw
     if vertical:
         shared = jnp.minimum(az + 0.5 * ah, bz + 0.5 * bh) - jnp.maximum(az - 0.5 * ah, bz - 0.5 * bh)
@@ -196,7 +196,7 @@ def _ratio(intersection: Array, union: Array) -> Array:
 def rotated_iou_bev(
     a: Float[Array | np.ndarray, "*m c"], b: Float[Array | np.ndarray, "*n d"]
 ) -> Float[Array, "*o"]:
-    """IoU in the ground plane; elementwise with broadcasting, differentiable.
+    """IoU in the ground plane; elementwise with broadcasting, differentiable in forward and reverse mode.
 
     Args:
         a: ``x, y, z, l, w, h, yaw, ...``, metres and radians.
@@ -215,7 +215,7 @@ def rotated_iou_bev(
 def rotated_iou_3d(
     a: Float[Array | np.ndarray, "*m c"], b: Float[Array | np.ndarray, "*n d"]
 ) -> Float[Array, "*o"]:
-    """IoU of upright boxes; elementwise with broadcasting, differentiable.
+    """IoU of upright boxes; elementwise with broadcasting, differentiable in forward and reverse mode.
 
     Args:
         a: ``x, y, z, l, w, h, yaw, ...``, metres and radians, z of the gravity centre.

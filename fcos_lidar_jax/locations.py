@@ -111,7 +111,7 @@ def location_cells(layout: ImageLayout) -> np.ndarray:
     return np.concatenate([cells[::s, ::s].ravel() for s in STRIDES])
 
 
-def look(image: RangeImage, layout: ImageLayout) -> Locations:
+def locate(image: RangeImage, layout: ImageLayout) -> Locations:
     """What every location of one sample looks at.
 
     Args:
@@ -119,7 +119,7 @@ def look(image: RangeImage, layout: ImageLayout) -> Locations:
         layout: sizes.
 
     >>> image = RangeImage(jnp.zeros((16, 256, 9, 1)), jnp.full((16, 256, 1), -1), jnp.int32(0))
-    >>> int(look(image, ImageLayout(16, 256, 2)).occupied.sum())
+    >>> int(locate(image, ImageLayout(16, 256, 2)).occupied.sum())
     0
     """
     cells = location_cells(layout)

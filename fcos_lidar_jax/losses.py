@@ -148,38 +148,40 @@ def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], m
     return _masked(jax.nn.softplus(logits) - iou * logits, mask)
 
 
-def loss_weights(config: LossConfig) -> dict[str, float]:
-    """Weight of each part of the loss by name.
+def loss_terms(config: LossConfig) -> dict[str, tuple[float, str]]:
+    """Weight of each loss, and the name of the count that divides its sum.
 
-    >>> loss_weights(LossConfig())
-    {'classification': 1.0, 'l1': 0.25, 'iou': 1.0, 'iou_prediction': 1.0}
+    Cross-entropy is divided by the positives, the box losses by the locations that they are summed over.
+
+    >>> loss_terms(LossConfig(regress_on="candidates"))["l1"]
+    (0.25, 'candidates')
     """
     return {
-        "classification": config.classification_weight,
-        "l1": config.l1_weight,
-        "iou": config.iou_weight,
-        "iou_prediction": config.iou_prediction_weight,
+        "classification": (config.classification_weight, "positives"),
+        "l1": (config.l1_weight, config.regress_on),
+        "iou": (config.iou_weight, config.regress_on),
+        "iou_prediction": (config.iou_prediction_weight, config.regress_on),
     }
 
 
 def combine(
-    sums: Mapping[str, Float[Array, ""]], num_positive: Int32[Array, ""], config: LossConfig
+    sums: Mapping[str, Float[Array, ""]], counts: Mapping[str, Array], config: LossConfig
 ) -> dict[str, Array]:
-    """The weighted total and its parts, each sum divided once by the positives of the global batch.
+    """The weighted total and its parts, each sum divided once by its count over the global batch.
 
     Args:
         sums: ``classification``, ``l1``, ``iou`` and ``iou_prediction``, over the global batch.
-        num_positive: positives of the global batch; at least one is assumed in the division.
-        config: the weights.
+        counts: ``positives`` and ``candidates`` of the global batch; at least one is assumed in a division.
+        config: the weights, and what divides.
 
     Returns:
         the divided parts, unweighted, and ``total``.
 
-    >>> sums = {part: jnp.float32(3) for part in loss_weights(LossConfig())}
-    >>> float(combine(sums, jnp.int32(3), LossConfig())["total"])
+    >>> sums = {part: jnp.float32(3) for part in loss_terms(LossConfig())}
+    >>> float(combine(sums, {"positives": jnp.int32(3)}, LossConfig())["total"])
     3.25
     """
-    weights = loss_weights(config)
-    divided = {name: sums[name] / jnp.maximum(num_positive, 1) for name in weights}
-    weighted = [weight * divided[name] for name, weight in weights.items()]
+    terms = loss_terms(config)
+    divided = {name: sums[name] / jnp.maximum(counts[divisor], 1) for name, (_, divisor) in terms.items()}
+    weighted = [weight * divided[name] for name, (weight, _) in terms.items()]
     return {**divided, "total": sum(weighted[1:], weighted[0])}

@@ -1,5 +1,6 @@
 """Rotated non-maximum suppression with static shapes (paper, section 3.4)."""
 
+import functools
 from typing import Literal
 
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ def rotated_nms(
     iou_threshold: float,
     max_outputs: int,
     overlap: Literal["bev", "3d"] = "bev",
-    form: Literal["rows", "matrix"] = "rows",
+    form: Literal["rows", "matrix"] | None = None,
 ) -> tuple[Int32[Array, "d"], Bool[Array, "d"]]:
     """Greedy suppression: the best box stays, whatever overlaps it by more than the threshold goes.
 
@@ -31,7 +32,8 @@ def rotated_nms(
         iou_threshold: suppressed if IoU > threshold (static).
         max_outputs: d, boxes kept at most (static).
         overlap: IoU in the ground plane or of the boxes (static).
-        form: one row of IoUs per kept box, or the whole matrix and a fixed point; the same result (static).
+        form: one row of IoUs per kept box, or the whole matrix and a fixed point; the same result (static). None:
+            rows on a CPU, the matrix elsewhere, decided where the program runs.
 
     Returns:
         indices of the kept boxes by falling score, 0 in unused slots, and which slots are used.
@@ -45,12 +47,16 @@ def rotated_nms(
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     ranked = jnp.where(usable, scores, -jnp.inf)
     kinds = jnp.zeros(ranked.shape, jnp.int32) if labels is None else jnp.asarray(labels)
-    if form not in ("rows", "matrix"):
-        raise ValueError(f"form: got {form!r}, expected 'rows' or 'matrix'")
+    if form not in ("rows", "matrix", None):
+        raise ValueError(f"form: got {form!r}, expected 'rows', 'matrix' or None")
     if overlap not in ("bev", "3d"):
         raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
-    suppress = _by_rows if form == "rows" else _by_matrix
-    return suppress(oriented(boxes), ranked, usable, kinds, iou_threshold, max_outputs, overlap == "3d")
+    options = {"threshold": iou_threshold, "max_outputs": max_outputs, "vertical": overlap == "3d"}
+    rows, matrix = (functools.partial(suppress, **options) for suppress in (_by_rows, _by_matrix))
+    candidates = oriented(boxes), ranked, usable, kinds
+    if form is not None:
+        return (rows if form == "rows" else matrix)(*candidates)
+    return lax.platform_dependent(*candidates, cpu=rows, default=matrix)
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
@@ -64,6 +70,7 @@ def _by_rows(
     scores: Array,
     valid: Array,
     labels: Array,
+    *,
     threshold: float,
     max_outputs: int,
     vertical: bool,
@@ -90,6 +97,7 @@ def _by_matrix(
     scores: Array,
     valid: Array,
     labels: Array,
+    *,
     threshold: float,
     max_outputs: int,
     vertical: bool,

@@ -21,7 +21,7 @@ from fcos_lidar_jax.types import RangeImage
 def close_to_sensor(
     points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float = 1.0
 ) -> Bool[Array | np.ndarray, "n"]:
-    """Points on the carrying vehicle itself: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
+    """Points on the ego vehicle: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
 
     Args:
         points: x, y, z, ... in metres, NumPy or JAX; the answer is of the same kind, so that clouds of any
@@ -44,7 +44,7 @@ def remove_close(
     mode: str,
     close_m: float = 1.0,
 ) -> Bool[Array | np.ndarray, "n"]:
-    """``valid`` without the points on the carrying vehicle, judged in the current frame.
+    """``valid`` without the points on the ego vehicle, judged in the current frame.
 
     Args:
         points: x, y, z, intensity, time lag; NumPy or JAX, as is the answer.

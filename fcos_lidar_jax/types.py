@@ -14,19 +14,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Bool, Float32, Int32
 
-CLASSES = (
-    "car",
-    "truck",
-    "bus",
-    "trailer",
-    "construction_vehicle",
-    "pedestrian",
-    "motorcycle",
-    "bicycle",
-    "traffic_cone",
-    "barrier",
-)
-"""The ten nuScenes classes, in the order of the paper's tables."""
+from fcos_lidar_jax.classes import NUSCENES_CLASSES as CLASSES  # noqa: F401
 
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
 """The nine channel types of a range image (paper, section 3.1)."""
@@ -61,6 +49,19 @@ class Batch:
     """Index into the classes."""
     box_valid: Bool[Array, "b m"]
     """False for padding."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class HostBatch:
+    """A batch on its way to the device, with what is to be told about it."""
+
+    batch: Batch
+    """NumPy arrays of this process's rows."""
+    counts: dict[str, int]
+    """To be recorded beside the metrics, such as ``truncated_points``."""
+    names: tuple[str, ...]
+    """Of the samples' frames, for messages."""
 
 
 @jax.tree_util.register_dataclass

@@ -1,6 +1,7 @@
 """Shared set-up: shape checks in signatures, a compilation cache, where the real data are."""
 
 import os
+import signal
 from pathlib import Path
 
 import jax
@@ -14,6 +15,10 @@ _PACKAGE = Path(__file__).parents[1] / "fcos_lidar_jax"
 _MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", "__main__", *_UNCHECKED)]
 _ROOMS = ["models", "training", "inference", "evaluation"]
 install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "typecheck.check")
+
+# A shell's background job ignores Ctrl-C, and so would the processes that the tests start and interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 
-import oracles
 from fcos_lidar_jax.assignment import assign, cheapest, dynamic_k, owners
 
 

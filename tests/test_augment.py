@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 
-import oracles
 from fcos_lidar_jax.augment import augment, flip_x, flip_y, rotate, sample_key, scale
 from fcos_lidar_jax.config import AugmentConfig
 

@@ -6,13 +6,9 @@ import json
 import pytest
 
 from fcos_lidar_jax.config import (
-    NUSCENES,
-    NUSCENES_SINGLE,
-    NUSCENES_TEST,
-    PRESETS,
-    QUICKSTART,
     AugmentConfig,
     Config,
+    CopyPasteConfig,
     InferenceConfig,
     LossConfig,
     ModelConfig,
@@ -22,6 +18,7 @@ from fcos_lidar_jax.config import (
     config_from_json,
     config_to_json,
 )
+from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, PRESETS, QUICKSTART
 
 
 def test_presets_are_the_papers():
@@ -50,7 +47,7 @@ def test_small_preset_differs_in_numbers_only():
     small, full = kinds(QUICKSTART), kinds(NUSCENES)
     for record in (small, full):
         del record["name"], record["sensor"]
-        del record["model"]["stem"]["form"]  # another formulation of the same function
+        del record["projection"]["remove_close"]  # as the shipped weights were trained
     assert small == full
 
 
@@ -108,12 +105,28 @@ def test_missing_field_is_named():
         lambda: LossConfig(l1_weight=-1),
         lambda: LossConfig(iou_loss="l2"),  # type: ignore[arg-type]
         lambda: InferenceConfig(iou_threshold=2),
-        lambda: InferenceConfig(nms_form="fast"),  # type: ignore[arg-type]
+        lambda: InferenceConfig(nms_overlap="4d"),  # type: ignore[arg-type]
         lambda: AugmentConfig(flip_x_probability=2),
         lambda: OptimizerConfig(warmup_fraction=1.0),
         lambda: Config(max_points=0),
+        lambda: Config(classes=()),
+        lambda: Config(classes=("crate", "crate")),
+        lambda: Config(class_ranges_m=(50.0,)),
+        lambda: Config(copy_paste=CopyPasteConfig(targets=(2, 2))),
     ],
 )
 def test_nonsense_is_refused_at_construction(make):
     with pytest.raises(ValueError, match="got"):
         make()
+
+
+def test_what_follows_from_the_names_of_the_classes_and_what_is_given():
+    own = Config(classes=("crate", "pedestrian"))
+    assert own.ranges_m == {"crate": 50.0, "pedestrian": 40.0}
+    assert own.paste_targets == (2, 2)
+    assert NUSCENES.paste_targets == (2, 3, 4, 6, 7, 2, 6, 6, 2, 2)
+    given = Config(
+        classes=("crate", "pedestrian"), class_ranges_m=(9.0, 8.0), copy_paste=CopyPasteConfig(targets=(1, 5))
+    )
+    assert (given.ranges_m, given.paste_targets) == ({"crate": 9.0, "pedestrian": 8.0}, (1, 5))
+    assert Config(copy_paste=None).paste_targets == (0,) * 10

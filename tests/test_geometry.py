@@ -3,9 +3,20 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-
 import oracles
-from fcos_lidar_jax.geometry import atan2, box_corners, points_in_box, safe_norm, spherical, wrap_angle
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fcos_lidar_jax.geometry import (
+    atan2,
+    box_corners,
+    points_in_box,
+    pose_matrix,
+    rotation_matrix,
+    safe_norm,
+    spherical,
+    wrap_angle,
+)
 
 
 def awkward_pairs():
@@ -78,3 +89,30 @@ def test_corners_and_membership_by_explicit_rotation():
     expected = [[oracles.inside(p, b) for b in boxes] for p in points]
     np.testing.assert_array_equal(found, expected)
     assert found.any()
+
+
+def test_rotations_and_poses_are_scipys():
+    rng = np.random.default_rng(3)
+    rotation, translation = rng.normal(size=(50, 4)), rng.normal(size=(50, 3))
+    expected = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
+    np.testing.assert_allclose(rotation_matrix(rotation), expected, atol=1e-15)
+    poses = pose_matrix(rotation, translation)
+    np.testing.assert_array_equal(poses[7], pose_matrix(rotation[7], translation[7]))
+    points = rng.normal(size=(50, 4))
+    points[:, 3] = 1
+    moved = Rotation.from_quat(rotation, scalar_first=True).apply(points[:, :3]) + translation
+    np.testing.assert_allclose((poses @ points[:, :, None])[:, :3, 0], moved, atol=1e-14)
+    np.testing.assert_array_equal(poses[:, 3], np.tile([0, 0, 0, 1.0], (50, 1)))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_angles_wrap_on_the_host_as_on_the_device(dtype):
+    angles = np.concatenate([np.linspace(-20, 20, 4001), np.arange(-6, 7) * np.pi]).astype(dtype)
+    wrapped = wrap_angle(angles)
+    assert isinstance(wrapped, np.ndarray)
+    assert wrapped.dtype == dtype
+    assert wrapped.max() < dtype(np.pi)
+    assert wrapped.min() >= dtype(-np.pi) - np.spacing(dtype(30))
+    difference = np.angle(np.exp(1j * (wrapped.astype(np.float64) - angles.astype(np.float64))))
+    assert np.abs(difference).max() < (1e-5 if dtype == np.float32 else 1e-13)
+    np.testing.assert_allclose(wrapped, np.asarray(wrap_angle(jnp.asarray(angles.astype(np.float32)))), atol=4e-6)

@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 
-import oracles
 from fcos_lidar_jax.iou import oriented_iou_3d, rotated_iou_3d, rotated_iou_bev
 
 NUMBER = 20_000
@@ -60,6 +60,44 @@ def test_float32_gradients_equal_float64_and_finite_differences(pairs, function)
     assert against < 1e-4
 
 
+def tangents(function, a, b, da, db):
+    return jax.jit(lambda *boxes: jax.jvp(function, boxes, (da, db))[1])(a, b)
+
+
+@pytest.mark.parametrize("function", [rotated_iou_3d, rotated_iou_bev])
+def test_forward_mode_equals_float64_and_finite_differences(pairs, function):
+    rng = np.random.default_rng(2)
+    directions = rng.normal(0, 1, (NUMBER, 14))
+    directions = np.split((directions / np.linalg.norm(directions, axis=1)[:, None]).astype(np.float32), 2, axis=1)
+    single = np.asarray(tangents(function, *pairs, *directions))
+    with jax.enable_x64(True):
+        a, b, da, db = (jnp.asarray(p, jnp.float64) for p in (*pairs, *directions))
+        double = np.asarray(tangents(function, a, b, da, db))
+        value, step = jax.jit(function), 1e-6
+        after, before = value(a + step * da, b + step * db), value(a - step * da, b - step * db)
+        differences = np.asarray(after - before) / (2 * step)
+    regular = np.ones(NUMBER, bool)
+    regular[IDENTICAL] = False
+    against = np.abs(double - differences)[regular].max()
+    error = np.abs(single - double).max()
+    print(f"\n{function.__name__}: float32 against float64 {error:.1e}, against differences {against:.1e}")
+    assert error < 1e-3
+    assert against < 1e-4
+
+
+@pytest.mark.parametrize("function", [rotated_iou_3d, rotated_iou_bev])
+def test_forward_and_reverse_mode_agree_also_mapped(pairs, function):
+    pairs = [jnp.asarray(p[4900:5200]) for p in pairs]  # nearly equal and identical ones
+    forward, reverse = (
+        jax.jit(jax.vmap(jacobian(function, argnums=(0, 1))))(*pairs) for jacobian in (jax.jacfwd, jax.jacrev)
+    )
+    for one, other in zip(forward, reverse, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+    alone = [jax.jacfwd(function)(a, b) for a, b in zip(pairs[0][98:102], pairs[1][98:102], strict=True)]
+    np.testing.assert_allclose(forward[0][98:102], alone, rtol=1e-4, atol=1e-5)
+    assert float(jnp.abs(forward[0]).max()) > 0.1
+
+
 BASE = [1, 2, 0, 4, 2, 1.5, 0.3]
 DEGENERATE = {
     "equal": (BASE, BASE, 1.0),
@@ -92,6 +130,9 @@ def test_degenerate_pairs(name):
     assert abs(float(rotated_iou_3d(b, a)) - expected) < 1e-5
     assert all(bool(jnp.isfinite(g).all()) for g in gradient)
     assert max(float(jnp.abs(g).max()) for g in gradient) < 1e3
+    forward = jax.jit(jax.jacfwd(rotated_iou_3d, argnums=(0, 1)))(a, b)
+    for one, other in zip(forward, gradient, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * max(1.0, float(jnp.abs(other).max())))
 
 
 def test_broadcasts_and_maps_like_loops(pairs):

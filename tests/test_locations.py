@@ -12,8 +12,8 @@ from fcos_lidar_jax.locations import (
     ImageLayout,
     image_layout,
     image_sensor,
+    locate,
     location_cells,
-    look,
     pad_image,
 )
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
@@ -57,7 +57,7 @@ def test_locations_see_the_first_round_and_pad_columns_are_empty():
     features[:, :, 7] = rng.random((16, 250, 2)) < 0.6
     features *= features[:, :, 7:8]
     image = RangeImage(jnp.asarray(features), jnp.zeros((16, 250, 2), jnp.int32), jnp.int32(0))
-    seen = look(image, layout)
+    seen = locate(image, layout)
     cells = location_cells(layout)
     for l in rng.choice(len(cells), 500, replace=False):
         row, column = divmod(int(cells[l]), 250)

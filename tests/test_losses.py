@@ -1,11 +1,13 @@
 """Every loss against NumPy, and finite where nothing is."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 
-import oracles
 from fcos_lidar_jax.config import LossConfig
 from fcos_lidar_jax.iou import oriented
 from fcos_lidar_jax.losses import classification_loss, combine, iou_loss, iou_prediction_loss, l1_loss
@@ -118,9 +120,13 @@ def test_parts_are_divided_once_and_weighed():
     )
     names = ("classification", "l1", "iou", "iou_prediction")
     parts = {n: f32(v) for n, v in zip(names, (8.0, 4.0, 2.0, 6.0), strict=True)}
-    assert float(combine(parts, jnp.int32(4), config)["total"]) == (8 + 1 + 4 + 3) / 4
-    assert float(combine(parts, jnp.int32(4), config)["l1"]) == 1.0
-    assert float(combine(parts, jnp.int32(0), config)["total"]) == 16
+    counts = {"positives": jnp.int32(4), "candidates": jnp.int32(8)}
+    assert float(combine(parts, counts, config)["total"]) == (8 + 1 + 4 + 3) / 4
+    assert float(combine(parts, counts, config)["l1"]) == 1.0
+    assert float(combine(parts, {"positives": jnp.int32(0)}, config)["total"]) == 16
+    wider = dataclasses.replace(config, regress_on="candidates")
+    assert float(combine(parts, counts, wider)["total"]) == 8 / 4 + (1 + 4 + 3) / 8
+    assert [float(combine(parts, counts, wider)[name]) for name in names] == [2.0, 0.5, 0.25, 0.75]
 
 
 def test_unknown_kind_is_refused():

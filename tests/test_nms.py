@@ -3,12 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-
 import oracles
+import pytest
+from jax import export
+
 from fcos_lidar_jax.nms import rotated_nms
 
 FORMS = pytest.mark.parametrize("form", ["rows", "matrix"])
+OPTIONS = {"iou_threshold": 0.2, "max_outputs": 50}
 
 
 def clusters(seed: int, number: int = 200):
@@ -74,13 +76,31 @@ def test_same_under_jit_and_vmap(form):
     stacked = [jnp.stack([jnp.asarray(d[i]) for d in data]) for i in range(4)]
 
     def go(boxes, scores, valid, labels):
-        return rotated_nms(boxes, scores, valid, labels=labels, iou_threshold=0.2, max_outputs=50, form=form)
+        return rotated_nms(boxes, scores, valid, labels=labels, **OPTIONS, form=form)
 
     kept, used = jax.jit(jax.vmap(go))(*stacked)
     for i in range(3):
         single, single_used = go(*(s[i] for s in stacked))
         np.testing.assert_array_equal(kept[i], single)
         np.testing.assert_array_equal(used[i], single_used)
+
+
+def test_the_form_is_that_of_the_platform_also_in_exported_programs():
+    boxes, scores, valid = (jnp.asarray(part) for part in clusters(0, 70)[:3])
+    suppress = jax.jit(lambda *args: rotated_nms(*args, **OPTIONS))
+    programs = {
+        platforms: export.export(suppress, platforms=platforms)(boxes, scores, valid)
+        for platforms in (("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda"))
+    }
+    texts = {platforms: program.mlir_module() for platforms, program in programs.items()}
+    # Each form has one loop; the matrix of overlaps is told by its shape.
+    loops = {platforms: text.count("stablehlo.while") for platforms, text in texts.items()}
+    matrices = [platforms for platforms, text in texts.items() if "tensor<70x70xi1>" in text]
+    assert loops == {("cpu",): 1, ("cuda",): 1, ("tpu",): 1, ("cpu", "cuda"): 2}
+    assert matrices == [("cuda",), ("tpu",), ("cpu", "cuda")]
+    rows = rotated_nms(boxes, scores, valid, **OPTIONS, form="rows")
+    for found, expected in zip(programs["cpu", "cuda"].call(boxes, scores, valid), rows, strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_unknown_options_are_refused():

@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 
-import oracles
 from fcos_lidar_jax.projection import image_cells, project_points, remove_close
 from fcos_lidar_jax.sensors import (
     KITTI_HDL64E,

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax import __version__
-from fcos_lidar_jax.data.frame import Frame, FrameSet
-from fcos_lidar_jax.files import write_beside
+from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf
+from fcos_lidar_jax.files import atomic_write
 
 _DESCRIPTION = "frames.json"
-_FIELDS = tuple(field.name for field in dataclasses.fields(Frame))
+_ARRAYS = ("points", "boxes", "labels", "num_points")
 
 
 class CacheError(ValueError):
@@ -21,7 +21,7 @@ class CacheError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class CachedFrames:
+class CachedFrames(FramesOf):
     """A frame set that makes every frame once: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
     The folder holds ``frames.json``, which says whose frames they are, and an archive of NumPy arrays for every
@@ -36,7 +36,7 @@ class CachedFrames:
         OSError: a file that cannot be written.
 
     >>> import tempfile
-    >>> from fcos_lidar_jax.data.synthetic.frame_set import SimulatedFrames
+    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
     >>> from fcos_lidar_jax.sensors import TINY
     >>> folder = Path(tempfile.mkdtemp())
     >>> frames = CachedFrames(SimulatedFrames(TINY, number=2), folder)
@@ -53,6 +53,7 @@ class CachedFrames:
 
     def __post_init__(self) -> None:
         """Make the folder this set's, or check that it is."""
+        super().__post_init__()
         wanted, file = _description(self.frames), self.folder / _DESCRIPTION
         if self.folder.exists() and not self.folder.is_dir():
             raise CacheError(f"{self.folder}: found a file, expected a folder")
@@ -61,36 +62,29 @@ class CachedFrames:
         if not file.is_file():
             if stray:
                 raise CacheError(f"{self.folder}: found {stray[0]} without {_DESCRIPTION}, expected a new folder")
-            write_beside(file, lambda path: path.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8"))
+            atomic_write(file, lambda path: path.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8"))
         _compare(file, wanted)
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        return len(self.frames)
 
     def frame(self, index: int) -> Frame:
         """One frame, read from its file; made and written where there is none."""
         file = self.folder / f"{index:06d}.npz"
         try:
             with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-                return Frame(**{name: archive[name] for name in _FIELDS})
+                arrays = {name: archive[name] for name in _ARRAYS}
+                return Frame(**arrays, num_close=int(archive["num_close"]))
         except FileNotFoundError:
             pass
         except Exception as error:  # wrong bytes in an archive raise nearly anything
             reason = str(error).partition("\n")[0] or type(error).__name__
             print(f"warning: {file}: damaged ({reason}): made anew", file=sys.stderr, flush=True)
         frame = self.frames.frame(index)
-        arrays = {name: getattr(frame, name) for name in _FIELDS}
-        write_beside(file, lambda path: np.savez(path, **arrays))
+        arrays = {name: getattr(frame, name) for name in (*_ARRAYS, "num_close")}
+        atomic_write(file, lambda path: np.savez(path, **arrays))
         return frame
 
     def labels(self, index: int) -> np.ndarray:
         """Labels of a frame's boxes; the frame is made for it where it is not there yet."""
         return self.frame(index).labels
-
-    def name(self, index: int) -> str:
-        """What messages call a frame."""
-        return self.frames.name(index)
 
 
 def _description(frames: FrameSet) -> dict[str, Any]:

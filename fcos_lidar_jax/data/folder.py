@@ -1,10 +1,9 @@
 """The user's own annotated clouds: a folder of point files with boxes in JSON beside them."""
 
-import difflib
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Container
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,14 +11,13 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data import point_files
-from fcos_lidar_jax.data.frame import Frame, count_inside
-from fcos_lidar_jax.data.sweeps import read_sweeps
-from fcos_lidar_jax.projection import remove_close
+from fcos_lidar_jax.data.box_geometry import LIMITS, count_inside
+from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
+from fcos_lidar_jax.data.sweeps import read_list, read_sweeps
 from fcos_lidar_jax.sensors import PRESETS, Sensor, sensor_from_json
-from fcos_lidar_jax.types import CLASSES
 
-_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
-_LARGEST = float(np.finfo(np.float32).max)
+SPLITS = "splits.json"
 
 
 class FolderError(ValueError):
@@ -44,7 +42,7 @@ class _Sweep(msgspec.Struct):
     file: str
 
 
-class FolderFrames:
+class FolderFrames(FrameSet):
     """The frames of a folder, sorted by name: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
     ``sensor.json`` is a sensor as :func:`~fcos_lidar_jax.sensors.sensor_from_json` reads it, or a preset's name.
@@ -52,16 +50,23 @@ class FolderFrames:
     ``boxes/NAME.json`` is ``{"boxes": [{"label": CLASS, "box": [x, y, z, l, w, h, yaw, vx, vy]}]}`` in the frame
     of the points, an unknown velocity ``null, null``; a frame without objects has an empty list.
     ``sweeps/NAME.json``, optional, is a list as :func:`~fcos_lidar_jax.data.sweeps.read_sweeps` reads it, its
-    first entry the frame's own cloud. ``classes.json``, optional, translates own labels, null for boxes to leave
-    out: ``{"lorry": "truck", "sign": null}``. No file may lie outside the folder, links included.
+    first entry the frame's own cloud. No file may lie outside the folder, links included.
 
-    Contents are read and checked when a frame is asked for, the names of all files at construction.
+    The classes are the labels of all boxes, sorted, unless there is a ``classes.json``: a list of them
+    (``["car", "sign"]``; other labels are refused), or a translation of labels, null for boxes to leave out
+    (``{"lorry": "truck", "sign": null}``; the classes are then the labels after it, sorted). ``splits.json``,
+    optional, is ``{"train": [NAME, ...], "val": [...]}``.
+
+    The names of all files are checked at construction, and their boxes read where the classes follow from them;
+    other contents when a frame is asked for.
 
     Args:
         root: the folder.
         sensor: whose points they are; replaces ``sensor.json``.
+        split: frames and order from the splits; all frames, sorted, without it.
+        splits: JSON file with them; default: ``splits.json``.
         num_sweeps: clouds to fuse at most, from the first of the list on.
-        remove_close: drop the points on the carrying vehicle, judged in each sweep's own frame: of ``"all"``
+        remove_close: drop the points on the ego vehicle, judged in each sweep's own frame: of ``"all"``
             sweeps, of the older ``"sweeps"``, or ``"none"``.
         close_m: half the side of the square that is emptied, metres.
 
@@ -78,8 +83,8 @@ class FolderFrames:
     >>> box = {"label": "car", "box": [8, 1, -1, 4, 2, 1.5, 0, None, None]}
     >>> _ = (root / "boxes" / "a.json").write_text(json.dumps({"boxes": [box]}))
     >>> frames = FolderFrames(root)
-    >>> len(frames), frames.labels(0).tolist(), frames.frame(0).num_points.tolist()
-    (1, [0], [1])
+    >>> frames.classes, frames.labels(0).tolist(), frames.frame(0).num_points.tolist()
+    (('car',), [0], [1])
     """
 
     def __init__(
@@ -87,6 +92,8 @@ class FolderFrames:
         root: str | Path,
         sensor: Sensor | None = None,
         *,
+        split: str | None = None,
+        splits: str | Path | None = None,
         num_sweeps: int = 10,
         remove_close: Literal["all", "sweeps", "none"] = "all",
         close_m: float = 1.0,
@@ -115,7 +122,9 @@ class FolderFrames:
         """Names of the frames: of their files, without the extension."""
         self.sensor = _read_sensor(root) if sensor is None else sensor
         """Whose points they are."""
-        self._classes = _read_classes(root)
+        self.classes, self._translation = self._read_classes()
+        if split is not None:
+            self.names = _read_split(root / SPLITS if splits is None else Path(splits), split, self._clouds)
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -124,8 +133,8 @@ class FolderFrames:
     def frame(self, index: int) -> Frame:
         """One frame, read anew; the points in each box are counted."""
         boxes, labels = self._annotation(index)
-        points = self._points(index)
-        return Frame(points, boxes, labels, count_inside(points[points[:, 4] == 0], boxes))
+        points, num_close = self._points(index)
+        return Frame(points, boxes, labels, count_inside(points[points[:, 4] == 0], boxes), num_close)
 
     def labels(self, index: int) -> np.ndarray:
         """i32[m]: labels of the frame's boxes, without reading its points."""
@@ -135,14 +144,29 @@ class FolderFrames:
         """The cloud's name."""
         return self.names[index]
 
-    def _points(self, index: int) -> np.ndarray:
+    def pose(self, index: int) -> np.ndarray | None:
+        """Of the list of sweeps, where the frame has one."""
+        listed = self._sweeps.get(self.names[index])
+        return None if listed is None else read_list(listed)[0].sensor_to_world
+
+    def time_us(self, index: int) -> int | None:
+        """Of the list of sweeps, where the frame has one."""
+        listed = self._sweeps.get(self.names[index])
+        return None if listed is None else read_list(listed)[0].time_us
+
+    def fingerprint(self) -> str:
+        """Checksum of all files by name, size and time of change, and of the frames and the reading options."""
+        files = [*self._clouds.values(), *self._boxes.values(), *self._sweeps.values()]
+        files += [file for name in ("sensor.json", "classes.json") if (file := self.root / name).exists()]
+        reading = self.names, self.sensor, self.num_sweeps, self.remove_close, self.close_m
+        return files_fingerprint(files, self.root, reading)
+
+    def _points(self, index: int) -> tuple[np.ndarray, int]:
         name = self.names[index]
         cloud, listed = self._clouds[name], self._sweeps.get(name)
         if listed is None or self.num_sweeps == 1:
             points = point_files.read_points(cloud, self.sensor)
-            kept = np.ones(len(points), bool)
-            kept = remove_close(points, kept, self.sensor, mode=self.remove_close, close_m=self.close_m)
-            return points[np.asarray(kept)]
+            return drop_close(points, self.sensor, mode=self.remove_close, close_m=self.close_m)
         self._check_sweeps(listed, cloud)
         return read_sweeps(
             listed,
@@ -150,7 +174,7 @@ class FolderFrames:
             remove_close=self.remove_close,
             close_m=self.close_m,
             num_sweeps=self.num_sweeps,
-        )[0]
+        )
 
     def _check_sweeps(self, listed: Path, cloud: Path) -> None:
         sweeps = _decode(listed, Annotated[list[_Sweep], msgspec.Meta(min_length=1)])
@@ -163,19 +187,32 @@ class FolderFrames:
             )
 
     def _annotation(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes and labels of the ten classes."""
         file = self._boxes[self.names[index]]
         boxes, labels = [], []
         for i, record in enumerate(_decode(file, _Annotation).boxes):
             where = f"{file}: $.boxes[{i}]"
             box = _check_box(record.box, f"{where}.box")
-            if record.label not in self._classes:
-                raise FolderError(f"{where}.label: {_unknown(record.label, self._classes)}")
-            label = self._classes[record.label]
+            label = self._translation.get(record.label, record.label)
             if label is not None:
+                if label not in self.classes:
+                    raise FolderError(f"{where}.label: {unknown_name(label, self.classes)}")
                 boxes.append(box)
-                labels.append(CLASSES.index(label))
+                labels.append(self.classes.index(label))
         return np.array(boxes, np.float32).reshape(-1, 9), np.array(labels, np.int32)
+
+    def _read_classes(self) -> tuple[tuple[str, ...], dict[str, str | None]]:
+        """The classes, and what labels in the files become, None for boxes to leave out."""
+        file = self.root / "classes.json"
+        own: list[str] | dict[str, str | None] = {}
+        if os.path.lexists(file):
+            _expect_file(file, self.root, str(file))
+            own = _decode(file, list[str] | dict[str, str | None])
+        if isinstance(own, list):
+            if not own or len(set(own)) < len(own):
+                raise FolderError(f"{file}: got {len(own)} names, expected at least one, each once")
+            return tuple(own), {}
+        found = {own.get(r.label, r.label) for f in self._boxes.values() for r in _decode(f, _Annotation).boxes}
+        return tuple(sorted(name for name in found if name is not None)), own
 
 
 def _list_files(root: Path, folder: str, endings: tuple[str, ...]) -> dict[str, Path]:
@@ -224,41 +261,48 @@ def _read_sensor(root: Path) -> Sensor:
     if isinstance(record, dict):
         return sensor_from_json(record, str(file))
     if record not in PRESETS:
-        raise FolderError(f"{file}: {_unknown(record, PRESETS)}")
+        raise FolderError(f"{file}: {unknown_name(record, PRESETS)}")
     return PRESETS[record]
 
 
-def _read_classes(root: Path) -> dict[str, str | None]:
-    """Label in the files -> one of the ten classes, or None for boxes to leave out."""
-    file = root / "classes.json"
-    own: dict[str, str | None] = {}
-    if os.path.lexists(file):
-        _expect_file(file, root, str(file))
-        own = _decode(file, dict[str, str | None])
-    for label, name in own.items():
-        if name is not None and name not in CLASSES:
-            raise FolderError(f"{file}: {label}: {_unknown(name, CLASSES)}")
-    return {**{name: name for name in CLASSES}, **own}
+def read_splits(file: Path) -> dict[str, list[str]]:
+    """The splits of a ``splits.json``: name -> frames."""
+    if not file.is_file():
+        raise FolderError(f"{file}: no such file, expected splits")
+    return _decode(file, dict[str, list[str]])
+
+
+def _read_split(file: Path, split: str, clouds: Container[str]) -> tuple[str, ...]:
+    splits = read_splits(file)
+    if split not in splits:
+        raise FolderError(f"{file}: split: {unknown_name(split, splits)}")
+    names: dict[str, None] = {}
+    for i, name in enumerate(splits[split]):
+        if name not in clouds:
+            raise FolderError(f"{file}: {split}[{i}]: got {name!r}, expected the name of a cloud")
+        if name in names:
+            raise FolderError(f"{file}: {split}[{i}]: got {name!r} a second time, expected every frame once")
+        names[name] = None
+    if not names:
+        raise FolderError(f"{file}: {split}: no frame in it, expected at least one")
+    return tuple(names)
 
 
 def _check_box(box: list[float | None], where: str) -> list[float | None]:
     """The box with its yaw brought to [-pi, pi]."""
-    if len(box) != len(_FIELDS):
-        raise FolderError(f"{where}: got {len(box)} values, expected {len(_FIELDS)}: {', '.join(_FIELDS)}")
-    for i, (name, value) in enumerate(zip(_FIELDS, box, strict=True)):
+    if len(box) != len(LIMITS):
+        raise FolderError(f"{where}: got {len(box)} values, expected {len(LIMITS)}: {', '.join(LIMITS)}")
+    for i, (name, value) in enumerate(zip(LIMITS, box, strict=True)):
         velocity, got = name in ("vx", "vy"), f"{where}[{i}]: {name}: got {json.dumps(value)}"
         if value is None and velocity:
             continue
-        # Numbers become 32-bit: what is too large for that is infinite, and a size that is too small is zero.
-        if value is None or not abs(value) <= _LARGEST:
+        if value is None or not math.isfinite(value):
             raise FolderError(f"{got}, expected a finite number{' or null' if velocity else ''}")
+        if abs(value) > LIMITS[name]:
+            raise FolderError(f"{got}, expected at most {LIMITS[name]:g}")
+        # Numbers become 32-bit: a size that is too small for that is zero.
         if name in ("l", "w", "h") and not np.float32(value) > 0:
             raise FolderError(f"{got}, expected a size above 0 m")
     if (box[7] is None) != (box[8] is None):
         raise FolderError(f"{where}: vx, vy: got {json.dumps(box[7:])}, expected two numbers, or null twice")
     return [*box[:6], math.remainder(box[6] or 0.0, math.tau), *box[7:]]
-
-
-def _unknown(name: str, known: Iterable[str]) -> str:
-    known = list(known)
-    return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"

@@ -1,10 +1,13 @@
 """Annotated clouds, and what a data set of them offers."""
 
 import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
+from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.projection import remove_close
 from fcos_lidar_jax.sensors import Sensor
 
@@ -19,20 +22,30 @@ class Frame:
     boxes: np.ndarray
     """f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown."""
     labels: np.ndarray
-    """i32[m]: index into ``types.CLASSES``."""
+    """i32[m]: index into the ``classes`` of the frame set."""
     num_points: np.ndarray
     """i32[m]: LiDAR points of the current sweep inside each box, as annotated."""
+    num_close: int = 0
+    """Points on the ego vehicle that the reader has removed, of all sweeps."""
 
 
 class FrameSet(Protocol):
-    """Frames in a fixed order: what every reader offers to the training pipeline and the commands."""
+    """Frames in a fixed order: what every reader offers to the training pipeline and the commands.
+
+    Readers inherit from it, so that what their data do not have (poses, times, scenes) has its default.
+    """
+
+    classes: tuple[str, ...]
+    """What labels count, in their order."""
+    sensor: Sensor
+    """Whose points they are."""
 
     def __len__(self) -> int:
         """Number of frames."""
         ...
 
     def frame(self, index: int) -> Frame:
-        """One frame, read anew: sweeps fused, close points dropped, all boxes of the ten classes."""
+        """One frame, read anew: sweeps fused, close points removed, all boxes of the classes."""
         ...
 
     def labels(self, index: int) -> np.ndarray:
@@ -43,46 +56,170 @@ class FrameSet(Protocol):
         """What messages call a frame."""
         ...
 
+    def fingerprint(self) -> str:
+        """A checksum of all that the frames follow from, as far as it can be known without reading the points."""
+        ...
 
-def without_close(frame: Frame, sensor: Sensor, *, mode: str = "all", close_m: float = 1.0) -> Frame:
-    """The frame without the points on the vehicle that carries the sensor, as detectors are trained.
+    def pose(self, index: int) -> np.ndarray | None:
+        """f64[4, 4] from the points' frame to the world's, None where it is not known."""
+        return None
+
+    def time_us(self, index: int) -> int | None:
+        """When the current sweep was taken, microseconds, None where it is not known."""
+        return None
+
+    def scene(self, index: int) -> str:
+        """Name of the drive that the frame is of, ``""`` where it is not known."""
+        return ""
+
+
+@dataclasses.dataclass(frozen=True)
+class GivenFrames(FrameSet):
+    """Frames in memory.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> nothing = Frame(np.zeros((0, 5)), np.zeros((0, 9)), np.zeros(0, int), np.zeros(0, int))
+    >>> len(GivenFrames((nothing,), TINY, ("car",)))
+    1
+    """
+
+    frames: tuple[Frame, ...]
+    """All of them."""
+    sensor: Sensor
+    """Whose points they are."""
+    classes: tuple[str, ...]
+    """What their labels count."""
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frames)
+
+    def frame(self, index: int) -> Frame:
+        """One of them, not copied."""
+        return self.frames[index]
+
+    def labels(self, index: int) -> np.ndarray:
+        """i32[m]: labels of the frame's boxes."""
+        return self.frames[index].labels
+
+    def name(self, index: int) -> str:
+        """Its number."""
+        return f"frame {index}"
+
+    def fingerprint(self) -> str:
+        """Checksum of all arrays."""
+        arrays = (np.ascontiguousarray(a).tobytes() for frame in self.frames for a in vars(frame).values())
+        return checksum(repr((self.classes, self.sensor, [checksum(data) for data in arrays])).encode())
+
+
+@dataclasses.dataclass(frozen=True)
+class FramesOf(FrameSet):
+    """A frame set made of another, from which it has whatever it does not define itself."""
+
+    frames: FrameSet
+    """The other."""
+    classes: tuple[str, ...] = dataclasses.field(init=False)
+    sensor: Sensor = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        """Classes and sensor are those of the frames."""
+        object.__setattr__(self, "classes", self.frames.classes)
+        object.__setattr__(self, "sensor", self.frames.sensor)
+
+    def _source(self, index: int) -> int:
+        """Which of the frames is meant."""
+        return index
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frames)
+
+    def frame(self, index: int) -> Frame:
+        """One frame, read anew."""
+        return self.frames.frame(self._source(index))
+
+    def labels(self, index: int) -> np.ndarray:
+        """i32[m]: labels of the frame's boxes."""
+        return self.frames.labels(self._source(index))
+
+    def name(self, index: int) -> str:
+        """What messages call a frame."""
+        return self.frames.name(self._source(index))
+
+    def fingerprint(self) -> str:
+        """That of the frames."""
+        return self.frames.fingerprint()
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """As the frames tell."""
+        return self.frames.pose(self._source(index))
+
+    def time_us(self, index: int) -> int | None:
+        """As the frames tell."""
+        return self.frames.time_us(self._source(index))
+
+    def scene(self, index: int) -> str:
+        """As the frames tell."""
+        return self.frames.scene(self._source(index))
+
+
+@dataclasses.dataclass(frozen=True)
+class ChosenFrames(FramesOf):
+    """Some of the frames, in any order.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+    >>> ChosenFrames(SimulatedFrames(TINY, 5), (4, 2)).name(1)
+    'seed 2'
+    """
+
+    indices: tuple[int, ...]
+    """Which ones."""
+
+    def _source(self, index: int) -> int:
+        return self.indices[index]
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.indices)
+
+    def fingerprint(self) -> str:
+        """Checksum of that of the frames, and of which they are."""
+        return checksum(repr((self.frames.fingerprint(), self.indices)).encode())
+
+
+def files_fingerprint(files: Iterable[Path], root: Path, reading: object) -> str:
+    """Checksum of files by name, size and time of their last change, and of how they are read.
 
     Args:
-        frame: of one sweep.
+        files: that the frames are read from.
+        root: names are relative to it, so that a data set may be moved as a whole.
+        reading: options of the reader, told apart by ``repr``.
+    """
+    states = [(str(file.relative_to(root)), (s := file.stat()).st_size, s.st_mtime_ns) for file in sorted(files)]
+    return checksum(repr((states, reading)).encode())
+
+
+def drop_close(points: np.ndarray, sensor: Sensor, *, mode: str, close_m: float) -> tuple[np.ndarray, int]:
+    """A cloud without the points on the ego vehicle, and how many they were.
+
+    Args:
+        points: f32[n, c] of one frame.
         sensor: gives the origin.
         mode: as in :func:`fcos_lidar_jax.projection.remove_close`.
-        close_m: half the side of the square that is emptied.
+        close_m: half the side of the square that is emptied, metres.
+    """
+    kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, mode=mode, close_m=close_m))
+    return points[kept], len(points) - int(kept.sum())
+
+
+def without_close(frame: Frame, sensor: Sensor, *, mode: str = "all", close_m: float = 1.0) -> Frame:
+    """The frame without the points on the ego vehicle, as detectors are trained; as :func:`drop_close`.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> frame = Frame(np.eye(5, dtype=np.float32) * 9, np.zeros((0, 9)), np.zeros(0), np.zeros(0))
     >>> len(without_close(frame, TINY).points)
     2
     """
-    everything = np.ones(len(frame.points), bool)
-    kept = remove_close(frame.points, everything, sensor, mode=mode, close_m=close_m)
-    return dataclasses.replace(frame, points=frame.points[np.asarray(kept)])
-
-
-def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Which points lie in an upright box, boundary included, bool[n]; in float64.
-
-    Args:
-        points: [n, >= 3], metres.
-        box: ``x, y, z, l, w, h, yaw, ...``.
-
-    >>> inside_box(np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.array([0, 0, 0, 4, 2, 2, 0.0])).tolist()
-    [True, False]
-    """
-    x, y, z, l, w, h, yaw = np.asarray(box, np.float64)[:7]
-    dx, dy, dz = (points[:, i].astype(np.float64) - c for i, c in enumerate((x, y, z)))
-    along, across = np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx
-    return (np.abs(along) <= l / 2) & (np.abs(across) <= w / 2) & (np.abs(dz) <= h / 2)
-
-
-def count_inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Points inside each upright box, boundary included, i32[m].
-
-    >>> count_inside(np.zeros((2, 3)), np.array([[0, 0, 0, 1, 1, 1, 0.3]])).tolist()
-    [2]
-    """
-    return np.array([int(inside_box(points, box).sum()) for box in boxes], np.int32)
+    points, number = drop_close(frame.points, sensor, mode=mode, close_m=close_m)
+    return dataclasses.replace(frame, points=points, num_close=frame.num_close + number)

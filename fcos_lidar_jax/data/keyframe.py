@@ -5,24 +5,26 @@ from pathlib import Path
 
 import numpy as np
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.data.box_geometry import find_bad_box
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.point_files import PointFileError, read_points
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import CLASSES
 
 _NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
 
 
-def read_keyframe(folder: str | Path, sensor: Sensor) -> Frame:
-    """The keyframe of a folder, with the boxes of the ten classes.
+def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
+    """A keyframe of a folder, with the boxes of the ten nuScenes classes.
 
     ``boxes.json`` is ``{"lidar_file": NAME, "boxes": [{"class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy",
-    "num_lidar_pts"}]}`` in the LiDAR frame; an unknown velocity is null and becomes NaN; other classes are
-    left out.
+    "num_lidar_pts"}]}`` in the LiDAR frame, or a list of such records, whose count may be called
+    "num_lidar_pts_at_key_frame"; an unknown velocity is null and becomes NaN; other classes are left out.
 
     Args:
         folder: holds ``boxes.json`` and the point file.
         sensor: whose points they are.
+        number: which record of a list.
 
     Raises:
         PointFileError: naming the file and the field.
@@ -35,11 +37,16 @@ def read_keyframe(folder: str | Path, sensor: Sensor) -> Frame:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise PointFileError(f"{file}: not JSON: {error}") from None
     try:
-        rows = [b for b in record["boxes"] if b["class"] in CLASSES]
+        record = record[number] if isinstance(record, list) else record
+        rows = [b for b in record["boxes"] if b["class"] in NUSCENES_CLASSES]
         boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in _NUMBERS] for b in rows], np.float32)
-        counts = np.array([int(b["num_lidar_pts"]) for b in rows], np.int32)
+        known = "num_lidar_pts" if all("num_lidar_pts" in b for b in rows) else "num_lidar_pts_at_key_frame"
+        counts = np.array([int(b[known]) for b in rows], np.int32)
         cloud = file.parent / str(record["lidar_file"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise PointFileError(f"{file}: a field is missing or of another kind: {error}") from None
-    labels = np.array([CLASSES.index(b["class"]) for b in rows], np.int32)
+    bad = find_bad_box(boxes.reshape(-1, 9))
+    if bad is not None:
+        raise PointFileError(f"{file}: box {bad[0]} of the ten classes: {bad[1]}")
+    labels = np.array([NUSCENES_CLASSES.index(b["class"]) for b in rows], np.int32)
     return Frame(read_points(cloud, sensor), boxes.reshape(-1, 9), labels, counts)

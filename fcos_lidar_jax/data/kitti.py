@@ -1,19 +1,20 @@
 """KITTI object detection: Velodyne clouds with labels in camera coordinates."""
 
-import difflib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from fcos_lidar_jax.data.frame import Frame, count_inside
+from fcos_lidar_jax.data.box_geometry import LIMITS, count_inside
+from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.projection import remove_close
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
-from fcos_lidar_jax.types import CLASSES
 
-CLASS_OF = {
+CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
+"""KITTI's types of objects. ``DontCare``, which marks parts of the image, is no object."""
+
+TO_NUSCENES = {
     "Car": "car",
     "Van": "car",
     "Truck": "truck",
@@ -22,10 +23,9 @@ CLASS_OF = {
     "Cyclist": "bicycle",
     "Tram": "bus",
     "Misc": None,
-    "DontCare": None,
 }
-"""KITTI's type -> one of the ten classes; None is left out. A car of nuScenes may be a van, its bicycle includes
-the rider and its pedestrian may sit; a tram has no class there and looks most like a bus."""
+"""A class map of KITTI's types to the ten nuScenes classes; None is left out. A car of nuScenes may be a van, its
+bicycle includes the rider and its pedestrian may sit; a tram has no class there and looks most like a bus."""
 
 IMAGE_SIZE = (1242, 375)
 """Pixels of KITTI's left colour image, width and height; single drives are up to 18 columns and 5 rows smaller."""
@@ -34,6 +34,7 @@ _FIELDS = (
     *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
+_LIMITS = [LIMITS[name] for name in ("h", "w", "l", "x", "y", "z", "yaw")]
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -41,13 +42,13 @@ class KittiError(ValueError):
     """A KITTI folder that cannot be used: one line with the file, the line, the field, found and expected."""
 
 
-class KittiFrames:
+class KittiFrames(FrameSet):
     """The frames of KITTI's ``training`` folder: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
     Reads ``training/velodyne/NAME.bin``, ``training/label_2/NAME.txt`` and ``training/calib/NAME.txt``. Points
     stay in the Velodyne's frame (x forward, y left, z up, where nuScenes has x right, y forward), and the labels
     are brought there: gravity centre, yaw counter-clockwise from +x. They are upright for the camera, so its tilt
-    against the Velodyne, about a degree, is lost. KITTI knows no velocities: NaN.
+    against the Velodyne, about a degree, is lost. KITTI knows no velocities: NaN. Labels count :data:`CLASSES`.
 
     Only what the left colour camera sees is labelled. Points outside of its image are therefore dropped, or a
     detector would learn that all behind the car is background.
@@ -57,7 +58,7 @@ class KittiFrames:
         split: frames and order from ``ImageSets/SPLIT.txt``, a name a line; all frames, sorted, without it.
         sensor: beam table, limits and intensity scale.
         image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.
-        remove_close: ``"all"`` drops the points on the car itself; ``"sweeps"`` and ``"none"`` keep them, for a
+        remove_close: ``"all"`` drops the points on the ego vehicle; ``"sweeps"`` and ``"none"`` keep them, for a
             frame is one sweep.
         close_m: half the side of the square that is emptied, metres.
 
@@ -65,6 +66,8 @@ class KittiFrames:
         KittiError: here or on reading a frame, naming the file, the line, the field, found and expected.
         ValueError: a point file that cannot be used, in the same form.
     """
+
+    classes = CLASSES
 
     def __init__(
         self,
@@ -102,9 +105,8 @@ class KittiFrames:
         kept = np.ones(len(points), bool)
         if self.image_size is not None:
             kept = in_image(points, calibration["P2"] @ calibration["velo_to_rect"], self.image_size)
-        kept = remove_close(points, kept, self.sensor, mode=self.remove_close, close_m=self.close_m)
-        points = points[np.asarray(kept)]
-        return Frame(points, boxes, labels, count_inside(points, boxes))
+        points, num_close = drop_close(points[kept], self.sensor, mode=self.remove_close, close_m=self.close_m)
+        return Frame(points, boxes, labels, count_inside(points, boxes), num_close)
 
     def labels(self, index: int) -> np.ndarray:
         """i32[m]: labels of the frame's boxes, without reading its points."""
@@ -113,6 +115,12 @@ class KittiFrames:
     def name(self, index: int) -> str:
         """The frame's number, as in its file names."""
         return self.names[index]
+
+    def fingerprint(self) -> str:
+        """Checksum of the files by name, size and time of change, and of the reading options."""
+        files = (self._file(kind, name) for kind in ("velodyne", "label_2", "calib") for name in self.names)
+        reading = self.names, self.sensor, self.image_size, self.remove_close, self.close_m
+        return files_fingerprint(files, self.root, reading)
 
     def _file(self, kind: str, name: str) -> Path:
         return self.root / "training" / kind / (name + (".bin" if kind == "velodyne" else ".txt"))
@@ -162,7 +170,8 @@ def in_image(points: np.ndarray, velo_to_image: np.ndarray, image_size: tuple[in
 
 
 def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Labels of a file, as :func:`to_lidar` takes them, f64[m, 7], and their classes, i32[m].
+    """Labels of a file, as :func:`to_lidar` takes them, f64[m, 7], and their classes, i32[m],
+    which count :data:`CLASSES`.
 
     Raises:
         KittiError: naming the file, the line, the field, what was found and what was expected.
@@ -171,18 +180,20 @@ def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
     for where, words in _lines(file):
         if len(words) not in (15, 16):
             raise KittiError(f"{where}: got {len(words)} values, expected 15, or 16 with a score")
-        if words[0] not in CLASS_OF:
-            raise KittiError(f"{where}: type: {_unknown(words[0], CLASS_OF)}")
+        if words[0] not in (*CLASSES, "DontCare"):
+            raise KittiError(f"{where}: type: {unknown_name(words[0], CLASSES)}")
         fields = dict(zip(_FIELDS, words[1:], strict=False))
         numbers = {name: _number(word, f"{where}: {name}") for name, word in fields.items()}
-        name = CLASS_OF[words[0]]
-        if name is None:
+        if words[0] == "DontCare":
             continue
         for size in ("height", "width", "length"):
             if numbers[size] <= 0:
                 raise KittiError(f"{where}: {size}: got {fields[size]}, expected a size above 0 m")
+        for field, limit in zip(_FIELDS[7:14], _LIMITS, strict=True):
+            if abs(numbers[field]) > limit:
+                raise KittiError(f"{where}: {field}: got {fields[field]}, expected at most {limit:g}")
         boxes.append([numbers[name] for name in _FIELDS[7:14]])
-        labels.append(CLASSES.index(name))
+        labels.append(CLASSES.index(words[0]))
     return np.array(boxes, np.float64).reshape(-1, 7), np.array(labels, np.int32)
 
 
@@ -217,7 +228,7 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
 def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
     splits = _stems(root / "ImageSets", ".txt")
     if split not in splits:
-        raise KittiError(f"{root / 'ImageSets'}: split: {_unknown(split, splits)}")
+        raise KittiError(f"{root / 'ImageSets'}: split: {unknown_name(split, sorted(splits))}")
     names: dict[str, None] = {}
     for where, words in _lines(root / "ImageSets" / f"{split}.txt"):
         name = " ".join(words)
@@ -259,8 +270,3 @@ def _number(word: str, where: str) -> float:
     if not abs(value) <= float(np.finfo(np.float32).max):
         raise KittiError(f"{where}: got {word!r}, expected a finite number")
     return value
-
-
-def _unknown(name: str, known: Iterable[str]) -> str:
-    known = sorted(known)
-    return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"

@@ -1,5 +1,7 @@
 """PCD files by their header: ascii, binary and binary_compressed."""
 
+import dataclasses
+
 import numpy as np
 
 _COLUMNS = {
@@ -15,6 +17,8 @@ _KINDS = {"F": ("f", "248"), "I": ("i", "1248"), "U": ("u", "1248")}
 """TYPE -> NumPy's letter, and the sizes it comes in."""
 _MAX_COUNT = 1_000_000
 """Values a field of one point may have; more is a damaged header."""
+_MAX_EXPANSION = 88
+"""Three bytes of LZF stand for 264 at most."""
 
 
 def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
@@ -35,26 +39,23 @@ def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
     {'x': [5.0], 'y': [0.0], 'z': [-1.5], 'laser': [31.0]}
     """
     header, body = _read_header(content)
-    fields, types = _field_types(header)
+    fields = _read_fields(header)
     number = _num_points(header)
+    if number == 0:
+        raise ValueError("POINTS: got 0, no points in it, expected at least one")
     form = " ".join(header["DATA"]).lower()
-    if form == "ascii":
-        columns = _from_ascii(body, types, number)
-    elif form == "binary":
-        columns = _from_binary(body, types, number)
-    elif form == "binary_compressed":
-        columns = _from_compressed(body, types, number)
-    else:
-        raise ValueError(f"DATA: got {form!r}, expected ascii, binary or binary_compressed")
-    table = {}
-    for name, aliases in _COLUMNS.items():
-        found = next((a for a in aliases if a in fields), None)
+    if form not in _FORMS:
+        raise ValueError(f"DATA: got {form!r}, expected {', '.join(_FORMS)}")
+    chosen: dict[str, int] = {}
+    names = [field.name for field in fields]
+    for column, aliases in _COLUMNS.items():
+        found = next((a for a in aliases if a in names), None)
         if found is not None:
-            column = columns[fields.index(found)]
-            if column.shape[1] != 1:
-                raise ValueError(f"COUNT: got {column.shape[1]} for field {found}, expected 1")
-            table[name] = column[:, 0]
-    return table
+            chosen[column] = names.index(found)
+            if fields[chosen[column]].count != 1:
+                raise ValueError(f"COUNT: got {fields[chosen[column]].count} for field {found}, expected 1")
+    columns = _FORMS[form](body, fields, number, list(chosen.values()))
+    return dict(zip(chosen, columns, strict=True))
 
 
 def _read_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -74,8 +75,20 @@ def _read_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
     raise ValueError("not a PCD file: no DATA line in its header")
 
 
-def _field_types(header: dict[str, list[str]]) -> tuple[list[str], list[tuple[np.dtype, int]]]:
-    """Names of the fields, and number type and count of each."""
+@dataclasses.dataclass(frozen=True)
+class _Field:
+    """A field of a point: numbers of one type. Sizes are Python's integers, which a header cannot overflow."""
+
+    name: str
+    dtype: np.dtype
+    count: int
+
+    @property
+    def size(self) -> int:
+        return self.dtype.itemsize * self.count
+
+
+def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
     fields = [name.lower() for name in header.get("FIELDS", [])]
     for axis in "xyz":
         if fields.count(axis) != 1:
@@ -85,7 +98,7 @@ def _field_types(header: dict[str, list[str]]) -> tuple[list[str], list[tuple[np
         number = len(columns.get(name, []))
         if number != len(fields):
             raise ValueError(f"{name}: got {number} entries, expected {len(fields)} as in FIELDS")
-    types = []
+    found = []
     for field, size, kind, count in zip(fields, columns["SIZE"], columns["TYPE"], columns["COUNT"], strict=True):
         letter, sizes = _KINDS.get(kind.upper(), ("", ""))
         if not letter or size not in tuple(sizes):
@@ -94,8 +107,8 @@ def _field_types(header: dict[str, list[str]]) -> tuple[list[str], list[tuple[np
             )
         if not count.isdecimal() or not 1 <= int(count) <= _MAX_COUNT:
             raise ValueError(f"COUNT: got {count} for field {field}, expected an integer of at least 1")
-        types.append((np.dtype(f"<{letter}{size}"), int(count)))
-    return fields, types
+        found.append(_Field(field, np.dtype(f"<{letter}{size}"), int(count)))
+    return found
 
 
 def _num_points(header: dict[str, list[str]]) -> int:
@@ -115,9 +128,8 @@ def _num_points(header: dict[str, list[str]]) -> int:
     return points
 
 
-def _from_ascii(body: bytes, types: list[tuple[np.dtype, int]], number: int) -> list[np.ndarray]:
-    words = body.split()
-    width = sum(count for _, count in types)
+def _from_ascii(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
+    words, width = body.split(), sum(field.count for field in fields)
     if len(words) != number * width:
         cause = "truncated" if len(words) < number * width else "too long"
         raise ValueError(f"DATA: {cause}: got {len(words)} values, expected {number} points of {width}")
@@ -125,7 +137,7 @@ def _from_ascii(body: bytes, types: list[tuple[np.dtype, int]], number: int) -> 
         values = np.array(words, np.float64).reshape(number, width)
     except ValueError:
         raise ValueError(f"DATA: got {_first_non_number(words)!r} among the values, expected a number") from None
-    return np.split(values, np.cumsum([count for _, count in types])[:-1], axis=1)
+    return [values[:, sum(field.count for field in fields[:i])] for i in chosen]
 
 
 def _first_non_number(words: list[bytes]) -> str:
@@ -137,32 +149,38 @@ def _first_non_number(words: list[bytes]) -> str:
     return ""
 
 
-def _from_binary(body: bytes, types: list[tuple[np.dtype, int]], number: int) -> list[np.ndarray]:
+def _from_binary(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
     """Points stored one after the other."""
-    record = np.dtype([(str(i), base, (count,)) for i, (base, count) in enumerate(types)])
-    if len(body) < number * record.itemsize:
+    record = sum(field.size for field in fields)
+    if len(body) < number * record:
         raise ValueError(
-            f"DATA: truncated: got {len(body)} bytes, expected {number * record.itemsize} "
-            f"({number} points of {record.itemsize})"
+            f"DATA: truncated: got {len(body)} bytes, expected {number * record} ({number} points of {record})"
         )
-    records = np.frombuffer(body, record, number)
-    return [records[str(i)] for i in range(len(types))]
+    firsts = [sum(field.size for field in fields[:i]) for i in chosen]
+    return [
+        np.ndarray((number,), fields[i].dtype, body, first, (record,))
+        for i, first in zip(chosen, firsts, strict=True)
+    ]
 
 
-def _from_compressed(body: bytes, types: list[tuple[np.dtype, int]], number: int) -> list[np.ndarray]:
+def _from_compressed(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
     """Points stored field by field and packed by LZF, behind the packed and the plain size."""
-    expected = number * sum(base.itemsize * count for base, count in types)
+    expected = number * sum(field.size for field in fields)
     packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
     if len(body) < 8 + packed:
         raise ValueError(f"DATA: truncated: got {max(len(body) - 8, 0)} compressed bytes, expected {packed}")
     if plain != expected:
         raise ValueError(f"DATA: got {plain} uncompressed bytes, expected {expected} for {number} points")
+    if plain > _MAX_EXPANSION * packed:
+        raise ValueError(f"DATA: got {packed} compressed bytes, expected more: they cannot unpack to {plain}")
     content = _unpack_lzf(body[8 : 8 + packed], plain)
-    columns, first = [], 0
-    for base, count in types:
-        columns.append(np.frombuffer(content, base, number * count, first).reshape(number, count))
-        first += number * count * base.itemsize
-    return columns
+    firsts = [number * sum(field.size for field in fields[:i]) for i in chosen]
+    return [
+        np.frombuffer(content, fields[i].dtype, number, first) for i, first in zip(chosen, firsts, strict=True)
+    ]
+
+
+_FORMS = {"ascii": _from_ascii, "binary": _from_binary, "binary_compressed": _from_compressed}
 
 
 def _unpack_lzf(packed: bytes, size: int) -> bytes:

@@ -1,6 +1,9 @@
-"""Point clouds from files: raw nuScenes and KITTI, NumPy, PCD."""
+"""Point clouds from files: raw nuScenes and KITTI, NumPy, PCD, Feather of Argoverse 2."""
 
 import io
+import math
+import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +11,11 @@ import numpy as np
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.sensors import Sensor
 
-ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd")
+ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")
 """File names that are read, the longest first."""
 _RAW_COLUMNS = (3, 4, 5, 6)
+MAX_BYTES = 2**31
+"""Of one cloud, as a file and unpacked: more is no LiDAR's, and would exhaust the memory."""
 _RAW_DTYPES = ("float16", "float32", "float64")
 
 # What tells a raw file that is read with the layout it was written with.
@@ -39,7 +44,8 @@ def read_points(
 
     ``.pcd.bin``: float32 x 5, the fifth the ring (nuScenes). ``.bin``: float32 x 4 (KITTI). Other raw layouts by
     ``columns`` and ``dtype``; a fifth column is then the time lag, but in a ``.pcd.bin`` it stays the ring.
-    ``.npy`` and ``.npz`` (one array, or one named ``points``): N x 3 to 6. ``.pcd``: by its header.
+    ``.npy`` and ``.npz`` (one array, or one named ``points``): N x 3 to 6. ``.pcd``: by its header. ``.feather``
+    (Argoverse 2): columns x, y, z, intensity, laser_number.
 
     A size cannot tell four from five columns, so a raw file is also refused when its values do not look like
     metres, or when another layout fits them clearly better.
@@ -73,26 +79,103 @@ def read_points(
         raise PointFileError(f"{path}: dtype: got {dtype}, expected {', '.join(_RAW_DTYPES)}")
     if not kind.endswith(".bin") and (columns is not None or dtype is not None):
         raise PointFileError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise PointFileError(f"{path}: cannot be read: {error.strerror}") from None
-    if not content:
-        raise PointFileError(f"{path}: empty file, expected points")
+    if kind == ".feather":
+        names = {"x": "x", "y": "y", "z": "z", "intensity": "intensity", "laser_number": "laser"}
+        table = read_feather(path, names)
+        return assemble_points(path, sensor, {names[name]: column for name, column in table.items()})
+    content = _read_whole(path)
     if kind == ".pcd":
         try:
             table = parse_pcd(content)
         except ValueError as error:
             raise PointFileError(f"{path}: {error}") from None
-        return _assemble(path, sensor, table)
+        return assemble_points(path, sensor, table)
+    if not kind.endswith(".bin"):
+        return points_from_array(_read_numpy(path, content, kind), sensor, str(path))
+    rows = _read_raw(path, content, columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32")
+    if kind != ".pcd.bin":
+        return points_from_array(rows, sensor, str(path))
+    return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
+
+
+def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") -> np.ndarray:
+    """The points of an array, in the columns that :func:`read_points` returns.
+
+    Args:
+        array: [n, 3 to 6]: x, y, z, intensity, time lag, laser number.
+        sensor: scales the intensity and says whether a laser number is needed.
+        where: what to call the array in messages.
+
+    Raises:
+        PointFileError: another shape or type, or a fifth column of whole numbers above 1, which is a ring.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> points_from_array(np.array([[8, 1, -1]]), TINY).tolist()
+    [[8.0, 1.0, -1.0, 0.0, 0.0]]
+    """
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        found = getattr(array, "dtype", type(array).__name__)
+        raise PointFileError(f"{where}: dtype: got {found}, expected real numbers")
+    if array.ndim != 2 or array.shape[1] not in _RAW_COLUMNS:
+        raise PointFileError(f"{where}: shape: got {array.shape}, expected N x 3, 4, 5 or 6")
+    lag = array[:, 4] if array.shape[1] > 4 else np.zeros(0)
+    if len(lag) and np.isfinite(lag).all() and lag.max() > 1 and not (lag % 1).any():
+        raise PointFileError(
+            f"{where}: fifth column: got whole numbers up to {lag.max():g}, which look like a ring, expected the "
+            "time lag in seconds: leave the column out"
+        )
     names = ("x", "y", "z", "intensity", "time_lag", "laser")
-    if kind.endswith(".bin"):
-        rows = _read_raw(path, content, columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32")
-        if kind == ".pcd.bin":
-            names = ("x", "y", "z", "intensity", "laser", "unknown")
-    else:
-        rows = _read_numpy(path, content, kind)
-    return _assemble(path, sensor, dict(zip(names, rows.T, strict=False)))
+    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
+
+
+def read_feather(path: Path, names: Iterable[str], kinds: str = "fiu") -> dict[str, np.ndarray]:
+    """Columns of an Apache Feather file (version 2); needs the extra ``argoverse2``.
+
+    Args:
+        path: the file.
+        names: of the columns.
+        kinds: NumPy's letters of the types that will do: ``"fiu"`` numbers, ``"iu"`` whole ones, ``"O"`` texts.
+
+    Raises:
+        PointFileError: not such a file, a column that is missing, of another type or without a value in some row,
+            or pyarrow is not installed.
+    """
+    try:
+        import pyarrow
+    except ImportError:
+        raise PointFileError(
+            f"{path}: pyarrow is not installed, which reads .feather: pip install 'fcos-lidar-jax[argoverse2]'"
+        ) from None
+    found = {}
+    try:
+        table = pyarrow.ipc.open_file(_read_whole(path)).read_all()
+        for name in names:
+            if table.column_names.count(name) != 1:
+                raise PointFileError(f"{path}: got columns {', '.join(table.column_names)}, expected one {name}")
+            column = table.column(name)
+            column.validate(full=True)  # offsets and lengths, which a crafted file may have wrong
+            found[name] = column.to_numpy()
+            if column.null_count or found[name].dtype.kind not in kinds:
+                got = f"{column.null_count} rows without a value" if column.null_count else column.type
+                expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kinds]
+                raise PointFileError(f"{path}: {name}: got {got}, expected {expected}")
+    except pyarrow.ArrowException as error:
+        raise PointFileError(f"{path}: not a readable .feather file: {' '.join(str(error).split())}") from None
+    return found
+
+
+def _read_whole(path: Path) -> bytes:
+    """The bytes of a file that may be one cloud's."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise PointFileError(f"{path}: got {size} bytes, expected at most {MAX_BYTES} for one cloud")
+        content = path.read_bytes()
+    except OSError as error:
+        raise PointFileError(f"{path}: cannot be read: {error.strerror}") from None
+    if not content:
+        raise PointFileError(f"{path}: empty file, expected points")
+    return content
 
 
 def _kind(path: Path) -> str:
@@ -185,29 +268,44 @@ def _read_numpy(path: Path, content: bytes, kind: str) -> np.ndarray:
     if not content.startswith(magic):
         raise PointFileError(f"{path}: not a readable {kind} file: got {content[:6]!r}, expected {magic!r} first")
     try:
-        array = np.load(io.BytesIO(content), allow_pickle=False)
-        if kind == ".npz":
-            names = array.files
-            if len(names) != 1 and "points" not in names:
-                found = ", ".join(names) or "none"
-                raise PointFileError(f"{path}: got arrays {found}, expected one, or one named points")
-            array = array["points" if "points" in names else names[0]]
-    except PointFileError:
-        raise
+        return _parse_npy(content if kind == ".npy" else _member(content))
     except Exception as error:  # damaged archives and headers fail in a dozen ways, down to the tokenizer's
         reason = " ".join(str(error).split())
-        raise PointFileError(
-            f"{path}: not a readable {kind} file, which must be without pickled objects: {reason}"
-        ) from None
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        found = getattr(array, "dtype", type(array).__name__)
-        raise PointFileError(f"{path}: dtype: got {found}, expected real numbers")
-    if array.ndim != 2 or array.shape[1] not in _RAW_COLUMNS:
-        raise PointFileError(f"{path}: shape: got {array.shape}, expected N x 3, 4, 5 or 6")
-    return array
+        raise PointFileError(f"{path}: not a readable {kind} file: {reason}") from None
 
 
-def _assemble(path: Path, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
+def _member(content: bytes) -> bytes:
+    """The array's file in an archive, unpacked; its size is known before."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        if len(members) != 1 and "points" not in members:
+            raise ValueError(f"got arrays {', '.join(members) or 'none'}, expected one, or one named points")
+        member = members.get("points") or next(iter(members.values()))
+        if member.file_size > MAX_BYTES:
+            raise ValueError(f"got {member.file_size} bytes unpacked, expected at most {MAX_BYTES}")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError("got another compression, expected none or deflate")
+        with archive.open(member) as stream:
+            return stream.read(member.file_size + 1)  # a limit, for what it unpacks to may be more than it says
+
+
+def _parse_npy(content: bytes) -> np.ndarray:
+    """An array from the bytes of its file, whose header is checked against their number first."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in read_header:
+        raise ValueError(f"version: got {version}, expected 1.0 or 2.0")
+    shape, fortran, dtype = read_header[version](stream)
+    if dtype.hasobject:
+        raise ValueError("got pickled objects, expected an array without pickled objects")
+    size, found = math.prod(shape) * dtype.itemsize, len(content) - stream.tell()
+    if size != found or min(shape, default=0) < 0:
+        raise ValueError(f"got {found} bytes of values, expected {size} for {shape} of {dtype}")
+    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
+
+
+def assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
     """The contract's columns from named ones."""
     number = len(table["x"])
     if number == 0:
@@ -228,7 +326,7 @@ def _assemble(path: Path, sensor: Sensor, table: dict[str, np.ndarray]) -> np.nd
     return points
 
 
-def _laser_numbers(path: Path, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
+def _laser_numbers(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
     if "laser" not in table:
         raise PointFileError(
             f"{path}: no laser number in it, expected one for every point, since sensor {sensor.name} needs it"

@@ -1,56 +1,44 @@
 """How far the scores could be chance: samples drawn anew, with replacement."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.metrics import DISTANCES_M, ERROR_DISTANCE_M, draw, summarise
-from fcos_lidar_jax.evaluation.ranking import Ranking
-from fcos_lidar_jax.types import CLASSES
+from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation, class_curves, summarise
 
 LEVEL = 0.95
 """Share of the drawn sets whose score lies in the interval."""
-SCORES = ("mean_ap", "nd_score")
-"""What intervals are told of."""
 
 
 def bootstrap(
-    rankings: Sequence[Ranking],
-    num_samples: int,
-    *,
-    repeats: int,
-    seed: int = 0,
-    report: Callable[[int], None] = lambda done: None,
+    evaluation: Evaluation, *, repeats: int, seed: int = 0, report: Callable[[int], None] = lambda done: None
 ) -> dict[str, Any]:
-    """Intervals of mAP and NDS over sets of as many samples, drawn from those at hand.
+    """Intervals of the scores over sets of as many samples, drawn from those at hand.
 
-    Matching never crosses samples, so it is done once; every set is scored as the benchmark would, a class whose
-    truth was not drawn with zero. Keyframes of a scene resemble each other: the true intervals are wider.
+    Matching never crosses samples, so it is done once; every set is scored by the metric of the evaluation.
+    Keyframes of a scene resemble each other: the true intervals are wider.
 
     Args:
-        rankings: of an evaluation, by label.
-        num_samples: that were evaluated.
+        evaluation: of the samples.
         repeats: sets to draw.
         seed: of the draws.
         report: told how many sets are done.
 
     Returns:
-        ``{"repeats", "seed", "level", "mean_ap": {"low", "high"}, "nd_score": {"low", "high"}}``.
+        ``{"repeats", "seed", "level", "mean_ap": {"low", "high"}}``, and ``"nd_score"`` for the benchmark.
     """
-    rng = np.random.default_rng(seed)
-    error_row = DISTANCES_M.index(ERROR_DISTANCE_M)
-    drawn = np.zeros((repeats, len(SCORES)))
+    rng, num_samples = np.random.default_rng(seed), len(evaluation.tokens)
+    scores = [score for score in ("mean_ap", "nd_score") if score in evaluation.summary]
+    drawn = np.zeros((repeats, len(scores)))
     for i in range(repeats):
         copies = np.bincount(rng.integers(0, num_samples, num_samples), minlength=num_samples)
-        summary = summarise(
-            {
-                name: draw(ranking.resampled(copies, error_row=error_row))
-                for name, ranking in zip(CLASSES, rankings, strict=True)
-            }
-        )
-        drawn[i] = [summary[score] for score in SCORES]
+        rankings = [ranking.resampled(copies, error_row=ERROR_ROW) for ranking in evaluation.rankings]
+        curves = dict(zip(evaluation.curves, map(class_curves, rankings), strict=True))
+        summary = summarise(curves, evaluation.metric)
+        drawn[i] = [summary[score] for score in scores]
         report(i + 1)
-    low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
-    intervals = {score: {"low": float(low[k]), "high": float(high[k])} for k, score in enumerate(SCORES)}
+    known = drawn[~np.isnan(drawn).any(axis=1)]  # a set without any truth has no score
+    low, high = np.quantile(known if len(known) else drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+    intervals = {score: {"low": float(low[k]), "high": float(high[k])} for k, score in enumerate(scores)}
     return {"repeats": repeats, "seed": seed, "level": LEVEL, **intervals}

@@ -2,10 +2,11 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
-from fcos_lidar_jax.types import CLASSES
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 
 _VEHICLE = ("vehicle.moving", "vehicle.parked", "vehicle.stopped")
 _CYCLE = ("cycle.with_rider", "cycle.without_rider")
@@ -37,7 +38,7 @@ class BoxColumns:
     sample: np.ndarray
     """i32[n]: row of the sample."""
     label: np.ndarray
-    """i8[n]: index into ``types.CLASSES``."""
+    """i16[n]: index into the classes of the metric."""
     translation: np.ndarray
     """f64[n, 3]: centre, metres."""
     size: np.ndarray
@@ -54,7 +55,6 @@ class BoxColumns:
     """i32[n]: LiDAR and radar points inside, :data:`UNKNOWN_POINTS` for a prediction."""
 
     def __len__(self) -> int:
-        """Number of boxes."""
         return len(self.sample)
 
     def take(self, rows: np.ndarray | slice) -> "BoxColumns":
@@ -62,31 +62,23 @@ class BoxColumns:
         return BoxColumns(**{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
 
 
-def join(parts: Sequence[BoxColumns]) -> BoxColumns:
-    """All rows of all parts, in their order; no parts give no rows."""
-    parts = [empty_columns(), *parts]
-    names = [field.name for field in dataclasses.fields(BoxColumns)]
-    return BoxColumns(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+_UNKNOWN = {"attribute": -1, "score": -1.0, "num_points": UNKNOWN_POINTS}
+_WHOLE = {"sample": np.int32, "label": np.int16, "attribute": np.int8, "num_points": np.int32}
 
 
-def empty_columns() -> BoxColumns:
-    """No boxes at all.
+def make_columns(**columns: Any) -> BoxColumns:
+    """Columns in their number types; a single value stands for all rows.
 
-    >>> len(empty_columns())
+    Args:
+        columns: fields of :class:`BoxColumns`; attribute, score and number of points are unknown where left out.
+
+    >>> no_box = np.zeros((0, 3))
+    >>> len(make_columns(sample=0, label=0, translation=no_box, size=no_box, yaw=0.0, velocity=no_box[:, :2]))
     0
     """
-    none = np.zeros(0)
-    return BoxColumns(
-        sample=none.astype(np.int32),
-        label=none.astype(np.int8),
-        translation=np.zeros((0, 3)),
-        size=np.zeros((0, 3)),
-        yaw=none,
-        velocity=np.zeros((0, 2)),
-        attribute=none.astype(np.int8),
-        score=none,
-        num_points=none.astype(np.int32),
-    )
+    arrays = {name: np.asarray(v, _WHOLE.get(name, np.float64)) for name, v in {**_UNKNOWN, **columns}.items()}
+    rows = len(arrays["translation"])
+    return BoxColumns(**{name: array if array.ndim else np.full(rows, array) for name, array in arrays.items()})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,27 +95,33 @@ class Racks:
     """f64[r, 3, 3]: rack to global."""
 
 
-def no_racks() -> Racks:
-    """No rack at all.
+NO_BOXES = make_columns(
+    sample=0, label=0, translation=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=0.0, velocity=np.zeros((0, 2))
+)
+"""No box at all."""
+NO_RACKS = Racks(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+"""No rack at all."""
+Rows = TypeVar("Rows", BoxColumns, Racks)
 
-    >>> len(no_racks().sample)
-    0
-    """
-    return Racks(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
+def join(parts: Sequence[Rows]) -> Rows:
+    """All rows of all parts, at least one, in their order."""
+    names = [field.name for field in dataclasses.fields(parts[0])]
+    return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 @dataclasses.dataclass(frozen=True)
 class GroundTruth:
-    """What there is to be found."""
+    """The annotations of some samples."""
 
     tokens: tuple[str, ...]
-    """The samples."""
+    """Names of the samples."""
     ego_translation: np.ndarray
-    """f64[samples, 3]: where the car is, global frame."""
+    """f64[samples, 3]: the ego vehicle, global frame; class ranges count from here."""
     boxes: BoxColumns
-    """Of the ten classes."""
+    """Of the metric's classes."""
     racks: Racks
-    """Bicycle racks."""
+    """Bicycle racks of all samples."""
 
 
 def heading_yaw(rotation: np.ndarray) -> np.ndarray:
@@ -139,22 +137,7 @@ def heading_yaw(rotation: np.ndarray) -> np.ndarray:
     return np.arctan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)
 
 
-def rotation_axes(rotation: np.ndarray) -> np.ndarray:
-    """Rotation matrices f64[n, 3, 3] on column vectors, of quaternions w, x, y, z of any length but zero.
-
-    >>> rotation_axes(np.array([[0.0, 0, 0, 3]])).tolist()
-    [[[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]]
-    """
-    w, x, y, z = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
-    rows = [
-        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
-LABELS = {name: i for i, name in enumerate(CLASSES)}
-"""Class name -> label."""
+LABELS = {name: i for i, name in enumerate(NUSCENES_CLASSES)}
+"""nuScenes class name -> label."""
 ATTRIBUTE_INDEX = {"": -1, **{name: i for i, name in enumerate(ATTRIBUTES)}}
 """Attribute name -> index."""

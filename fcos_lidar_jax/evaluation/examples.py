@@ -4,14 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.metrics import DISTANCES_M, ERROR_DISTANCE_M, Evaluation
-
-_ROW = DISTANCES_M.index(ERROR_DISTANCE_M)
+from fcos_lidar_jax.evaluation.boxes import BoxColumns
+from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation
 
 
 @dataclasses.dataclass(frozen=True)
 class Examples:
-    """Samples worth a picture."""
+    """Samples to draw, and the detections to draw in them."""
 
     rows: dict[str, int]
     """``best``, ``typical`` and ``worst`` -> row of the sample; fewer where there are fewer samples."""
@@ -19,18 +18,14 @@ class Examples:
     """The score from which on the predictions of all samples together have the highest F1."""
 
 
-def choose_examples(evaluation: Evaluation, num_samples: int) -> Examples:
+def choose_examples(evaluation: Evaluation) -> Examples:
     """Samples by their F1 at two metres over all classes, at the score that is best for all samples together.
 
     Among equals the sample with the most truth comes first. Samples without truth are left out.
-
-    Args:
-        evaluation: of the samples.
-        num_samples: how many.
     """
-    rankings = evaluation.rankings
+    rankings, num_samples = evaluation.rankings, len(evaluation.tokens)
     score = np.concatenate([ranking.score for ranking in rankings])
-    hit = np.concatenate([ranking.hit[_ROW] for ranking in rankings])
+    hit = np.concatenate([ranking.hit[ERROR_ROW] for ranking in rankings])
     sample = np.concatenate([ranking.sample for ranking in rankings])
     truth = np.bincount(np.concatenate([r.truth_sample for r in rankings]), minlength=num_samples)
     order = np.argsort(-score, kind="stable")
@@ -46,11 +41,11 @@ def choose_examples(evaluation: Evaluation, num_samples: int) -> Examples:
         return Examples({}, min_score)
     ranked = candidates[np.lexsort((-truth[candidates], -quality[candidates]))]
     worst = candidates[np.lexsort((-truth[candidates], quality[candidates]))[0]]
-    rows = {"best": int(ranked[0]), "worst": int(worst), "typical": int(ranked[len(ranked) // 2])}
-    first = {row: name for name, row in reversed(rows.items())}
-    return Examples(
-        {name: rows[name] for name in ("best", "typical", "worst") if first[rows[name]] == name}, min_score
-    )
+    rows: dict[str, int] = {}
+    for name, row in (("best", ranked[0]), ("worst", worst), ("typical", ranked[len(ranked) // 2])):
+        if row not in rows.values():
+            rows[name] = int(row)
+    return Examples(dict(sorted(rows.items())), min_score)
 
 
 def sensor_boxes(
@@ -64,18 +59,16 @@ def sensor_boxes(
         sensor_to_global: f64[4, 4].
         min_score: of the predictions.
     """
-    found = evaluation.predictions
-    found = found.take((found.sample == sample) & (found.score >= min_score))
-    truth = evaluation.truth.take(evaluation.truth.sample == sample)
     turn, origin = sensor_to_global[:3, :3], sensor_to_global[:3, 3]
 
-    def local(columns: np.ndarray, size: np.ndarray, yaw: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        heading = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=1) @ turn
-        moved = np.pad(velocity, ((0, 0), (0, 1))) @ turn
-        angle = np.arctan2(heading[:, 1], heading[:, 0])[:, None]
-        return np.concatenate([(columns - origin) @ turn, size[:, [1, 0, 2]], angle, moved[:, :2]], axis=1)
+    def local(boxes: BoxColumns) -> np.ndarray:
+        heading = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw), 0 * boxes.yaw], axis=1) @ turn
+        velocity = np.pad(boxes.velocity, ((0, 0), (0, 1))) @ turn
+        yaw = np.arctan2(heading[:, 1], heading[:, 0])[:, None]
+        centre = (boxes.translation - origin) @ turn
+        return np.concatenate([centre, boxes.size[:, [1, 0, 2]], yaw, velocity[:, :2]], axis=1)
 
-    return (
-        (local(found.translation, found.size, found.yaw, found.velocity), found.label, found.score),
-        (local(truth.translation, truth.size, truth.yaw, truth.velocity), truth.label),
-    )
+    found, truth = evaluation.predictions, evaluation.truth
+    found = found.take((found.sample == sample) & (found.score >= min_score))
+    truth = truth.take(truth.sample == sample)
+    return (local(found), found.label, found.score), (local(truth), truth.label)

@@ -1,61 +1,129 @@
-"""The benchmark's metric on frames that come from anywhere: boxes in the sensor's frame, no tokens, no racks."""
+"""Evaluation of frames from anywhere: boxes in the sensor's frame, no tokens, no racks, no attributes."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.frame import Frame
-from fcos_lidar_jax.evaluation.boxes import UNKNOWN_POINTS, BoxColumns, GroundTruth, join, no_racks
-from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
+from fcos_lidar_jax.evaluation.boxes import NO_BOXES, NO_RACKS, BoxColumns, GroundTruth, join, make_columns
+from fcos_lidar_jax.evaluation.json_io import decode_json, expect_samples, read_json
+from fcos_lidar_jax.evaluation.metrics import Evaluation, Metric, evaluate
+from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.inference.records import confident
 from fcos_lidar_jax.types import Detections
 
 
-def evaluate_frames(found: Sequence[Detections], frames: Sequence[Frame]) -> Evaluation:
-    """Evaluate detections against the boxes of their frames.
+def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric: Metric) -> Evaluation:
+    """Evaluate detections against the boxes of their frames; the score is the mAP by centre distance.
 
-    The ranges of the classes count from the sensor, and nothing is known of attributes, whose error is 1.
+    It differs from the nuScenes benchmark: ranges count from the sensor and not from the ego vehicle, boxes count
+    by their LiDAR points alone, there are no bicycle racks, attributes and NDS, and means are over the classes
+    that occur in the truth.
 
     Args:
-        found: NumPy arrays, one for each frame.
-        frames: with the truth; boxes without a point do not count.
+        found: NumPy arrays, one for each frame, labels by the metric's classes.
+        frames: with the truth, labels likewise; boxes without a point do not count. Points are not looked at.
+        metric: of :func:`fcos_lidar_jax.evaluation.metrics.metric_of`.
 
+    Raises:
+        ValueError: the metric is the benchmark's.
+
+    >>> from fcos_lidar_jax.evaluation.metrics import metric_of
     >>> frame = Frame(np.zeros((0, 5)), np.ones((1, 9)), np.zeros(1, int), np.ones(1, int))
-    >>> one = np.ones(1, bool)
-    >>> exact = Detections(frame.boxes, np.ones(1), frame.labels, one, np.zeros(0))
-    >>> round(evaluate_frames([exact], [frame]).summary["mean_dist_aps"]["car"], 9)
+    >>> exact = Detections(frame.boxes, np.ones(1), frame.labels, np.ones(1, bool), np.zeros(0))
+    >>> round(evaluate_frames([exact], [frame], metric_of(["car", "tram"])).summary["mean_ap"], 9)
     1.0
     """
-    predictions, truths = [], []
-    for sample, (d, frame) in enumerate(zip(found, frames, strict=True)):
-        valid = np.asarray(d.valid)
-        boxes, labels, scores = (np.asarray(column)[valid] for column in (d.boxes, d.labels, d.scores))
-        unknown = np.full(len(boxes), UNKNOWN_POINTS)
-        predictions.append(_columns(sample, boxes, labels, scores, unknown))
-        truths.append(
-            _columns(sample, frame.boxes, frame.labels, np.full(len(frame.boxes), -1.0), frame.num_points)
+    if metric.benchmark:
+        raise ValueError(
+            "metric: got the nuScenes benchmark's, expected one of metric_of: frames have no attributes"
         )
-    truth = GroundTruth(
-        tokens=tuple(map(str, range(len(frames)))),
-        ego_translation=np.zeros((len(frames), 3)),
-        boxes=join(truths),
-        racks=no_racks(),
-    )
-    return evaluate(join(predictions), truth)
+    return evaluate(*frame_columns(found, frames), metric)
 
 
-def _columns(
-    sample: int, boxes: np.ndarray, labels: np.ndarray, scores: np.ndarray, num_points: np.ndarray
-) -> BoxColumns:
+def frame_columns(found: Iterable[Detections], frames: Iterable[Frame]) -> tuple[BoxColumns, GroundTruth]:
+    """Detections and truth of frames as columns, with the sensors' frames as the global one."""
+    predictions, truths = [NO_BOXES], [NO_BOXES]
+    sample = 0
+    for sample, (d, frame) in enumerate(zip(found, frames, strict=True), start=1):
+        boxes, labels, scores = confident(d, 0.0)
+        predictions.append(_columns(sample - 1, boxes, label=labels, score=scores))
+        truths.append(_columns(sample - 1, frame.boxes, label=frame.labels, num_points=frame.num_points))
+    tokens = tuple(map(str, range(sample)))
+    return join(predictions), GroundTruth(tokens, np.zeros((sample, 3)), join(truths), NO_RACKS)
+
+
+def _columns(sample: int, boxes: np.ndarray, **columns: np.ndarray) -> BoxColumns:
     """Boxes ``x, y, z, l, w, h, yaw, vx, vy`` of one sample."""
-    boxes = np.asarray(boxes, np.float64)
-    return BoxColumns(
-        sample=np.full(len(boxes), sample, np.int32),
-        label=np.asarray(labels, np.int8),
-        translation=boxes[:, :3],
-        size=boxes[:, [4, 3, 5]],
-        yaw=boxes[:, 6],
-        velocity=boxes[:, 7:9],
-        attribute=np.full(len(boxes), -1, np.int8),
-        score=np.asarray(scores, np.float64),
-        num_points=np.asarray(num_points, np.int32),
-    )
+    boxes = np.asarray(boxes, np.float64).reshape(-1, 9)
+    centre, size, yaw, velocity = boxes[:, :3], boxes[:, [4, 3, 5]], boxes[:, 6], boxes[:, 7:9]
+    return make_columns(sample=sample, translation=centre, size=size, yaw=yaw, velocity=velocity, **columns)
+
+
+def write_detections(path: Path, frames: Iterable[tuple[str, bytes]], classes: Sequence[str]) -> None:
+    """Write detections: ``{"classes", "frames": [{"name", "boxes": [{"label", "score", "box"}]}]}``.
+
+    Args:
+        path: JSON file to write.
+        frames: names with their boxes as JSON, see :func:`fcos_lidar_jax.inference.records.as_records`.
+        classes: of the detector.
+    """
+    lines = (b'{"name": %s, "boxes": %s}' % (json.dumps(name).encode(), boxes) for name, boxes in frames)
+    text = b'{"classes": %s, "frames": [\n%s\n]}\n' % (json.dumps(list(classes)).encode(), b",\n".join(lines))
+    atomic_write(path, lambda file: file.write_bytes(text))
+
+
+class _Box(msgspec.Struct, gc=False):
+    label: str
+    score: float
+    box: tuple[float, float, float, float, float, float, float, float | None, float | None]
+
+
+class _FrameBoxes(msgspec.Struct, gc=False):
+    name: str
+    boxes: list[_Box]
+
+
+class _DetectionsFile(msgspec.Struct, gc=False):
+    frames: list[_FrameBoxes]
+
+
+def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) -> list[Detections]:
+    """Read what :func:`write_detections` wrote, in the order of the names.
+
+    Args:
+        path: the file.
+        names: of the frames that it must cover, no more and no less.
+        classes: that the labels shall index.
+
+    Raises:
+        ValueError: naming the file, the frame, the box (from 0) and what is wrong.
+    """
+    by_name: dict[str, list[_Box]] = {}
+    for frame in decode_json(read_json(path), _DetectionsFile, str(path)).frames:
+        if frame.name in by_name:
+            raise ValueError(f"{path}: frame {frame.name}: occurs twice")
+        by_name[frame.name] = frame.boxes
+    expect_samples(by_name, tuple(names), str(path), of="the data")
+    label_of = {name: label for label, name in enumerate(classes)}
+    found = []
+    for name in names:
+        boxes = by_name[name]
+        for i, box in enumerate(boxes):
+            if box.label not in label_of or box.score < 0 or min(box.box[3:6]) <= 0:
+                got = f"got {box.label!r}, score {box.score:g}, size {list(box.box[3:6])}"
+                expected = f"one of {', '.join(classes)}, a score of at least 0 and a positive size"
+                raise ValueError(f"{path}: frame {name}: box {i}: {got}, expected {expected}")
+        columns: tuple[Any, ...] = (
+            np.array([box.box for box in boxes], np.float32).reshape(-1, 9),
+            np.array([box.score for box in boxes], np.float32),
+            np.array([label_of[box.label] for box in boxes], np.int32),
+            np.ones(len(boxes), bool),
+            np.int32(0),
+        )
+        found.append(Detections(*columns))
+    return found

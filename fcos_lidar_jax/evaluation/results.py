@@ -1,32 +1,38 @@
-"""The official results file of detections: read and checked to the last field."""
+"""The official results file of detections: read and checked to the last field, and written."""
 
 import dataclasses
+import json
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.evaluation.boxes import (
     ATTRIBUTE_INDEX,
     CLASS_ATTRIBUTES,
     LABELS,
-    UNKNOWN_POINTS,
+    NO_BOXES,
     BoxColumns,
     heading_yaw,
     join,
+    make_columns,
 )
-from fcos_lidar_jax.evaluation.documents import (
-    DocumentError,
-    as_document,
-    by_sample,
-    decode_document,
+from fcos_lidar_jax.evaluation.json_io import (
+    decode_json,
     decode_samples,
+    encode_json,
     expect_samples,
-    read_document,
+    read_json,
+    split_samples,
 )
 from fcos_lidar_jax.evaluation.metrics import MAX_BOXES
+from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.types import Detections
 
 USE_FLAGS = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
 """What ``meta`` tells of the input that was used."""
@@ -38,7 +44,7 @@ Quaternion = tuple[float, float, float, float]
 Velocity = tuple[float | None, float | None] | None
 
 
-class Document(msgspec.Struct, gc=False):
+class ResultsFile(msgspec.Struct, gc=False):
     """The file: what was used, and boxes by sample."""
 
     meta: dict[str, Any]
@@ -81,15 +87,15 @@ def read_results(
         of: what they are the samples of, for the messages.
 
     Raises:
-        DocumentError: naming the file, the sample, the box (from 0) and the field.
+        ValueError: naming the file, the sample, the box (from 0) and the field.
     """
     given = isinstance(source, dict)
     name = "results" if given else str(source)
-    document = decode_document(as_document(source) if given else read_document(source), Document, name)
-    warnings = _check_meta(document.meta, name)
-    entries = by_sample(document.results, f"{name}: results")
+    file = decode_json(encode_json(source) if given else read_json(source), ResultsFile, name)
+    warnings = _check_meta(file.meta, name)
+    entries = split_samples(file.results, f"{name}: results")
     row = {token: i for i, token in enumerate(tokens)}
-    parts: list[BoxColumns] = []
+    parts = [NO_BOXES]
     off_norm: list[tuple[str, int, float]] = []
     wanted = {token: entry for token, entry in entries.items() if token in row}
     for token, boxes in decode_samples(wanted, list[Box], name):
@@ -104,13 +110,13 @@ def read_results(
         warnings.append(
             f"{name}: sample {token}: box {box}: rotation: normalised, got a quaternion of norm {norm:.6g}{more}"
         )
-    return Results(document.meta, join(parts), tuple(warnings))
+    return Results(file.meta, join(parts), tuple(warnings))
 
 
 def _check_meta(meta: dict[str, Any], name: str) -> list[str]:
     for flag in USE_FLAGS:
         if flag in meta and not isinstance(meta[flag], bool):
-            raise DocumentError(f"{name}: meta: {flag}: got {meta[flag]!r}, expected true or false")
+            raise ValueError(f"{name}: meta: {flag}: got {meta[flag]!r}, expected true or false")
     absent = [flag for flag in USE_FLAGS if flag not in meta]
     return [f"{name}: meta: {', '.join(absent)}: missing; the benchmark's server wants all five"] if absent else []
 
@@ -118,63 +124,47 @@ def _check_meta(meta: dict[str, Any], name: str) -> list[str]:
 def _columns(sample: int, boxes: list[Box], *, where: str, token: str) -> tuple[BoxColumns, np.ndarray]:
     """One sample's boxes and the norms of their quaternions."""
     if len(boxes) > MAX_BOXES:
-        raise DocumentError(f"{where}: box {MAX_BOXES}: got {len(boxes)} boxes, expected at most {MAX_BOXES}")
-    columns = geometry(boxes, where)
+        raise ValueError(f"{where}: box {MAX_BOXES}: got {len(boxes)} boxes, expected at most {MAX_BOXES}")
+    columns, rotation = geometry(boxes, where)
     score = np.array([box.detection_score for box in boxes])
     expect(where, "detection_score", score, (score >= 0) & np.isfinite(score), "a finite number of at least 0")
     kinds = [_KIND_ROW.get((box.detection_name, box.attribute_name), -1) for box in boxes]
     if min(kinds) < 0 or any(box.sample_token != token for box in boxes):
-        raise _name_fault(boxes, where, token)
+        _refuse_names(boxes, where, token)
     label, attribute = _KIND_COLUMNS[:, kinds]
-    rows = BoxColumns(
-        sample=np.full(len(boxes), sample, np.int32),
-        label=label,
-        translation=columns["translation"],
-        size=columns["size"],
-        yaw=heading_yaw(columns["rotation"]),
-        velocity=columns["velocity"],
-        attribute=attribute,
-        score=score,
-        num_points=np.full(len(boxes), UNKNOWN_POINTS, np.int32),
-    )
-    return rows, np.linalg.norm(columns["rotation"], axis=1)
+    rows = make_columns(sample=sample, label=label, attribute=attribute, score=score, **columns)
+    return rows, np.linalg.norm(rotation, axis=1)
 
 
 _KINDS = [(name, attribute) for name, allowed in CLASS_ATTRIBUTES.items() for attribute in ("", *allowed)]
 _KIND_ROW = {kind: row for row, kind in enumerate(_KINDS)}
 """Class and attribute of a box, where they go together."""
-_KIND_COLUMNS = np.array([[LABELS[name], ATTRIBUTE_INDEX[attribute]] for name, attribute in _KINDS], np.int8).T
+_KIND_COLUMNS = np.array([[LABELS[name], ATTRIBUTE_INDEX[attribute]] for name, attribute in _KINDS], np.int16).T
 
 
-def _name_fault(boxes: list[Box], where: str, token: str) -> DocumentError:
-    """What is wrong with the names of the first box that has a wrong one."""
-    faulty = (
-        (box.detection_name, box.attribute_name) not in _KIND_ROW or box.sample_token != token for box in boxes
+def _refuse_names(boxes: list[Box], where: str, token: str) -> None:
+    """Raise for the first box with a wrong name."""
+    tokens, names, attributes = (
+        np.array([getattr(box, field) for box in boxes])
+        for field in ("sample_token", "detection_name", "attribute_name")
     )
-    i = list(faulty).index(True)
-    box = boxes[i]
-    allowed = CLASS_ATTRIBUTES.get(box.detection_name)
-    if box.sample_token != token:
-        fault = f"sample_token: got {box.sample_token!r}, expected {token!r}"
-    elif allowed is None:
-        fault = f"detection_name: got {box.detection_name!r}, expected one of {', '.join(LABELS)}"
-    else:
-        fault = (
-            f"attribute_name: got {box.attribute_name!r}, expected "
-            f"{', '.join((*allowed, 'nothing')).replace(', nothing', ' or nothing')} for a {box.detection_name}"
-        )
-    return DocumentError(f"{where}: box {i}: {fault}")
+    expect(where, "sample_token", tokens, tokens == token, repr(token))
+    expect(where, "detection_name", names, np.isin(names, list(LABELS)), f"one of {', '.join(LABELS)}")
+    good = np.array([(box.detection_name, box.attribute_name) in _KIND_ROW for box in boxes])
+    name = str(names[np.argmin(good)])
+    allowed = " or ".join(filter(None, (", ".join(CLASS_ATTRIBUTES[name]), "nothing")))
+    expect(where, "attribute_name", attributes, good, f"{allowed} for a {name}")
 
 
-def geometry(boxes: list[Any], where: str) -> dict[str, np.ndarray]:
-    """Translation, size, rotation and velocity of boxes as columns, checked.
+def geometry(boxes: list[Any], where: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Translation, size, yaw and velocity of boxes as columns, and their rotations f64[n, 4], checked.
 
     Args:
         boxes: with these fields.
         where: file and sample, for the messages.
 
     Raises:
-        DocumentError: naming the box and the field.
+        ValueError: naming the box and the field.
     """
     unknown = (None, None)
     # One flat list: several times as fast as arrays of tuples. None becomes NaN.
@@ -188,11 +178,97 @@ def geometry(boxes: list[Any], where: str) -> dict[str, np.ndarray]:
     expect(where, "size", size, fine, "three positive lengths")
     fine = np.isfinite(rotation).all(axis=1) & (rotation != 0).any(axis=1)
     expect(where, "rotation", rotation, fine, "a quaternion w, x, y, z that is not zero")
-    return {"translation": translation, "size": size, "rotation": rotation, "velocity": velocity}
+    columns = {"translation": translation, "size": size, "yaw": heading_yaw(rotation), "velocity": velocity}
+    return columns, rotation
 
 
 def expect(where: str, field: str, values: np.ndarray, good: np.ndarray | np.bool, expected: str) -> None:
     """Refuse the first box whose value is not good."""
     if not good.all():
         box = int(np.argmin(good))
-        raise DocumentError(f"{where}: box {box}: {field}: got {values[box].tolist()}, expected {expected}")
+        raise ValueError(f"{where}: box {box}: {field}: got {values[box].tolist()!r}, expected {expected}")
+
+
+MOVING_MPS = 0.2
+"""Faster objects have a moving attribute."""
+
+_MOVING = {
+    **dict.fromkeys(("car", "truck", "bus", "trailer", "construction_vehicle"), "vehicle.moving"),
+    **dict.fromkeys(("motorcycle", "bicycle"), "cycle.with_rider"),
+    "pedestrian": "pedestrian.moving",
+}
+_STILL = {
+    **dict.fromkeys(("car", "truck", "trailer", "construction_vehicle"), "vehicle.parked"),
+    **dict.fromkeys(("motorcycle", "bicycle"), "cycle.without_rider"),
+    "bus": "vehicle.stopped",
+    "pedestrian": "pedestrian.standing",
+}
+
+
+def attribute_of(name: str, speed_mps: float) -> str:
+    """The likeliest attribute of a detection, which has none of its own; ``''`` for barriers and cones.
+
+    >>> attribute_of("bus", 0.1), attribute_of("bicycle", 3.0), attribute_of("barrier", 0.0)
+    ('vehicle.stopped', 'cycle.with_rider', '')
+    """
+    return (_MOVING if speed_mps > MOVING_MPS else _STILL).get(name, "")
+
+
+def result_entries(
+    found: Detections, token: str, sensor_to_global: np.ndarray, classes: Sequence[str] = NUSCENES_CLASSES
+) -> list[dict[str, Any]]:
+    """Detections of one sample as entries of the results file, best first, 500 at most.
+
+    Args:
+        found: of one sample, in its LiDAR frame.
+        token: of the sample.
+        sensor_to_global: f64[4, 4].
+        classes: names that the labels index, of the benchmark's.
+
+    >>> one = np.ones(1, bool)
+    >>> car = Detections(np.array([[1.0, 0, 0, 4, 2, 1, 0, 3, 0]]), np.ones(1), np.zeros(1, int), one, np.zeros(0))
+    >>> entry = result_entries(car, "a", np.eye(4))[0]
+    >>> entry["size"], entry["rotation"], entry["attribute_name"]
+    ([2.0, 4.0, 1.0], [1.0, 0.0, 0.0, 0.0], 'vehicle.moving')
+    """
+    valid = np.flatnonzero(np.asarray(found.valid))[:MAX_BOXES]
+    boxes = np.asarray(found.boxes, np.float64)[valid]
+    names = [classes[int(label)] for label in np.asarray(found.labels)[valid]]
+    scores = np.asarray(found.scores, np.float64)[valid]
+    turn = sensor_to_global[:3, :3]
+    centres = boxes[:, :3] @ turn.T + sensor_to_global[:3, 3]
+    rotations = Rotation.from_matrix(turn) * Rotation.from_rotvec(np.pad(boxes[:, 6:7], ((0, 0), (2, 0))))
+    quaternions = rotations.as_quat(canonical=True, scalar_first=True).reshape(-1, 4)
+    velocities = np.pad(boxes[:, 7:9], ((0, 0), (0, 1))) @ turn.T
+    speeds = np.hypot(boxes[:, 7], boxes[:, 8])
+    return [
+        {
+            "sample_token": token,
+            "translation": centres[i].tolist(),
+            "size": boxes[i, [4, 3, 5]].tolist(),
+            "rotation": quaternions[i].tolist(),
+            "velocity": velocities[i, :2].tolist(),
+            "detection_name": name,
+            "detection_score": float(scores[i]),
+            "attribute_name": attribute_of(name, float(speeds[i])),
+        }
+        for i, name in enumerate(names)
+    ]
+
+
+def write_results(path: str | Path, samples: Iterable[tuple[str, bytes]]) -> None:
+    """Write an official results file of a detector that sees the LiDAR alone.
+
+    Args:
+        path: JSON file to write.
+        samples: every token of the split with its entries as JSON, ``[]`` where nothing was found.
+    """
+
+    def write(file: Path) -> None:
+        with file.open("wb") as stream:
+            stream.write(b'{"meta": %s, "results": {' % json.dumps(LIDAR_META).encode())
+            for i, (token, entries) in enumerate(samples):
+                stream.write(b"%s\n%s: %s" % (b"," if i else b"", json.dumps(token).encode(), entries))
+            stream.write(b"\n}}\n")
+
+    atomic_write(path, write)

@@ -1,17 +1,18 @@
-"""From files to the official ``metrics_summary.json``, and the curves behind it."""
+"""An evaluation as files and as lines of text, the official ``metrics_summary.json`` among them."""
 
 import json
-import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.evaluation.bootstrap import bootstrap
+from fcos_lidar_jax.evaluation.matching import TP_ERRORS
 from fcos_lidar_jax.evaluation.metrics import DISTANCES_M, Evaluation, evaluate
-from fcos_lidar_jax.evaluation.ranking import TP_ERRORS
 from fcos_lidar_jax.evaluation.results import read_results
 from fcos_lidar_jax.evaluation.truth import read_truth
-from fcos_lidar_jax.files import write_beside
+from fcos_lidar_jax.files import atomic_write
 
 
 def evaluate_detections(predictions: dict[str, Any] | str | Path, ground_truth: Any) -> dict[str, Any]:
@@ -40,39 +41,108 @@ def evaluate_detections(predictions: dict[str, Any] | str | Path, ground_truth: 
     """
     truth = read_truth(ground_truth)
     results = read_results(predictions, truth.tokens)
-    began = time.perf_counter()
-    evaluation = evaluate(results.boxes, truth)
-    return official_summary(evaluation, meta=results.meta, eval_time=time.perf_counter() - began)
+    return full_summary(evaluate(results.boxes, truth), results.meta)
 
 
-def official_summary(evaluation: Evaluation, *, meta: dict[str, Any], eval_time: float) -> dict[str, Any]:
+def full_summary(evaluation: Evaluation, meta: Mapping[str, Any]) -> dict[str, Any]:
     """All that ``metrics_summary.json`` holds.
 
     Args:
         evaluation: the numbers.
-        meta: of the results file.
-        eval_time: seconds that filtering, matching and scoring took.
+        meta: of the official results file; only the benchmark's summary holds it.
     """
-    summary = dict(evaluation.summary)
-    config = summary.pop("cfg")
-    return {**summary, "eval_time": eval_time, "cfg": config, "meta": meta}
+    summary = {**evaluation.summary, "eval_time": evaluation.seconds}
+    summary["cfg"] = summary.pop("cfg")  # last but for meta
+    return {**summary, "meta": meta} if evaluation.metric.benchmark else summary
 
 
 def curve_record(evaluation: Evaluation) -> dict[str, Any]:
-    """The curves as a JSON object: precision by class, distance and recall; errors by class, error and recall."""
+    """The curves as a JSON object: precision by class, distance and recall; errors by class, error and recall.
+
+    Classes and errors are those of the summary.
+    """
     classes = {}
-    for name, curves in evaluation.curves.items():
-        by_distance = dict(
-            zip(map(str, DISTANCES_M), zip(curves.precision, curves.confidence, strict=True), strict=True)
-        )
+    for name, defined in evaluation.summary["label_tp_errors"].items():
+        curves = evaluation.curves[name]
         classes[name] = {
-            "precision": {key: precision.tolist() for key, (precision, _) in by_distance.items()},
-            "confidence": {key: confidence.tolist() for key, (_, confidence) in by_distance.items()},
-            "errors": {key: values.tolist() for key, values in zip(TP_ERRORS, curves.errors, strict=True)},
+            "precision": dict(zip(map(str, DISTANCES_M), curves.precision.tolist(), strict=True)),
+            "confidence": dict(zip(map(str, DISTANCES_M), curves.confidence.tolist(), strict=True)),
+            "errors": {e: v.tolist() for e, v in zip(TP_ERRORS, curves.errors, strict=True) if e in defined},
         }
     return {"recall": np.linspace(0, 1, 101).tolist(), "classes": classes}
 
 
+def write_evaluation(
+    out: Path,
+    evaluation: Evaluation,
+    meta: Mapping[str, Any],
+    *,
+    repeats: int = 0,
+    report: Callable[[int], None] = lambda done: None,
+) -> dict[str, Any] | None:
+    """Write ``metrics_summary.json``, ``curves.json`` and, where there are repeats, ``bootstrap.json``.
+
+    Args:
+        out: folder; an older ``bootstrap.json`` in it is removed.
+        evaluation: the numbers.
+        meta: see :func:`full_summary`.
+        repeats: sets of samples to draw for the intervals of the scores; 0 for none.
+        report: told how many sets are done.
+
+    Returns:
+        the intervals, see :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`; None without.
+    """
+    write_json(out / "metrics_summary.json", full_summary(evaluation, meta))
+    write_json(out / "curves.json", curve_record(evaluation))
+    if not repeats:
+        (out / "bootstrap.json").unlink(missing_ok=True)
+        return None
+    intervals = bootstrap(evaluation, repeats=repeats, report=report)
+    write_json(out / "bootstrap.json", intervals)
+    return intervals
+
+
+def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None) -> str:
+    """The scores as lines of text, named as what they are.
+
+    Args:
+        evaluation: the numbers.
+        intervals: of them, if there are.
+    """
+    summary, benchmark = evaluation.summary, evaluation.metric.benchmark
+    names = {"nd_score": "NDS", "mean_ap": "mAP"} if benchmark else {"mean_ap": "mAP by centre distance"}
+    scores = "  ".join(f"{name} {summary[key]:.4f}" for key, name in names.items())
+    lines = [f"{scores}  on {len(evaluation.tokens)} {'samples' if benchmark else 'frames'}"]
+    lines.append("  ".join(f"{name} {value:.4f}" for name, value in summary["tp_errors"].items()))
+    if intervals is not None:
+        spans = (f"{n} {intervals[k]['low']:.4f} to {intervals[k]['high']:.4f}" for k, n in names.items())
+        lines.append(f"{intervals['level']:.0%} intervals over samples: {'; '.join(spans)}")
+    return "\n".join(filter(None, lines))
+
+
+def warnings(evaluation: Evaluation, num_found: int) -> list[str]:
+    """What the scores must not be mistaken for: a line for missing truth, and one for missing detections.
+
+    Args:
+        evaluation: the numbers.
+        num_found: boxes that were to be evaluated, before the filters.
+    """
+    benchmark, lines = evaluation.metric.benchmark, []
+    absent = [name for name, curves in evaluation.curves.items() if not curves.num_truth]
+    if not len(evaluation.truth):
+        lines.append(
+            f"no ground truth counts here: {'every AP is 0 and every error 1' if benchmark else 'no score'}"
+        )
+    elif absent:
+        rule = "AP 0 and errors 1, as in the benchmark" if benchmark else "left out of the means"
+        lines.append(f"no ground truth counts of {', '.join(absent)}: {rule}")
+    if not num_found:
+        lines.append("the results hold not a single box: every AP is 0 and every error 1")
+    elif not len(evaluation.predictions):
+        lines.append("no box of the results is within the range of its class: every AP is 0")
+    return lines
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file, whole or not at all."""
-    write_beside(path, lambda file: file.write_text(json.dumps(value, indent=2), encoding="utf-8"))
+    atomic_write(path, lambda file: file.write_text(json.dumps(value, indent=2), encoding="utf-8"))

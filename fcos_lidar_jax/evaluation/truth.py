@@ -12,26 +12,22 @@ from fcos_lidar_jax.data.nuscenes.names import BICYCLE_RACK, label_of
 from fcos_lidar_jax.evaluation.boxes import (
     ATTRIBUTE_INDEX,
     LABELS,
+    NO_BOXES,
+    NO_RACKS,
+    UNKNOWN_POINTS,
     BoxColumns,
     GroundTruth,
     Racks,
     heading_yaw,
     join,
-    no_racks,
-    rotation_axes,
+    make_columns,
 )
-from fcos_lidar_jax.evaluation.documents import (
-    DocumentError,
-    as_document,
-    by_sample,
-    decode_document,
-    decode_samples,
-    read_document,
-)
-from fcos_lidar_jax.evaluation.results import Quaternion, Vector, Velocity, geometry
+from fcos_lidar_jax.evaluation.json_io import decode_json, decode_samples, encode_json, read_json, split_samples
+from fcos_lidar_jax.evaluation.results import Quaternion, Vector, Velocity, expect, geometry
+from fcos_lidar_jax.geometry import rotation_matrix
 
-_RACK = -1
-"""Label of a bicycle rack while it is among the boxes."""
+_RACK, _OTHER = -1, -2
+"""Labels of bicycle racks, while they are among the boxes, and of what nobody knows."""
 
 
 class Box(msgspec.Struct, gc=False):
@@ -60,95 +56,48 @@ def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
         source: the JSON file, or what ``json.load`` gives for it.
 
     Raises:
-        DocumentError: naming the file, the sample, the box (from 0) and the field.
+        ValueError: naming the file, the sample, the box (from 0) and the field.
     """
     given = isinstance(source, dict)
     name = "ground truth" if given else str(source)
-    raw = decode_document(as_document(source) if given else read_document(source), msgspec.Raw, name)
+    raw = decode_json(encode_json(source) if given else read_json(source), msgspec.Raw, name)
     tokens: list[str] = []
     ego: list[Vector] = []
-    parts: list[tuple[BoxColumns, Racks]] = []
-    for row, (token, sample) in enumerate(decode_samples(by_sample(raw, name), Sample, name)):
+    boxes, racks = [NO_BOXES], [NO_RACKS]
+    for row, (token, sample) in enumerate(decode_samples(split_samples(raw, name), Sample, name)):
         if not np.isfinite(sample.ego_translation).all():
-            raise DocumentError(
-                f"{name}: sample {token}: ego_translation: got {list(sample.ego_translation)}, expected three "
-                "finite numbers"
-            )
+            got = f"got {list(sample.ego_translation)}, expected three finite numbers"
+            raise ValueError(f"{name}: sample {token}: ego_translation: {got}")
         tokens.append(token)
         ego.append(sample.ego_translation)
-        parts.append(_columns(row, sample.boxes, f"{name}: sample {token}"))
+        own_boxes, own_racks = _columns(row, sample.boxes, f"{name}: sample {token}")
+        boxes.append(own_boxes)
+        racks.append(own_racks)
     if not tokens:
-        raise DocumentError(f"{name}: got no sample, expected at least one")
-    return GroundTruth(
-        tokens=tuple(tokens),
-        ego_translation=np.array(ego),
-        boxes=join([boxes for boxes, _ in parts]),
-        racks=_join_racks([racks for _, racks in parts]),
-    )
+        raise ValueError(f"{name}: got no sample, expected at least one")
+    return GroundTruth(tuple(tokens), np.array(ego), join(boxes), join(racks))
 
 
 def _columns(sample: int, boxes: list[Box], where: str) -> tuple[BoxColumns, Racks]:
-    labels = []
-    for i, box in enumerate(boxes):
-        label = _RACK if box.detection_name == BICYCLE_RACK else LABELS.get(box.detection_name)
-        if label is None:
-            raise DocumentError(
-                f"{where}: box {i}: detection_name: got {box.detection_name!r}, expected one of "
-                f"{', '.join(LABELS)}, {BICYCLE_RACK}"
-            )
-        if box.attribute_name not in ATTRIBUTE_INDEX:
-            raise DocumentError(
-                f"{where}: box {i}: attribute_name: got {box.attribute_name!r}, expected one of "
-                f"{', '.join(filter(None, ATTRIBUTE_INDEX))} or nothing"
-            )
-        if box.num_pts < -1:
-            raise DocumentError(
-                f"{where}: box {i}: num_pts: got {box.num_pts}, expected a count, or -1 for unknown"
-            )
-        labels.append(label)
-    columns = geometry(boxes, where)
-    attribute = [ATTRIBUTE_INDEX[box.attribute_name] for box in boxes]
-    return _split_racks(
-        np.full(len(boxes), sample), np.array(labels, np.int64), columns, attribute, [box.num_pts for box in boxes]
-    )
+    names = np.array([box.detection_name for box in boxes])
+    attributes = np.array([box.attribute_name for box in boxes])
+    points = np.array([box.num_pts for box in boxes])
+    label = np.array([_RACK if name == BICYCLE_RACK else LABELS.get(str(name), _OTHER) for name in names], int)
+    attribute = np.array([ATTRIBUTE_INDEX.get(str(name), _OTHER) for name in attributes], int)
+    expect(where, "detection_name", names, label > _OTHER, f"one of {', '.join(LABELS)}, {BICYCLE_RACK}")
+    known = ", ".join(filter(None, ATTRIBUTE_INDEX))
+    expect(where, "attribute_name", attributes, attribute > _OTHER, f"one of {known} or nothing")
+    expect(where, "num_pts", points, points >= UNKNOWN_POINTS, "a count, or -1 for unknown")
+    columns, rotation = geometry(boxes, where)
+    every = make_columns(sample=sample, label=label, attribute=attribute, num_points=points, **columns)
+    return _split_racks(every, rotation)
 
 
-def _split_racks(
-    sample: np.ndarray,
-    label: np.ndarray,
-    columns: dict[str, np.ndarray],
-    attribute: Sequence[int] | np.ndarray,
-    num_points: Sequence[int] | np.ndarray,
-) -> tuple[BoxColumns, Racks]:
+def _split_racks(boxes: BoxColumns, rotation: np.ndarray) -> tuple[BoxColumns, Racks]:
     """Boxes of the ten classes, and racks."""
-    boxes = BoxColumns(
-        sample=sample.astype(np.int32),
-        label=label.astype(np.int8),
-        translation=columns["translation"],
-        size=columns["size"],
-        yaw=heading_yaw(columns["rotation"]),
-        velocity=columns["velocity"],
-        attribute=np.array(attribute, np.int8),
-        score=np.full(len(label), -1.0),
-        num_points=np.array(num_points, np.int32),
-    )
-    rack = label == _RACK
-    return boxes.take(~rack), Racks(
-        sample=sample[rack].astype(np.int32),
-        translation=columns["translation"][rack],
-        size=columns["size"][rack],
-        axes=rotation_axes(columns["rotation"][rack]),
-    )
-
-
-def _join_racks(parts: list[Racks]) -> Racks:
-    parts = [no_racks(), *parts]
-    return Racks(
-        sample=np.concatenate([part.sample for part in parts]),
-        translation=np.concatenate([part.translation for part in parts]),
-        size=np.concatenate([part.size for part in parts]),
-        axes=np.concatenate([part.axes for part in parts]),
-    )
+    rack = boxes.label == _RACK
+    racks = boxes.take(rack)
+    return boxes.take(~rack), Racks(racks.sample, racks.translation, racks.size, rotation_matrix(rotation[rack]))
 
 
 def split_truth(data: NuScenes, tokens: Sequence[str]) -> GroundTruth:
@@ -173,21 +122,18 @@ def split_truth(data: NuScenes, tokens: Sequence[str]) -> GroundTruth:
     for used in np.unique(index.box_attribute[rows]):
         name = str(index.attribute_name[used]) if used >= 0 else ""
         if name not in ATTRIBUTE_INDEX:
-            raise DocumentError(
-                f"{data.tables / 'attribute.json'}: name: got {name!r}, expected a known attribute"
-            )
+            raise ValueError(f"{data.tables / 'attribute.json'}: name: got {name!r}, expected a known attribute")
     attribute = np.array([ATTRIBUTE_INDEX.get(str(name), -1) for name in index.attribute_name] + [-1])
-    boxes, racks = _split_racks(
-        sample,
-        wanted[index.box_category[rows]],
-        {
-            "translation": index.box_translation[rows],
-            "size": index.box_size[rows],
-            "rotation": index.box_rotation[rows],
-            "velocity": index.box_velocity[rows, :2],
-        },
-        attribute[index.box_attribute[rows]],
-        index.box_lidar_points[rows] + index.box_radar_points[rows],
+    every = make_columns(
+        sample=sample,
+        label=wanted[index.box_category[rows]],
+        translation=index.box_translation[rows],
+        size=index.box_size[rows],
+        yaw=heading_yaw(index.box_rotation[rows]),
+        velocity=index.box_velocity[rows, :2],
+        attribute=attribute[index.box_attribute[rows]],
+        num_points=index.box_lidar_points[rows] + index.box_radar_points[rows],
     )
+    boxes, racks = _split_racks(every, index.box_rotation[rows])
     ego = np.array([data.ego_translation(token) for token in tokens]).reshape(-1, 3)
     return GroundTruth(tuple(tokens), ego, boxes, racks)

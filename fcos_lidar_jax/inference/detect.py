@@ -10,12 +10,11 @@ from jax import lax
 from jaxtyping import Array
 
 from fcos_lidar_jax.coding import decode
-from fcos_lidar_jax.config import Config, InferenceConfig
-from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, look
+from fcos_lidar_jax.config import InferenceConfig
+from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.nms import rotated_nms
 from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections, Locations, Outputs
 
 Detect = Callable[[Any, Array, Array], Detections]
@@ -80,7 +79,6 @@ def postprocess(
             iou_threshold=config.iou_threshold,
             max_outputs=config.max_detections,
             overlap=config.nms_overlap,
-            form=config.nms_form,
         )
     return (
         jnp.where(used[:, None], boxes[index], 0.0),
@@ -90,19 +88,18 @@ def postprocess(
     )
 
 
-def make_detect(detector: Detector, config: Config, sensor: Sensor) -> Detect:
+def make_detect(detector: Detector) -> Detect:
     """The whole path from points to boxes: projection, network, decoding, NMS.
 
     Args:
-        detector: the network.
-        config: all choices.
-        sensor: the image's geometry.
+        detector: from :func:`fcos_lidar_jax.models.build_detector`.
 
     Returns:
         pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` of one cloud, to be jitted by the
         caller: one compilation for a point count. Close points are the caller's to drop, see
         :func:`fcos_lidar_jax.projection.remove_close`.
     """
+    config, sensor = detector.config, detector.sensor
     binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
 
     def detect(variables: Any, points: Array | np.ndarray, valid: Array | np.ndarray) -> Detections:
@@ -117,7 +114,7 @@ def make_detect(detector: Detector, config: Config, sensor: Sensor) -> Detect:
         outputs, _ = detector.apply(variables, image.features[None], train=False)
         outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
         boxes, scores, labels, used = postprocess(
-            outputs, look(image, layout), config=config.inference, layout=layout
+            outputs, locate(image, layout), config=config.inference, layout=layout
         )
         return Detections(boxes, scores, labels, used, image.num_dropped)
 

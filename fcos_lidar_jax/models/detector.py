@@ -1,5 +1,6 @@
 """The network as a pair of pure functions."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,23 +24,28 @@ Variables = dict[str, Any]
 
 
 class Detector(NamedTuple):
-    """The network's two pure functions.
+    """The network's two pure functions, with the configuration and the sensor that they were built for.
 
     Attributes:
         init: ``key -> variables``.
         apply: ``(variables, features f32[b, h, w, 9, r], train=False) -> (Outputs, batch_stats)``. The
             features are a range image's, in raw units; the batch statistics are the given ones unless
             training.
+        config: all choices.
+        sensor: the image's geometry.
     """
 
     init: Callable[[Any], Variables]
     apply: Callable[..., tuple[Outputs, Any]]
+    config: Config
+    sensor: Sensor
 
 
 class Network(nn.Module):
     """Stem, backbone, feature pyramid and heads."""
 
     config: ModelConfig
+    num_classes: int
 
     def setup(self) -> None:
         """The four parts; their names are the top level of the parameters."""
@@ -48,7 +54,7 @@ class Network(nn.Module):
         self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width)
         self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
         self.heads = Heads(
-            c.num_classes, c.head_channels, c.head_convs, c.background_prior, c.tied_heads, c.circular_width
+            self.num_classes, c.head_channels, c.head_convs, c.background_prior, c.tied_heads, c.circular_width
         )
 
     def __call__(self, image: Image, *, train: bool) -> Outputs:
@@ -86,23 +92,24 @@ def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, la
     return image.reshape(*image.shape[:3], -1)
 
 
+@functools.cache
 def build_detector(config: Config, sensor: Sensor) -> Detector:
-    """The network of a configuration as pure functions.
+    """The network of a configuration as pure functions; the same for the same arguments, as are their programs.
 
     Args:
         config: which network.
         sensor: whose images.
 
     Returns:
-        the pair ``(init, apply)``.
+        the functions ``init`` and ``apply``, and what was given.
 
-    >>> from fcos_lidar_jax.config import QUICKSTART
+    >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import TINY
     >>> detector = build_detector(QUICKSTART, TINY)
     >>> sorted(jax.eval_shape(detector.init, jax.random.key(0)))
     ['batch_stats', 'params']
     """
-    network = Network(config.model)
+    network = Network(config.model, len(config.classes))
     layout = image_layout(sensor, config.model)
     channels = 9 * config.projection.num_rounds
 
@@ -120,7 +127,7 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
         outputs, updates = network.apply(variables, image, train=train, mutable=["batch_stats"] if train else [])
         return outputs, updates["batch_stats"] if train else variables["batch_stats"]
 
-    return Detector(init, apply)
+    return Detector(init, apply, config, sensor)
 
 
 def count_parameters(params: Any) -> dict[str, int]:

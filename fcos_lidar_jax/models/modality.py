@@ -1,15 +1,19 @@
 """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.models.layers import BatchNorm, Image, Kernel, convolve, kernel_init, pieces
 
+Form = Literal["split", "dense", "grouped"]
+"""Of the stem, see there."""
 _MODALITIES = (3, 3, 1, 1, 1)
 """Channel types a modality: (x, y, z), (range, azimuth, inclination), intensity, existence, time lag."""
 _WIDE = 24
@@ -104,13 +108,14 @@ class ModalityBranch(nn.Module):
     config: StemConfig
     groups: tuple[tuple[int, int], ...]
     dilation: int
+    form: Form
     circular: bool = False
     precision: str = "float32"
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
         """Features of the groups, in as many parts as are given."""
-        together = bundles(self.groups, self.config.form)
+        together = bundles(self.groups, self.form)
         sizes = [size for size, _ in self.groups]
         widths = [width for _, width in self.groups]
         for layer in range(self.config.num_convs):
@@ -118,7 +123,7 @@ class ModalityBranch(nn.Module):
                 self.param(f"conv{layer}_group{g}", kernel_init, (3, 3, size, width))
                 for g, (size, width) in enumerate(zip(sizes, widths, strict=True))
             ]
-            grouped = self.config.form == "grouped"
+            grouped = self.form == "grouped"
             parts = modality_convolve(
                 parts,
                 [kernels[cut] for cut in together],
@@ -134,11 +139,17 @@ class ModalityBranch(nn.Module):
 
 
 class Stem(nn.Module):
-    """Parallel modality-wise branches, merged by 1x1 convolutions and summed."""
+    """Parallel modality-wise branches, merged by 1x1 convolutions and summed.
+
+    The same function in three forms, with the same parameters: ``"split"``, independent chains, of which narrow
+    ones are joined to what a CPU does well; ``"dense"``, one block-diagonal kernel; ``"grouped"``,
+    ``feature_group_count``. Without a choice it is the one that suits the platform that runs the program.
+    """
 
     config: StemConfig
     circular: bool = False
     precision: str = "float32"
+    form: Form | None = None
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
@@ -148,10 +159,26 @@ class Stem(nn.Module):
             image: normalised, ``9 r`` channels, those of one type adjacent.
             train: normalise by the batch's statistics.
         """
+        if self.form is not None or self.is_initializing():
+            return self._merged(image, self.form or "split", train)
+
+        def compute(form: Form) -> Callable[..., tuple[Image, Any]]:
+            stem = self.clone(form=form, parent=None)
+            return lambda variables, x: stem.apply(variables, x, train=train, mutable=["batch_stats"])
+
+        merged, updates = lax.platform_dependent(
+            self.variables, image, cpu=compute("split"), default=compute("dense")
+        )
+        if train:
+            for name, value in updates["batch_stats"].items():
+                self.put_variable("batch_stats", name, value)
+        return merged
+
+    def _merged(self, image: Image, form: Form, train: bool) -> Image:
         config = self.config
         num_rounds = image.shape[-1] // 9
         groups = channel_groups(config, num_rounds)
-        sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups, config.form)]
+        sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups, form)]
         parts = [image[..., cut] for cut in pieces(sizes)]
         merged = jnp.zeros((), image.dtype)  # the sum over all groups keeps the image's precision
         computed = image.dtype
@@ -160,7 +187,7 @@ class Stem(nn.Module):
         kernels = [self.param(f"merge{i}", nn.initializers.he_normal(), shape) for i in range(num_kernels)]
         for index, dilation in enumerate(config.dilations):
             branch = ModalityBranch(
-                config, tuple(groups), dilation, self.circular, self.precision, name=f"branch{index}"
+                config, tuple(groups), dilation, form, self.circular, self.precision, name=f"branch{index}"
             )
             features = branch(parts, train=train)
             computed = features[0].dtype

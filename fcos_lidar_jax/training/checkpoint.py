@@ -14,20 +14,27 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from fcos_lidar_jax import __version__
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
 from fcos_lidar_jax.types import TrainState
 
-_FORMAT = 2
+_FORMAT = 3
+_OLD_FORMAT = 2
 _DESCRIPTION = "checkpoint.json"
 _VARIABLES = "variables"
 _STATE = "state"
 _ROOM_FOR_NAMES = 2**20
 """Bytes on disk for what describes the arrays."""
+
+
+class NonFiniteStateError(ArithmeticError):
+    """A state that holds a number that is not finite; the message names the first such array."""
 
 
 class CheckpointError(ValueError):
@@ -64,10 +71,12 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
         state: to go on from; None for detection alone.
 
     Raises:
+        NonFiniteStateError: nothing is written.
         OSError: it cannot be written; in one line.
     """
     folder = Path(folder).absolute()
     parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
+    _check_finite(folder, parts)
     _check_room(folder, parts)
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -156,6 +165,13 @@ def _alone() -> Any:
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
     )
     return ocp.StandardCheckpointer(multiprocessing_options=options)
+
+
+def _check_finite(folder: Path, tree: Any) -> None:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not jnp.isfinite(leaf).all():
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise NonFiniteStateError(f"{folder}: not saved: {name}: not finite")
 
 
 def _check_room(folder: Path, tree: Any) -> None:
@@ -248,7 +264,7 @@ def read_description(folder: Path) -> dict[str, Any]:
         description = json.loads(file.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise CheckpointError(f"{file}: not JSON: {error}") from None
-    if not isinstance(description, dict) or description.get("format") != _FORMAT:
+    if not isinstance(description, dict) or description.get("format") not in (_OLD_FORMAT, _FORMAT):
         found = description.get("format") if isinstance(description, dict) else type(description).__name__
         raise CheckpointError(f"{file}: format: got {found!r}, expected {_FORMAT}")
     if description.get("hash") != _hash(_canonical(description)):
@@ -256,7 +272,21 @@ def read_description(folder: Path) -> dict[str, Any]:
     for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
         if not isinstance(description.get(name), kind):
             raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
-    return description
+    return _converted(description) if description["format"] == _OLD_FORMAT else description
+
+
+def _converted(description: dict[str, Any]) -> dict[str, Any]:
+    """A description of format 2 in the fields of format 3."""
+    config = dict(description["config"])
+    model, inference = dict(config["model"]), dict(config["inference"])
+    model["stem"] = {name: value for name, value in model["stem"].items() if name != "form"}
+    del model["num_classes"], inference["nms_form"]
+    classes = {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}
+    return {
+        **description,
+        "format": _FORMAT,
+        "config": {**config, "model": model, "inference": inference, **classes},
+    }
 
 
 def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:

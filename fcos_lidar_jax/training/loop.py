@@ -3,36 +3,15 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol, runtime_checkable
 
 import jax
 import numpy as np
 
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.training.step import TrainStep
-from fcos_lidar_jax.types import Batch, TrainState
+from fcos_lidar_jax.types import HostBatch, TrainState
 
 Record = dict[str, float | list[float]]
-
-
-@runtime_checkable
-class Fed(Protocol):
-    """A batch with what is to be told about it."""
-
-    @property
-    def batch(self) -> Batch:
-        """For the step."""
-        ...
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """To be recorded beside the metrics."""
-        ...
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Of the samples, for messages."""
-        ...
 
 
 class NonFiniteLossError(ArithmeticError):
@@ -42,7 +21,7 @@ class NonFiniteLossError(ArithmeticError):
 def fit(
     step: TrainStep,
     state: TrainState,
-    batches: Iterable[Fed],
+    batches: Iterable[HostBatch],
     *,
     num_steps: int,
     report: Callable[[int, Record], None] | None = None,
@@ -75,20 +54,20 @@ def fit(
     """
     done = int(state.step)
     progress = Progress("steps", num_steps, every_s=log_every_s)
-    unread: tuple[int, Fed, dict[str, jax.Array], float] | None = None
+    unread: tuple[int, HostBatch, dict[str, jax.Array], float] | None = None
     before = time.monotonic()
 
     def read() -> None:
         nonlocal unread, before
         if unread is None:
             return
-        number, fed, metrics, waited = unread
+        number, host, metrics, waited = unread
         unread = None
         record: Record = {name: np.asarray(value).tolist() for name, value in metrics.items()}
         now = time.monotonic()
-        record |= {"seconds": now - before, "waiting_seconds": waited, **fed.counts}
+        record |= {"seconds": now - before, "waiting_seconds": waited, **host.counts}
         before = now
-        _check_finite(number, record, fed.names)
+        _check_finite(number, record, host.names)
         total, iou = record["loss/total"], record["positive_iou"]
         progress.show(number, f"loss {total:.3f}  IoU {iou:.2f}")
         if report is not None:
@@ -97,12 +76,12 @@ def fit(
     iterator = iter(batches)
     while done < num_steps:
         began = time.monotonic()
-        fed = next(iterator)
+        host = next(iterator)
         waited = time.monotonic() - began
-        state, metrics = step(state, fed.batch)
+        state, metrics = step(state, host.batch)
         done += 1
         read()
-        unread = done, fed, metrics, waited
+        unread = done, host, metrics, waited
         stop = stopping(done)
         if stop or done == num_steps or pause_at(done):
             read()

@@ -13,7 +13,7 @@ from fcos_lidar_jax.assignment import assign, owners
 from fcos_lidar_jax.coding import decode_oriented, encode
 from fcos_lidar_jax.config import Config, LossConfig
 from fcos_lidar_jax.iou import oriented, oriented_iou_3d
-from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, look
+from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
 from fcos_lidar_jax.losses import (
     classification_loss,
     combine,
@@ -21,11 +21,10 @@ from fcos_lidar_jax.losses import (
     iou_loss,
     iou_prediction_loss,
     l1_loss,
-    loss_weights,
+    loss_terms,
 )
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Batch, Locations, Outputs, RangeImage, Targets
 
 Metrics = dict[str, Array]
@@ -73,7 +72,7 @@ def sample_losses(
         the four losses as (sum, count), the targets, and counts to be summed over the batch.
     """
     background = outputs.logits.shape[-1] - 1
-    locations = look(image, layout)
+    locations = locate(image, layout)
     owner = location_owners(image, locations, boxes, box_valid)
     owned = jnp.maximum(owner, 0)
     box, label = boxes[owned], labels[owned]
@@ -131,22 +130,21 @@ Loss = Callable[[Any, Any, Batch], tuple[Array, tuple[Any, Metrics]]]
 
 
 def make_sums(
-    detector: Detector, config: Config, sensor: Sensor
-) -> Callable[[Any, Any, Batch], tuple[Array, tuple[Any, Metrics, Metrics]]]:
-    """The weighted loss of a batch of raw points before the division by the positives.
+    detector: Detector,
+) -> Callable[[Any, Any, Batch], tuple[Metrics, tuple[Any, Metrics, Metrics]]]:
+    """The weighted losses of a batch of raw points before the division, summed by the count that divides them.
 
-    Sums and counts add up over micro-batches and devices; :func:`finish` divides them once.
+    Sums and counts add up over micro-batches and devices; :func:`batch_metrics` divides them once.
 
     Args:
-        detector: the network.
-        config: all choices.
-        sensor: the image's geometry.
+        detector: from :func:`fcos_lidar_jax.models.build_detector`.
 
     Returns:
-        pure ``(params, batch_stats, batch) -> (sum, (batch_stats, parts, counts))``.
+        pure ``(params, batch_stats, batch) -> ({count: sum}, (batch_stats, parts, counts))``.
     """
+    config, sensor = detector.config, detector.sensor
     binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
-    projection, weights = config.projection, loss_weights(config.loss)
+    projection = config.projection
 
     def project(points: Array, valid: Array) -> RangeImage:
         return project_points(
@@ -160,7 +158,7 @@ def make_sums(
     def losses_of(outputs: Outputs, image: RangeImage, boxes: Array, labels: Array, box_valid: Array) -> Any:
         return sample_losses(outputs, image, boxes, labels, box_valid, config=config.loss, layout=layout)
 
-    def sums(params: Any, batch_stats: Any, batch: Batch) -> tuple[Array, tuple[Any, Metrics, Metrics]]:
+    def sums(params: Any, batch_stats: Any, batch: Batch) -> tuple[Metrics, tuple[Any, Metrics, Metrics]]:
         with jax.named_scope("mrv"):
             image = jax.vmap(project)(batch.points, batch.valid)
         variables = {"params": params, "batch_stats": batch_stats}
@@ -170,21 +168,23 @@ def make_sums(
         parts, counts = jax.tree.map(
             lambda leaf: leaf.sum(axis=0), ({name: part[0] for name, part in parts.items()}, counts)
         )
-        total = sum(weight * parts[name] for name, weight in weights.items())
-        return total, (batch_stats, parts, counts)  # type: ignore[return-value]
+        totals: dict[str, Array] = {}
+        for name, (weight, divisor) in loss_terms(config.loss).items():
+            totals[divisor] = totals.get(divisor, 0) + weight * parts[name]
+        return totals, (batch_stats, parts, counts)
 
     return sums
 
 
-def finish(parts: Metrics, counts: Metrics, config: Config) -> Metrics:
-    """The metrics of a whole batch from its sums: each loss divided once by the positives.
+def batch_metrics(parts: Metrics, counts: Metrics, config: Config) -> Metrics:
+    """The metrics of a whole batch from its sums: each loss divided once by its count.
 
     Args:
         parts: sums of the losses.
         counts: from :func:`make_sums`.
         config: the weights.
     """
-    losses = combine(parts, counts["positives"], config.loss)
+    losses = combine(parts, counts, config.loss)
     positives = jnp.maximum(counts["positives"], 1)
     metrics = {f"loss/{name}": value for name, value in losses.items()}
     metrics |= {name: value for name, value in counts.items() if name != "iou_sum"}
@@ -193,22 +193,20 @@ def finish(parts: Metrics, counts: Metrics, config: Config) -> Metrics:
     return metrics
 
 
-def make_loss(detector: Detector, config: Config, sensor: Sensor) -> Loss:
+def make_loss(detector: Detector) -> Loss:
     """The loss of a batch of raw points as a pure function.
 
     Args:
-        detector: the network.
-        config: all choices.
-        sensor: the image's geometry.
+        detector: from :func:`fcos_lidar_jax.models.build_detector`.
 
     Returns:
         ``(params, batch_stats, batch) -> (loss, (batch_stats, metrics))``.
     """
-    sums = make_sums(detector, config, sensor)
+    sums = make_sums(detector)
 
     def loss(params: Any, batch_stats: Any, batch: Batch) -> tuple[Array, tuple[Any, Metrics]]:
         _, (batch_stats, parts, counts) = sums(params, batch_stats, batch)
-        metrics = finish(parts, counts, config)
+        metrics = batch_metrics(parts, counts, detector.config)
         return metrics["loss/total"], (batch_stats, metrics)
 
     return loss

@@ -1,5 +1,6 @@
 """One training step as a pure function: raw points in, new state and metrics out."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,10 +11,8 @@ from jax import lax
 from jaxtyping import Array
 
 from fcos_lidar_jax.augment import augment, sample_key
-from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.models import Detector
-from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.training.objective import Metrics, finish, make_sums
+from fcos_lidar_jax.models import Detector, Variables
+from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_sums
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
 from fcos_lidar_jax.types import Batch, TrainState
 
@@ -21,23 +20,29 @@ TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
 def make_state(
-    variables: dict[str, Any], optimizer: optax.GradientTransformation, key: jax.Array, *, ema: bool = False
+    detector: Detector,
+    optimizer: optax.GradientTransformation,
+    key: jax.Array,
+    *,
+    variables: Variables | None = None,
 ) -> TrainState:
-    """The state before the first step.
+    """The state before the first step, with a running mean of the weights if ``ema_decay`` asks for one.
 
     Args:
-        variables: ``params`` and ``batch_stats`` of a detector.
-        optimizer: whose state to begin.
+        detector: from :func:`fcos_lidar_jax.models.build_detector`.
+        optimizer: from :func:`fcos_lidar_jax.training.make_optimizer`.
         key: the run's random key.
-        ema: keep a running mean of the weights.
+        variables: ``params`` and ``batch_stats`` to start from; None for random ones.
     """
+    if variables is None:
+        variables = detector.init(key)
     state = TrainState(
         step=jnp.zeros((), jnp.int32),
         params=variables["params"],
         batch_stats=variables["batch_stats"],
         opt_state=optimizer.init(variables["params"]),
         # A copy: the step gives its input's buffers away, and none twice.
-        ema=jax.tree.map(jnp.copy, variables["params"]) if ema else None,
+        ema=jax.tree.map(jnp.copy, variables["params"]) if detector.config.optimizer.ema_decay > 0 else None,
         key=key,
     )
     # Strong types throughout: a weakly typed leaf would compile the step a second time.
@@ -49,27 +54,31 @@ def _numeric(leaf: Any) -> bool:
 
 
 def make_gradient(
-    detector: Detector, config: Config, sensor: Sensor
+    detector: Detector,
 ) -> Callable[[Any, Any, Batch], tuple[Any, Any, Metrics]]:
     """The gradient of the loss of a batch, in ``config.optimizer.accumulate`` micro-batches.
 
     The gradients of the sums are summed and divided once by the positives of all micro-batches, so their number
-    does not change what is weighed how; only batch norm sees smaller batches.
+    does not change what is weighed how; only batch norm sees smaller batches. Where the box losses are divided by
+    the candidates instead, their gradient is a second one.
 
     Args:
-        detector: the network.
-        config: all choices.
-        sensor: the image's geometry.
+        detector: from :func:`fcos_lidar_jax.models.build_detector`.
 
     Returns:
         pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``.
     """
-    of_sums = jax.value_and_grad(make_sums(detector, config, sensor), has_aux=True)
+    config = detector.config
+    sums = make_sums(detector)
     pieces = config.optimizer.accumulate
 
     def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
         def visit(batch_stats: Any, micro: Batch) -> tuple[Any, tuple[Any, Metrics, Metrics]]:
-            (_, (batch_stats, parts, counts)), grads = of_sums(params, batch_stats, micro)
+            totals, pull_back, (batch_stats, parts, counts) = jax.vjp(
+                lambda params: sums(params, batch_stats, micro), params, has_aux=True
+            )
+            zero = jax.tree.map(jnp.zeros_like, totals)
+            grads = {name: pull_back(zero | {name: jnp.ones_like(t)})[0] for name, t in totals.items()}
             return batch_stats, (grads, parts, counts)
 
         if pieces == 1:
@@ -86,29 +95,30 @@ def make_gradient(
             shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
             nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
             (batch_stats, (grads, parts, counts)), _ = lax.scan(add, (batch_stats, nothing), micros)
-        scale = 1 / jnp.maximum(counts["positives"], 1)
-        grads = jax.tree.map(lambda leaf: leaf * scale.astype(leaf.dtype), grads)
-        return grads, batch_stats, finish(parts, counts, config)
+
+        def divided(name: str) -> Any:
+            scale = 1 / jnp.maximum(counts[name], 1)
+            return jax.tree.map(lambda leaf: leaf * scale.astype(leaf.dtype), grads[name])
+
+        grads = functools.reduce(optax.tree.add, [divided(name) for name in grads])
+        return grads, batch_stats, batch_metrics(parts, counts, config)
 
     return gradient
 
 
-def make_train_step(
-    detector: Detector, config: Config, sensor: Sensor, optimizer: optax.GradientTransformation
-) -> TrainStep:
+def make_train_step(detector: Detector, optimizer: optax.GradientTransformation) -> TrainStep:
     """A training step: augment, project, predict, assign, differentiate, update.
 
     Args:
-        detector: the network.
-        config: all choices; ``config.augment`` None for none.
-        sensor: the image's geometry.
+        detector: from :func:`fcos_lidar_jax.models.build_detector`; ``config.augment`` None for no augmentation.
         optimizer: from :func:`fcos_lidar_jax.training.make_optimizer`.
 
     Returns:
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. The metrics are scalars but
         for ``positives_per_level`` i32[6].
     """
-    gradient = make_gradient(detector, config, sensor)
+    config, sensor = detector.config, detector.sensor
+    gradient = make_gradient(detector)
     decay = config.optimizer.ema_decay
 
     def augmented(state: TrainState, batch: Batch) -> Batch:

@@ -1,17 +1,17 @@
 """Bird's-eye views: points, detections, truth."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.types import CLASSES
-from fcos_lidar_jax.visualization.figure import new_figure, save_png
-from fcos_lidar_jax.visualization.palette import CLASS_COLORS
+from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png
 
 _SIZE_IN = 9.0
 _DASHES = (0, (3, 2))
 _TEXT_POINTS = 7.0
+_LEGEND_CLASSES = 30
 
 
 def draw_bev(
@@ -19,6 +19,7 @@ def draw_bev(
     path: str | Path,
     *,
     limit_m: float,
+    classes: Sequence[str],
     detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     truth: tuple[np.ndarray, np.ndarray] | None = None,
     title: str | None = None,
@@ -34,10 +35,11 @@ def draw_bev(
         points: f32[n, >= 3], metres; non-finite rows do not show.
         path: PNG to write.
         limit_m: half the side of the square that is shown.
+        classes: names that the labels index.
         detections: boxes f32[d, 9], labels i32[d], scores f32[d].
         truth: boxes f32[m, 9], labels i32[m].
         title: above the picture.
-        global_axes: x and y are the directions of the global frame and not the car's.
+        global_axes: x and y are the directions of the global frame and not the ego vehicle's.
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
     axis = figure.add_subplot()
@@ -46,16 +48,17 @@ def draw_bev(
     if truth is not None:
         for box, label in zip(*truth, strict=True):
             if _in_view(box, limit_m):
-                axis.fill(*_corners(box), color=CLASS_COLORS[label], alpha=0.3, linewidth=0, zorder=1)
+                axis.fill(*_corners(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
                 _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
                 present.add(int(label))
     if detections is not None:
         shown = [d for d in zip(*detections, strict=True) if _in_view(d[0], limit_m)]
         for box, label, _ in shown:
-            _outline(axis, box, limit_m, color=CLASS_COLORS[label], linewidth=1.7, zorder=4)
+            _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
             present.add(int(label))
         _write_scores(axis, shown, limit_m)
-    _legend(figure, sorted(present), with_truth=truth is not None, with_detections=detections is not None)
+    extra = [name for name, there in (("detection", detections), ("truth", truth)) if there is not None]
+    _legend(figure, sorted(present), classes, extra)
     axis.set_xlim(-limit_m, limit_m)
     axis.set_ylim(-limit_m, limit_m)
     axis.set_aspect("equal")
@@ -120,14 +123,19 @@ def _write_scores(axis: Any, shown: list[tuple[np.ndarray, int, float]], limit_m
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
-def _legend(figure: Any, present: list[int], *, with_truth: bool, with_detections: bool) -> None:
+def _legend(figure: Any, present: list[int], classes: Sequence[str], extra: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    entries: list[Any] = [Patch(color=CLASS_COLORS[k], label=CLASSES[k].replace("_", " ")) for k in present]
-    if with_detections:
-        entries.append(Line2D([], [], color="#444444", linewidth=1.7, label="detection"))
-    if with_truth:
-        entries.append(Line2D([], [], color="black", linewidth=0.9, linestyle=_DASHES, label="truth"))
+    lines = {
+        "detection": Line2D([], [], color="#444444", linewidth=1.7, label="detection"),
+        "truth": Line2D([], [], color="black", linewidth=0.9, linestyle=_DASHES, label="truth"),
+    }
+    shown, rest = present[:_LEGEND_CLASSES], len(present[_LEGEND_CLASSES:])
+    entries: list[Any] = [Patch(color=class_color(k), label=classes[k].replace("_", " ")) for k in shown]
+    entries += [Patch(color="white", label=f"and {rest} more")] if rest else []
+    entries += [lines[name] for name in extra]
     if entries:
-        figure.legend(handles=entries, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+        legend = figure.legend(handles=entries, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+        for text in legend.get_texts():
+            text.set_parse_math(False)

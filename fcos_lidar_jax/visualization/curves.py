@@ -3,10 +3,8 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fcos_lidar_jax.visualization.figure import new_figure, save_png
+from fcos_lidar_jax.visualization.figure import LINE_COLORS, new_axis, save_png
 
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-"""Okabe and Ito's, which colour-blind readers tell apart."""
 _FEW = 40
 """Up to so many points are marked one by one; a single one would not show otherwise."""
 
@@ -30,8 +28,7 @@ def draw_curves(
         title: above the picture.
         log_y: logarithmic ordinate; values that are not positive leave a gap.
     """
-    figure = new_figure(8, 4.5)
-    axis = figure.add_subplot()
+    figure, axis = new_axis(8, 4.5)
     for i, (name, points) in enumerate(series.items()):
         xs, ys = [x for x, _ in points], [y for _, y in points]
         # A second turn through the colours is dashed.
@@ -39,8 +36,8 @@ def draw_curves(
             xs,
             ys,
             label=name.replace("_", " "),
-            color=_COLORS[i % len(_COLORS)],
-            linestyle="-" if i < len(_COLORS) else "--",
+            color=LINE_COLORS[i % len(LINE_COLORS)],
+            linestyle="-" if i < len(LINE_COLORS) else "--",
             linewidth=1.3,
             marker="o" if len(points) <= _FEW else None,
             markersize=3.5,
@@ -50,8 +47,6 @@ def draw_curves(
     axis.set_xlabel(x_label)
     axis.set_ylabel(y_label)
     axis.set_title(title, fontsize=11)
-    axis.grid(color="#e5e5e5", linewidth=0.6)
-    axis.spines[["top", "right"]].set_visible(False)
     if series:
         axis.legend(fontsize=9, frameon=False)
     save_png(figure, path)

@@ -1,9 +1,34 @@
-"""Matplotlib without a screen and without global state."""
+"""Matplotlib without a screen and without global state, and the colours of all figures."""
 
+import colorsys
 from pathlib import Path
 from typing import Any
 
-from fcos_lidar_jax.files import write_beside
+from fcos_lidar_jax.files import atomic_write
+
+LINE_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+"""Okabe and Ito's, which colour-blind readers tell apart."""
+EMPTY = "#d9d9d9"
+"""Cells without a point."""
+_CLASS_COLORS = (
+    *("#1f77b4", "#d62728", "#9467bd", "#8c564b", "#e6a000"),
+    *("#e377c2", "#17becf", "#2ca02c", "#ff6f00", "#5b5b5b"),
+)
+_GOLDEN = 0.6180339887
+"""Hues that are this far apart never meet."""
+
+
+def class_color(label: int) -> str:
+    """Colour of a class, for any number of classes; the first ten are told apart most easily.
+
+    >>> class_color(0), class_color(10)
+    ('#1f77b4', '#b83d91')
+    """
+    if label < len(_CLASS_COLORS):
+        return _CLASS_COLORS[label]
+    turn = label - len(_CLASS_COLORS)
+    rgb = colorsys.hsv_to_rgb((0.885 + turn * _GOLDEN) % 1, 0.67, (0.72, 0.5, 0.88)[turn % 3])
+    return "#" + "".join(f"{round(255 * part):02x}" for part in rgb)
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
@@ -13,6 +38,15 @@ def new_figure(width_in: float, height_in: float) -> Any:
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
+def new_axis(width_in: float, height_in: float) -> tuple[Any, Any]:
+    """A figure with one axis for curves: grid, and no frame above and on the right."""
+    figure = new_figure(width_in, height_in)
+    axis = figure.add_subplot()
+    axis.grid(color="#e5e5e5", linewidth=0.6)
+    axis.spines[["top", "right"]].set_visible(False)
+    return figure, axis
+
+
 def save_png(figure: Any, path: str | Path, *, dpi: int = 110) -> None:
     """Write a figure as PNG, whole or not at all."""
-    write_beside(path, lambda file: figure.savefig(file, dpi=dpi, format="png"))
+    atomic_write(path, lambda file: figure.savefig(file, dpi=dpi, format="png"))

@@ -4,13 +4,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from fcos_lidar_jax.geometry import points_in_box
+from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.types import CHANNELS, RangeImage
-from fcos_lidar_jax.visualization.figure import new_figure, save_png
-from fcos_lidar_jax.visualization.palette import EMPTY
+from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
 
 _RANGE, _INCLINATION, _INTENSITY, _EXISTENCE, _LAG = (
     CHANNELS.index(c) for c in ("range", "inclination", "intensity", "existence", "time_lag")
@@ -128,20 +126,17 @@ def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray) -> int:
     from matplotlib.patches import Rectangle
 
     columns = features.shape[1]
-    points = jnp.asarray(features[:, :, :3, 0])
-    drawn = 0
-    for box in boxes:
-        inside = np.asarray(points_in_box(points, jnp.asarray(box))) & (features[:, :, _EXISTENCE, 0] > 0)
-        rows_in, columns_in = np.nonzero(inside)
-        if not len(rows_in):
-            continue
-        drawn += 1
+    first_round = features[..., 0].reshape(-1, features.shape[2])
+    filled = np.flatnonzero(first_round[:, _EXISTENCE] > 0)
+    found = [filled[rows] for rows in points_in_boxes(first_round[filled, :3], boxes) if len(rows)]
+    for cells in found:
+        rows_in, columns_in = np.divmod(cells, columns)
         top, bottom = rows_in.min(), rows_in.max() + 1
         for first, last in _spans(columns_in, columns):
             left = 180 - 360 * first / columns
             width = -360 * (last + 1 - first) / columns
             axis.add_patch(Rectangle((left, top), width, bottom - top, fill=False, edgecolor=_BOX, linewidth=1.2))
-    return drawn
+    return len(found)
 
 
 def _spans(columns_in: np.ndarray, columns: int) -> Iterator[tuple[int, int]]:

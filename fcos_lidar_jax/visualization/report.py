@@ -5,7 +5,7 @@ import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fcos_lidar_jax.files import write_beside
+from fcos_lidar_jax.files import atomic_write
 
 Cell = str | float | int
 Table = tuple[str, Sequence[str], Sequence[Sequence[Cell]]]
@@ -79,7 +79,7 @@ def write_report(
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{_text(title)}</title><style>{_STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
     )
-    write_beside(path, lambda out: out.write_text(page, encoding="utf-8"))
+    atomic_write(path, lambda out: out.write_text(page, encoding="utf-8"))
 
 
 def _text(value: Cell) -> str:

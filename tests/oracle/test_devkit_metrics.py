@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 
-from fcos_lidar_jax.commands.evaluate import Evaluate, run
+from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.cli.evaluate import Evaluate, run
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.evaluation import evaluate_detections
-from fcos_lidar_jax.evaluation.results import LIDAR_META
-from fcos_lidar_jax.evaluation.submission import result_entries
+from fcos_lidar_jax.evaluation.results import LIDAR_META, result_entries
 from fcos_lidar_jax.types import Detections
 
 pytest.importorskip("nuscenes")
@@ -72,8 +72,8 @@ def test_every_number_is_the_official_one(task, devkit, tmp_path):
     root = write_task(tmp_path / "root", tables, results)
     theirs = devkit(root, root / "results.json", tmp_path / "official")
     out = tmp_path / "ours"
-    place = {"data_root": root, "version": VERSION, "split": SPLIT}
-    run(Evaluate(out=out, results=root / "results.json", **place, report=False))
+    place = DataOptions(data_root=root, version=VERSION)
+    run(Evaluate(place, out, split=SPLIT, results=root / "results.json", report=False))
     assert_equal(json.loads((out / "metrics_summary.json").read_text()), theirs)
     assert_equal(evaluate_detections(results, truth_of(tables)), theirs)
 
@@ -93,7 +93,7 @@ def test_every_number_is_the_official_one_on_a_real_scene(real_data, devkit, tmp
     file = tmp_path / "results.json"
     file.write_text(json.dumps({"meta": LIDAR_META, "results": results}))
     theirs = devkit(root, file, tmp_path / "official", version, split)
-    place = {"data_root": root, "version": version, "split": split}
-    run(Evaluate(out=tmp_path / "ours", results=file, **place, report=False))
+    place = DataOptions(data_root=root, version=version)
+    run(Evaluate(place, tmp_path / "ours", split=split, results=file, report=False))
     assert_equal(json.loads((tmp_path / "ours" / "metrics_summary.json").read_text()), theirs)
     assert theirs["nd_score"] > 0.3

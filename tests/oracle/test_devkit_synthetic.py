@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.commands.synthesize import Synthesize, run
+from fcos_lidar_jax.cli.synthesize import Synthesize, run
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
 

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.nuscenes.index import Index
 from fcos_lidar_jax.data.nuscenes.tables import (
     Attribute,
@@ -23,9 +24,12 @@ from fcos_lidar_jax.data.nuscenes.tables import (
     read_table,
     table_file,
 )
+from fcos_lidar_jax.data.sweeps import FARTHEST_M
 
 CHANNEL = "LIDAR_TOP"
 """The one sensor that is kept."""
+
+_METRES = f"finite numbers of at most {FARTHEST_M:g} m"
 
 Report = Callable[[str, int], None]
 """Told which file is being read and how many of its rows have been."""
@@ -79,7 +83,7 @@ class _Tables:
         """Finite translations and rotations of norm one, normalised to the last bit."""
         norm = np.linalg.norm(rotation, axis=1)
         checks = (
-            ("translation", translation, np.isfinite(translation).all(axis=1), "finite numbers"),
+            ("translation", translation, (np.abs(translation) <= FARTHEST_M).all(axis=1), _METRES),
             ("rotation", rotation, np.abs(norm - 1) < 1e-3, "a unit quaternion w, x, y, z"),
         )
         for field, values, good, expected in checks:
@@ -293,12 +297,11 @@ def _boxes(tables: _Tables, sample_row: dict[str, int], sample_time_us: np.ndarr
 
 def _check_boxes(tables: _Tables, columns: dict[str, np.ndarray]) -> None:
     size, tokens = columns["size"], columns["token"]
-    good = (np.isfinite(size) & (size > 0)).all(axis=1)
+    good = ((size <= LIMITS["l"]) & (size > 0)).all(axis=1)
     if not good.all():
         row = int(np.argmin(good))
-        raise tables.fail(
-            SampleAnnotation, tokens[row], "size", f"got {size[row].tolist()}, expected three positive lengths"
-        )
+        expected = f"three positive lengths of at most {LIMITS['l']:g} m"
+        raise tables.fail(SampleAnnotation, tokens[row], "size", f"got {size[row].tolist()}, expected {expected}")
     columns["rotation"] = tables.check_poses(SampleAnnotation, tokens, columns["rotation"], columns["translation"])
 
 

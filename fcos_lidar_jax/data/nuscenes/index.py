@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.nuscenes.tables import TABLES, TableError
-from fcos_lidar_jax.files import write_beside
+from fcos_lidar_jax.files import atomic_write
 
 _FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 2
 _MANIFEST = "index.json"
@@ -96,7 +96,7 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
     columns = {}
     for field in dataclasses.fields(index):
         column = np.ascontiguousarray(getattr(index, field.name))
-        write_beside(folder / f"{field.name}.npy", lambda path, column=column: np.save(path, column))
+        atomic_write(folder / f"{field.name}.npy", lambda path, column=column: np.save(path, column))
         columns[field.name] = {"rows": len(column), "blake2b": _digest(column)}
     manifest = {
         "format": _FORMAT,
@@ -104,7 +104,7 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
         "tables": table_sizes(tables),
         "columns": columns,
     }
-    write_beside(folder / _MANIFEST, lambda path: path.write_text(json.dumps(manifest, indent=1)))
+    atomic_write(folder / _MANIFEST, lambda path: path.write_text(json.dumps(manifest, indent=1)))
 
 
 def has_index(folder: str | Path) -> bool:
@@ -166,6 +166,12 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
+def column_checksums(index: Index) -> list[tuple[str, str]]:
+    """Name and checksum of every column, as the manifest of a saved index holds them."""
+    return [(field.name, _digest(getattr(index, field.name))) for field in dataclasses.fields(index)]
+
+
 def _digest(column: np.ndarray) -> str:
+    column = np.ascontiguousarray(column)
     described = f"{column.dtype.str}{column.shape}".encode()
     return hashlib.blake2b(column.data if column.size else b"", digest_size=16, key=described[:64]).hexdigest()

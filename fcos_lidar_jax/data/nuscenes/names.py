@@ -1,6 +1,6 @@
 """What nuScenes calls things, and what they are to a detector."""
 
-from fcos_lidar_jax.types import CLASSES
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 
 CATEGORY_TO_CLASS = {
     "vehicle.car": "car",
@@ -31,4 +31,4 @@ def label_of(category: str) -> int:
     (2, -1)
     """
     name = CATEGORY_TO_CLASS.get(category)
-    return -1 if name is None else CLASSES.index(name)
+    return -1 if name is None else NUSCENES_CLASSES.index(name)

@@ -4,15 +4,19 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.data.nuscenes.build import build_index
-from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index
+from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, has_index, open_index
 from fcos_lidar_jax.data.nuscenes.names import label_of
 from fcos_lidar_jax.data.nuscenes.splits import SplitError, scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import TableError
-from fcos_lidar_jax.data.point_files import PointFileError
+from fcos_lidar_jax.data.point_files import MAX_BYTES, PointFileError
+from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
+from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.geometry import pose_matrix, rotation_matrix, wrap_angle
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 
 _COLUMNS = 5
 """x, y, z, intensity, ring: float32 each."""
@@ -25,7 +29,7 @@ class Boxes:
     boxes: np.ndarray
     """f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown."""
     labels: np.ndarray
-    """i32[m]: index into ``types.CLASSES``."""
+    """i32[m]: index into ``NUSCENES_CLASSES``."""
     num_lidar_pts: np.ndarray
     """i32[m]: points of the current sweep inside, counted with the full rotation."""
     attributes: tuple[str, ...]
@@ -37,18 +41,6 @@ class Boxes:
 def default_index(root: str | Path, version: str) -> Path:
     """Where an index is looked for, and written, unless another place is given."""
     return Path(root) / ".fcos_lidar" / version
-
-
-def pose_matrix(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """f64[4, 4] on column vectors, from a quaternion w, x, y, z and a translation.
-
-    >>> pose_matrix(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]))[:3, 3].tolist()
-    [1.0, 2.0, 3.0]
-    """
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
-    matrix[:3, 3] = translation
-    return matrix
 
 
 class NuScenes:
@@ -139,7 +131,7 @@ class NuScenes:
         Args:
             sample_token: of the keyframe.
             num: sweeps at most, the current one included.
-            remove_close: drop the points on the car, ``|x|, |y| < close_m`` in their own sweep's frame: of
+            remove_close: drop the points on the ego vehicle, ``|x|, |y| < close_m`` in their own sweep's frame: of
                 ``"all"`` sweeps as the official devkit does, of the older ``"sweeps"``, or ``"none"``.
             close_m: half the side of the square that is emptied.
 
@@ -149,26 +141,18 @@ class NuScenes:
         Raises:
             ValueError: a file that is missing, cut, empty, or not below the data root.
         """
-        if remove_close not in ("all", "sweeps", "none"):
-            raise ValueError(f"remove_close: got {remove_close!r}, expected 'all', 'sweeps' or 'none'")
+        return self.fuse_sweeps(sample_token, num, remove_close=remove_close, close_m=close_m)[0]
+
+    def fuse_sweeps(
+        self, sample_token: str, num: int, *, remove_close: str, close_m: float
+    ) -> tuple[np.ndarray, int]:
+        """As :meth:`sweeps`, and how many points on the ego vehicle were dropped."""
         chain = self._chain(sample_token, num)
-        current = chain[0]
-        to_current = np.linalg.inv(self._sensor_to_global(current))
-        parts = []
-        for row in chain:
-            older = row != current
-            if older and self.allow_missing_sweeps and not self._path(row).is_file():
-                continue
-            points = self._read(row)
-            if remove_close == "all" or (remove_close == "sweeps" and older):
-                near = (np.abs(points[:, 0]) < close_m) & (np.abs(points[:, 1]) < close_m)
-                points = points[~near]
-            points[:, 4] = (self.index.sweep_time_us[current] - self.index.sweep_time_us[row]) / 1e6
-            if older:  # the current sweep keeps its very bits
-                motion = to_current @ self._sensor_to_global(row)
-                points[:, :3] = points[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
-            parts.append(points)
-        return np.concatenate(parts)
+        if self.allow_missing_sweeps:
+            chain = [row for row in chain if row == chain[0] or self._path(row).is_file()]
+        times = self.index.sweep_time_us
+        sweeps = (Sweep(self._read(row), self._sensor_to_global(row), times[row]) for row in chain)
+        return fuse_sweeps(sweeps, NUSCENES_HDL32E, remove_close=remove_close, close_m=close_m)
 
     def boxes(self, sample_token: str) -> Boxes:
         """The boxes of the ten classes in the keyframe's LiDAR frame, those without points included.
@@ -182,10 +166,9 @@ class NuScenes:
         rows, labels = rows[labels >= 0], labels[labels >= 0]
         to_lidar = np.linalg.inv(self._sensor_to_global(self._sweep(sample_token)))
         centre = index.box_translation[rows] @ to_lidar[:3, :3].T + to_lidar[:3, 3]
-        turn = Rotation.from_quat(index.box_rotation[rows].reshape(-1, 4), scalar_first=True)
-        heading = turn.apply(np.array([1.0, 0, 0])).reshape(-1, 3) @ to_lidar[:3, :3].T
+        heading = rotation_matrix(index.box_rotation[rows])[:, :, 0] @ to_lidar[:3, :3].T
         velocity = index.box_velocity[rows] @ to_lidar[:3, :3].T
-        yaw = wrapped(np.arctan2(heading[:, 1], heading[:, 0]))
+        yaw = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]).astype(np.float32))
         size = index.box_size[rows][:, [1, 0, 2]]
         boxes = np.concatenate([centre, size, yaw[:, None], velocity[:, :2]], axis=1).astype(np.float32)
         names = ["", *map(str, index.attribute_name)]
@@ -217,8 +200,12 @@ class NuScenes:
         """f64[4, 4]: from a keyframe's LiDAR frame to the global frame."""
         return self._sensor_to_global(self._sweep(sample_token))
 
+    def time_us(self, sample_token: str) -> int:
+        """When a keyframe's own sweep was taken, microseconds."""
+        return int(self.index.sweep_time_us[self._sweep(sample_token)])
+
     def ego_translation(self, sample_token: str) -> np.ndarray:
-        """f64[3]: where the car is, global frame."""
+        """f64[3]: where the ego vehicle is, global frame."""
         return self.index.ego_translation[self._sweep(sample_token)]
 
     def _row(self, sample_token: str) -> int:
@@ -253,26 +240,17 @@ class NuScenes:
             raise PointFileError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
         if not path.resolve().is_relative_to(self._base):
             raise PointFileError(f"{path}: leads to {path.resolve()}, expected a file below {self._base}")
-        values = np.fromfile(path, np.float32)
         size = path.stat().st_size
-        if size == 0 or size % (4 * _COLUMNS):
+        if size == 0 or size % (4 * _COLUMNS) or size > MAX_BYTES:
             found = "an empty file" if size == 0 else f"{size} bytes"
-            raise PointFileError(f"{path}: got {found}, expected a multiple of {4 * _COLUMNS} (float32 x 5)")
-        return values.reshape(-1, _COLUMNS)
-
-
-def wrapped(angle_rad: np.ndarray) -> np.ndarray:
-    """Angles in [-pi, pi) after rounding to float32.
-
-    >>> [round(float(angle), 4) for angle in wrapped(np.array([np.pi, 7.0]))]
-    [-3.1416, 0.7168]
-    """
-    turned = ((angle_rad + np.pi) % (2 * np.pi) - np.pi).astype(np.float32)
-    return np.where(turned >= np.float32(np.pi), np.float32(-np.pi), turned)
+            raise PointFileError(
+                f"{path}: got {found}, expected a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_BYTES}"
+            )
+        return np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
 
 
 @dataclasses.dataclass(frozen=True)
-class NuScenesFrames:
+class NuScenesFrames(FrameSet):
     """Keyframes of nuScenes as a :class:`fcos_lidar_jax.data.frame.FrameSet`."""
 
     nuscenes: NuScenes
@@ -285,6 +263,9 @@ class NuScenesFrames:
     """As in :meth:`NuScenes.sweeps`."""
     close_m: float = 1.0
     """As in :meth:`NuScenes.sweeps`."""
+    sensor: Sensor = NUSCENES_HDL32E
+    """Whose points they are; its origin is the frame's."""
+    classes = NUSCENES_CLASSES
 
     def __len__(self) -> int:
         """Number of keyframes."""
@@ -293,11 +274,15 @@ class NuScenesFrames:
     def frame(self, index: int) -> Frame:
         """Fused sweeps and boxes of one keyframe."""
         truth = self.nuscenes.boxes(self.tokens[index])
-        return Frame(self.points(index), truth.boxes, truth.labels, truth.num_lidar_pts)
+        points, num_close = self._fuse(index)
+        return Frame(points, truth.boxes, truth.labels, truth.num_lidar_pts, num_close)
 
     def points(self, index: int) -> np.ndarray:
         """Fused sweeps alone."""
-        return self.nuscenes.sweeps(
+        return self._fuse(index)[0]
+
+    def _fuse(self, index: int) -> tuple[np.ndarray, int]:
+        return self.nuscenes.fuse_sweeps(
             self.tokens[index], self.num_sweeps, remove_close=self.remove_close, close_m=self.close_m
         )
 
@@ -308,3 +293,20 @@ class NuScenesFrames:
     def name(self, index: int) -> str:
         """The keyframe's token."""
         return self.tokens[index]
+
+    def pose(self, index: int) -> np.ndarray:
+        """f64[4, 4] from the LiDAR frame to the global one."""
+        return self.nuscenes.sensor_to_global(self.tokens[index])
+
+    def time_us(self, index: int) -> int:
+        """When the keyframe's own sweep was taken, microseconds."""
+        return self.nuscenes.time_us(self.tokens[index])
+
+    def scene(self, index: int) -> str:
+        """Name of the keyframe's scene."""
+        return self.nuscenes.scene_of(self.tokens[index])
+
+    def fingerprint(self) -> str:
+        """Checksum of all columns of the index, of the keyframes, and of how they are read."""
+        how = self.num_sweeps, self.remove_close, self.close_m
+        return checksum(repr((column_checksums(self.nuscenes.index), self.tokens, how)).encode())

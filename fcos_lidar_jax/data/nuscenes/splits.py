@@ -30,8 +30,7 @@ def scenes_of_split(split: str, tables: str | Path, *, file: str | Path | None =
     own = Path(tables) / "splits.json"
     places: list[str] = []
     if file is not None or own.is_file():
-        path = own if file is None else Path(file)
-        named = _read_splits(path)
+        path, named = own if file is None else Path(file), own_splits(tables, file)
         if split in named:
             if not named[split]:
                 raise SplitError(f"{path}: {split}: got no scene, expected at least one")
@@ -47,6 +46,12 @@ def scenes_of_split(split: str, tables: str | Path, *, file: str | Path | None =
     raise SplitError(
         f"split {split!r}: not found in {' or in '.join(places)}; a file {{name: [scene, ...]}} can be given"
     )
+
+
+def own_splits(tables: str | Path, file: str | Path | None = None) -> dict[str, list[str]]:
+    """The splits of a file, or of the version's own ``splits.json``; none where there is no such file."""
+    path = Path(tables) / "splits.json" if file is None else Path(file)
+    return _read_splits(path) if file is not None or path.is_file() else {}
 
 
 def _read_splits(path: Path) -> dict[str, list[str]]:

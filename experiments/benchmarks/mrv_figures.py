@@ -1,0 +1,201 @@
+"""What does multi-round projection keep, and what does it cost? The paper's figures that need no training.
+
+    python -m experiments.benchmarks.mrv_figures  # the cloud of FCOS_LIDAR_REAL_DATA, else a simulated one
+    python -m experiments.benchmarks.mrv_figures --data FOLDER  # FOLDER/ten_sweep_cloud/cloud.f16.bin
+    python -m experiments.benchmarks.mrv_figures --repeats 10  # a look
+
+Counts: points kept by 1, 3, 5 and 7 rounds with and without priority of the current sweep, and how many cells of
+round 1 the current sweep holds; with the points on the vehicle, and without. What each round keeps does not depend
+on how many rounds follow, and the priority decides which points are kept, not how many. Times: one sweep and ten,
+all rounds in turns, beside table 1's, as ratios to one round.
+
+Cost: half a minute on two CPU cores. Expected of the paper (section 3.2): ~240K points, ~28K of them kept by one
+round, more than 50 % by five; seven rounds hardly slower than one (0.76 and 0.66 ms on its GPU).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.benchmarks.latency import ROWS, fused_cloud, padded
+from experiments.hardware import hardware_line
+from experiments.paper import PAPER
+from experiments.script import run_script, save
+from experiments.statistics import interleaved
+from fcos_lidar_jax.projection import project_points, remove_close
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
+
+ROUNDS = (1, 3, 5, 7)
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """On which cloud, and how often."""
+
+    data: Path | None = None
+    """Folder with ten_sweep_cloud/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated cloud."""
+    repeats: int = 100
+    """Turns of the times."""
+    out: Path = Path("outputs/mrv_figures.json")
+    """Where the figures go."""
+
+
+def kept_by_rounds(
+    points: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, close: str = "all"
+) -> dict[str, Any]:
+    """Points of a fused cloud that so many rounds keep, with and without priority of the current sweep.
+
+    Args:
+        points: f32[n, c]; a point is current if its time lag is 0.
+        sensor: the image's geometry.
+        rounds: counts of rounds.
+        close: ``"none"`` keeps the points on the vehicle, ``"all"`` drops them, judged in the current frame.
+
+    Returns:
+        ``in_range`` and ``in_view``, points within the sensor's limits and, of those, in its field of view; for
+        ``prioritized`` and ``not prioritized``: ``kept`` and ``percent`` (of those in range) by rounds, and
+        ``current``, how many of the kept are current.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
+    >>> found = kept_by_rounds(cloud, TINY, rounds=(1, 2))
+    >>> found["prioritized"]["kept"], found["prioritized"]["current"], found["not prioritized"]["current"]
+    ({'1': 1, '2': 2}, {'1': 1, '2': 1}, {'1': 0, '2': 1})
+    """
+    valid = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, mode=close))
+    x, y, z = np.abs(points[:, 0]), np.abs(points[:, 1]), points[:, 2]
+    inside = (x < sensor.limit_xy_m) & (y < sensor.limit_xy_m)
+    inside &= (z > sensor.limit_z_m[0]) & (z < sensor.limit_z_m[1])
+    in_range = int((inside & valid).sum())
+    found: dict[str, Any] = {"in_range": in_range}
+    for name, priority in (("prioritized", True), ("not prioritized", False)):
+        image = project_points(points, valid, sensor, num_rounds=max(rounds), prioritize_current=priority)
+        index = np.asarray(image.point_index).reshape(-1, max(rounds))
+        filled = index >= 0
+        current = filled & (points[np.maximum(index, 0), 4] == 0)
+        kept, newest = filled.sum(0).cumsum(), current.sum(0).cumsum()
+        found["in_view"] = int(valid.sum()) - int(image.num_dropped)
+        found[name] = {
+            "kept": {str(r): int(kept[r - 1]) for r in rounds},
+            "percent": {str(r): round(100 * float(kept[r - 1]) / max(in_range, 1), 2) for r in rounds},
+            "current": {str(r): int(newest[r - 1]) for r in rounds},
+        }
+    return found
+
+
+def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[str, dict[str, float]]]:
+    """Means of :func:`kept_by_rounds` over clouds.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
+    >>> mean_kept([cloud, cloud[:1]], TINY)["prioritized"]["percent"]["1"]
+    75.0
+    """
+    found = [kept_by_rounds(cloud, sensor) for cloud in clouds]
+    return {
+        name: {
+            what: {r: round(float(np.mean([f[name][what][r] for f in found])), 2) for r in map(str, ROUNDS)}
+            for what in ("percent", "current")
+        }
+        for name in ("prioritized", "not prioritized")
+    }
+
+
+def mrv_times(
+    cloud: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, repeats: int = 100
+) -> dict[str, Any]:
+    """Times of the projection by setting and rounds, all in turns.
+
+    Args:
+        cloud: ten fused sweeps, f32[n, 5].
+        sensor: the image's geometry.
+        rounds: counts of rounds.
+        repeats: turns.
+
+    Returns:
+        ``{"single" | "multi": {rounds: {"median_ms", "p99_ms", "ratio"}}}``, the ratio to the first of ``rounds``;
+        clouds are padded as by the presets.
+    """
+    calls = {}
+    for setting in ROWS:
+        ready = padded(cloud, setting, sensor)
+        points, valid = jax.device_put((ready.points, ready.valid))
+        for r in rounds:
+            calls[setting, r] = lambda p=points, v=valid, r=r: project_points(p, v, sensor, num_rounds=r)
+    names = {f"{setting}, {r}": (setting, r) for setting, r in calls}
+    found = interleaved({name: calls[key] for name, key in names.items()}, repeats)
+    times: dict[str, Any] = {setting: {} for setting in ROWS}
+    for name, (setting, r) in names.items():
+        first = found[f"{setting}, {rounds[0]}"]["median_ms"]
+        times[setting][str(r)] = {**found[name], "ratio": round(found[name]["median_ms"] / first, 3)}
+    return times
+
+
+def paper_times() -> dict[str, dict[str, float]]:
+    """Times of table 1 by rounds, and their ratios to one round."""
+    rows = PAPER["tables"]["table1"]["rows"]
+    times = {str(r): rows[f"multi, {r}"]["time_ms"] for r in ROUNDS}
+    return {r: {"median_ms": ms, "ratio": round(ms / times["1"], 3)} for r, ms in times.items()}
+
+
+def as_text(record: dict[str, Any]) -> str:
+    """All figures as tables."""
+    text = PAPER["text"]
+    lines = [f"{record['cloud']}, {record['points']} points; paper: {text['fused_points']['printed']}"]
+    for name, found in record["kept"].items():
+        lines += ["", f"{name}: {found['in_range']} points in range, {found['in_view']} of them in view"]
+        lines.append(f"{'rounds':>8s}{'kept':>10s}{'%':>8s}{'current, prioritized':>24s}{'not prioritized':>18s}")
+        first, second = found["prioritized"], found["not prioritized"]
+        lines += [
+            f"{r:>8s}{first['kept'][r]:10d}{first['percent'][r]:8.1f}{now:24d}{second['current'][r]:18d}"
+            for r, now in first["current"].items()
+        ]
+    lines += [
+        f"paper: {text['points_kept_by_one_round']['value']} by 1 round, "
+        f"more than {100 * text['share_kept_by_five_rounds']['value']:.0f} % by 5",
+        "",
+        f"projection, ms (ratio to 1 round), {record['repeats']} turns, {hardware_line()}",
+        f"{'rounds':>8s}{'one sweep':>26s}{'ten sweeps':>26s}{'paper':>18s}",
+    ]
+    for r, theirs in record["paper_times"].items():
+        ours = "".join(
+            f"{t['median_ms']:10.2f} p99{t['p99_ms']:7.2f}{'(' + format(t['ratio'], '.2f') + ')':>8s}"
+            for t in (record["times"][setting][r] for setting in ROWS)
+        )
+        lines.append(f"{r:>8s}{ours}{theirs['median_ms']:11.2f} ({theirs['ratio']:.2f})")
+    lines.append(f"paper's times: {PAPER['times']}; elsewhere only the ratios can be compared")
+    return "\n".join(lines)
+
+
+def measure(args: Args) -> dict[str, Any]:
+    """Counts and times."""
+    sensor = NUSCENES_HDL32E
+    cloud, label = fused_cloud(args.data, sensor)
+    now = cloud[cloud[:, 4] == 0]
+    return {
+        "cloud": label,
+        "points": len(cloud),
+        "kept": {
+            "ten sweeps, with close points": kept_by_rounds(cloud, sensor, close="none"),
+            "ten sweeps, without close points": kept_by_rounds(cloud, sensor),
+            "one sweep, with close points": kept_by_rounds(now, sensor, close="none"),
+            "one sweep, without close points": kept_by_rounds(now, sensor),
+        },
+        "repeats": args.repeats,
+        "times": mrv_times(cloud, sensor, repeats=args.repeats),
+        "paper_times": paper_times(),
+    }
+
+
+def main(args: Args) -> None:
+    """Measure, print, write."""
+    record = measure(args)
+    save(record, args.out, as_text(record))
+
+
+if __name__ == "__main__":
+    run_script(main, Args, __doc__)

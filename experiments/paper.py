@@ -1,0 +1,7 @@
+"""The paper's own figures, with their places."""
+
+import json
+from pathlib import Path
+
+PAPER = json.loads((Path(__file__).parent / "paper_tables" / "paper.json").read_text(encoding="utf-8"))
+"""``{"tables": {name: {"place", "columns", "rows"}}, "text": {name: {"value", ...}}, "times": hardware}``."""

@@ -1,0 +1,33 @@
+"""All tables of the paper, one after the other: ``python -m experiments.paper_tables --scale smoke``.
+
+Every table prints our figure beside the paper's, writes Markdown, JSON and a picture below ``--out``, and can be
+stopped and started again. The same command in several processes shares the cells: one a GPU, by
+
+    for i in 0 1 2 3; do CUDA_VISIBLE_DEVICES=$i python -m experiments.paper_tables --scale simulated & done
+
+Times want a machine that does nothing else: once all cells are there, the command again measures them anew.
+On two CPU cores ``--scale smoke`` takes a quarter of an hour. ``--scale simulated`` has 66 cells of 1200 steps for
+all tables, ``--scale nuscenes`` needs the data.
+"""
+
+from experiments.paper_tables.table1_mrv_rounds import TABLE as TABLE_1
+from experiments.paper_tables.table2_priority import TABLE as TABLE_2
+from experiments.paper_tables.table3_modality_groups import TABLE as TABLE_3
+from experiments.paper_tables.table4_num_convs import TABLE as TABLE_4
+from experiments.paper_tables.table5_dilations import TABLE as TABLE_5
+from experiments.paper_tables.table6_untied_heads import TABLE as TABLE_6
+from experiments.paper_tables.table7_latency import TABLE as TABLE_7
+from experiments.paper_tables.table8_test_submission import TABLE as TABLE_8
+from experiments.paper_tables.tables import Args, command, run_table
+
+TABLES = (TABLE_1, TABLE_2, TABLE_3, TABLE_4, TABLE_5, TABLE_6, TABLE_7, TABLE_8)
+
+
+def main(args: Args) -> None:
+    """All tables."""
+    for table in TABLES:
+        run_table(table, args)
+
+
+if __name__ == "__main__":
+    command(main, __doc__)

@@ -1,0 +1,25 @@
+"""Table 5: dilation rates of the parallel branches.
+
+    python -m experiments.paper_tables.table5_dilations  # smoke: minutes, a toy
+    python -m experiments.paper_tables.table5_dilations --scale simulated  # 4 cells, three seeds
+    python -m experiments.paper_tables.table5_dilations --scale nuscenes --data-root DIR
+
+Expected of the paper: (1, 3, 6) beats (1,) by 1.2 points of mAP, and three equal branches by 0.45.
+"""
+
+from experiments.paper_tables.grid import change
+from experiments.paper_tables.tables import Row, Table, command, run_table
+
+TABLE = Table(
+    "table5",
+    "Table 5: dilations",
+    tuple(
+        Row(str(dilations), change(model__stem__dilations=dilations), str(dilations))
+        for dilations in ((1,), (1, 3), (1, 3, 6), (1, 1, 1))
+    ),
+    reference="(1,)",
+)
+
+
+if __name__ == "__main__":
+    command(lambda args: run_table(TABLE, args), __doc__)

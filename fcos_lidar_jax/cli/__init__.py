@@ -1,0 +1,87 @@
+"""The command line: parse, run, and turn every foreseeable failure into one line."""
+
+import sys
+from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any
+
+import tyro
+
+from fcos_lidar_jax.cli import demo, detect, evaluate, prepare, project, synthesize, train
+
+_DESCRIPTION = "FCOS-LiDAR in JAX: 3D object detection on LiDAR range images."
+
+_COMMANDS = {
+    "demo": (demo.Demo, demo.run),
+    "synthesize": (synthesize.Synthesize, synthesize.run),
+    "prepare": (prepare.Prepare, prepare.run),
+    "train": (train.Train, train.run),
+    "evaluate": (evaluate.Evaluate, evaluate.run),
+    "detect": (detect.Detect, detect.run),
+    "project": (project.Project, project.run),
+}
+"""Name -> its options and what it does."""
+
+Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _) in _COMMANDS.items()))
+
+
+_LESS_MEMORY = (
+    "in training --optimizer.accumulate N takes a batch in N parts, and --model.precision bfloat16 halves the "
+    "activations; elsewhere --batch-size 1 needs the least"
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        argv: arguments without the program's name; the process's by default.
+
+    Returns:
+        exit code: 0, 1 after a failure that one line on standard error explains, 130 when interrupted. Usage
+        errors leave with 2.
+    """
+    command = tyro.cli(
+        Command,
+        prog="fcos-lidar",
+        description=_DESCRIPTION,
+        args=argv,
+        config=(tyro.conf.CascadeSubcommandArgs,),  # a command's options may stand behind its preset
+    )  # type: ignore[call-overload]
+    run = next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))
+    return exit_code("fcos-lidar", lambda: run(command))
+
+
+def exit_code(program: str, work: Callable[[], object]) -> int:
+    """Do the work; one line on standard error, from the program of that name, tells why it failed.
+
+    Args:
+        program: name for the line.
+        work: what to do; its result is dropped.
+
+    Returns:
+        0, 1 after a foreseeable failure, 130 when interrupted.
+
+    >>> exit_code("example", lambda: 0)
+    0
+    """
+    try:
+        work()
+    except (ValueError, OSError, ArithmeticError) as error:
+        line = " ".join(str(error).split())
+        print(f"{program}: error: {line}", file=sys.stderr)
+        return 1
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        print(f"{program}: error: out of memory: {_LESS_MEMORY}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

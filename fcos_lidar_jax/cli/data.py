@@ -1,0 +1,167 @@
+"""The options that name a data set, the same for every command."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Literal
+
+from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.classes import ClassMap, MappedFrames
+from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.input_pipeline.open import Format, Layout, default_split, find_layout, open_frames
+from fcos_lidar_jax.sensors import Sensor, load_sensor
+
+
+@dataclasses.dataclass(frozen=True)
+class DataOptions:
+    """Which data set, and how it is read."""
+
+    data_root: Path | None = None
+    """Folder of the data set; --format simulated needs none."""
+    format: Format | None = None
+    """Layout of the data set; recognised by default."""
+    version: str | None = None
+    """nuScenes: folder of the tables, such as v1.0-trainval; may be left out where there is one."""
+    index: Path | None = None
+    """nuScenes: where fcos-lidar prepare puts the index; default: DATA_ROOT/.fcos_lidar/VERSION."""
+    splits: Path | None = None
+    """JSON file with own splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
+    class_map: Path | None = None
+    """JSON file {name in the data: name to use, or null for objects to leave out}."""
+    allow_missing_sweeps: bool = False
+    """nuScenes: go on with fewer sweeps where files of older sweeps are missing."""
+
+    def layout(self) -> Layout:
+        """What kind of data set it is.
+
+        Raises:
+            ValueError: in one line.
+        """
+        return find_layout(self.data_root, self.format, self.version)
+
+    def open(
+        self,
+        config: Config,
+        *,
+        split: str | None,
+        samples: str | None = None,
+        sensor: Sensor | None = None,
+        option: str = "--samples",
+    ) -> FrameSet:
+        """Frames for a detector, their labels those of its classes.
+
+        Boxes of other classes are left out; a line on standard error counts them.
+
+        Args:
+            config: sweeps, close points and classes.
+            split: which part; None for all.
+            samples: ranges of the frames, see :func:`parse_ranges`; None for all.
+            sensor: for layouts that do not tell theirs; default: the configuration's.
+            option: where ``samples`` is from, for messages.
+        """
+        projection = config.projection
+        frames = self.open_whole(
+            split,
+            num_sweeps=config.num_sweeps,
+            remove_close=projection.remove_close,
+            close_m=projection.close_m,
+            sensor=sensor or load_sensor(config.sensor),
+        )
+        if samples is not None:
+            frames = ChosenFrames(frames, tuple(parse_ranges(samples, len(frames), option)))
+        mapped = MappedFrames(frames, config.classes)
+        lost = mapped.left_out() if set(frames.classes) - set(config.classes) else {}
+        if lost:
+            told = ", ".join(f"{count} {name}" for name, count in lost.items())
+            print(f"boxes of classes that the detector does not have are left out: {told}", file=sys.stderr)
+        return mapped
+
+    def open_whole(
+        self,
+        split: str | None,
+        *,
+        num_sweeps: int,
+        remove_close: Literal["all", "sweeps", "none"] = "all",
+        close_m: float = 1.0,
+        sensor: Sensor | None = None,
+    ) -> FrameSet:
+        """Frames with all of their own classes; by default as the ground-truth database is made of them.
+
+        Args:
+            split: which part; None for all.
+            num_sweeps: as in :func:`open_frames`, as are the next two.
+            remove_close: of which sweeps.
+            close_m: within which distance.
+            sensor: for layouts that do not tell theirs.
+        """
+        layout = self.layout()
+        frames = open_frames(
+            self.data_root,
+            format=layout.format,
+            version=layout.version,
+            split=split,
+            sensor=None if layout.format == "folder" else sensor,
+            num_sweeps=num_sweeps,
+            remove_close=remove_close,
+            close_m=close_m,
+            class_map=read_class_map(self.class_map),
+            index=self.index,
+            splits=self.splits,
+            allow_missing_sweeps=self.allow_missing_sweeps,
+        )
+        if isinstance(frames, NuScenesFrames):
+            missing = frames.nuscenes.missing_sweeps(list(frames.tokens), num_sweeps)
+            if missing:
+                print(f"{missing} sweep files of split {split!r} are missing", file=sys.stderr)
+        return frames
+
+    def split(self, purpose: Literal["train", "val"], *, required: bool = True) -> str | None:
+        """The split that is meant where none is named."""
+        return default_split(self.layout(), purpose, required=required, splits=self.splits)
+
+
+def read_class_map(file: Path | None) -> ClassMap | None:
+    """The translation of class names in a JSON file; None for none.
+
+    Raises:
+        ValueError: naming the file.
+    """
+    if file is None:
+        return None
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{file}: cannot be read: {error}") from None
+    if not isinstance(found, dict) or not all(v is None or isinstance(v, str) for v in found.values()):
+        raise ValueError(f"{file}: expected a JSON object {{name: name or null}}")
+    return found
+
+
+def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]:
+    """Indices of ``FIRST:LAST[,FIRST:LAST...]``, each range without its end.
+
+    Args:
+        text: ranges in any order that do not overlap.
+        number: of what is counted.
+        option: where the text is from, for messages.
+
+    Raises:
+        ValueError: with the range that cannot be.
+
+    >>> parse_ranges("0:2,5:7", 7)
+    [0, 1, 5, 6]
+    """
+    found: list[int] = []
+    for part in text.split(","):
+        first, colon, last = part.partition(":")
+        if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
+            raise ValueError(f"{option}: got {part!r}, expected FIRST:LAST")
+        indices = range(int(first), int(last))
+        if not indices or int(last) > number:
+            raise ValueError(f"{option}: got {part!r}, expected FIRST < LAST within the {number} frames")
+        if set(indices) & set(found):
+            raise ValueError(f"{option}: {part!r} overlaps with another range of {text!r}")
+        found += indices
+    return found

@@ -1,0 +1,84 @@
+"""``fcos-lidar project``: one point file to a multi-round range image."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import numpy as np
+import tyro
+
+from fcos_lidar_jax.config import Config, ProjectionConfig
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.inference.cloud import expect_points, make_cloud
+from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import load_sensor
+
+
+@dataclasses.dataclass(frozen=True)
+class Project:
+    """Project a point file to its multi-round range image.
+
+    Writes point_index i32[h,w,r] (row of the file, -1 empty), features f32[h,w,9,r] (x, y, z, range, azimuth,
+    inclination, intensity, existence, time lag) and the counts to a .npz file, and prints the counts as JSON.
+    """
+
+    file: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FILE")]]
+    """Point file: .pcd.bin, .bin, .npy, .npz or .pcd."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.npz")]
+    """Where the range image goes."""
+    png: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also draw the image, round by round."""
+    sensor: str = "nuscenes_hdl32e"
+    """Sensor preset, or a sensor file."""
+    rounds: int = 5
+    """Rounds of the projection."""
+    prioritize_current: bool = True
+    """Points of the current sweep win every collision with older ones."""
+    remove_close: Literal["all", "sweeps", "none"] = "all"
+    """Drop points within a metre of the sensor in x and y: of all sweeps, of the older ones, or none."""
+    columns: int | None = None
+    """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
+    dtype: Literal["float16", "float32", "float64"] | None = None
+    """Number type of a raw file of another layout."""
+
+
+def run(args: Project) -> None:
+    """Do it."""
+    if args.rounds < 1:
+        raise ValueError(f"--rounds: got {args.rounds}, expected at least 1")
+    sensor = load_sensor(args.sensor)
+    points = read_points(args.file, sensor, columns=args.columns, dtype=args.dtype)
+    config = Config(max_points=max(len(points), 1), projection=ProjectionConfig(remove_close=args.remove_close))
+    cloud = make_cloud(points, config, sensor=sensor)
+    image = jax.tree.map(
+        np.asarray,
+        project_points(
+            cloud.points,
+            cloud.valid,
+            sensor,
+            num_rounds=args.rounds,
+            prioritize_current=args.prioritize_current,
+        ),
+    )
+    dropped = int(image.num_dropped)
+    expect_points(args.file, cloud, dropped, sensor)
+    counts = {
+        "num_points": cloud.num_points,
+        "num_dropped": dropped + cloud.num_removed,
+        "num_close": cloud.num_close,
+        "kept_by_round": (image.point_index >= 0).sum(axis=(0, 1)).tolist(),
+    }
+
+    def save(path: Path) -> None:
+        with path.open("wb") as stream:
+            np.savez_compressed(stream, point_index=image.point_index, features=image.features, **counts)
+
+    atomic_write(args.out, save)
+    if args.png is not None:
+        from fcos_lidar_jax.visualization.range_image import draw_range_image
+
+        draw_range_image(image, args.png, title=f"{args.file.name}, {sensor.name}")
+    print(json.dumps({"file": str(args.file), **counts}))

@@ -1,0 +1,64 @@
+"""``fcos-lidar synthesize``: a simulated data set in the official nuScenes layout."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset
+from fcos_lidar_jax.simulation.render import SWEEPS_PER_KEYFRAME, DatasetSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class Synthesize:
+    """Simulate streets with objects of all ten classes, seen by a turning LiDAR, and write them as a data set in
+    the official nuScenes layout.
+
+    The same options give the same bytes, and a scene does not depend on how many there are. Ctrl-C, or a kill,
+    loses the scene at hand: the same command goes on. The last fifth of the scenes is the split val, the others
+    are train; the official devkit, which reserves those names, knows them as synthetic_val and synthetic_train.
+    """
+
+    out: Path
+    """Folder of the data set: new or empty, or where the same command was stopped."""
+    scenes: int
+    """How many; with the defaults a scene lasts 19.5 s and takes 272 MB."""
+    seed: int = 0
+    """Another seed gives other streets."""
+    keyframes: int = 40
+    """Annotated keyframes a scene, at 2 Hz, with nine sweeps between two of them."""
+    sensor: str = "nuscenes_hdl32e"
+    """Sensor preset, or a sensor file."""
+    rolling_shutter: bool = False
+    """Car and objects move while the sensor turns, as they do in real data; takes about twice as long."""
+    workers: int = 1
+    """Processes."""
+    version: str = "v1.0-synthetic"
+    """Folder of the tables."""
+
+
+def run(args: Synthesize) -> None:
+    """Do it, and print what there is."""
+    for name, least in (("scenes", 1), ("keyframes", 1), ("workers", 1), ("seed", 0)):
+        if getattr(args, name) < least:
+            raise ValueError(f"--{name}: got {getattr(args, name)}, expected at least {least}")
+    if not args.version or args.version.startswith(".") or Path(args.version).name != args.version:
+        raise ValueError(f"--version: got {args.version!r}, expected a folder's name")
+    if args.version in ("samples", "sweeps", "maps"):
+        raise ValueError(f"--version: got {args.version!r}, which is the name of another folder")
+    sensor = load_sensor(args.sensor)
+    order = DatasetSpec(args.scenes, args.seed, args.keyframes, sensor, args.rolling_shutter, args.version)
+    sweeps = args.scenes * ((args.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1)
+    progress = Progress("sweeps", sweeps)
+    if not write_dataset(order, args.out, workers=args.workers, report=progress.show):
+        print(f"{args.out}: was there already", file=sys.stderr)
+    record = {
+        "data_root": str(args.out),
+        "version": args.version,
+        "splits": {name: len(scenes) for name, scenes in splits(args.scenes).items()},
+        "keyframes": args.scenes * args.keyframes,
+        "sweeps": sweeps,
+    }
+    print(json.dumps(record))

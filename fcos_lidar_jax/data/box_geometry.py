@@ -1,0 +1,154 @@
+"""Boxes in the ground plane, on the host: which of them overlap, and which points they hold."""
+
+import numpy as np
+
+from fcos_lidar_jax.geometry import points_in_box
+
+LIMITS = {
+    **dict.fromkeys(("x", "y", "z"), 10_000.0),
+    **dict.fromkeys(("l", "w", "h"), 500.0),
+    "yaw": 1000.0,
+    **dict.fromkeys(("vx", "vy"), 500.0),
+}
+"""Field of a box -> largest magnitude that is no mistake: metres, radians, metres a second."""
+_CELL_M = 0.5
+_MAX_CELLS = 1024
+"""Along a side: a box far away makes the cells larger, not the grid."""
+_SLACK_M = 1e-3
+"""Far above the rounding of float32 coordinates: the coarse tests never lose a point that lies inside."""
+
+
+def find_bad_box(boxes: np.ndarray) -> tuple[int, str] | None:
+    """The first box that no object can have, and what is wrong with it; None where all can be.
+
+    Args:
+        boxes: [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``; an unknown velocity is NaN twice.
+
+    >>> find_bad_box(np.array([[8, 0, 0, 4, 2, 0, 0, np.nan, np.nan]]))
+    (0, 'h: got 0, expected a size above 0 m')
+    """
+    limits = np.array(list(LIMITS.values()))
+    good = (np.abs(boxes) <= limits) | (np.isnan(boxes) & np.isnan(boxes[:, 7:].sum(axis=1))[:, None])
+    good[:, :7] &= np.isfinite(boxes[:, :7])
+    good[:, 3:6] &= boxes[:, 3:6] > 0
+    if good.all():
+        return None
+    row, column = np.argwhere(~good)[0]
+    name, value = list(LIMITS)[column], boxes[row, column]
+    if name in ("l", "w", "h") and value <= 0:
+        return int(row), f"{name}: got {value:g}, expected a size above 0 m"
+    return int(row), f"{name}: got {value:g}, expected at most {LIMITS[name]:g}"
+
+
+def footprints_overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Whether the rotated rectangles of boxes share some area; elementwise with broadcasting.
+
+    Touching is no overlap. Separating axes, float64.
+
+    Args:
+        a: [..., >= 7], ``x, y, z, l, w, h, yaw, ...``.
+        b: likewise.
+
+    Returns:
+        bool[...].
+
+    >>> car = np.array([0, 0, 0, 4, 2, 1.5, 0.0])
+    >>> footprints_overlap(car, car + np.array([[3.0], [4.0]]) * [1, 0, 0, 0, 0, 0, 0]).tolist()
+    [True, False]
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    turn = b[..., 6] - a[..., 6]
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    apart = np.zeros(turn.shape, bool)
+    for own, other in ((a, b), (b, a)):
+        axis_x, axis_y = np.cos(own[..., 6]), np.sin(own[..., 6])
+        along, across = np.abs(axis_x * dx + axis_y * dy), np.abs(axis_x * dy - axis_y * dx)
+        l, w = other[..., 3], other[..., 4]
+        apart |= 2 * along >= own[..., 3] + l * cos + w * sin
+        apart |= 2 * across >= own[..., 4] + l * sin + w * cos
+    return ~apart
+
+
+def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Which points lie in an upright box, boundary included, bool[n]; in float64.
+
+    Args:
+        points: [n, >= 3], metres.
+        box: ``x, y, z, l, w, h, yaw, ...``.
+
+    >>> inside_box(np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.array([0, 0, 0, 4, 2, 2, 0.0])).tolist()
+    [True, False]
+    """
+    return np.asarray(points_in_box(points[:, :3].astype(np.float64), np.asarray(box, np.float64)))
+
+
+def count_inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Points inside each upright box, boundary included, i32[m].
+
+    >>> count_inside(np.zeros((2, 3)), np.array([[0, 0, 0, 1, 1, 1, 0.3]])).tolist()
+    [2]
+    """
+    return np.array([len(rows) for rows in points_in_boxes(points, boxes)], np.int32)
+
+
+def points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
+    """Rows of the points inside each upright box, boundary included.
+
+    All points are looked up once in a coarse grid of the ground that marks where boxes are; only the few near a
+    box are tested exactly, by :func:`inside_box`.
+
+    Args:
+        points: [n, >= 3], metres; non-finite ones are in no box.
+        boxes: [m, >= 7], ``x, y, z, l, w, h, yaw, ...``.
+
+    Returns:
+        one i64 array a box, ascending.
+
+    >>> box = np.array([[0, 0, 0, 4, 2, 2, 0.0]])
+    >>> [rows.tolist() for rows in points_in_boxes(np.array([[1.0, 0, 0], [3.0, 0, 0], [-2.0, 1, 1]]), box)]
+    [[0, 2]]
+    """
+    boxes = np.asarray(boxes, np.float64)
+    if not len(points) or not len(boxes):
+        return [np.zeros(0, np.int64) for _ in boxes]
+    reach = _reach(boxes)
+    near = _near_boxes(points, boxes[:, :2], reach)
+    near = near[np.argsort(points[near, 0], kind="stable")]
+    x = points[near, 0].astype(np.float64)
+    first = np.searchsorted(x, boxes[:, 0] - reach[:, 0], side="left")
+    last = np.searchsorted(x, boxes[:, 0] + reach[:, 0], side="right")
+    found = []
+    for box, i, j in zip(boxes, first, last, strict=True):
+        rows = near[i:j]
+        found.append(np.sort(rows[inside_box(points[rows], box)]))
+    return found
+
+
+def _reach(boxes: np.ndarray) -> np.ndarray:
+    """Half the sides of the upright rectangle around each footprint, f64[m, 2]."""
+    cos, sin = np.abs(np.cos(boxes[:, 6])), np.abs(np.sin(boxes[:, 6]))
+    l, w = boxes[:, 3], boxes[:, 4]
+    return np.stack([l * cos + w * sin, l * sin + w * cos], axis=1) / 2 + _SLACK_M
+
+
+def _near_boxes(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Rows of the points in a cell of the ground that some box touches, ascending."""
+    low, high = (centres - reach).min(axis=0), (centres + reach).max(axis=0)
+    cell_m = max(_CELL_M, float((high - low).max()) / _MAX_CELLS)
+    # One cell around everything stays free: what lies outside is sent there.
+    low -= cell_m
+    shape = ((high - low) / cell_m).astype(np.int64) + 2
+    occupied = np.zeros(shape, bool)
+    begin = ((centres - reach - low) / cell_m).astype(np.int64)
+    end = ((centres + reach - low) / cell_m).astype(np.int64) + 1
+    for (i, j), (k, l) in zip(begin, end, strict=True):
+        occupied[i:k, j:l] = True
+    cells = []
+    for axis in (0, 1):
+        cell = (points[:, axis] - points.dtype.type(low[axis])) * points.dtype.type(1 / cell_m)
+        # fmax and fmin turn NaN into a number, so that the conversion is defined.
+        np.fmax(cell, 0, out=cell)
+        np.fmin(cell, shape[axis] - 1, out=cell)
+        cells.append(cell.astype(np.int32))
+    return np.flatnonzero(occupied.ravel().take(cells[0] * np.int32(shape[1]) + cells[1]))

@@ -1,0 +1,124 @@
+"""Classes by name: from those of a data set to those of a detector."""
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf
+from fcos_lidar_jax.files import checksum
+
+ClassMap = Mapping[str, str | None]
+"""Name in the data -> name to use instead, None for objects to leave out; other names stay."""
+
+
+def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None = None) -> np.ndarray:
+    """Where each of some classes is among others, by name.
+
+    Args:
+        of: classes of the data.
+        to: classes that are wanted.
+        class_map: translates names of ``of``.
+
+    Returns:
+        i32[len(of)]: index into ``to``, -1 for classes that are left out.
+
+    Raises:
+        ValueError: the class map has a name that is none of the data's.
+
+    >>> map_labels(("Car", "Van", "Tram"), ("person", "car"), {"Car": "car", "Van": "car"}).tolist()
+    [1, 1, -1]
+    """
+    class_map = class_map or {}
+    for name in class_map:
+        if name not in of:
+            raise ValueError(f"class map: {unknown_name(name, of)}")
+    place = {name: i for i, name in enumerate(to)}
+    names = (class_map.get(name, name) for name in of)
+    return np.array([-1 if name is None else place.get(name, -1) for name in names], np.int32)
+
+
+def mapped_classes(of: Sequence[str], class_map: ClassMap) -> tuple[str, ...]:
+    """The classes that a class map makes of those of the data, in their order, each once.
+
+    >>> mapped_classes(("Car", "Van", "Tram", "Misc"), {"Car": "car", "Van": "car", "Misc": None})
+    ('car', 'Tram')
+    """
+    names = (class_map.get(name, name) for name in of)
+    return tuple(dict.fromkeys(name for name in names if name is not None))
+
+
+def unknown_name(name: str, known: Iterable[str]) -> str:
+    """What was found and what was expected, the nearest names or all.
+
+    >>> unknown_name("trunk", ("car", "truck"))
+    "got 'trunk', expected truck"
+    """
+    known = list(known)
+    return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"
+
+
+@dataclasses.dataclass(frozen=True)
+class MappedFrames(FramesOf):
+    """Frames whose labels count other classes, mapped by name; boxes of classes that are not there are left out.
+
+    Raises:
+        ValueError: at construction, when no name is shared.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+    >>> frames = MappedFrames(SimulatedFrames(TINY, 3), ("person", "barrier"), {"pedestrian": "person"})
+    >>> sorted(set(frames.labels(0).tolist())), sorted(frames.left_out())[:3]
+    ([0, 1], ['bicycle', 'bus', 'car'])
+    """
+
+    frames: FrameSet
+    """Of any classes."""
+    wanted: tuple[str, ...]
+    """The classes from now on."""
+    class_map: ClassMap | None = None
+    """Translates the names of the frames' classes first."""
+
+    def __post_init__(self) -> None:
+        """Compare the names."""
+        super().__post_init__()
+        object.__setattr__(self, "classes", self.wanted)
+        if (self._table < 0).all():
+            raise ValueError(
+                f"classes: the data have {', '.join(self.frames.classes) or 'none'}, the detector "
+                f"{', '.join(self.wanted)}, expected a name in both: a class map translates names"
+            )
+
+    @property
+    def _table(self) -> np.ndarray:
+        return map_labels(self.frames.classes, self.wanted, self.class_map)
+
+    def frame(self, index: int) -> Frame:
+        """One frame, read anew, without the boxes of other classes."""
+        frame = self.frames.frame(index)
+        labels = self._table[frame.labels]
+        kept = labels >= 0
+        return dataclasses.replace(
+            frame, boxes=frame.boxes[kept], labels=labels[kept], num_points=frame.num_points[kept]
+        )
+
+    def labels(self, index: int) -> np.ndarray:
+        """i32[m]: labels of the frame's boxes that stay."""
+        labels = self._table[self.frames.labels(index)]
+        return labels[labels >= 0]
+
+    def left_out(self) -> dict[str, int]:
+        """Boxes that are left out, by the class that they have in the data; reads the labels of all frames."""
+        counts = np.zeros(len(self.frames.classes), np.int64)
+        for index in range(len(self.frames)):
+            counts += np.bincount(self.frames.labels(index), minlength=len(counts))
+        lost = (self._table < 0) & (counts > 0)
+        return {self.frames.classes[i]: int(counts[i]) for i in np.flatnonzero(lost)}
+
+    def fingerprint(self) -> str:
+        """That of the frames where the classes stay what they are, else a checksum of it and of the mapping."""
+        source = self.frames.fingerprint()
+        if self.class_map is None and self.classes == self.frames.classes:
+            return source
+        return checksum(repr((source, self.classes, self._table.tolist())).encode())

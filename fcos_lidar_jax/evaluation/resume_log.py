@@ -1,0 +1,81 @@
+"""Detections of finished samples, kept so that an interrupted run resumes."""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+
+class ResumeLog:
+    """Entries of the samples that are done, one line each, in a file that is only appended to.
+
+    A line that an interruption truncated is dropped. The first line is the fingerprint of detector and data: a
+    file with another one is begun anew.
+
+    Args:
+        path: of the file.
+        fingerprint: of the detector and the data.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "resume_log"
+    >>> with ResumeLog(file, "this detector") as resume_log:
+    ...     resume_log.add("a", [])
+    >>> with ResumeLog(file, "this detector") as resume_log:
+    ...     "a" in resume_log, "b" in resume_log
+    (True, False)
+    """
+
+    def __init__(self, path: Path, fingerprint: str) -> None:
+        self.path, self.places = path, dict[str, tuple[int, int]]()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._stream = path.open("a+b")
+        end = self._read(json.dumps(fingerprint).encode())
+        self._stream.truncate(end)
+        self._stream.seek(end)
+        if end == 0:
+            self._stream.write(json.dumps(fingerprint).encode() + b"\n")
+
+    def _read(self, first: bytes) -> int:
+        """Where the whole lines end; 0 if they are of something else."""
+        self._stream.seek(0)
+        end = 0
+        for number, line in enumerate(self._stream):
+            token, separator, entries = line.partition(b"\t")
+            if not line.endswith(b"\n") or (number == 0 and line != first + b"\n"):
+                break
+            if number:
+                if not separator:
+                    break
+                self.places[json.loads(token)] = end + len(token) + 1, len(entries) - 1
+            end += len(line)
+        return end
+
+    def __contains__(self, token: str) -> bool:
+        return token in self.places
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def add(self, token: str, entries: list[dict[str, Any]]) -> None:
+        """Append the entries of a sample."""
+        name, text = json.dumps(token).encode(), json.dumps(entries).encode()
+        start = self._stream.seek(0, 2) + len(name) + 1
+        self._stream.write(b"%s\t%s\n" % (name, text))
+        self._stream.flush()
+        self.places[token] = start, len(text)
+
+    def entries(self, tokens: Sequence[str]) -> Iterator[tuple[str, bytes]]:
+        """Samples with their entries as JSON, in the order asked for."""
+        for token in tokens:
+            start, length = self.places[token]
+            self._stream.seek(start)
+            yield token, self._stream.read(length)
+
+    def __enter__(self) -> "ResumeLog":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stream.close()

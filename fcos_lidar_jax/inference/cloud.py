@@ -1,0 +1,250 @@
+"""The one policy for every cloud that meets a detector, in training too: what is removed, truncated and told."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.projection import image_cells
+from fcos_lidar_jax.projection import remove_close as without_close
+from fcos_lidar_jax.sensors import Sensor
+
+MAX_INTENSITY = 65_535.0
+"""On the scale 0-255. Unscaled 16-bit counts reach this far, no measurement lies beyond; one value of 1e30 would
+leave an infinite running variance in the network."""
+MAX_TIME_LAG_S = 60.0
+"""Far more than anybody fuses: what lies beyond is a time stamp or damage, as is a negative lag."""
+
+_SEED = 0
+"""Which rows of a sweep are truncated."""
+_MIN_ROWS = 500
+"""Fewer rows tell nothing about the sensor."""
+_NEAR_M = 2.0
+"""Points on the ego vehicle tell nothing either."""
+_MAX_BEYOND = 0.9
+_MAX_OUTSIDE = 0.3
+_MAX_DENSITY = 1.7
+_MIN_NEIGHBOURS = 0.3
+"""The four bounds of :func:`sensor_mismatch`. A sensor's own clouds have at most 0.17, 0.01 and 1.05, and at least
+0.84; of all pairs of different presets at least one figure lies clearly on the other side."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cloud:
+    """One cloud as a detector takes it, always of ``config.max_points`` rows."""
+
+    points: np.ndarray
+    """f32[max_points, c]: x, y, z (m), intensity (0-255), time lag (s), and the laser number for sensors that need
+    it. Rows in their order, in their places unless there are more than fit; zero behind them."""
+    valid: np.ndarray
+    """bool[max_points]: rows that take part; False for removed rows and padding."""
+    num_points: int
+    """Rows as given, those that the reader removed included."""
+    num_close: int
+    """Rows on the ego vehicle, removed here or by the reader."""
+    num_invalid: int
+    """Rows removed because they were not finite or beyond physical limits."""
+    num_truncated: int
+    """Rows removed because there were more than ``config.max_points``."""
+
+    @property
+    def num_removed(self) -> int:
+        """Rows that do not reach the detector."""
+        return self.num_close + self.num_invalid + self.num_truncated
+
+
+def make_cloud(
+    points: np.ndarray, config: Config, *, sensor: Sensor, num_close: int = 0, remove_close: str | None = None
+) -> Cloud:
+    """Remove what no detector should see, and truncate or pad to ``config.max_points`` rows.
+
+    Where more rows than fit are left, the oldest sweeps lose theirs first; of the sweep at the boundary, which may
+    be the current one, random rows go, by a fixed seed. So no cloud is ever compiled for anew.
+
+    Args:
+        points: f32[n, 3 to 6]: x, y, z, intensity (0-255), time lag (s), laser number. Intensity and lag are 0
+            where missing; columns that the sensor has no use for are left out.
+        config: ``max_points``, and which close points are removed.
+        sensor: whose points they are.
+        num_close: points on the ego vehicle that the reader has removed already.
+        remove_close: ``"all"``, ``"sweeps"`` or ``"none"``, see :func:`fcos_lidar_jax.projection.remove_close`;
+            default: as configured. Readers that fuse sweeps have removed theirs, in each sweep's own frame:
+            ``"none"``.
+
+    Raises:
+        ValueError: another number of columns.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> cloud = make_cloud(np.array([[9, 0, 0], [0, 9, np.inf], [0, 0, 0]]), QUICKSTART, sensor=SHORT_RANGE)
+    >>> cloud.points.shape, cloud.valid[:3].tolist(), cloud.num_invalid, cloud.num_close
+    ((4096, 5), [True, False, False], 1, 1)
+    """
+    points = _with_columns(points, sensor)
+    valid = usable_rows(points)
+    num_invalid = int((~valid).sum())
+    mode = remove_close or config.projection.remove_close
+    kept = np.asarray(without_close(points, valid, sensor, mode=mode, close_m=config.projection.close_m))
+    num_removed = int((~kept).sum())
+    padded = np.zeros((config.max_points, points.shape[1]), np.float32)
+    padded_valid = np.zeros(config.max_points, bool)
+    num_truncated = write_points([points], kept, padded, padded_valid)
+    close = num_close + num_removed - num_invalid
+    return Cloud(padded, padded_valid, len(points) + num_close, close, num_invalid, num_truncated)
+
+
+def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """The columns that the sensor's clouds have."""
+    points = np.asarray(points, np.float32)
+    laser = sensor.row_source == "laser"
+    if points.ndim != 2 or not (6 if laser else 3) <= points.shape[1] <= 6:
+        raise ValueError(
+            f"points: got shape {points.shape}, expected [n, {'6' if laser else '3 to 6'}]: x, y, z, intensity, "
+            f"time lag, laser number"
+        )
+    columns = sensor.point_columns
+    return np.pad(points[:, :columns], ((0, 0), (0, max(columns - points.shape[1], 0))))
+
+
+def usable_rows(points: np.ndarray) -> np.ndarray:
+    """Which rows are finite and within physical limits, bool[n].
+
+    Args:
+        points: f32[n, 5 or 6].
+
+    >>> usable_rows(np.array([[1, 2, 0, 255, 0.45], [1, 2, 0, 1e30, 0], [1, np.nan, 0, 0, 0]])).tolist()
+    [True, False, False]
+    """
+    lag, finite = points[:, 4], np.isfinite(points)
+    usable = (np.abs(points[:, 3]) <= MAX_INTENSITY) & (lag >= 0) & (lag <= MAX_TIME_LAG_S)
+    return usable if finite.all() else usable & finite.all(axis=1)
+
+
+def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarray, valid: np.ndarray) -> int:
+    """Write a cloud's rows into arrays of a fixed size, see :func:`make_cloud`.
+
+    Args:
+        parts: f32[n, c] each, written one behind another.
+        kept: bool[n of all parts]: the others stay in their places, invalid, where all fits.
+        points: f32[m, c], zero, written to.
+        valid: bool[m], False, written to.
+
+    Returns:
+        how many rows were truncated.
+
+    >>> points, valid = np.zeros((2, 5), np.float32), np.zeros(2, bool)
+    >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 0, 0]], np.float32)
+    >>> write_points([cloud], np.ones(3, bool), points, valid), points[:, 0].tolist()
+    (1, [1.0, 3.0])
+    """
+    num_truncated = 0
+    if len(kept) > len(points):
+        cloud = np.concatenate(parts)[kept]
+        rows = _newest(cloud[:, 4], len(points))
+        num_truncated = len(cloud) - len(rows)
+        parts, kept = [cloud[rows]], np.ones(len(rows), bool)
+    end = 0
+    for part in parts:
+        points[end : end + len(part)] = part
+        end += len(part)
+    valid[:end] = kept
+    return num_truncated
+
+
+def _newest(lags: np.ndarray, number: int) -> np.ndarray:
+    """Rows of the newest sweeps, ascending; those of the sweep at the boundary by lot."""
+    if len(lags) <= number:
+        return np.arange(len(lags))
+    boundary = np.partition(lags, number)[number]
+    chosen = lags < boundary
+    sweep = np.flatnonzero(lags == boundary)
+    drawn = np.random.default_rng(_SEED).permutation(sweep)
+    chosen[drawn[: number - np.count_nonzero(chosen)]] = True
+    return np.flatnonzero(chosen)
+
+
+def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> None:
+    """Refuse a cloud of which nothing reaches the range image.
+
+    Args:
+        name: of the cloud, for the message.
+        cloud: from :func:`make_cloud`.
+        num_dropped: valid rows that the projection dropped.
+        sensor: whose range image.
+
+    Raises:
+        ValueError: naming the cloud and what became of its points.
+    """
+    if np.count_nonzero(cloud.valid) > num_dropped:
+        return
+    low, high = sensor.limit_z_m
+    limits = f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m"
+    raise ValueError(
+        f"{name}: none of its {cloud.num_points} points is usable ({cloud.num_invalid} not finite or beyond "
+        f"physical limits, {cloud.num_close} on the ego vehicle, the others out of range or view), expected some "
+        f"with {limits} in the field of view of {sensor.name}"
+    )
+
+
+def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
+    """A line that says why a cloud is hardly of this sensor, or None.
+
+    Judged by the current sweep: the share of points beyond the sensor's limits and outside its vertical field of
+    view, points a cell of the image, and how many points have a neighbour in the next column and in the next row.
+
+    Args:
+        points: f32[n, 3 to 6] as in :func:`make_cloud`, as read.
+        sensor: of the detector.
+
+    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
+    >>> from fcos_lidar_jax.simulation.frames import make_frame
+    >>> cloud = make_frame(0, NUSCENES_HDL32E).points
+    >>> sensor_mismatch(cloud, NUSCENES_HDL32E)
+    >>> sensor_mismatch(cloud, SHORT_RANGE)[:68]
+    "points hardly of sensor 'short_range' (32 rows, 128 columns): 7.7 of"
+    """
+    points = _with_columns(points, sensor)
+    points = points[usable_rows(points)]
+    points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
+    far = without_close(points, np.ones(len(points), bool), sensor, mode="all", close_m=_NEAR_M)
+    points = points[np.asarray(far)]
+    if len(points) < _MIN_ROWS:
+        return None
+    finding = _mismatch(points, sensor)
+    if finding is None:
+        return None
+    about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
+    return f"points hardly of {about}: {finding}; expect poor detections"
+
+
+def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
+    low, high = sensor.limit_z_m
+    within = (np.abs(points[:, :2]) < sensor.limit_xy_m).all(axis=1) & (points[:, 2] > low) & (points[:, 2] < high)
+    beyond = 1 - within.mean()
+    if beyond > _MAX_BEYOND:
+        limits = f"|x|, |y| < {sensor.limit_xy_m:g} m, {low:g} < z < {high:g} m"
+        return f"{beyond:.0%} of the points lie beyond its limits, {limits}"
+    # A power of two of rows: few compilations for clouds of any length.
+    rows = 1 << (len(points) - 1).bit_length()
+    padded = np.pad(points, ((0, rows - len(points)), (0, 0)))
+    valid = np.arange(rows) < len(points)
+    valid[: len(points)] = within
+    cells = np.bincount(
+        np.asarray(image_cells(padded, valid, sensor)[0])[valid],
+        minlength=sensor.num_rows * sensor.num_columns + 1,
+    )
+    outside = cells[-1] / within.sum()
+    if outside > _MAX_OUTSIDE:
+        return f"{outside:.0%} of the points lie outside its vertical field of view"
+    filled = cells[:-1].reshape(sensor.num_rows, sensor.num_columns) > 0
+    density = cells[:-1].sum() / filled.sum()
+    if density > _MAX_DENSITY:
+        return f"{density:.1f} of the points share a cell, expected about one"
+    beside = (filled & np.roll(filled, 1, axis=1)).sum() / filled.sum()
+    below = (filled[1:] & filled[:-1]).sum() / filled.sum()
+    for share, what in ((beside, "column"), (below, "row")):
+        if share < _MIN_NEIGHBOURS:
+            return f"{share:.0%} of the points have a neighbour in the next {what}, expected most"
+    return None

@@ -1,0 +1,37 @@
+"""Detections as plain records."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.types import Detections
+
+
+def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 0.0) -> list[dict[str, Any]]:
+    """Detections of one cloud as JSON objects, best first.
+
+    Args:
+        found: NumPy arrays.
+        classes: names that the labels index.
+        min_score: leave out what is below.
+
+    >>> one = np.ones(1, np.float32)
+    >>> as_records(Detections(np.ones((1, 9)), one, one.astype(int), one > 0, one), ("car", "tram"))[0]["label"]
+    'tram'
+    """
+    return [
+        {"label": classes[label], "score": float(score), "box": [float(v) for v in box]}
+        for box, label, score in zip(*confident(found, min_score), strict=True)
+    ]
+
+
+def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes, labels and scores of the detections of one cloud that reach a score.
+
+    Args:
+        found: of one cloud.
+        min_score: leave out what is below.
+    """
+    kept = np.asarray(found.valid) & (np.asarray(found.scores) >= min_score)
+    return np.asarray(found.boxes)[kept], np.asarray(found.labels)[kept], np.asarray(found.scores)[kept]

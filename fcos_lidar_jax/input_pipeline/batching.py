@@ -1,0 +1,119 @@
+"""Frames to batches of a fixed size."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.inference.cloud import usable_rows, write_points
+from fcos_lidar_jax.types import Batch
+
+
+def empty_batch(size: int, *, max_points: int, max_boxes: int, columns: int) -> Batch:
+    """NumPy arrays of a batch in which nothing is valid yet, all zero.
+
+    >>> empty_batch(2, max_points=8, max_boxes=4, columns=5).points.shape
+    (2, 8, 5)
+    """
+    # NumPy arrays, which travel to the device later.
+    arrays: Any = (
+        np.zeros((size, max_points, columns), np.float32),
+        np.zeros((size, max_points), bool),
+        np.zeros((size, max_boxes, 9), np.float32),
+        np.zeros((size, max_boxes), np.int32),
+        np.zeros((size, max_boxes), bool),
+    )
+    return Batch(*arrays)
+
+
+def fill_row(
+    batch: Batch, row: int, parts: Sequence[Frame], removed: Sequence[int] | np.ndarray = ()
+) -> dict[str, int]:
+    """Write one sample into a row of a batch of NumPy arrays.
+
+    Points follow the one policy of :mod:`fcos_lidar_jax.inference.cloud`. Where there are too many boxes, those
+    with the fewest points go, among equals the last; the others keep their order.
+
+    Args:
+        batch: from :func:`empty_batch`.
+        row: which sample.
+        parts: the frame, and what is pasted into it.
+        removed: i64[k], rows of points to leave out, counted through the parts.
+
+    Returns:
+        ``truncated_points``, ``truncated_boxes``, and ``invalid_points``, which are not finite or beyond physical
+        limits.
+
+    >>> batch = empty_batch(1, max_points=2, max_boxes=1, columns=5)
+    >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 1e30, 0]], np.float32)
+    >>> frame = Frame(cloud, np.zeros((0, 9)), np.zeros(0, int), np.zeros(0, int))
+    >>> fill_row(batch, 0, [frame], removed=[0]), batch.points[0, :, 0].tolist()
+    ({'truncated_points': 0, 'truncated_boxes': 0, 'invalid_points': 1}, [2.0, 0.0])
+    """
+    points, valid, boxes, labels, box_valid = (
+        cast(np.ndarray, array)[row]
+        for array in (batch.points, batch.valid, batch.boxes, batch.labels, batch.box_valid)
+    )
+    kept = np.concatenate([usable_rows(part.points) for part in parts])
+    num_invalid = int((~kept).sum())
+    kept[np.asarray(removed, np.int64)] = False
+    truncated = write_points([part.points for part in parts], kept, points, valid)
+    num_points = np.concatenate([part.num_points for part in parts])
+    most = np.sort(np.argsort(-num_points, kind="stable")[: len(boxes)])
+    boxes[: len(most)] = np.concatenate([part.boxes for part in parts])[most]
+    labels[: len(most)] = np.concatenate([part.labels for part in parts])[most]
+    box_valid[: len(most)] = True
+    return {
+        "truncated_points": truncated,
+        "truncated_boxes": len(num_points) - len(most),
+        "invalid_points": num_invalid,
+    }
+
+
+def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> Batch:
+    """Pad frames to one shape and stack them.
+
+    Args:
+        frames: at least one, with the same number of point columns.
+        max_points: rows of points a frame.
+        max_boxes: rows of boxes a frame.
+
+    Raises:
+        ValueError: when a frame is larger; nothing is truncated.
+
+    >>> from fcos_lidar_jax.simulation.frames import make_frame
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> make_batch([make_frame(0, TINY)], max_points=4096, max_boxes=32).points.shape
+    (1, 4096, 5)
+    """
+    columns = frames[0].points.shape[1]
+    batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
+    for row, frame in enumerate(frames):
+        for name, rows, limit in (
+            ("points", len(frame.points), max_points),
+            ("boxes", len(frame.boxes), max_boxes),
+        ):
+            if rows > limit:
+                raise ValueError(f"frame {row}: {name}: got {rows}, expected at most {limit}")
+        fill_row(batch, row, [frame])
+    return batch
+
+
+def check_boxes(boxes: np.ndarray, name: str) -> None:
+    """Refuse boxes that no loss can be computed from: one would make all weights NaN.
+
+    Args:
+        boxes: f32[m, 9] of one frame; NaN velocities are unknown ones.
+        name: of the frame, for the message.
+
+    Raises:
+        ValueError: naming the frame and the first such box.
+    """
+    shapes = boxes[:, :7]
+    bad = np.flatnonzero(~np.isfinite(shapes).all(axis=1) | (shapes[:, 3:6] <= 0).any(axis=1))
+    if len(bad):
+        found = ", ".join(f"{value:g}" for value in shapes[bad[0]])
+        raise ValueError(
+            f"frame {name!r}: box {bad[0]}: got {found}, expected finite x, y, z, l, w, h, yaw with sizes above 0"
+        )

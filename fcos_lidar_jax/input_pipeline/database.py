@@ -1,0 +1,439 @@
+"""The ground-truth database for copy-paste: points of single objects, cut from annotated clouds.
+
+A folder of shards, one a scene, and a manifest. A shard is two files: ``NAME.points.f32``, the points of its
+objects one behind another as plain float32, and ``NAME.objects.npz``, a table that says where each object's points
+are and holds their checksum. ``manifest.json``, written last, holds the checksum of every table. So opening reads
+the small tables alone and sees every altered table and every cut-off file; an altered point is seen when its
+object is read.
+"""
+
+import dataclasses
+import io
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from fcos_lidar_jax.data.box_geometry import points_in_boxes
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.files import atomic_write, checksum
+from fcos_lidar_jax.inference.cloud import usable_rows
+from fcos_lidar_jax.input_pipeline.batching import check_boxes
+
+MAX_SWEEPS = 20
+"""Sweeps by which an object's points are told apart."""
+
+_FORMAT, _VERSION = "fcos_lidar_jax objects", 2
+_MANIFEST = "manifest.json"
+_ROW = np.dtype(
+    [
+        ("box", "<f4", (9,)),  # x, y, z, l, w, h, yaw, vx, vy in the frame it was cut from
+        ("label", "<i4"),  # index into the manifest's classes
+        ("frame", "<i4"),  # index of the frame it was cut from
+        ("start", "<i8"),  # its first row in the shard's points
+        ("count", "<i4"),  # its rows, of all sweeps, in the order of their age
+        ("newest", "<i4", (MAX_SWEEPS,)),  # those of the newest 1, 2, ... sweeps of the frame
+        ("crc32", "<u4"),  # of the rows' bytes
+    ]
+)
+"""One object in a shard's table."""
+_BLOCK = 100
+"""Frames of a shard where the data know no scenes."""
+
+
+class DatabaseError(ValueError):
+    """The database cannot be used; the message names the file, what was found and what was expected."""
+
+
+class Shard(msgspec.Struct, forbid_unknown_fields=True):
+    """One scene's entry in the manifest."""
+
+    name: str
+    objects: int
+    points: int
+    table_blake2b: str
+
+
+class Manifest(msgspec.Struct, forbid_unknown_fields=True):
+    """The last file to be written: without it a database is not finished."""
+
+    format: str
+    version: int
+    source: str
+    classes: list[str]
+    min_points: int
+    columns: int
+    shards: list[Shard]
+
+
+class _Header(msgspec.Struct):
+    format: str
+    version: int
+
+
+@dataclasses.dataclass(frozen=True)
+class _Table:
+    """What a shard's table file holds."""
+
+    rows: np.ndarray
+    """:data:`_ROW`, one an object."""
+    columns: int
+    """Of a point; 0 where there was no frame."""
+    recipe: str
+    """Checksum of all that the shard's bytes follow from."""
+    blake2b: str
+    """Checksum of the file."""
+
+    @property
+    def num_points(self) -> int:
+        """Points of all its objects."""
+        return int(self.rows["count"].sum(dtype=np.int64))
+
+
+@dataclasses.dataclass(frozen=True)
+class GroundTruthDatabase:
+    """An opened database: the tables in memory, the points on disk."""
+
+    folder: Path
+    """Where the shards are."""
+    manifest: Manifest
+    """What was built."""
+    table: np.ndarray
+    """One row an object, all shards one behind another: ``box``, ``label`` (index into the manifest's classes),
+    ``frame``, and what says where its points are."""
+    shard: np.ndarray
+    """i32: which shard of the manifest holds each object."""
+
+    def __len__(self) -> int:
+        """Number of objects."""
+        return len(self.table)
+
+    def num_points(self, num_sweeps: int) -> np.ndarray:
+        """Points of every object in the newest sweeps of its frame, i32[n].
+
+        Raises:
+            ValueError: more sweeps than the table tells apart.
+        """
+        if not 1 <= num_sweeps <= MAX_SWEEPS:
+            raise ValueError(f"num_sweeps: got {num_sweeps}, expected 1 to {MAX_SWEEPS} for copy-paste")
+        return self.table["newest"][:, num_sweeps - 1]
+
+    def points(self, index: int) -> np.ndarray:
+        """The points of one object at their original pose, f32[n, c], read anew, in the order of their age.
+
+        Files are opened for each object, not mapped: a thousand maps would exhaust the open files of a process.
+
+        Raises:
+            DatabaseError: when the bytes are not those that were written.
+        """
+        row, columns = self.table[index], self.manifest.columns
+        file = _points_file(self.folder, self.manifest.shards[self.shard[index]].name)
+        start, count = int(row["start"]) * columns, int(row["count"]) * columns
+        values = np.fromfile(file, "<f4", count=count, offset=4 * start)
+        if zlib.crc32(values.data) != row["crc32"]:
+            raise DatabaseError(
+                f"{file}: object {index}: checksum differs, expected the bytes that were written; build it anew"
+            )
+        return values.reshape(-1, columns)
+
+
+def open_database(folder: str | Path, *, fingerprint: str | None = None) -> GroundTruthDatabase:
+    """Open and check a finished ground-truth database.
+
+    Args:
+        folder: of the database.
+        fingerprint: of the frames that it must have been built from; None to take any.
+
+    Raises:
+        DatabaseError: missing, unfinished, of another format version or other data, altered or cut off.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    file = folder / _MANIFEST
+    if fingerprint is not None and manifest.source != fingerprint:
+        raise DatabaseError(
+            f"{file}: source: got {manifest.source!r}, expected {fingerprint!r}: built from other data, "
+            f"build it anew"
+        )
+    tables = []
+    for entry in manifest.shards:
+        table = _read_shard(folder, entry.name, expected=entry.table_blake2b)
+        found = len(table.rows), table.num_points
+        if found != (entry.objects, entry.points):
+            raise DatabaseError(
+                f"{file}: {entry.name}: got {entry.objects} objects of {entry.points} points, "
+                f"expected {found[0]} of {found[1]} as in its table; build it anew"
+            )
+        tables.append(table.rows)
+    rows = np.concatenate([np.zeros(0, _ROW), *tables])
+    if len(manifest.classes) <= rows["label"].max(initial=-1):
+        raise DatabaseError(
+            f"{file}: classes: got {manifest.classes}, expected at least {rows['label'].max() + 1}; build it anew"
+        )
+    shard = np.repeat(np.arange(len(tables), dtype=np.int32), [len(table) for table in tables])
+    return GroundTruthDatabase(folder, manifest, rows, shard)
+
+
+def objects_folder(index: Path, split: str | None) -> Path:
+    """Where the objects of a split are, below the index: those of another split never get into a training."""
+    return index / "objects" / (split or "all_frames")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a finished database.
+
+    Raises:
+        DatabaseError: as :func:`open_database`.
+    """
+    file = folder / _MANIFEST
+    if not file.is_file():
+        raise DatabaseError(f"{file}: no such file, expected a finished ground-truth database")
+    data = _read(file)
+    try:
+        header = msgspec.json.decode(data, type=_Header)
+        if (header.format, header.version) != (_FORMAT, _VERSION):
+            raise DatabaseError(
+                f"{file}: got {header.format!r} version {header.version}, expected {_FORMAT!r} version "
+                f"{_VERSION}; build it anew: fcos-lidar prepare"
+            )
+        return msgspec.json.decode(data, type=Manifest)
+    except msgspec.DecodeError as error:
+        raise DatabaseError(f"{file}: {error}") from None
+
+
+def prepare_database(
+    frames: FrameSet,
+    folder: str | Path,
+    *,
+    min_points: int = 5,
+    workers: int = 1,
+    report: Callable[[int, int], None] | None = None,
+) -> GroundTruthDatabase:
+    """Cut the points of every box of at least ``min_points`` points out of the frames, a shard a scene.
+
+    Each shard is written beside its place and renamed, its table last, so a kill at any moment loses the shards in
+    work at most; the next call goes on with the rest. The files are the same bytes whatever the number of workers
+    and however often it was stopped. Shards of frames with another fingerprint are replaced.
+
+    Args:
+        frames: of any classes; picklable where there are several workers.
+        folder: of the database; made if missing. Nothing else may live there.
+        min_points: points, of all sweeps, an object needs.
+        workers: processes; 1 works in this one.
+        report: called with (frames done, frames in all) at the beginning, frames of an earlier run counted as
+            done, and after every shard.
+
+    Returns:
+        the finished database, checked and opened.
+
+    Raises:
+        ValueError: frames with different columns, or a box without a size.
+        OSError: what the file system raises, or a worker that died.
+    """
+    folder = Path(folder)
+    if workers < 1:
+        raise ValueError(f"workers: got {workers}, expected at least 1")
+    shards, source = shards_by_scene(frames), frames.fingerprint()
+    folder.mkdir(parents=True, exist_ok=True)
+    _remove_left_overs(folder, set(shards))
+    jobs, done = [], 0
+    for name, indices in shards.items():
+        follows_from = _FORMAT, _VERSION, tuple(frames.classes), source, min_points, name, indices
+        job = _Job(folder, name, indices, min_points, checksum(repr(follows_from).encode()))
+        if _finished(job):
+            done += len(indices)
+        else:
+            jobs.append(job)
+    if jobs:  # an old manifest would not fit the new shards
+        (folder / _MANIFEST).unlink(missing_ok=True)
+    report = report or (lambda done, total: None)
+    report(done, len(frames))
+    for count in (_cut_shard(frames, job) for job in jobs) if workers == 1 else _pooled(frames, jobs, workers):
+        done += count
+        report(done, len(frames))
+    _write_manifest(folder, shards, source, frames.classes, min_points)
+    return open_database(folder, fingerprint=source)
+
+
+def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
+    """Shard, named for a scene, or for its first frame where the data know no scenes -> indices of its frames.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+    >>> shards_by_scene(SimulatedFrames(TINY, 3))
+    {'frames_000000': [0, 1, 2]}
+    """
+    shards: dict[str, list[int]] = {}
+    for index in range(len(frames)):
+        scene = re.sub(r"[^\w.-]|^[.-]", "_", frames.scene(index))
+        shards.setdefault(scene or f"frames_{index // _BLOCK * _BLOCK:06d}", []).append(index)
+    return shards
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """A shard to be written."""
+
+    folder: Path
+    name: str
+    indices: list[int]
+    min_points: int
+    recipe: str
+
+
+def _points_file(folder: Path, shard: str) -> Path:
+    return folder / f"{shard}.points.f32"
+
+
+def _table_file(folder: Path, shard: str) -> Path:
+    return folder / f"{shard}.objects.npz"
+
+
+def _remove_left_overs(folder: Path, names: set[str]) -> None:
+    """Remove what a killed run left half-written, and shards of scenes that the frames no longer have."""
+    for file in folder.iterdir():
+        shard = re.sub(r"\.(points\.f32|objects\.npz)$", "", file.name)
+        left_over = re.fullmatch(r"\.[0-9a-f]{12}\.(f32|npz|json)", file.name)
+        if left_over or (shard != file.name and shard not in names):
+            file.unlink()
+
+
+def _finished(job: _Job) -> bool:
+    """Whether an earlier run left the whole shard, every point of it."""
+    try:
+        table = _read_shard(job.folder, job.name)
+    except DatabaseError:
+        return False
+    if table.recipe != job.recipe:
+        return False
+    data, size = memoryview(_points_file(job.folder, job.name).read_bytes()), 4 * table.columns
+    starts, counts = (table.rows[field].tolist() for field in ("start", "count"))
+    found = [zlib.crc32(data[size * i : size * (i + n)]) for i, n in zip(starts, counts, strict=True)]
+    return found == table.rows["crc32"].tolist()
+
+
+def _cut_shard(frames: FrameSet, job: _Job) -> int:
+    """Write one shard; returns how many frames it has."""
+    rows: list[tuple] = []
+    parts: list[np.ndarray] = []
+    start = columns = 0
+    for index in job.indices:
+        frame = frames.frame(index)
+        if columns not in (0, frame.points.shape[1]):
+            raise ValueError(f"frame {index}: points: got {frame.points.shape[1]} columns, expected {columns}")
+        columns = frame.points.shape[1]
+        check_boxes(frame.boxes, frames.name(index))
+        cloud = frame.points[usable_rows(frame.points)]
+        lags = np.unique(np.append(cloud[:, 4], np.float32(0)))[:MAX_SWEEPS]
+        for box, label, inside in zip(frame.boxes, frame.labels, points_in_boxes(cloud, frame.boxes), strict=True):
+            if len(inside) < job.min_points:
+                continue
+            points = cloud[inside]
+            points = np.ascontiguousarray(points[np.argsort(points[:, 4], kind="stable")], "<f4")
+            newest = np.searchsorted(points[:, 4], lags, side="right")
+            newest = np.pad(newest, (0, MAX_SWEEPS - len(lags)), mode="edge")
+            rows.append((box, label, index, start, len(points), newest, zlib.crc32(points.data)))
+            parts.append(points)
+            start += len(points)
+    table = {"rows": np.array(rows, _ROW), "columns": np.int32(columns), "recipe": np.array(job.recipe)}
+    points = np.concatenate(parts) if parts else np.zeros((0, columns), "<f4")
+    atomic_write(_points_file(job.folder, job.name), lambda path: points.tofile(path))
+    atomic_write(_table_file(job.folder, job.name), lambda path: np.savez(path, allow_pickle=False, **table))
+    return len(job.indices)
+
+
+def _pooled(frames: FrameSet, jobs: Sequence[_Job], workers: int) -> Iterator[int]:
+    pool = ProcessPoolExecutor(
+        min(workers, max(len(jobs), 1)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin_worker,
+        initargs=(frames,),
+    )
+    try:
+        # The workers inherit the mask: an interruption is this process's to answer.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            futures = [pool.submit(_work, job) for job in jobs]
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for future in as_completed(futures):
+            yield future.result()
+    except BrokenProcessPool:
+        raise OSError("a worker died, perhaps for want of memory: try fewer workers") from None
+    finally:  # after an interruption too: the shards in work are finished, no other is begun
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+_worker_frames: FrameSet | None = None
+
+
+def _begin_worker(frames: FrameSet) -> None:
+    global _worker_frames
+    _worker_frames = frames
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:  # which may be killed
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def _work(job: _Job) -> int:
+    assert _worker_frames is not None
+    return _cut_shard(_worker_frames, job)
+
+
+def _write_manifest(
+    folder: Path, names: Iterable[str], source: str, classes: Iterable[str], min_points: int
+) -> None:
+    entries, columns = [], 0
+    for name in names:
+        table = _read_shard(folder, name)
+        if columns and table.columns not in (0, columns):
+            raise ValueError(f"shard {name!r}: points: got {table.columns} columns, expected {columns}")
+        columns = columns or table.columns
+        entries.append(Shard(name, len(table.rows), table.num_points, table.blake2b))
+    manifest = Manifest(_FORMAT, _VERSION, source, list(classes), min_points, columns, entries)
+    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
+    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
+
+
+def _read_shard(folder: Path, name: str, *, expected: str | None = None) -> _Table:
+    """A shard's table, its points being as many as it says; ``expected`` is the table's checksum."""
+    file = _table_file(folder, name)
+    data = _read(file)
+    found = checksum(data)
+    if expected is not None and found != expected:
+        raise DatabaseError(f"{file}: checksum differs from the manifest's; build it anew")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            table = _Table(arrays["rows"], int(arrays["columns"]), str(arrays["recipe"]), found)
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise DatabaseError(f"{file}: not a table of objects: {error}") from None
+    if table.rows.dtype != _ROW or table.rows.ndim != 1:
+        raise DatabaseError(f"{file}: got columns {table.rows.dtype.names}, expected {_ROW.names}; build it anew")
+    file = _points_file(folder, name)
+    size = 4 * table.columns * table.num_points
+    found = f"{file.stat().st_size} bytes" if file.is_file() else "no file"
+    if found != f"{size} bytes":
+        raise DatabaseError(f"{file}: got {found}, expected {size} bytes of points; build it anew")
+    return table
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise DatabaseError(f"{file}: {error.strerror}, expected a part of a ground-truth database") from None

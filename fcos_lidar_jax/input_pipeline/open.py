@@ -1,0 +1,255 @@
+"""One way to open any data set: its layout is recognised, its reader chosen, its classes translated."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
+from fcos_lidar_jax.data.classes import ClassMap, MappedFrames, mapped_classes, unknown_name
+from fcos_lidar_jax.data.folder import SPLITS, FolderFrames, read_splits
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.data.kitti import KittiFrames
+from fcos_lidar_jax.data.nuscenes.reader import NuScenes, NuScenesFrames
+from fcos_lidar_jax.data.nuscenes.splits import own_splits
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
+from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
+
+Format = Literal["nuscenes", "kitti", "argoverse2", "folder", "simulated"]
+
+_MARKS: dict[Format, tuple[str, ...]] = {
+    "nuscenes": ("*/sample.json",),
+    "kitti": ("training/velodyne",),
+    "argoverse2": ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar"),
+    "folder": ("clouds",),
+}
+"""By what a layout is recognised: one of these is there."""
+
+
+_FULL_REACH_M = 45.0
+_SIMULATED = {"train": (100_000, 0), "val": (400, UNSEEN_SEED)}
+"""Split of simulated frames -> how many there are, and the first one's seed."""
+
+
+class LayoutError(ValueError):
+    """A folder that is no data set that can be read; one line that says what was looked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What kind of data set a folder holds."""
+
+    root: Path
+    """The folder."""
+    format: Format
+    """Who reads it."""
+    version: str | None
+    """Folder of the tables, for nuScenes alone."""
+
+    @property
+    def index(self) -> Path:
+        """Where ``prepare`` writes, and its product is looked for, unless another place is given."""
+        return self.root / ".fcos_lidar" / (self.version or "")
+
+
+def find_layout(root: str | Path | None, format: Format | None = None, version: str | None = None) -> Layout:
+    """What kind of data set a folder holds.
+
+    Args:
+        root: the folder; None for simulated frames.
+        format: one of :data:`Format`; recognised by default.
+        version: of nuScenes, which other formats have not; may be left out where there is one.
+
+    Raises:
+        LayoutError: not one format's or version's, naming the folder and what was looked for.
+    """
+    if format == "simulated":
+        if root is not None:
+            raise LayoutError(f"data root: got {root}, expected none for simulated frames")
+        return Layout(Path("simulated"), format, None)
+    if root is None:
+        raise LayoutError("data root: missing, expected the folder of a data set")
+    root = Path(root)
+    if not root.is_dir():
+        raise LayoutError(f"{root}: no such folder, expected a data set")
+    known = _recognise(root) if format is None else format
+    if known not in _MARKS:
+        raise LayoutError(f"format: {unknown_name(known, _MARKS)}")
+    if known == "nuscenes":
+        version = _find_version(root) if version is None else version
+    elif version is not None:
+        raise LayoutError(f"version: got {version!r}, expected none: {root} is of format {known}")
+    return Layout(root, known, version)
+
+
+def _recognise(root: Path) -> Format:
+    found: list[Format] = [
+        name for name, marks in _MARKS.items() if any(next(root.glob(mark), None) for mark in marks)
+    ]
+    if len(found) > 1:
+        raise LayoutError(f"{root}: looks like {' and '.join(found)}, expected one format: name it")
+    if not found:
+        marks = ", ".join(f"{' or '.join(marks)} ({name})" for name, marks in _MARKS.items())
+        raise LayoutError(f"{root}: no known data set, expected one of {marks}")
+    return found[0]
+
+
+def _find_version(root: Path) -> str:
+    there = sorted(file.parent.name for file in root.glob("*/sample.json"))
+    if len(there) != 1:
+        raise LayoutError(f"{root}: got versions {', '.join(there) or '(none)'}, expected one: name it")
+    return there[0]
+
+
+def default_split(
+    layout: Layout, purpose: Literal["train", "val"], *, required: bool, splits: str | Path | None = None
+) -> str | None:
+    """The split that is meant unless another is named: ``train`` or ``val``.
+
+    For nuScenes versions that end in mini: ``mini_train`` or ``mini_val``.
+
+    Args:
+        layout: of the data set.
+        purpose: what it is for.
+        required: where the data have one other split alone, take that; where they have several, refuse to choose.
+        splits: JSON file of own splits.
+
+    Returns:
+        a name, or None where the data have no splits, and, if it is not required, where they have no such split.
+
+    Raises:
+        LayoutError: several splits, none of that name, and one is required.
+    """
+    name = f"mini_{purpose}" if (layout.version or "").endswith("mini") else purpose
+    names = _split_names(layout, splits)
+    if name in names or (layout.format == "nuscenes" and not names):
+        return name
+    if not required or not names:
+        return None
+    if len(names) > 1:
+        raise LayoutError(f"{layout.root}: split: got splits {', '.join(names)}, none is {name}: name one")
+    return names[0]
+
+
+def _split_names(layout: Layout, splits: str | Path | None) -> list[str]:
+    """Splits that the data set defines itself; nuScenes' official ones are in its devkit."""
+    if layout.format == "nuscenes":
+        return list(own_splits(layout.root / (layout.version or ""), splits))
+    if layout.format == "simulated":
+        return list(_SIMULATED)
+    if layout.format == "kitti":
+        return sorted(file.stem for file in (layout.root / "ImageSets").glob("*.txt"))
+    if layout.format == "argoverse2":
+        return find_splits(layout.root)
+    file = layout.root / SPLITS if splits is None else Path(splits)
+    return list(read_splits(file)) if splits is not None or file.exists() else []
+
+
+def open_frames(
+    root: str | Path | None = None,
+    *,
+    format: Format | None = None,
+    version: str | None = None,
+    split: str | None = None,
+    sensor: Sensor | None = None,
+    num_sweeps: int = 1,
+    remove_close: Literal["all", "sweeps", "none"] = "sweeps",
+    close_m: float = 1.0,
+    class_map: ClassMap | None = None,
+    index: str | Path | None = None,
+    splits: str | Path | None = None,
+    allow_missing_sweeps: bool = False,
+) -> FrameSet:
+    """The frames of a data set in any layout that there is a reader for.
+
+    Args:
+        root: the folder; None for simulated frames.
+        format: ``"nuscenes"``, ``"kitti"``, ``"argoverse2"``, ``"folder"`` or ``"simulated"``; by default
+            recognised.
+        version: of nuScenes; may be left out where there is one.
+        split: name of the part that is wanted; all frames by default, see also :func:`default_split`.
+        sensor: whose points they are; by default the format's own.
+        num_sweeps: sweeps fused at most, the current one included; fewer where the data have fewer.
+        remove_close: drop the points on the ego vehicle, judged in each sweep's own frame: of ``"all"`` sweeps, of
+            the older ``"sweeps"``, or ``"none"``.
+        close_m: half the side of the square that is emptied, metres.
+        class_map: the data's name -> another, None for objects to leave out; other names stay.
+        index: of nuScenes, where ``prepare`` has put it.
+        splits: JSON file of own splits, ``{"name": [scene, ...]}`` for nuScenes, of frames for a folder.
+        allow_missing_sweeps: of nuScenes: go on without older sweeps whose file is missing.
+
+    Returns:
+        frames whose labels count their own classes; :class:`~fcos_lidar_jax.data.classes.MappedFrames` brings them
+        to those of a detector.
+
+    Raises:
+        ValueError: in one line, what was found and what was expected.
+
+    >>> import tempfile
+    >>> open_frames(tempfile.mkdtemp())  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    fcos_lidar_jax.input_pipeline.open.LayoutError: ...: no known data set, expected one of ...
+    """
+    layout = find_layout(root, format, version)
+    _refuse(layout, index=index, allow_missing_sweeps=allow_missing_sweeps or None)
+    if num_sweeps < 1:
+        raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
+    if layout.format == "simulated":
+        _refuse(layout, splits=splits)
+        frames = _simulated_frames(split, sensor or NUSCENES_HDL32E, num_sweeps, remove_close, close_m)
+    elif layout.format == "nuscenes":
+        assert layout.version is not None
+        data = NuScenes(layout.root, layout.version, index=index, allow_missing_sweeps=allow_missing_sweeps)
+        tokens = data.sample_tokens if split is None else data.split(split, file=splits)
+        sensor = sensor or NUSCENES_HDL32E
+        frames = NuScenesFrames(data, tuple(tokens), num_sweeps, remove_close, close_m, sensor)
+    elif layout.format == "kitti":
+        _refuse(layout, splits=splits)
+        frames = KittiFrames(
+            layout.root, split, sensor=sensor or KITTI_HDL64E, remove_close=remove_close, close_m=close_m
+        )
+    elif layout.format == "argoverse2":
+        _refuse(layout, splits=splits)
+        frames = Argoverse2Frames(
+            layout.root,
+            split,
+            sensor=sensor or ARGOVERSE2,
+            num_sweeps=num_sweeps,
+            remove_close=remove_close,
+            close_m=close_m,
+        )
+    else:
+        frames = FolderFrames(
+            layout.root,
+            sensor,
+            split=split,
+            splits=splits,
+            num_sweeps=num_sweeps,
+            remove_close=remove_close,
+            close_m=close_m,
+        )
+    return (
+        frames if class_map is None else MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
+    )
+
+
+def _simulated_frames(
+    split: str | None, sensor: Sensor, num_sweeps: int, remove_close: str, close_m: float
+) -> FrameSet:
+    """Streets that fit the sensor: what is near for one of a short reach, else up to 45 m."""
+    split = split or "train"
+    if split not in _SIMULATED:
+        raise LayoutError(f"split: {unknown_name(split, _SIMULATED)}")
+    number, first = _SIMULATED[split]
+    # The simulated ego vehicle has no body that the sensor could see: what is close is the road.
+    frames = SimulatedFrames(
+        sensor, number, first, num_sweeps=num_sweeps, close_m=0.0 if remove_close == "none" else close_m
+    )
+    if sensor.limit_xy_m < _FULL_REACH_M:
+        return frames
+    return dataclasses.replace(frames, num_objects=40, reach_m=_FULL_REACH_M)
+
+
+def _refuse(layout: Layout, **options: object) -> None:
+    for name, value in options.items():
+        if value is not None and layout.format != "nuscenes":
+            raise ValueError(f"{name}: got {value}, expected none: {layout.root} is of format {layout.format}")

@@ -1,0 +1,93 @@
+"""The named configurations: the paper's detectors and small ones for first contact and tests."""
+
+import dataclasses
+import math
+
+from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES
+from fcos_lidar_jax.config import (
+    AugmentConfig,
+    Config,
+    CopyPasteConfig,
+    OptimizerConfig,
+    ProjectionConfig,
+    StemConfig,
+)
+
+NUSCENES = Config()
+"""The paper's detector: ten sweeps, five rounds."""
+
+NUSCENES_SINGLE = dataclasses.replace(NUSCENES, name="nuscenes_single", num_sweeps=1, max_points=40_000)
+"""The paper's single-frame detector: the same network on one sweep, five rounds too."""
+
+NUSCENES_TEST = dataclasses.replace(
+    NUSCENES,
+    name="nuscenes_test",
+    fade_epochs=5,
+    model=dataclasses.replace(NUSCENES.model, head_channels=128),
+)
+"""The paper's test-set model "c128" (section 4.5): wider heads, fade strategy."""
+
+KITTI = dataclasses.replace(
+    NUSCENES_SINGLE,
+    name="kitti",
+    sensor="kitti_hdl64e",
+    classes=KITTI_CLASSES,
+    max_points=131_072,
+    max_boxes=64,
+    class_balanced=False,
+    # 64 beams need no doubling.
+    model=dataclasses.replace(
+        NUSCENES.model,
+        row_upscale=1,
+        channel_mean=(10.9, 0.0, -1.04, 12.1, 0.0, -0.15, 53.6, 0.0, 0.0),
+        channel_scale=(11.5, 6.9, 0.86, 12.3, 0.4, 0.13, 40.8, 1.0, 0.144),
+    ),
+    # Labels and points lie within the camera's view, ahead: no turns that leave it, no driving backwards.
+    augment=AugmentConfig(flip_x_probability=0.0, max_rotation_rad=math.pi / 4),
+)
+"""KITTI's benchmark: one sweep, the camera's view, three classes. The channels' means and scales are those
+commonly used for this view; those of the angles are nominal."""
+
+ARGOVERSE2 = dataclasses.replace(
+    NUSCENES_SINGLE,
+    name="argoverse2",
+    sensor="argoverse2",
+    classes=ARGOVERSE2_CLASSES,
+    max_points=131_072,
+    model=dataclasses.replace(
+        NUSCENES.model,
+        row_upscale=1,
+        channel_mean=(0.0, 0.0, 0.75, 14.0, 0.0, -0.14, 17.5, 0.0, 0.0),
+        channel_scale=(14.0, 14.0, 1.3, 13.0, 1.8, 0.17, 17.6, 1.0, 0.144),
+    ),
+)
+"""Argoverse 2's sensor data set: one sweep of both LiDARs, 26 classes. The channels' means and scales are nominal,
+those of simulated frames."""
+
+QUICKSTART = dataclasses.replace(
+    NUSCENES,
+    name="quickstart",
+    sensor="short_range",
+    num_sweeps=1,
+    max_points=4096,
+    max_boxes=32,
+    copy_paste=CopyPasteConfig(targets=(2, 1, 1, 1, 1, 2, 1, 1, 1, 1)),
+    projection=ProjectionConfig(num_rounds=1, remove_close="all"),
+    model=dataclasses.replace(
+        NUSCENES.model,
+        row_upscale=1,
+        stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3)),
+        backbone_blocks=(2, 2, 1, 1),
+        backbone_widths=(16, 32, 32, 32),
+        fpn_channels=32,
+        head_channels=32,
+        head_convs=2,
+    ),
+    optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=2),
+)
+"""Small enough to train on two CPU cores: the same code, other numbers."""
+
+PRESETS: dict[str, Config] = {
+    c.name: c for c in (NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, KITTI, ARGOVERSE2, QUICKSTART)
+}
+"""Name -> configuration."""

@@ -1,0 +1,203 @@
+"""Where rays meet solids, and at what angle: one vectorised test for each kind of solid."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, WHEEL, unit_map
+
+_POROUS_COSINE = 0.5
+"""Incidence on leaves and wires, which have no surface to speak of."""
+
+
+Crossing = Callable[[np.ndarray, tuple[np.ndarray, ...], np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Where rays (origins and directions in a unit shape's axes, tapers) enter and leave it; leave < enter or NaN
+where they miss."""
+
+
+def crossings(
+    solids: np.ndarray, which: np.ndarray, rays: np.ndarray, d: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Way along each pair's ray to where the solid stops it, f32[k], inf where it does not.
+
+    Args:
+        solids: [s], centres relative to the rays' origin.
+        which: i32[k], solid of each pair.
+        rays: i32[k], ray of each pair.
+        d: f32[3, n], unit vectors.
+        rng: how deep rays get into porous solids.
+    """
+    maps = unit_map(solids)
+    start = -np.einsum("sij,sj->is", maps, solids["center"]).astype(np.float32)
+    maps = np.ascontiguousarray(maps.transpose(1, 2, 0), np.float32)
+    taper = solids["taper"].astype(np.float32)
+    density = solids["density"].astype(np.float32)
+    reach = np.full(len(which), np.inf, np.float32)
+    for crossing, pairs in _by_shape(solids, which):
+        of = which[pairs]
+        v = _turned(maps, of, d.take(rays[pairs], axis=1))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            enter, leave = crossing(start.take(of, axis=1), v, taper[of])
+            crossed = np.flatnonzero((enter < leave) & (enter > 0))
+        enter, leave, thick = enter[crossed], leave[crossed], density[of[crossed]]
+        porous = np.flatnonzero(np.isfinite(thick))
+        depth = rng.standard_exponential(len(porous), np.float32) / thick[porous]
+        enter[porous] += depth
+        reach[pairs[crossed]] = np.where(enter <= leave, enter, np.float32(np.inf))
+    return reach
+
+
+def incidence(solids: np.ndarray, which: np.ndarray, points: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Cosine of the angle between rays and the surfaces that they meet, f32[k].
+
+    Args:
+        solids: [s], centres relative to the rays' origin.
+        which: i32[k], solid of each ray.
+        points: f32[3, k], on the solids.
+        d: f32[3, k], unit vectors.
+    """
+    maps = np.ascontiguousarray(unit_map(solids).transpose(1, 2, 0), np.float32)
+    center = np.ascontiguousarray(solids["center"].T, np.float32)
+    taper = np.ascontiguousarray(solids["taper"].T, np.float32)
+    u = _turned(maps, which, points - center.take(which, axis=1))
+    normal = np.array(u)  # that of a ball
+    slope = (taper.take(which, axis=1) - 1) / 2
+    bound = np.maximum((1 + slope) + slope * u[2], np.float32(1e-9))
+    kind = solids["kind"][which]
+    _box_normals(normal, np.flatnonzero(kind == BOX), bound, slope)
+    drum = np.flatnonzero(kind == DRUM)
+    normal[2, drum] = -slope[0, drum] * bound[0, drum]
+    cap = drum[np.abs(u[2][drum]) > np.hypot(u[0][drum], u[1][drum]) / bound[0, drum]]
+    normal[:, cap] = np.array([[0], [0], [1]])
+    wheel = np.flatnonzero(kind == WHEEL)
+    normal[1, wheel] = 0
+    side = wheel[np.abs(u[1][wheel]) > np.hypot(u[0][wheel], u[2][wheel])]
+    normal[:, side] = np.array([[0], [1], [0]])
+    along = _turned(maps, which, d)
+    m = {(i, j): maps[i, j].take(which) for i, j in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 2))}
+    x = m[0, 0] * normal[0] + m[1, 0] * normal[1]
+    y = m[0, 1] * normal[0] + m[1, 1] * normal[1]
+    z = m[0, 2] * normal[0] + m[2, 2] * normal[2]
+    dot = along[0] * normal[0] + along[1] * normal[1] + along[2] * normal[2]
+    cosine = np.abs(dot) / np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
+    porous = np.isfinite(solids["density"])[which]
+    return np.where(porous, np.float32(_POROUS_COSINE), np.minimum(cosine, np.float32(1)))
+
+
+def _by_shape(solids: np.ndarray, which: np.ndarray) -> Iterator[tuple[Crossing, np.ndarray]]:
+    """The pairs of every shape; straight cuboids, the most frequent, have a test of their own."""
+    straight = (solids["kind"] == BOX) & (solids["taper"] == 1).all(axis=1)
+    shape = np.where(straight, -1, solids["kind"])[which]
+    for name, crossing in _CROSSINGS.items():
+        pairs = np.flatnonzero(shape == name)
+        if len(pairs):
+            yield crossing, pairs
+
+
+def _turned(maps: np.ndarray, which: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vectors in the unit shapes' axes; the maps' other entries are 0."""
+    return (
+        maps[0, 0].take(which) * d[0] + maps[0, 1].take(which) * d[1] + maps[0, 2].take(which) * d[2],
+        maps[1, 0].take(which) * d[0] + maps[1, 1].take(which) * d[1],
+        maps[2, 2].take(which) * d[2],
+    )
+
+
+def _box_normals(normal: np.ndarray, box: np.ndarray, bound: np.ndarray, slope: np.ndarray) -> None:
+    """Turn positions on boxes into normals of the faces that they lie on."""
+    u = normal[:, box]
+    share = np.abs(u)
+    share[:2] /= bound[:, box]
+    face = np.argmax(share, axis=0)
+    for axis in range(3):
+        at = np.flatnonzero(face == axis)
+        on = box[at]
+        normal[:, on] = 0
+        normal[axis, on] = np.sign(u[axis, at])
+        if axis < 2:
+            normal[2, on] = -slope[axis, on]
+
+
+def _slab(o: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays enter and leave ``|o + t v| <= 1``."""
+    inverse = 1 / np.where(v == 0, np.float32(1e-20), v)
+    first, second = (-1 - o) * inverse, (1 - o) * inverse
+    return np.minimum(first, second), np.maximum(first, second)
+
+
+def _cross_cuboid(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    spans = [_slab(o[axis], v[axis]) for axis in range(3)]
+    enter = np.maximum(np.maximum(spans[0][0], spans[1][0]), spans[2][0])
+    return enter, np.minimum(np.minimum(spans[0][1], spans[1][1]), spans[2][1])
+
+
+def _cross_box(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    enter, leave = _slab(o[2], v[2])
+    for axis in (0, 1):
+        ratio = taper[:, axis]
+        # |u| <= middle + slope * height: two half-spaces, each entered or left.
+        middle, slope = (1 + ratio) / 2, (ratio - 1) / 2
+        bound, gain = middle + slope * o[2], slope * v[2]
+        for sign in (np.float32(1), np.float32(-1)):
+            room, speed = bound - sign * o[axis], sign * v[axis] - gain
+            at = room / np.where(speed == 0, np.float32(1e-20), speed)
+            leave = np.where(speed > 0, np.minimum(leave, at), leave)
+            enter = np.where(speed < 0, np.maximum(enter, at), enter)
+            leave = np.where((speed == 0) & (room < 0), np.float32(-np.inf), leave)
+    return enter, leave
+
+
+def _cross_ball(o: np.ndarray, v: tuple[np.ndarray, ...], _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    # About the point of the ray nearest to the centre: from far away the squares would cancel.
+    a = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    nearest = -(o[0] * v[0] + o[1] * v[1] + o[2] * v[2]) / a
+    p = [o[i] + nearest * v[i] for i in range(3)]
+    span = np.sqrt((1 - (p[0] * p[0] + p[1] * p[1] + p[2] * p[2])) / a)
+    return nearest - span, nearest + span
+
+
+def _round_span(
+    o: tuple[np.ndarray, np.ndarray], v: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays are inside an endless unit cylinder."""
+    a = np.maximum(v[0] * v[0] + v[1] * v[1], np.float32(1e-20))
+    nearest = -(o[0] * v[0] + o[1] * v[1]) / a
+    p, q = o[0] + nearest * v[0], o[1] + nearest * v[1]
+    span = np.sqrt((1 - (p * p + q * q)) / a)
+    return nearest - span, nearest + span
+
+
+def _cross_wheel(o: np.ndarray, v: tuple[np.ndarray, ...], _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    enter, leave = _round_span((o[0], o[2]), (v[0], v[2]))
+    near, far = _slab(o[1], v[1])
+    return np.maximum(enter, near), np.minimum(leave, far)
+
+
+def _cross_drum(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    near, far = _slab(o[2], v[2])
+    ratio = taper[:, 0]
+    # A cone: x^2 + y^2 <= (middle + slope z)^2, about the point of the ray nearest to its axis.
+    middle, slope = (1 + ratio) / 2, (ratio - 1) / 2
+    at = -(o[0] * v[0] + o[1] * v[1]) / np.maximum(v[0] * v[0] + v[1] * v[1], np.float32(1e-20))
+    p, q, radius = o[0] + at * v[0], o[1] + at * v[1], middle + slope * (o[2] + at * v[2])
+    gain = slope * v[2]
+    a = v[0] * v[0] + v[1] * v[1] - gain * gain
+    b = p * v[0] + q * v[1] - radius * gain
+    c = p * p + q * q - radius * radius
+    root = np.sqrt(b * b - a * c)
+    early, late = (-b - root) / a, (-b + root) / a
+    # A ray steeper than the cone's side crosses it once: inwards where the cone widens ahead, else outwards.
+    steep = a <= 0
+    begin = np.where(steep & (gain < 0), np.float32(-np.inf), early)
+    end = np.where(steep & (gain > 0), np.float32(np.inf), late)
+    return np.maximum(near, at + begin), np.minimum(far, at + end)
+
+
+_CROSSINGS: dict[int, Crossing] = {
+    -1: _cross_cuboid,
+    BOX: _cross_box,
+    DRUM: _cross_drum,
+    BALL: _cross_ball,
+    WHEEL: _cross_wheel,
+}
+"""By kind, -1 for straight cuboids."""

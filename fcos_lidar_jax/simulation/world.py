@@ -1,0 +1,177 @@
+"""A simulated world: streets, scenery, traffic, and the car that carries the sensor."""
+
+import dataclasses
+
+import numpy as np
+from numpy.random import Generator
+
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.simulation.ground import Ground
+from fcos_lidar_jax.simulation.motion import MOTION, pose_at
+from fcos_lidar_jax.simulation.object_models import LOOKS
+from fcos_lidar_jax.simulation.places import LANE_M
+from fcos_lidar_jax.simulation.scenery import sample_scenery
+from fcos_lidar_jax.simulation.shapes import object_solids, sample_paint
+from fcos_lidar_jax.simulation.solids import SOLID, place_solids
+from fcos_lidar_jax.simulation.traffic import Traffic, sample_traffic
+
+_SHARES = np.array([0.36, 0.08, 0.02, 0.04, 0.015, 0.17, 0.015, 0.02, 0.09, 0.19])
+"""Of the classes, in their order; every class has one object or more."""
+_MANOEUVRES = ("straight", "straight", "left", "right", "stopped", "braking", "starting")
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """All that there is, in the street's frame: x along the main street, y left of it, z up."""
+
+    ground: Ground
+    """Streets and slopes."""
+    scenery: np.ndarray
+    """[s] solids that never move."""
+    traffic: Traffic
+    """The objects of the ten classes."""
+    parts: np.ndarray
+    """[s] solids of the objects, each in the frame of the object that it names as its owner."""
+    ego: np.ndarray
+    """[1] of ``motion.MOTION``: the rear axle of the car that carries the sensor."""
+
+    def object_poses(self, time_s: float) -> np.ndarray:
+        """``x, y, z, yaw`` of the middles of all objects' undersides, f64[m, 4]."""
+        pose = pose_at(self.traffic.motions, time_s)
+        height = self.ground.height(pose[:, 0], pose[:, 1])
+        return np.stack([pose[:, 0], pose[:, 1], height, pose[:, 2]], axis=1)
+
+    def solids(self, time_s: float) -> np.ndarray:
+        """Everything but the ground and the car that carries the sensor, at a moment."""
+        return np.concatenate(
+            [self.scenery, place_solids(self.parts, self.object_poses(time_s)[self.parts["owner"]])]
+        )
+
+    def ego_pose(self, time_s: float) -> np.ndarray:
+        """The car at a moment, f64[4, 4]: its axes (x forward, z off the ground) in the street's frame."""
+        x, y, yaw = pose_at(self.ego, time_s)[0]
+        a, b, _ = max(self.ground.planes, key=lambda p: p[0] * x + p[1] * y + p[2])
+        up = np.array([-a, -b, 1]) / np.sqrt(1 + a * a + b * b)
+        forward = np.array([np.cos(yaw), np.sin(yaw), a * np.cos(yaw) + b * np.sin(yaw)])
+        forward /= np.linalg.norm(forward)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
+        pose[:3, 3] = x, y, self.ground.slope_height(x, y)
+        return pose
+
+
+def sample_world(
+    rng: Generator,
+    *,
+    reach_m: float,
+    beyond_m: float,
+    duration_s: float,
+    labels: np.ndarray,
+    level: bool = False,
+    fused: bool = False,
+    fast_traffic: bool = False,
+) -> World:
+    """A random world.
+
+    Args:
+        rng: draws all of it.
+        reach_m: every object is within this distance of the car at some moment.
+        beyond_m: scenery reaches this far beyond where the car goes.
+        duration_s: how long it lasts.
+        labels: i32[m], objects wanted; those without room are left out.
+        level: without slopes.
+        fused: seen at its end alone, in a few sweeps before: every object is within reach then.
+        fast_traffic: the ego vehicle drives straight on at 10 to 20 m/s, every lane flows, and nearly all that can
+            move does.
+
+    >>> labels = np.arange(10)
+    >>> world = sample_world(np.random.default_rng(0), reach_m=30, beyond_m=40, duration_s=0.0, labels=labels)
+    >>> len(world.traffic.labels) <= 10, world.object_poses(0.0).shape[1]
+    (True, 4)
+    """
+    ground = _draw_ground(rng, level)
+    ego = _draw_ego(rng, ground, duration_s, fast_traffic)
+    path = pose_at(ego, np.arange(0, duration_s + 0.1, 0.5))[:, :2]
+    scenery = sample_scenery(rng, ground, path.min(axis=0), path.max(axis=0), beyond_m=beyond_m)
+    standing = scenery["center"][:, 2] - scenery["half"][:, 2] < 2 + ground.height(*scenery["center"][:, :2].T)
+    columns = [scenery["center"][:, :2], 2 * scenery["half"][:, :2], scenery["yaw"][:, None]]
+    occupied = np.concatenate(columns, axis=1)[standing]
+    largest_first = np.array(
+        sorted(labels, key=lambda k: -np.prod(LOOKS[NUSCENES_CLASSES[k]][0].size_m)), np.int32
+    )
+    traffic = sample_traffic(
+        rng,
+        ground,
+        ego,
+        labels=largest_first,
+        reach_m=reach_m,
+        duration_s=duration_s,
+        occupied=occupied,
+        fused=fused,
+        fast_traffic=fast_traffic,
+    )
+    parts = [np.zeros(0, SOLID)]
+    for index, (look, size) in enumerate(zip(traffic.looks, traffic.sizes, strict=True)):
+        solids = object_solids(look, size, sample_paint(rng, look))
+        solids["owner"] = index
+        parts.append(solids)
+    return World(ground, scenery, traffic, np.concatenate(parts), ego)
+
+
+def sample_labels(rng: Generator, number: int) -> np.ndarray:
+    """Classes of a street's objects, i32: all ten, the rest as often as in the streets of nuScenes.
+
+    >>> len(np.unique(sample_labels(np.random.default_rng(0), 40)))
+    10
+    """
+    more = rng.choice(len(NUSCENES_CLASSES), max(number - len(NUSCENES_CLASSES), 0), p=_SHARES / _SHARES.sum())
+    return np.concatenate([np.arange(len(NUSCENES_CLASSES)), more]).astype(np.int32)[:number]
+
+
+def _draw_ground(rng: Generator, level: bool) -> Ground:
+    lanes, across = rng.integers(1, 3, 2)
+    slope = 0.0 if level else 1.0
+    a, b = slope * rng.normal(0, 0.012, 2)
+    ahead, behind, beside = slope * rng.uniform(0, 0.02, 3)
+    planes = np.array(
+        [
+            [a, b, 0],
+            [a + ahead, b, -ahead * rng.uniform(30, 90)],
+            [a - behind, b, -behind * rng.uniform(30, 90)],
+            [a, b + beside, -beside * rng.uniform(15, 40)],
+            [a, b - beside, -beside * rng.uniform(15, 40)],
+        ]
+    )
+    return Ground(
+        planes[:1] if level else planes,
+        half_width=lanes * LANE_M + 2.5,
+        crossing_x=rng.uniform(20, 45),
+        crossing_half_width=across * LANE_M + 2.5,
+        kerb=0.13,
+        pavement=rng.uniform(2.5, 4.5),
+        brightness=(rng.uniform(0.03, 0.08), rng.uniform(0.07, 0.16), rng.uniform(0.05, 0.14)),
+    )
+
+
+def _draw_ego(rng: Generator, ground: Ground, duration_s: float, fast_traffic: bool) -> np.ndarray:
+    ego = np.zeros(1, MOTION)
+    ego["y"] = -LANE_M / 2 if rng.random() < 0.6 else -(ground.half_width - 2.5 - LANE_M / 2)
+    if fast_traffic:
+        ego["speed"] = rng.uniform(10, 20)
+        return ego
+    manoeuvre = rng.choice(_MANOEUVRES)
+    ego["speed"] = rng.uniform(4, 11)
+    if manoeuvre == "stopped":
+        ego["speed"] = 0
+    elif manoeuvre == "braking":
+        ego["acceleration"] = -ego["speed"] / max(0.6 * duration_s, 2.0)
+    elif manoeuvre == "starting":
+        ego["speed"], ego["acceleration"] = 0, rng.uniform(0.4, 0.9)
+    elif manoeuvre in ("left", "right"):
+        left = manoeuvre == "left"
+        lane = ground.crossing_x + (LANE_M / 2 if left else -LANE_M / 2)
+        radius = rng.uniform(10, 14) if left else rng.uniform(6, 9)
+        ego["speed"] = rng.uniform(4, 6.5)
+        ego["straight"] = lane - radius
+        ego["curvature"], ego["turn"] = (1 / radius, np.pi / 2) if left else (-1 / radius, -np.pi / 2)
+    return ego

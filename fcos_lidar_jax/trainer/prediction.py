@@ -1,0 +1,122 @@
+"""A detector on many frames: read ahead, spread over the devices."""
+
+import dataclasses
+import sys
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
+from fcos_lidar_jax.inference.detector import TrainedDetector, sharded_detect
+from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
+from fcos_lidar_jax.types import Detections
+
+_AHEAD = 2
+"""Groups of frames that are read while the devices work on others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """What was found in a frame."""
+
+    index: int
+    """Of the frame."""
+    detections: Detections
+    """NumPy arrays."""
+    frame: Frame | None
+    """As it was read; None where another process has read it."""
+    cloud: Cloud | None
+    """What the network was given of it, and how many points were dropped; likewise."""
+
+
+def predict(
+    detector: TrainedDetector,
+    frames: FrameSet,
+    *,
+    indices: Sequence[int] | None = None,
+    batch_size: int = 1,
+    devices: Sequence[Any] | None = None,
+) -> Iterator[Prediction]:
+    """Boxes in every frame, in order.
+
+    Every device runs the program of a single cloud on its own frames, so the boxes are bit-identical on any number
+    of devices and processes. Frames are read in threads while the devices work.
+
+    Args:
+        detector: network and weights.
+        frames: to detect in.
+        indices: which of them; default: all.
+        batch_size: clouds that a device takes at once; more than one changes scores and boxes by rounding, at most
+            1e-4.
+        devices: to work on; default: all, those of other processes too. Every process then makes the same call,
+            reads its share of the frames, and is given all predictions.
+
+    Yields:
+        a prediction for every frame.
+
+    Raises:
+        ValueError: a batch size below 1, or a frame that cannot be read.
+    """
+    if batch_size < 1:
+        raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
+    mesh = make_mesh(devices)
+    program = sharded_detect(detector.model, mesh, batch_size)
+    variables = replicate(detector.variables, mesh)
+    todo = list(range(len(frames)) if indices is None else indices)
+    size = batch_size * mesh.size
+    groups = [todo[i : i + size] for i in range(0, len(todo), size)]
+    # The rows of a group that this process reads.
+    own = [r for r in range(size) if mesh.devices[r // batch_size].process_index == jax.process_index()]
+
+    def read(group: list[int]) -> tuple[dict[int, tuple[Frame, Cloud]], tuple[np.ndarray, np.ndarray]]:
+        shape = (len(own), detector.config.max_points, detector.sensor.point_columns)
+        points, valid = np.zeros(shape, np.float32), np.zeros(shape[:2], bool)
+        loaded = {}
+        for slot, row in enumerate(own):
+            if row < len(group):
+                frame = frames.frame(group[row])
+                if group is groups[0] and slot == 0:
+                    _warn_of_another_sensor(detector, frame)
+                cloud = make_cloud(
+                    frame.points,
+                    detector.config,
+                    sensor=detector.sensor,
+                    num_close=frame.num_close,
+                    remove_close="none",
+                )
+                points[slot], valid[slot] = cloud.points, cloud.valid
+                loaded[row] = frame, cloud
+        return loaded, (points, valid)
+
+    def finished(group: list[int], loaded: dict[int, tuple[Frame, Cloud]], found: Any) -> Iterator[Prediction]:
+        arrays = multihost_utils.process_allgather(found, tiled=True) if jax.process_count() > 1 else found
+        arrays = jax.device_get(arrays)
+        for row, index in enumerate(group):
+            detections = jax.tree.map(lambda leaf, row=row: leaf[row], arrays)
+            yield Prediction(index, detections, *loaded.get(row, (None, None)))
+
+    with ThreadPoolExecutor(_AHEAD) as pool:
+        reading = deque(pool.submit(read, group) for group in groups[:_AHEAD])
+        running: tuple[list[int], dict[int, tuple[Frame, Cloud]], Any] | None = None
+        for number, group in enumerate(groups):
+            loaded, clouds = reading.popleft().result()
+            if number + _AHEAD < len(groups):
+                reading.append(pool.submit(read, groups[number + _AHEAD]))
+            found = program(variables, *shard_batch(clouds, mesh))
+            if running is not None:
+                yield from finished(*running)
+            running = group, loaded, found
+        if running is not None:
+            yield from finished(*running)
+
+
+def _warn_of_another_sensor(detector: TrainedDetector, frame: Frame) -> None:
+    told = sensor_mismatch(frame.points, detector.sensor)
+    if told is not None:
+        print(f"warning: {told}", file=sys.stderr, flush=True)

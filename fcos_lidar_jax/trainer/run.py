@@ -1,0 +1,369 @@
+"""Training as a run in a folder: begun, stopped, resumed, evaluated along the way.
+
+``run.json`` is the run's specification, ``metrics.jsonl`` and ``tensorboard/`` hold the metrics, ``checkpoints/``
+the last checkpoints and the best one, ``pictures/`` some test frames at every evaluation, ``loss.png`` and
+``scores.png`` the curves.
+"""
+
+import contextlib
+import dataclasses
+import json
+import math
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.data.classes import MappedFrames
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.files import atomic_write, folder_lock
+from fcos_lidar_jax.inference.detector import TrainedDetector
+from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
+from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.models import Detector, Variables, build_detector
+from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.trainer.evaluation import evaluate
+from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
+from fcos_lidar_jax.trainer.prediction import predict
+from fcos_lidar_jax.training import (
+    Checkpoint,
+    NonFiniteLossError,
+    detection_variables,
+    fit,
+    load_checkpoint,
+    make_optimizer,
+    make_state,
+    make_train_step,
+)
+from fcos_lidar_jax.training.checkpoint import NonFiniteStateError, check_arrays
+from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, find_checkpoint
+from fcos_lidar_jax.training.loop import Record
+from fcos_lidar_jax.training.metrics_log import MetricsLog
+from fcos_lidar_jax.training.preemption import stop_requests
+from fcos_lidar_jax.training.sharding import check_batch_size, jit_step, make_mesh, replicate, shard_batch
+from fcos_lidar_jax.types import TrainState
+
+_NUM_PICTURES = 2
+"""Test frames that are drawn at an evaluation."""
+RUN_SPEC = "run.json"
+"""Name of the file in a run's folder that says what the run is."""
+
+Hook = Callable[[int, Record], None]
+"""Called with (steps done, metrics of the last of them) after every step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """When a run saves and evaluates."""
+
+    save_every: int
+    """Steps between two checkpoints."""
+    evaluate_every: int
+    """Steps between two evaluations; each saves a checkpoint, too."""
+    keep: int = 2
+    """Newest checkpoints that are kept, beside the best."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """What stays the same through a run."""
+
+    folder: Path
+    detector: Detector
+    schedule: Schedule
+    num_steps: int
+    tests: FrameSet | None
+    devices: Sequence[Any] | None
+    spec: dict[str, Any]
+    is_main_process: bool
+
+    @property
+    def checkpoints(self) -> Checkpoints:
+        return Checkpoints(self.folder / CHECKPOINTS, keep=self.schedule.keep)
+
+    def evaluates_at(self, step: int) -> bool:
+        due = step % self.schedule.evaluate_every == 0 or step == self.num_steps
+        return self.tests is not None and due
+
+    def saves_at(self, step: int) -> bool:
+        return step % self.schedule.save_every == 0 or self.evaluates_at(step)
+
+
+def train(
+    config: Config,
+    frames: FrameSet,
+    out: str | Path,
+    *,
+    steps: int,
+    seed: int = 0,
+    tests: FrameSet | None = None,
+    objects: GroundTruthDatabase | None = None,
+    resume: bool = False,
+    weights: str | Path | Variables | None = None,
+    devices: Sequence[Any] | None = None,
+    hooks: Sequence[Hook] = (),
+    schedule: Schedule | None = None,
+    threads: int = 2,
+    workers: int = 0,
+) -> TrainState:
+    """Train to the end, or until Ctrl-C or SIGTERM, which save a checkpoint first.
+
+    Args:
+        config: what to train.
+        frames: to train on; their classes are matched to ``config.classes`` by name, and their sensor is the
+            detector's.
+        out: folder of the run.
+        steps: updates of the whole run.
+        seed: of weights, order, pasted objects and augmentation.
+        tests: frames to evaluate on along the way.
+        objects: ground-truth database for copy-paste; needed unless ``config.copy_paste`` is None.
+        resume: go on from the newest whole checkpoint in the folder; the run must be the same.
+        weights: to begin with, instead of random ones: a checkpoint, or arrays.
+        devices: to share each batch; default: all.
+        hooks: called after every step.
+        schedule: default: 50 checkpoints and 10 evaluations a run.
+        threads: that prepare batches.
+        workers: processes that prepare batches, beside the threads.
+
+    Returns:
+        the last state.
+
+    Raises:
+        ValueError: the folder holds another run, no class is shared, or devices and batch do not fit.
+        OSError: another process trains in the folder, or it cannot be written.
+        NonFiniteLossError, NonFiniteStateError: the last checkpoint is from before.
+        KeyboardInterrupt: after Ctrl-C, when all is saved.
+        SystemExit: after SIGTERM, likewise.
+    """
+    frames = MappedFrames(frames, config.classes)
+    tests = None if tests is None else MappedFrames(tests, config.classes)
+    mesh = make_mesh(devices)
+    check_batch_size(config.optimizer.batch_size, mesh)
+    run = _Run(
+        folder=Path(out),
+        detector=build_detector(config, frames.sensor),
+        schedule=schedule or Schedule(-(-steps // 50), -(-steps // 10)),
+        num_steps=steps,
+        tests=tests,
+        devices=devices,
+        spec=run_spec(config, frames, steps=steps, seed=seed, objects=objects, weights=weights),
+        is_main_process=jax.process_index() == 0,
+    )
+    check_run(run.folder, run.spec, resume=resume)
+    given = None if resume else _given_weights(run.detector, weights)
+    with _claimed(run, resume=resume):
+        optimizer = make_optimizer(config.optimizer, steps)
+        start = _start(run, optimizer, seed, resume, given)
+        first = int(start.step)
+        if first == steps:
+            print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
+            return start
+        step = jit_step(make_train_step(run.detector, optimizer), mesh)
+        metrics = MetricsLog(run.folder, first_step=first) if run.is_main_process else None
+        saved = first if resume else -1
+
+        def report(number: int, record: Record) -> None:
+            if metrics is not None:
+                samples = config.optimizer.batch_size / max(float(record["seconds"]), 1e-9)  # type: ignore[arg-type]
+                metrics.write(number, record | {"samples_per_second": samples})
+            for hook in hooks:
+                hook(number, record)
+
+        def pause(number: int, state: TrainState) -> None:
+            nonlocal saved
+            score = _evaluate(run, number, state, metrics) if run.evaluates_at(number) else None
+            if metrics is not None:
+                metrics.flush()
+                _save(run, state, score)
+            saved = number
+
+        several = jax.process_count() > 1
+        batches = make_batches(
+            frames,
+            config,
+            seed=seed,
+            num_steps=steps,
+            first_step=first,
+            objects=objects,
+            process_index=jax.process_index(),
+            num_processes=jax.process_count(),
+            threads=threads,
+            workers=workers,
+        )
+        with stop_requests(active=not several) as request, batches as stream:
+
+            def stopping(done: int) -> bool:
+                if several:  # all stop after the same step, whichever of them was asked to
+                    return multihost_utils.reached_preemption_sync_point(done)
+                return request.signal is not None
+
+            try:
+                state = fit(
+                    step,
+                    replicate(start, mesh),
+                    (dataclasses.replace(b, batch=shard_batch(b.batch, mesh)) for b in stream),
+                    num_steps=steps,
+                    report=report,
+                    pause_at=run.saves_at,
+                    pause=pause,
+                    stopping=stopping,
+                    log_every_s=10.0 if run.is_main_process else float("inf"),
+                )
+                done = int(state.step)
+                if run.is_main_process and saved != done:
+                    _save(run, state, None)
+            except (NonFiniteLossError, NonFiniteStateError) as error:
+                kept = run.checkpoints.paths()
+                last = f"the last checkpoint is {kept[-1]}" if kept else "there is no checkpoint yet"
+                raise type(error)(f"{error}; {last}") from None
+            finally:
+                if metrics is not None:
+                    metrics.close()
+        if run.is_main_process:
+            draw_metrics(run.folder)
+    if done < steps:
+        print(f"stopped after step {done}, which is saved", file=sys.stderr)
+        if request.signal == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + signal.SIGTERM)
+    return state
+
+
+def run_spec(
+    config: Config,
+    frames: FrameSet,
+    *,
+    steps: int,
+    seed: int,
+    objects: GroundTruthDatabase | None = None,
+    weights: str | Path | Variables | None = None,
+) -> dict[str, Any]:
+    """What a run follows from, as JSON; it is resumed with the same alone.
+
+    Args:
+        config: as in :func:`train`, as are the others; weights that are given as arrays are not told.
+    """
+    record = {
+        "config": config_to_json(config),
+        "sensor": sensor_to_json(frames.sensor),
+        "steps": steps,
+        "seed": seed,
+        "frames": len(frames),
+        "data": frames.fingerprint(),
+        "objects": None if objects is None else objects.manifest.source,
+        "weights": str(weights) if isinstance(weights, str | Path) else None,
+    }
+    return json.loads(json.dumps(record))
+
+
+def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> None:
+    """Refuse a folder that cannot take a run.
+
+    Args:
+        folder: of the run.
+        spec: from :func:`run_spec`; None to look no closer than whether there is a run.
+        resume: the run is to go on.
+
+    Raises:
+        ValueError: there is a run and it is not to be resumed, or none to resume, or another one, with the first
+            field that differs.
+    """
+    folder = Path(folder)
+    file = folder / RUN_SPEC
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: found a file, expected a folder")
+    if not file.is_file():
+        if resume:
+            raise ValueError(f"{file}: found nothing, expected the run to resume")
+        return
+    if not resume:
+        raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError:
+        raise ValueError(f"{file}: not JSON, expected the specification of a run") from None
+    for name, (was, wanted) in _differences(found, spec) if spec is not None else ():
+        raise ValueError(f"{file}: {name}: was {was!r}, got {wanted!r}: only the same run can be resumed")
+
+
+@contextlib.contextmanager
+def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
+    """Hold the run's folder in the main process; the others go on only when it does."""
+    several = jax.process_count() > 1
+    with contextlib.ExitStack() as held:
+        error: Exception | None = None
+        if run.is_main_process:
+            try:
+                held.enter_context(folder_lock(run.folder, "training"))
+                check_run(run.folder, run.spec, resume=resume)  # another process may have been faster
+                text = json.dumps(run.spec, indent=1)
+                if not resume:
+                    atomic_write(run.folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
+            except (OSError, ValueError) as failure:
+                error = failure
+        if several and not multihost_utils.broadcast_one_to_all(np.array(error is None)):
+            error = error or OSError(f"{run.folder}: the main process cannot work there")
+        if error is not None:
+            raise error
+        yield
+
+
+def _given_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
+    """Arrays to begin with, of the same network."""
+    if not isinstance(weights, str | Path):
+        return weights
+    folder = find_checkpoint(Path(weights))
+    variables = load_checkpoint(folder).variables
+    expected = jax.eval_shape(detector.init, jax.random.key(0))
+    check_arrays(folder, expected, variables, whose="the network that is to be trained")
+    return variables
+
+
+def _start(run: _Run, optimizer: Any, seed: int, resume: bool, weights: Variables | None) -> TrainState:
+    """The state of the newest checkpoint, or one of given or random weights."""
+    key = jax.random.key(seed)
+    if resume:
+        like = jax.eval_shape(lambda k: make_state(run.detector, optimizer, k), key)
+        found = run.checkpoints.newest(like)
+        if found is not None:
+            return found[1]
+    return make_state(run.detector, optimizer, key, variables=weights)
+
+
+def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | None) -> float | None:
+    """Score on the test frames, which all processes share."""
+    assert run.tests is not None
+    variables = jax.tree.map(lambda leaf: leaf.addressable_data(0), detection_variables(state))
+    trained = TrainedDetector(run.detector, variables)
+    summary = evaluate(trained, run.tests, devices=run.devices).summary
+    score = summary["mean_ap"]
+    first = range(min(_NUM_PICTURES, len(run.tests)))
+    shown = list(predict(trained, run.tests, indices=first, devices=run.devices))
+    if metrics is not None:
+        values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
+        metrics.write(number, {"test/mAP": score, **values})
+        print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
+        draw_predictions(run.folder / "pictures", shown, run.tests, number)
+    return None if math.isnan(score) else score
+
+
+def _save(run: _Run, state: TrainState, score: float | None) -> None:
+    local = jax.tree.map(lambda leaf: leaf.addressable_data(0), detection_variables(state))
+    told = json.dumps({name: run.spec[name] for name in ("data", "frames", "weights")}, sort_keys=True)
+    config, sensor = run.detector.config, run.detector.sensor
+    run.checkpoints.save(Checkpoint(config, sensor, local, int(state.step), told, score), state)
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
+    """Where two JSON values differ."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in sorted(found.keys() | wanted.keys()):
+            yield from _differences(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
+    elif found != wanted:
+        yield name, (found, wanted)

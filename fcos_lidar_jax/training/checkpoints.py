@@ -1,0 +1,117 @@
+"""The checkpoints of a run: the newest ones to go on from, and the best."""
+
+import shutil
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+from fcos_lidar_jax.training.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    load_checkpoint,
+    load_state,
+    read_description,
+    save_checkpoint,
+)
+from fcos_lidar_jax.types import TrainState
+
+
+class Checkpoints:
+    """Checkpoints below a folder, one a step.
+
+    Args:
+        folder: made where there is none.
+        keep: so many of the newest are kept, and the one of the best score.
+    """
+
+    def __init__(self, folder: Path, *, keep: int = 2) -> None:
+        """Nothing is written yet."""
+        self.folder, self.keep = folder, keep
+
+    def save(self, checkpoint: Checkpoint, state: TrainState) -> Path:
+        """Write a checkpoint, then remove what is no longer kept.
+
+        Raises:
+            OSError: it cannot be written; the others are as they were.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"{checkpoint.step:08d}"
+        save_checkpoint(path, checkpoint, state=state)
+        for leftover in self.folder.glob(".*"):  # of saves that were killed
+            shutil.rmtree(leftover, ignore_errors=True)
+        paths = self.paths()
+        for old in {*paths[: -self.keep]} - {best_of(paths)}:
+            shutil.rmtree(old)
+        return path
+
+    def paths(self) -> list[Path]:
+        """All checkpoints, the oldest first, unread."""
+        return sorted(path for path in self.folder.glob("[0-9]*") if path.is_dir())
+
+    def newest(self, like: TrainState) -> tuple[Checkpoint, TrainState] | None:
+        """The newest checkpoint that is whole, with its state; None where there are none.
+
+        A damaged one is passed over with a warning on standard error.
+
+        Args:
+            like: any state of the same run.
+
+        Raises:
+            CheckpointError: there are some, and all are damaged.
+        """
+        paths = self.paths()
+        for path in reversed(paths):
+            try:
+                return load_checkpoint(path), load_state(path, like)
+            except CheckpointError as error:
+                print(f"warning: {error}: going back to the checkpoint before", file=sys.stderr)
+        if paths:
+            raise CheckpointError(f"{self.folder}: all {len(paths)} checkpoints are damaged, expected a whole one")
+        return None
+
+
+def best_of(paths: list[Path]) -> Path | None:
+    """The checkpoint of the highest score, of equal ones the newest; None where none has one."""
+    scored = []
+    for path in paths:
+        try:
+            score = read_description(path).get("score")
+        except CheckpointError:
+            continue
+        if score is not None:
+            scored.append((score, path))
+    return max(scored)[1] if scored else None
+
+
+def find_checkpoint(folder: Path) -> Path:
+    """The checkpoint that a path or a name stands for.
+
+    Args:
+        folder: of a checkpoint; of a run, which stands for its last checkpoint, as ``RUN/best`` does for the one
+            that scored best while it was trained; or the name of weights that come with the package.
+
+    >>> find_checkpoint(Path("nowhere"))
+    PosixPath('nowhere')
+    """
+    if not folder.exists():
+        shipped = shipped_checkpoints()
+        run_best = best_of(Checkpoints(folder.parent / CHECKPOINTS).paths()) if folder.name == BEST else None
+        return run_best or shipped.get(str(folder), folder)
+    paths = Checkpoints(folder / CHECKPOINTS).paths()
+    return paths[-1] if paths else folder
+
+
+def shipped_checkpoints() -> dict[str, Path]:
+    """Name -> folder of the checkpoints that come with the package.
+
+    >>> sorted(shipped_checkpoints())
+    ['quickstart']
+    """
+    folder = Path(str(files("fcos_lidar_jax") / "weights"))
+    return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()} if folder.is_dir() else {}
+
+
+CHECKPOINTS = "checkpoints"
+"""Folder of the checkpoints in a run's folder."""
+BEST = "best"
+"""Below a run's folder: name for its best checkpoint."""

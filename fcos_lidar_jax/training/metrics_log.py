@@ -1,0 +1,71 @@
+"""What is remembered of a run: one line of JSON a step, and the same for TensorBoard."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.files import atomic_write
+
+_FILE = "metrics.jsonl"
+
+
+class MetricsLog:
+    """Appends to ``metrics.jsonl`` and to TensorBoard's events below a run's folder.
+
+    Args:
+        folder: of the run.
+        first_step: steps done before; what is told of later ones, by a run that was killed, is forgotten.
+    """
+
+    def __init__(self, folder: Path, *, first_step: int) -> None:
+        """Open both."""
+        from tensorboardX import SummaryWriter
+
+        file = folder / _FILE
+        if file.exists():
+            kept = [json.dumps(line) + "\n" for line in read_metrics(folder) if line["step"] <= first_step]
+            atomic_write(file, lambda path: path.write_text("".join(kept), encoding="utf-8"))
+        self._lines = file.open("a", encoding="utf-8")
+        self._events = SummaryWriter(str(folder / "tensorboard"), purge_step=first_step + 1)
+
+    def write(self, step: int, values: Mapping[str, Any]) -> None:
+        """Remember numbers and lists of numbers by name."""
+        self._lines.write(json.dumps({"step": step, **values}) + "\n")
+        self._lines.flush()
+        for name, value in values.items():
+            for suffix, number in _numbers(value):
+                self._events.add_scalar(name + suffix, number, step)
+
+    def flush(self) -> None:
+        """Write what is waiting, so that a checkpoint never knows of more steps than the records."""
+        self._events.flush()
+
+    def close(self) -> None:
+        """Write what is waiting."""
+        self._lines.close()
+        self._events.close()
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """All lines of a run, in order; half a line, of a run that was killed as it wrote, is left out.
+
+    Args:
+        folder: of the run.
+    """
+    lines = []
+    for text in (folder / _FILE).read_text(encoding="utf-8").splitlines():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def _numbers(value: Any) -> Iterator[tuple[str, float]]:
+    if isinstance(value, list):
+        yield from ((f"/{i}", float(v)) for i, v in enumerate(value))
+    elif np.isscalar(value):
+        yield "", float(value)  # type: ignore[arg-type]

@@ -1,0 +1,217 @@
+"""The report of an evaluation: curves, example pictures and one HTML page, from the files that it wrote."""
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.visualization.bev import draw_bev
+from fcos_lidar_jax.visualization.figure import LINE_COLORS, new_axis, save_png
+from fcos_lidar_jax.visualization.range_image import draw_range_image
+from fcos_lidar_jax.visualization.report import Cell, Picture, write_report
+
+ERROR_NAMES = {
+    "trans_err": ("ATE", "translation [m]"),
+    "scale_err": ("ASE", "scale [1 - IoU]"),
+    "orient_err": ("AOE", "orientation [rad]"),
+    "vel_err": ("AVE", "velocity [m/s]"),
+    "attr_err": ("AAE", "attribute [1 - accuracy]"),
+}
+"""Errors of the hits: abbreviation, name and unit."""
+_MARGIN_M = 2.0
+"""Shown beyond the largest class range."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """One sample of an evaluation to draw, in its sensor's frame."""
+
+    kind: str
+    """``best``, ``typical`` or ``worst``."""
+    name: str
+    """Of the sample."""
+    points: np.ndarray
+    """f32[n, >= 5]: the cloud; without points there is no range image."""
+    detections: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """Boxes f64[d, 9], labels and scores."""
+    truth: tuple[np.ndarray, np.ndarray]
+    """Boxes f64[m, 9] and labels."""
+
+
+def write_evaluation_report(
+    out: Path,
+    *,
+    title: str,
+    num_samples: int,
+    examples: Iterable[Example],
+    sensor: Sensor,
+    global_axes: bool = False,
+) -> None:
+    """Write ``report.html``, one file that needs nothing else, and its pictures into ``pictures/``.
+
+    All scores, errors and curves are read from ``metrics_summary.json``, ``curves.json`` and, where there is one,
+    ``bootstrap.json``, of the nuScenes benchmark or of another metric.
+
+    Args:
+        out: folder that holds these files.
+        title: heading.
+        num_samples: that were evaluated.
+        examples: samples to draw.
+        sensor: of their range images.
+        global_axes: x and y of the examples are the directions of the global frame.
+    """
+    summary, curves = (json.loads((out / f"{name}.json").read_text()) for name in ("metrics_summary", "curves"))
+    file, folder = out / "bootstrap.json", out / "pictures"
+    intervals = json.loads(file.read_text()) if file.is_file() else None
+    precisions, errors = _draw_class_curves(folder, summary, curves)
+    views, images = _draw_examples(folder, examples, summary["cfg"]["class_range"], sensor, global_axes)
+    defined = [error for error in ERROR_NAMES if error in summary["tp_errors"]]
+    distances = [str(distance) for distance in summary["cfg"]["dist_ths"]]
+    rows = [
+        (
+            _words(name),
+            summary["mean_dist_aps"][name],
+            *(aps[distance] for distance in distances),
+            *(summary["label_tp_errors"][name].get(error, float("nan")) for error in defined),
+        )
+        for name, aps in summary["label_aps"].items()
+    ]
+    short = [ERROR_NAMES[error][0] for error in defined]
+    write_report(
+        out / "report.html",
+        title=title,
+        lead=_lead(summary, num_samples, defined),
+        summary=_scores(summary, intervals, defined),
+        tables=[("By class", ("class", "AP", *(f"AP {float(d):g} m" for d in distances), *short), rows)],
+        galleries=[("Precision over recall", precisions), ("Mean errors of the hits, up to each recall", errors)],
+        pictures=views,
+        wide_pictures=images,
+    )
+
+
+def _lead(summary: Mapping[str, Any], num_samples: int, defined: Sequence[str]) -> str:
+    """What was evaluated, and by which rules."""
+    rules = f"over {num_samples} samples: average precision (AP) by matching distance"
+    if defined:
+        names = ", ".join(ERROR_NAMES[error][1].split(" [")[0] for error in defined)
+        short = ", ".join(ERROR_NAMES[error][0] for error in defined)
+        rules += f", and the mean errors of the hits at {summary['cfg']['dist_th_tp']:g} m in {names} ({short})"
+    if "nd_score" in summary:
+        return f"The nuScenes detection metrics (detection_cvpr_2019) {rules}."
+    absent = ", ".join(map(_words, summary["absent_classes"]))
+    missing = f" Without truth here: {absent}." if absent else ""
+    return f"Centre-distance metrics {rules}. This is {summary['cfg']['note']}.{missing}"
+
+
+def _scores(
+    summary: Mapping[str, Any], intervals: Mapping[str, Any] | None, defined: Sequence[str]
+) -> dict[str, Cell]:
+    names = {"NDS": "nd_score", "mAP": "mean_ap"}
+    names = names if "nd_score" in summary else {"mAP by centre distance": "mean_ap"}
+    scores: dict[str, Cell] = {name: summary[key] for name, key in names.items()}
+    if intervals is not None:
+        for name, key in names.items():
+            low, high = intervals[key]["low"], intervals[key]["high"]
+            scores[f"{name}, {intervals['level']:.0%} interval"] = f"{low:.3f} to {high:.3f}"
+    return scores | {f"m{ERROR_NAMES[e][0]}, {ERROR_NAMES[e][1]}": summary["tp_errors"][e] for e in defined}
+
+
+def _draw_class_curves(
+    folder: Path, summary: Mapping[str, Any], curves: Mapping[str, Any]
+) -> tuple[list[Picture], list[Picture]]:
+    """Precision and error curves of every class, as pictures with captions."""
+    recall, distance = curves["recall"], str(summary["cfg"]["dist_th_tp"])
+    first = round(100 * summary["cfg"]["min_recall"]) + 1
+    precisions: list[Picture] = []
+    errors: list[Picture] = []
+    for row, (name, curve) in enumerate(curves["classes"].items()):
+        plain = re.sub(r"[^\w-]", "_", name)  # class names may hold what file names may not
+        files = [folder / f"{kind}_{row:02d}_{plain}.png" for kind in ("precision", "errors")]
+        _draw_precision(files[0], recall, curve["precision"])
+        precisions.append((f"{_words(name)}: AP {summary['mean_dist_aps'][name]:.3f}", files[0]))
+        own = {e: v for e, v in curve["errors"].items() if not np.isnan(summary["label_tp_errors"][name][e])}
+        last = int(np.max(np.flatnonzero(curve["confidence"][distance]), initial=0))
+        _draw_errors(files[1], recall, own, last=last, first=first)
+        errors.append((_words(name), files[1]))
+    return precisions, errors
+
+
+def _draw_precision(path: str | Path, recall: Sequence[float], precision: Mapping[str, Sequence[float]]) -> None:
+    """Precision over recall of one class; ``precision`` is matching distance -> values."""
+    figure, axis = new_axis(4.2, 3.5)
+    for rank, (distance, values) in enumerate(precision.items()):
+        # What is beyond the highest recall is not drawn along the bottom. Curves that coincide still all show: the
+        # larger the distance, the wider the line and the lower.
+        end = int(np.max(np.flatnonzero(values), initial=0)) + 1
+        style = {"color": LINE_COLORS[rank], "linewidth": 1.2 + rank, "zorder": 9 - rank}
+        axis.plot(recall[:end], values[:end], label=f"{float(distance):g} m", **style)
+    axis.set_ylim(0, 1.02)
+    axis.set_ylabel("precision")
+    _save(figure, path, columns=4, title="match within")
+
+
+def _draw_errors(
+    path: str | Path, recall: Sequence[float], errors: Mapping[str, Sequence[float]], *, last: int, first: int
+) -> None:
+    """Mean errors of the hits up to each recall, from the lowest that counts to the highest that was reached."""
+    figure, axis = new_axis(4.2, 3.5)
+    span, marker = slice(first, last + 1), "o" if last == first else None
+    if last >= first:
+        for color, (error, (_, name)) in zip(LINE_COLORS, ERROR_NAMES.items(), strict=False):
+            if error in errors:
+                axis.plot(recall[span], errors[error][span], color=color, linewidth=1.5, label=name, marker=marker)
+    else:
+        axis.text(0.5, 0.5, "recall never above 0.1", ha="center", transform=axis.transAxes, color="#555555")
+    axis.set_ylim(bottom=0)
+    axis.set_ylabel("mean error of the hits")
+    _save(figure, path, columns=2)
+
+
+def _save(figure: Any, path: str | Path, *, columns: int, title: str | None = None) -> None:
+    """Recall below, and the legend below that, where no curve runs."""
+    axis = figure.axes[0]
+    axis.set_xlim(0, 1)
+    axis.set_xlabel("recall")
+    handles = axis.get_lines()
+    if handles:
+        style = {"loc": "outside lower center", "title_fontsize": 9, "fontsize": 9, "frameon": False}
+        figure.legend(handles=handles, ncols=columns, title=title, **style)
+    save_png(figure, path)
+
+
+def _draw_examples(
+    folder: Path, examples: Iterable[Example], ranges_m: Mapping[str, float], sensor: Sensor, global_axes: bool
+) -> tuple[list[Picture], list[Picture]]:
+    """Samples from above, and their range images where there are points."""
+    views: list[Picture] = []
+    images: list[Picture] = []
+    for one in examples:
+        view, image = folder / f"{one.kind}_bev.png", folder / f"{one.kind}_range.png"
+        draw_bev(
+            one.points,
+            view,
+            limit_m=max(ranges_m.values()) + _MARGIN_M,
+            classes=list(ranges_m),
+            detections=one.detections,
+            truth=one.truth,
+            global_axes=global_axes,
+        )
+        views.append(
+            (f"The {one.kind} sample by hits and misses at 2 m ({one.name}): detections, truth dashed.", view)
+        )
+        if len(one.points):
+            valid = np.ones(len(one.points), bool)
+            projected = project_points(one.points, valid, sensor, num_rounds=1)
+            draw_range_image(projected, image, boxes=one.truth[0], detections=one.detections[0])
+            images.append((f"The {one.kind} sample's range image: truth above, detections below.", image))
+    return views, images
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

@@ -1,0 +1,284 @@
+"""Metrics of other classes than the benchmark's: plain loops as oracle, files read back, the report of them."""
+
+import dataclasses
+import json
+import re
+
+import metrics_oracle
+import numpy as np
+import pytest
+from made_evaluation import make_task, truth_of
+
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.evaluation.bootstrap import bootstrap
+from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
+from fcos_lidar_jax.evaluation.frames import evaluate_frames, frame_columns, read_detections, write_detections
+from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, evaluate, metric_of
+from fcos_lidar_jax.evaluation.results import read_results
+from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
+from fcos_lidar_jax.evaluation.truth import read_truth
+from fcos_lidar_jax.inference.records import as_records
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.types import Detections
+from fcos_lidar_jax.visualization.evaluation_report import Example, write_evaluation_report
+
+OWN = ("crate/box", "traffic_cone", "fork$lift", "barrier", "never_seen")
+MANY = tuple(f"kind_{k}" for k in range(150))
+"""More than an int8 counts."""
+
+
+def made(classes, used, seed=0, frames=8, objects=25):
+    """Frames with objects of some classes, the first of which has no velocity, and detections near them."""
+    rng = np.random.default_rng(seed)
+    truths, found = [], []
+    for _ in range(frames):
+        boxes = np.concatenate(
+            [
+                rng.uniform(-60, 60, (objects, 2)),
+                rng.normal(0, 1, (objects, 1)),
+                rng.uniform(0.5, 5, (objects, 3)),
+                rng.uniform(-np.pi, np.pi, (objects, 1)),
+                rng.normal(0, 3, (objects, 2)),
+            ],
+            axis=1,
+        ).astype(np.float32)
+        labels = rng.choice(used, objects).astype(np.int32)
+        boxes[labels == used[0], 7:] = np.nan
+        boxes[rng.random(objects) < 0.2, 8] = np.nan
+        truths.append(Frame(np.zeros((0, 5), np.float32), boxes, labels, rng.integers(0, 5, objects)))
+        rows = rng.choice(objects, 2 * objects)
+        near = boxes[rows] + rng.normal(0, [0.7, 0.7, 0.3, 0, 0, 0, 0.5, 1, 1], (len(rows), 9)).astype(np.float32)
+        guessed = np.where(rng.random(len(rows)) < 0.8, labels[rows], rng.choice(len(classes), len(rows)))
+        scores = np.sort(rng.random(len(rows)).astype(np.float32))[::-1]
+        guessed, valid = guessed.astype(np.int32), rng.random(len(rows)) < 0.9
+        found.append(Detections(np.nan_to_num(near), scores, guessed, valid, np.int32(0)))
+    return found, truths
+
+
+def as_dicts(boxes, labels, classes, scores, counts):
+    """Boxes as the oracle takes them."""
+    return [
+        {
+            "translation": box[:3].tolist(),
+            "size": box[[4, 3, 5]].tolist(),
+            "rotation": [np.cos(box[6] / 2), 0.0, 0.0, np.sin(box[6] / 2)],
+            "velocity": box[7:].tolist(),
+            "detection_name": classes[label],
+            "detection_score": score,
+            "attribute_name": "",
+            "num_pts": count,
+        }
+        for box, label, score, count in zip(boxes.astype(float), labels, scores, counts, strict=True)
+    ]
+
+
+def by_loops(found, truths, classes, ranges):
+    boxes, true = {}, {}
+    for i, (d, frame) in enumerate(zip(found, truths, strict=True)):
+        columns = [np.asarray(column)[d.valid] for column in (d.boxes, d.labels, d.scores)]
+        boxes[i] = as_dicts(columns[0], columns[1], classes, columns[2].tolist(), [-1] * len(columns[0]))
+        true[i] = as_dicts(frame.boxes, frame.labels, classes, [-1] * len(frame.boxes), frame.num_points)
+    return metrics_oracle.score_frames(boxes, true, dict(zip(classes, ranges, strict=True)))
+
+
+@pytest.mark.parametrize(
+    ("classes", "used", "ranges"),
+    [(OWN, [0, 1, 2, 3], (30.0, 20.0, 70.0, 45.0, 10.0)), (MANY, [2, 149, 77, 130, 128], (40.0,) * 150)],
+    ids=["own", "many"],
+)
+def test_every_number_is_that_of_plain_loops(classes, used, ranges):
+    found, truths = made(classes, used)
+    summary = evaluate_frames(found, truths, metric_of(classes, ranges)).summary
+    expected = by_loops(found, truths, classes, ranges)
+    assert list(summary) == [*expected, "cfg"]
+    assert summary["absent_classes"] == [name for k, name in enumerate(classes) if k not in used]
+    assert summary["absent_classes"] == expected["absent_classes"]
+    for key in ("label_aps", "label_tp_errors"):
+        assert summary[key].keys() == expected[key].keys()
+        for name, row in expected[key].items():
+            assert summary[key][name] == pytest.approx(row, abs=1e-6), (key, name)
+    for key in ("mean_dist_aps", "tp_errors", "mean_ap"):
+        assert summary[key] == pytest.approx(expected[key], abs=1e-6), key
+    assert "vel_err" not in summary["label_tp_errors"][classes[used[0]]]
+    assert summary["mean_ap"] > 0.1
+
+
+def test_other_metrics_say_what_they_are():
+    found, truths = made(OWN, [0, 1])
+    summary = evaluate_frames(found, truths, metric_of(OWN)).summary
+    assert summary["cfg"]["metric"] == summary["cfg"]["dist_fcn"] == "center_distance"
+    assert "not the nuScenes benchmark" in summary["cfg"]["note"]
+    assert summary["cfg"]["class_range"] == dict(zip(OWN, (50, 30, 50, 30, 50), strict=True))
+    assert "nd_score" not in summary
+    with pytest.raises(ValueError, match="metric: got the nuScenes benchmark's"):
+        evaluate_frames(found, truths, NUSCENES_METRIC)
+
+
+def test_properties_go_by_name_and_not_by_order():
+    """The benchmark with its classes in another order gives every class the same numbers."""
+    tables, results = make_task(1, samples=8, objects=80)
+    truth = read_truth(truth_of(tables))
+    boxes = read_results(results, truth.tokens).boxes
+    straight = evaluate(boxes, truth).summary
+    order = np.random.default_rng(3).permutation(10)
+    label_of = np.argsort(order).astype(np.int16)  # old label -> new label
+    other = dataclasses.replace(
+        NUSCENES_METRIC,
+        classes=tuple(NUSCENES_METRIC.classes[k] for k in order),
+        class_ranges_m=tuple(NUSCENES_METRIC.class_ranges_m[k] for k in order),
+    )
+    turned = dataclasses.replace(truth, boxes=dataclasses.replace(truth.boxes, label=label_of[truth.boxes.label]))
+    shuffled = evaluate(dataclasses.replace(boxes, label=label_of[boxes.label]), turned, other).summary
+    assert list(shuffled["label_aps"]) == list(other.classes)
+    for key in ("label_aps", "label_tp_errors"):
+        for name, row in straight[key].items():
+            np.testing.assert_array_equal(list(shuffled[key][name].values()), list(row.values()))
+    assert shuffled["nd_score"] == pytest.approx(straight["nd_score"], abs=1e-12)
+
+
+def test_the_benchmarks_sums_over_frames_count_absent_classes_and_attributes():
+    """What studies on simulated frames report beside the metric by centre distance."""
+    classes = NUSCENES_METRIC.classes
+    found, truths = made(classes, [0, 5])
+    official = evaluate(*frame_columns(found, truths)).summary
+    own = evaluate_frames(found, truths, metric_of(classes)).summary
+    assert official["mean_ap"] == pytest.approx(own["mean_ap"] * 2 / 10)
+    assert official["tp_errors"]["attr_err"] == 1
+    for name in ("car", "pedestrian"):
+        assert official["label_aps"][name] == own["label_aps"][name]
+
+
+@pytest.mark.parametrize(
+    ("classes", "ranges", "message"),
+    [
+        ((), (), "classes: got .*expected at least one name"),
+        (("a", "b", "a"), (), "classes: got .*each once"),
+        (("a", "b"), (1.0,), "class_ranges_m: got .*expected 2 positive lengths"),
+        (("a",), (0.0,), "class_ranges_m: got .*expected 1 positive"),
+    ],
+)
+def test_classes_that_make_no_metric_are_refused(classes, ranges, message):
+    with pytest.raises(ValueError, match=message):
+        metric_of(classes, ranges)
+
+
+def test_without_truth_there_is_no_score_and_no_interval_breaks(tmp_path):
+    found, truths = made(OWN, [0, 1], frames=2)
+    empty = [dataclasses.replace(frame, num_points=frame.num_points * 0) for frame in truths]
+    evaluation = evaluate_frames(found, empty, metric_of(OWN))
+    assert np.isnan(evaluation.summary["mean_ap"])
+    assert evaluation.summary["absent_classes"] == list(OWN)
+    assert warnings(evaluation, 3) == ["no ground truth counts here: no score"]
+    write_evaluation(tmp_path, evaluation, {}, repeats=3)
+    write_evaluation_report(tmp_path, title="t", num_samples=2, examples=(), sensor=TINY)
+    page = (tmp_path / "report.html").read_text()
+    assert "average precision (AP) by matching distance. This is not the nuScenes benchmark" in page
+    assert "<td>–</td>" in page
+    # Of two frames one has truth: a set of the other alone has no score, and does not count.
+    half = evaluate_frames(found, [truths[0], empty[1]], metric_of(OWN))
+    drawn = bootstrap(half, repeats=40)
+    assert set(drawn) == {"repeats", "seed", "level", "mean_ap"}
+    assert 0 < drawn["mean_ap"]["low"] <= half.summary["mean_ap"] <= drawn["mean_ap"]["high"]
+
+
+def test_scores_are_named_as_what_they_are():
+    found, truths = made(OWN, [0, 1])
+    evaluation = evaluate_frames(found, truths, metric_of(OWN))
+    lines = describe(evaluation, bootstrap(evaluation, repeats=20)).splitlines()
+    assert lines[0] == f"mAP by centre distance {evaluation.summary['mean_ap']:.4f}  on 8 frames"
+    assert lines[1].startswith("trans_err ")
+    assert re.fullmatch(r"95% intervals over samples: mAP by centre distance 0\.\d+ to 0\.\d+", lines[2])
+    absent = ", ".join(OWN[2:])
+    assert warnings(evaluation, 9) == [f"no ground truth counts of {absent}: left out of the means"]
+    invalid = [dataclasses.replace(d, valid=d.valid & False) for d in found]
+    nothing = evaluate_frames(invalid, truths, metric_of(OWN))
+    assert "not a single box" in warnings(nothing, 0)[1]
+    assert "within the range" in warnings(nothing, 5)[1]
+
+
+NAMES = [f"frame {i}" for i in range(8)]
+
+
+def test_written_detections_are_read_back(tmp_path):
+    found, _ = made(OWN, [0, 1])
+    file = tmp_path / "detections.json"
+    lines = [json.dumps(as_records(one, OWN)).encode() for one in found]
+    write_detections(file, zip(NAMES, lines, strict=True), OWN)
+    written = json.loads(file.read_text())
+    assert written["classes"] == list(OWN)
+    assert [frame["name"] for frame in written["frames"]] == NAMES
+    again = read_detections(file, NAMES[::-1], OWN[::-1])[::-1]
+    for one, back in zip(found, again, strict=True):
+        np.testing.assert_array_equal(back.boxes, one.boxes[one.valid])
+        np.testing.assert_array_equal(back.scores, one.scores[one.valid])
+        np.testing.assert_array_equal(4 - back.labels, one.labels[one.valid])
+        assert back.valid.all()
+    box = {"label": "barrier", "score": 0.5, "box": [0, 0, 0, 1, 1, 1, 0, None, None]}
+    file.write_text(json.dumps({"frames": [{"name": "a", "boxes": [box]}]}))
+    assert np.isnan(read_detections(file, ["a"], OWN)[0].boxes[0, 7:]).all()
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ([{"name": "a", "boxes": []}], "sample b: missing"),
+        ([{"name": n, "boxes": []} for n in "abc"], "sample c: not expected: expected the 2 samples"),
+        ([{"name": n, "boxes": []} for n in "aba"], "frame a: occurs twice"),
+        ([{"name": "a", "boxes": []}, {"name": "b", "boxes": [{}]}], "label"),
+        (
+            [{"name": "a", "boxes": []}, {"name": "b", "boxes": [{"label": "x", "score": 1, "box": [1] * 9}]}],
+            "frame b: box 0: got 'x'.*expected one of crate/box, traffic_cone",
+        ),
+        (
+            [
+                {"name": "a", "boxes": []},
+                {"name": "b", "boxes": [{"label": "barrier", "score": 1, "box": [0] * 9}]},
+            ],
+            r"frame b: box 0: got 'barrier', score 1, size \[0\.0, 0\.0, 0\.0\].*positive size",
+        ),
+    ],
+)
+def test_bad_detections_are_named(frames, message, tmp_path):
+    file = tmp_path / "detections.json"
+    file.write_text(json.dumps({"frames": frames}))
+    with pytest.raises(ValueError, match=f"^{re.escape(str(file))}: .*{message}"):
+        read_detections(file, ["a", "b"], OWN)
+
+
+def test_files_and_report_of_own_classes(tmp_path):
+    """Class names that no file name may hold, a class without truth, and nothing of the benchmark's."""
+    found, truths = made(OWN, [0, 1, 2, 3])
+    evaluation = evaluate_frames(found, truths, metric_of(OWN))
+    write_evaluation(tmp_path, evaluation, {}, repeats=5)
+    chosen = choose_examples(evaluation)
+    cloud = np.random.default_rng(0).normal(0, 5, (50, 5)).astype(np.float32)
+    examples = [
+        Example(kind, NAMES[row], cloud, *sensor_boxes(evaluation, row, np.eye(4), min_score=chosen.min_score))
+        for kind, row in chosen.rows.items()
+    ]
+    kept = found[chosen.rows["best"]]
+    shown = kept.valid & (kept.scores >= chosen.min_score) & (np.hypot(*kept.boxes[:, :2].T) < 30)
+    in_range = np.hypot(*examples[0].detections[0][:, :2].T) < 30
+    off = examples[0].detections[0][in_range] - kept.boxes[shown]
+    off[:, 6] = (off[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(off, 0, atol=1e-5)
+    write_evaluation_report(tmp_path, title="t", num_samples=8, examples=examples, sensor=TINY)
+    summary = json.loads((tmp_path / "metrics_summary.json").read_text())
+    assert list(summary)[-2:] == ["eval_time", "cfg"]
+    assert "NaN" not in (tmp_path / "metrics_summary.json").read_text()
+    curves = json.loads((tmp_path / "curves.json").read_text())["classes"]
+    assert list(curves) == list(OWN[:4])
+    assert "attr_err" not in curves["barrier"]["errors"]
+    page = re.sub(r'src="data:[^"]*"', "src", (tmp_path / "report.html").read_text())
+    assert page.count("<img") == 2 * 4 + 2 * 3
+    assert "NDS" not in page.replace("no NDS", "")
+    assert "not the nuScenes benchmark" in page
+    assert "Without truth here: never seen." in page
+    cells = dict(re.findall(r'<th scope="row">([^<]*)</th><td>([^<]*)</td>', page))
+    assert cells["mAP by centre distance"] == f"{summary['mean_ap']:.3f}"
+    assert cells["mAP by centre distance, 95% interval"].count("0.") == 2
+    assert cells["mAOE, orientation [rad]"] == f"{summary['tp_errors']['orient_err']:.3f}"
+    assert cells["fork$lift"] == f"{summary['mean_dist_aps']['fork$lift']:.3f}"
+    assert '<th scope="col">AAE</th>' not in page
+    write_evaluation(tmp_path, evaluation, {})
+    assert not (tmp_path / "bootstrap.json").exists()

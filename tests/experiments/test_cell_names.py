@@ -1,0 +1,89 @@
+"""Result cells keep their names while the configuration grows."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments.paper_tables import scales
+from experiments.paper_tables.cell_names import ADDED, FIELDS, IGNORED, cell_name, config_of_cell, describe_sensor
+from experiments.paper_tables.grid import change
+from fcos_lidar_jax.config import AugmentConfig, Config, CopyPasteConfig, config_to_json
+from fcos_lidar_jax.presets import QUICKSTART
+
+CELLS = sorted((Path(__file__).parents[2] / "experiments/results/tables").glob("*/cells/*.json"))
+
+
+def fields_of(value, path=""):
+    """Dotted names of all fields that are no sections."""
+    for field in dataclasses.fields(value):
+        part = getattr(value, field.name)
+        name = f"{path}{field.name}"
+        if dataclasses.is_dataclass(part):
+            yield from fields_of(part, f"{name}.")
+        else:
+            yield name
+
+
+def test_every_committed_cell_is_named_by_what_it_holds():
+    assert len(CELLS) == 45
+    for file in CELLS:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        config = config_of_cell(record["config"])
+        assert cell_name(config, record["scale"], record["seed"]) == file.stem
+        assert config_of_cell(json.loads(json.dumps(config_to_json(config)))) == config
+
+
+@pytest.mark.parametrize("make", [scales.simulated, scales.calm])
+def test_the_scales_of_today_find_the_committed_cells(make, tmp_path):
+    scale = make(tmp_path)
+    names = {file.stem for file in CELLS if file.parts[-3] == scale.name}
+    rows = ({}, {"projection__num_rounds": 1}, {"projection__prioritize_current": False})
+    assert {cell_name(change(**row)(scale.base), scale.describe(), s) for row in rows for s in range(3)} <= names
+
+
+def test_a_field_of_a_committed_cell_comes_back():
+    record = json.loads(CELLS[0].read_text(encoding="utf-8"))["config"]
+    config = config_of_cell(record)
+    assert config.model.stem.dilations == tuple(record["model"]["stem"]["dilations"])
+    assert (config.name, config.max_points, config.augment) == (record["name"], record["max_points"], None)
+    with pytest.raises(ValueError, match=r"cell\.projection\.num_rounds: got 'five', expected int"):
+        config_of_cell({**record, "projection": {**record["projection"], "num_rounds": "five"}})
+
+
+def test_every_field_of_the_configuration_is_told_to_name_cells_or_not():
+    whole = Config(augment=AugmentConfig(), copy_paste=CopyPasteConfig())
+    told = FIELDS | ADDED.keys() | IGNORED
+    missing = set(fields_of(whole)) - told
+    assert not missing, f"say in experiments/paper_tables/cell_names.py whether these name a cell: {missing}"
+
+
+def test_cells_are_told_apart_by_what_decides_them():
+    changes = (
+        {},
+        {"model__tied_heads": True},
+        {"projection__prioritize_current": False},
+        {"class_ranges_m": (30.0,) * 10},
+        {"classes": tuple("abcdefghij")},
+        {"copy_paste": None},
+        {"copy_paste__min_points": 6},
+        {"augment__scale_range": (0.9, 1.1)},
+    )
+    names = {cell_name(change(**fields)(QUICKSTART), {}, seed) for fields in changes for seed in (0, 1)}
+    assert len(names) == 2 * len(changes)
+    assert cell_name(QUICKSTART, {"scale": "elsewhere"}, 0) not in names
+    assert cell_name(change(name="other")(QUICKSTART), {}, 0) in names
+    by_name, by_count = (change(copy_paste__targets=t)(Config()) for t in ((), Config().paste_targets))
+    assert cell_name(by_name, {}, 0) == cell_name(by_count, {}, 0)
+
+
+def test_a_sensor_is_described_by_its_first_fields_and_by_what_was_added():
+    @dataclasses.dataclass(frozen=True)
+    class Grown(scales.Sensor):
+        added: float = 0.0
+
+    first = dataclasses.asdict(scales.TINY)
+    grown = Grown(**first)
+    assert describe_sensor(grown) == first
+    assert describe_sensor(dataclasses.replace(grown, added=1.0)) == {**first, "added": 1.0}

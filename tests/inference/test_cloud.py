@@ -1,0 +1,222 @@
+"""The cloud policy: what is removed, counted and truncated, and clouds of another sensor."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.inference.cloud import (
+    MAX_INTENSITY,
+    MAX_TIME_LAG_S,
+    expect_points,
+    make_cloud,
+    sensor_mismatch,
+)
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, PRESETS, TINY
+from fcos_lidar_jax.simulation.frames import make_frame
+
+LAGS = np.repeat(np.array([0, 0.05, 0.1], np.float32), [40, 50, 60])
+
+
+def cloud_of(points, size=200, *, sensor=TINY, remove="all", **options):
+    config = dataclasses.replace(QUICKSTART, max_points=size)
+    return make_cloud(points, config, sensor=sensor, remove_close=remove, **options)
+
+
+def numbered(lags=LAGS, *, columns=5):
+    """Rows whose x tells their place, in an order in which the sweeps are mixed."""
+    points = np.full((len(lags), columns), 9, np.float32)
+    points[:, 0] = 5 + np.arange(len(lags)) / 1000
+    points[:, 4] = np.random.default_rng(0).permutation(lags)
+    return points
+
+
+def test_rows_that_are_fine_stay_as_they_are():
+    points = numbered()
+    cloud = cloud_of(points)
+    np.testing.assert_array_equal(cloud.points[:150], points)
+    assert not cloud.points[150:].any()
+    assert cloud.valid.tolist() == [True] * 150 + [False] * 50
+    assert (cloud.num_points, cloud.num_removed) == (150, 0)
+
+
+@pytest.mark.parametrize("column", range(5))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_rows_that_are_not_finite_are_removed_in_their_places(column, value):
+    points = numbered()
+    points[[3, 77], column] = value
+    cloud = cloud_of(points)
+    assert np.flatnonzero(~cloud.valid[:150]).tolist() == [3, 77]
+    assert (cloud.num_invalid, cloud.num_close, cloud.num_truncated) == (2, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("column", "fine", "absurd"),
+    [(3, MAX_INTENSITY, 1e30), (3, -1.0, -65_536.0), (4, MAX_TIME_LAG_S, 60.1), (4, 0.0, -0.05)],
+)
+def test_rows_beyond_physical_limits_are_removed_and_counted(column, fine, absurd):
+    points = numbered()
+    points[7, column], points[8, column] = fine, absurd
+    cloud = cloud_of(points)
+    assert np.flatnonzero(~cloud.valid[:150]).tolist() == [8]
+    assert cloud.num_invalid == 1
+
+
+@pytest.mark.parametrize(("mode", "removed"), [("all", [0, 2]), ("sweeps", [2]), ("none", [])])
+def test_close_points_are_removed_once(mode, removed):
+    points = numbered()
+    points[:4, :2] = [[0.5, -0.5], [1.0, 0], [-0.99, 0.99], [0, 0]]
+    points[:4, 4] = [0, 0, 0.05, 0.05]
+    points[3, 3] = np.nan  # close, and not finite: counted as that
+    cloud = cloud_of(points, remove=mode, num_close=11)
+    assert np.flatnonzero(~cloud.valid[:150]).tolist() == [*removed, 3]
+    assert (cloud.num_close, cloud.num_invalid) == (len(removed) + 11, 1)
+    assert (cloud.num_points, cloud.num_removed) == (161, len(removed) + 12)
+
+
+def test_the_configuration_says_which_close_points_go():
+    points = np.array([[1.5, 1.5, 0, 0, 0], [1.5, 1.5, 0, 0, 0.1], [2.5, 0, 0, 0, 0.1]], np.float32)
+    for mode, valid in (("all", [False, False, True]), ("sweeps", [True, False, True]), ("none", [True] * 3)):
+        projection = dataclasses.replace(QUICKSTART.projection, remove_close=mode, close_m=2.0)
+        config = dataclasses.replace(QUICKSTART, projection=projection)
+        assert make_cloud(points, config, sensor=TINY).valid[:3].tolist() == valid
+
+
+@pytest.mark.parametrize(
+    ("size", "kept"),
+    [(150, (40, 50, 60)), (149, (40, 50, 59)), (95, (40, 50, 5)), (60, (40, 20, 0)), (13, (13, 0, 0))],
+)
+def test_the_oldest_sweeps_are_truncated_first(size, kept):
+    points = numbered()
+    cloud = cloud_of(points, size)
+    assert cloud.points.shape == (size, 5)
+    assert cloud.valid.all()
+    assert cloud.num_truncated == 150 - size
+    assert tuple(np.count_nonzero(cloud.points[:, 4] == lag) for lag in np.unique(LAGS)) == kept
+    assert (np.diff(cloud.points[:, 0]) > 0).all()  # in their order, none twice
+    assert np.isin(cloud.points[:, 0], points[:, 0]).all()
+
+
+def test_rows_of_the_sweep_at_the_boundary_go_by_lot():
+    """Evenly over the sweep, not its end: a part of the turn would be missing."""
+    points = numbered(np.zeros(10_000, np.float32))
+    first, again = cloud_of(points, 4000), cloud_of(points, 4000)
+    np.testing.assert_array_equal(first.points, again.points)
+    rows = np.searchsorted(points[:, 0], first.points[:, 0])
+    assert np.abs(np.bincount(rows // 1000, minlength=10) - 400).max() < 60
+
+
+def test_removed_rows_do_not_take_places_of_others():
+    points = numbered()
+    points[:30, 0] = np.nan
+    cloud = cloud_of(points, 120)
+    np.testing.assert_array_equal(cloud.points, points[30:])
+    assert (cloud.valid.all(), cloud.num_invalid, cloud.num_truncated) == (True, 30, 0)
+    assert cloud_of(points, 119).num_truncated == 1
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+def test_missing_columns_are_zero_and_others_are_left_out(columns):
+    cloud = cloud_of(numbered(columns=6)[:, :columns].astype(np.float64))
+    assert (cloud.points.shape, cloud.points.dtype) == ((200, 5), np.float32)
+    assert cloud.points[:150, 3].any() == (columns > 3)
+    assert cloud.points[:150, 4].any() == (columns > 4)
+    assert cloud.valid.sum() == 150
+
+
+@pytest.mark.parametrize(
+    ("shape", "sensor", "expected"),
+    [((4, 2), TINY, "3 to 6"), ((4, 7), TINY, "3 to 6"), ((5,), TINY, "3 to 6"), ((4, 5), ARGOVERSE2, "6")],
+)
+def test_other_columns_are_one_line(shape, sensor, expected):
+    with pytest.raises(ValueError, match=rf"points: got shape \(.*\), expected \[n, {expected}\]") as caught:
+        cloud_of(np.zeros(shape, np.float32), sensor=sensor)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_empty_cloud_is_one_line_with_what_became_of_its_points():
+    points = numbered()
+    points[:20, 2], points[20:50, :2] = np.nan, 0
+    cloud = cloud_of(points)
+    expect_points("a.bin", cloud, 99, TINY)
+    with pytest.raises(
+        ValueError, match=r"a\.bin: none of its 150 points .*\(20 not finite .*, 30 on the ego vehicle"
+    ):
+        expect_points("a.bin", cloud, 100, TINY)
+    assert not cloud_of(points[:0]).valid.any()
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    return {name: make_frame(0, sensor).points for name, sensor in PRESETS.items()}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_sensor_knows_its_own_clouds(clouds, name):
+    sensor = PRESETS[name]
+    assert sensor_mismatch(clouds[name], sensor) is None
+    ahead = clouds[name][np.abs(np.arctan2(clouds[name][:, 1], clouds[name][:, 0])) < 0.7]
+    assert sensor_mismatch(ahead, sensor) is None  # KITTI's labelled part of the turn
+
+
+def test_older_sweeps_do_not_count():
+    points = make_frame(1, TINY, num_sweeps=4).points
+    assert sensor_mismatch(points, TINY) is None
+    points[:, 4] = 0
+    assert sensor_mismatch(points, TINY) is not None
+
+
+@pytest.mark.parametrize("theirs", PRESETS)
+@pytest.mark.parametrize("own", PRESETS)
+def test_a_sensor_knows_the_clouds_of_others(clouds, own, theirs):
+    if own == theirs:
+        return
+    points, sensor = clouds[theirs], PRESETS[own]
+    if sensor.row_source == "laser":
+        with pytest.raises(ValueError, match=r"expected \[n, 6\]"):
+            sensor_mismatch(points, sensor)
+        return
+    line = sensor_mismatch(points, sensor)
+    assert repr(own) in (line or "")
+    assert "\n" not in (line or "")
+
+
+def test_what_a_mismatch_says(clouds):
+    hdl32e = clouds["nuscenes_hdl32e"]
+    for points, sensor, finding in (
+        (hdl32e, "short_range", r"\d\.\d of the points share a cell"),
+        (clouds["kitti_hdl64e"], "nuscenes_hdl32e", r"\d\.\d of the points share a cell"),
+        (hdl32e, "kitti_hdl64e", "0% of the points have a neighbour in the next row|next column"),
+        (hdl32e, "waymo_top", "outside its vertical field of view"),
+        (
+            hdl32e * np.array([1000, 1000, 1000, 1, 1], np.float32),
+            "nuscenes_hdl32e",
+            "beyond its limits, .* < 54 m",
+        ),
+    ):
+        assert re.search(finding, sensor_mismatch(points, PRESETS[sensor]) or "")
+
+
+def test_few_points_tell_nothing():
+    assert sensor_mismatch(np.ones((400, 5), np.float32) * 9, TINY) is None
+    assert sensor_mismatch(np.zeros((0, 3), np.float32), TINY) is None
+
+
+@pytest.mark.real_data
+def test_real_clouds_are_of_their_sensor_alone(real_data):
+    files = [
+        *real_data.glob("nuscenes_scene0[01]*/*.pcd.bin"),
+        *real_data.glob("nuscenes_scene0523/samples/*/*.bin"),
+    ]
+    assert len(files) == 43
+    for file in files:
+        points = read_points(file, NUSCENES_HDL32E)
+        assert sensor_mismatch(points, NUSCENES_HDL32E) is None
+        for name, sensor in PRESETS.items():
+            if name != "nuscenes_hdl32e" and sensor.row_source != "laser":
+                assert sensor_mismatch(points, sensor) is not None, (file, name)
+    fused = np.fromfile(real_data / "ten_sweep_cloud" / "cloud.f16.bin", np.float16).reshape(-1, 5)
+    assert sensor_mismatch(fused, NUSCENES_HDL32E) is None

@@ -1,0 +1,119 @@
+"""Candidates and detection against loops."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+
+from fcos_lidar_jax.coding import decode
+from fcos_lidar_jax.config import InferenceConfig
+from fcos_lidar_jax.inference import make_detect, postprocess, select_candidates
+from fcos_lidar_jax.locations import ImageLayout, locate
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.types import Outputs
+
+LAYOUT = ImageLayout(16, 256, 2)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Random predictions over a real range image."""
+    rng = np.random.default_rng(0)
+    frame = make_frame(0, TINY)
+    image = project_points(frame.points, np.ones(len(frame.points), bool), TINY, num_rounds=1)
+    number = LAYOUT.num_locations
+    logits = rng.normal(0, 2, (number, 4)).astype(np.float32)
+    logits[:, 3] += 3
+    regression = rng.normal(0, 0.5, (number, 10, 3)).astype(np.float32)
+    iou_logits = rng.normal(0, 1, (number, 3)).astype(np.float32)
+    return Outputs(*map(jnp.asarray, (logits, regression, iou_logits))), locate(image, LAYOUT)
+
+
+def candidates_by_loops(outputs, locations, config):
+    logits = np.asarray(outputs.logits, np.float64)
+    p = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+    quality = 1 / (1 + np.exp(-np.asarray(outputs.iou_logits, np.float64)))
+    found, first = [], 0
+    for size in LAYOUT.level_sizes:
+        level = []
+        for l in range(first, first + size):
+            if not bool(locations.occupied[l]):
+                continue
+            for k in range(3):
+                if p[l, k] > config.min_probability:
+                    level.append((-p[l, k] * quality[l, k], l, k))
+        found += sorted(level)[: config.candidates_per_level]
+        first += size
+    return found
+
+
+def test_candidates_are_the_best_pairs_of_each_level(scene):
+    outputs, locations = scene
+    locations = jax.tree.map(np.asarray, locations)
+    config = InferenceConfig(min_probability=0.2, candidates_per_level=150)
+    boxes, scores, labels, valid = map(
+        np.asarray, select_candidates(outputs, look_again(locations), config=config, layout=LAYOUT)
+    )
+    expected = candidates_by_loops(outputs, locations, config)
+    assert valid.sum() == len(expected) > 300
+    np.testing.assert_allclose(np.sort(scores[valid]), np.sort([-s for s, _, _ in expected]), atol=1e-6)
+    order = {(round(float(s), 5), int(k)) for s, k in zip(scores[valid], labels[valid], strict=True)}
+    assert len(order ^ {(round(-s, 5), k) for s, _, k in expected}) <= 0.02 * len(expected)  # last-digit rounding
+    best = int(np.argmax(np.where(valid, scores, -1)))
+    _, l, k = min(expected)
+    one = decode(
+        outputs.regression[l, :, k], jnp.asarray(locations.points[l]), jnp.asarray(locations.azimuth_rad[l])
+    )
+    np.testing.assert_allclose(boxes[best], one, atol=1e-5)
+    assert not scores[~valid].any()
+
+
+def look_again(locations):
+    return jax.tree.map(jnp.asarray, locations)
+
+
+def test_postprocessing_is_class_wise_greedy_nms_of_the_candidates(scene):
+    outputs, locations = scene
+    config = InferenceConfig(min_probability=0.2, candidates_per_level=60, max_detections=40)
+    boxes, scores, labels, valid = map(
+        np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT)
+    )
+    expected = oracles.nms(boxes, scores, valid, labels, 0.2, 40)
+    found, found_scores, found_labels, used = map(
+        np.asarray, postprocess(outputs, locations, config=config, layout=LAYOUT)
+    )
+    assert used.sum() == len(expected)
+    np.testing.assert_array_equal(found[used], boxes[expected])
+    np.testing.assert_array_equal(found_scores[used], scores[expected])
+    np.testing.assert_array_equal(found_labels[used], labels[expected])
+    assert not found[~used].any()
+
+
+def test_detection_ignores_padding_and_is_the_same_under_vmap():
+    detector = build_detector(QUICKSTART, TINY)
+    variables = detector.init(jax.random.key(0))
+    for head in variables["params"]["heads"].values():
+        head["classification"]["logits_bias"] = jnp.zeros(11)
+    detect = make_detect(detector)
+    clouds = []
+    for seed in range(2):
+        points = np.full((4096, 5), np.nan, np.float32)
+        scan = make_frame(seed, TINY).points
+        points[: len(scan)] = scan
+        clouds.append((points, np.arange(4096) < len(scan)))
+    single = [jax.jit(detect)(variables, *cloud) for cloud in clouds]
+    assert all(bool(d.valid.any()) for d in single)
+    assert all(bool(jnp.isfinite(d.boxes).all()) for d in single)
+    points, valid = (np.stack(v) for v in zip(*clouds, strict=True))
+    both = jax.jit(jax.vmap(detect, in_axes=(None, 0, 0)))(variables, points, valid)
+    for i, one in enumerate(single):
+        np.testing.assert_allclose(both.scores[i][:20], one.scores[:20], atol=1e-4)
+        assert int(both.num_dropped[i]) == int(one.num_dropped)
+    empty = jax.jit(detect)(variables, clouds[0][0], np.zeros(4096, bool))
+    assert not empty.valid.any()
+    assert not empty.boxes.any()

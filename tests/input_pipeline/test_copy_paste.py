@@ -1,0 +1,197 @@
+"""Copy-paste: counts, overlaps, removed points, sweeps, classes by name."""
+
+import dataclasses
+
+import numpy as np
+import oracles
+import pytest
+from shapely import area, intersection
+from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
+
+from fcos_lidar_jax.config import CopyPasteConfig
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
+from fcos_lidar_jax.input_pipeline.database import MAX_SWEEPS, prepare_database
+from fcos_lidar_jax.presets import NUSCENES
+
+SPEC = CopyPasteConfig()
+TOY_LAGS = np.array([0, 0.05, 0.1], np.float32)
+
+
+def configured(spec=SPEC, num_sweeps=10, **options):
+    return dataclasses.replace(NUSCENES, copy_paste=spec, num_sweeps=num_sweeps, **options)
+
+
+def rectangles(boxes: np.ndarray) -> np.ndarray:
+    return np.asarray(oracles.rectangles(boxes))
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory):
+    frames = SceneFrames(ToyFrames(40), (("a", tuple(range(20))), ("b", tuple(range(20, 40)))))
+    return prepare_database(frames, tmp_path_factory.mktemp("objects"))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("num_sweeps", [1, 2, 3, 10])
+def test_pasted_objects_fill_up_the_classes_without_overlap(objects, seed, num_sweeps):
+    frame = toy_frame(100 + seed)
+    paste, removed = make_paste(objects, configured(SPEC, num_sweeps))(frame, np.random.default_rng(seed))
+    present = np.bincount(frame.labels[frame.num_points >= 1], minlength=10)
+    after = present + np.bincount(paste.labels, minlength=10)
+    assert (after <= np.maximum(present, NUSCENES.paste_targets)).all()
+    assert len(paste.boxes) > 5
+    everything = rectangles(np.concatenate([frame.boxes, paste.boxes]))
+    for i in range(len(frame.boxes), len(everything)):
+        shared = area(intersection(everything[i], np.delete(everything, i)))
+        assert shared.max() < 1e-9
+    key = {tuple(row["box"][:7].tolist()): i for i, row in enumerate(objects.table)}
+    assert np.isnan(paste.boxes[:, 7:]).any()
+    sources = [key[tuple(box[:7].tolist())] for box in paste.boxes]
+    assert len(set(sources)) == len(sources)
+    originals = [objects.points(i) for i in sources]
+    newest = TOY_LAGS[:num_sweeps]
+    originals = [p[np.isin(p[:, 4], newest)] for p in originals]
+    assert np.unique(paste.points[:, 4]).tolist() == newest.tolist()
+    assert min(map(len, originals)) >= SPEC.min_points
+    np.testing.assert_array_equal(paste.points, np.concatenate(originals))
+    assert paste.num_points.tolist() == [int((p[:, 4] == 0).sum()) for p in originals]
+    assert paste.num_points.min() >= 1
+    pasted = paste.boxes.astype(float)
+    inside = [any(oracles.inside(p, box) for box in pasted) for p in frame.points[:, :3].astype(float)]
+    assert removed.tolist() == np.flatnonzero(inside).tolist()
+
+
+def test_a_drawn_object_is_pasted_or_overlaps(objects):
+    """On an empty plain, what is left out overlaps something pasted before."""
+    none = np.zeros(0, np.int32)
+    bare = Frame(np.zeros((1, 5), np.float32), np.zeros((0, 9), np.float32), none, none)
+    one_class = CopyPasteConfig(targets=(0, 0, 0, 0, 0, 1000, 0, 0, 0, 0))
+    paste, _ = make_paste(objects, configured(one_class))(bare, np.random.default_rng(0))
+    usable = objects.table[(objects.table["label"] == 5) & (objects.num_points(1) >= 1)]
+    assert set(paste.labels) == {5}
+    assert 3 < len(paste.boxes) < len(usable)
+    pasted = rectangles(paste.boxes)
+    for row in usable:
+        overlaps = area(intersection(rectangles(row["box"][None])[0], pasted)) > 1e-9
+        assert overlaps.any()
+
+
+def test_what_was_left_out_takes_no_room(tmp_path):
+    """Three in a row, of which the middle one overlaps both others: it comes alone, or they come both."""
+    boxes = np.zeros((3, 9), np.float32)
+    boxes[:, 0], boxes[:, 3:6] = [10, 13, 16], [4, 2, 2]
+    points = np.zeros((30, 5), np.float32)
+    points[:, 0] = np.repeat([9, 13, 17], 10)
+    labels, counts = np.zeros(3, np.int32), np.full(3, 10, np.int32)
+    frames = ListedFrames((Frame(points, boxes, labels, counts),))
+    objects = prepare_database(frames, tmp_path)
+    paste = make_paste(objects, configured(CopyPasteConfig(targets=(3,) + (0,) * 9)))
+    empty = Frame(points[:1] + 50, boxes[:0], labels[:0], counts[:0])
+    seen = {tuple(sorted(paste(empty, np.random.default_rng(s))[0].boxes[:, 0])) for s in range(20)}
+    assert seen == {(13,), (10, 16)}
+
+
+def test_full_classes_get_nothing(objects):
+    frame = toy_frame(100)
+    present = np.bincount(frame.labels[frame.num_points >= 1], minlength=10)
+    full = CopyPasteConfig(targets=tuple(present.tolist()))
+    paste, removed = make_paste(objects, configured(full))(frame, np.random.default_rng(0))
+    assert (paste.points.shape, len(paste.boxes), len(removed)) == ((0, 5), 0, 0)
+
+
+def test_boxes_without_points_take_room_but_do_not_count(objects):
+    frame = toy_frame(100)
+    hidden = Frame(frame.points, frame.boxes, frame.labels, np.zeros_like(frame.num_points))
+    paste, _ = make_paste(objects, configured(SPEC))(hidden, np.random.default_rng(0))
+    boxes = rectangles(frame.boxes)
+    assert all(area(intersection(r, boxes)).max() < 1e-9 for r in rectangles(paste.boxes))
+    seen, _ = make_paste(objects, configured(SPEC))(frame, np.random.default_rng(0))
+    assert len(paste.boxes) > len(seen.boxes)
+
+
+def test_the_generator_decides(objects):
+    paste, frame = make_paste(objects, configured(SPEC)), toy_frame(100)
+    a, b, c = (paste(frame, np.random.default_rng(s))[0].boxes for s in (1, 1, 2))
+    np.testing.assert_array_equal(a, b)
+    assert a.shape != c.shape or (a != c).any()
+
+
+def test_objects_of_stale_points_alone_are_not_pasted(tmp_path):
+    frame = toy_frame(0)
+    stale = frame.points.copy()
+    stale[:, 4] = 0.05
+    frames = ListedFrames((Frame(stale, frame.boxes, frame.labels, frame.num_points),))
+    objects = prepare_database(frames, tmp_path)
+    assert len(objects) > 5
+    for num_sweeps in (1, 2, 10):
+        paste, _ = make_paste(objects, configured(SPEC, num_sweeps))(toy_frame(100), np.random.default_rng(0))
+        assert len(paste.boxes) == 0
+
+
+@pytest.fixture(scope="module")
+def long_frame():
+    """A frame of 24 sweeps in any order, with boxes far apart of 6 to 300 points."""
+    rng = np.random.default_rng(0)
+    boxes = np.zeros((12, 9), np.float32)
+    boxes[:, 0], boxes[:, 1] = np.tile([-30, -10, 10, 30], 3), np.repeat([-20, 0, 20], 4)
+    boxes[:, 3:6], boxes[:, 6] = [4, 2, 2], rng.uniform(-3, 3, 12)
+    points = np.repeat(boxes[:, :5], [6, 24, 30, 48, 60, 90, 120, 150, 180, 200, 240, 300], axis=0)
+    points[:, :3] += rng.uniform(-0.9, 0.9, (len(points), 3))
+    points[:, 4] = rng.choice(np.arange(24, dtype=np.float32) / 20, len(points))
+    order = rng.permutation(len(points))
+    return Frame(points[order], boxes, np.arange(12, dtype=np.int32) % 10, np.ones(12, np.int32))
+
+
+@pytest.mark.parametrize("num_sweeps", [1, 3, 10, MAX_SWEEPS])
+def test_a_model_of_k_sweeps_gets_the_points_of_the_newest_k(tmp_path, long_frame, num_sweeps):
+    """As if the database had been cut from frames of k sweeps, and not one point of an older one."""
+    objects = prepare_database(ListedFrames((long_frame,)), tmp_path)
+    empty = dataclasses.replace(
+        long_frame, boxes=long_frame.boxes[:0], labels=long_frame.labels[:0], num_points=long_frame.num_points[:0]
+    )
+    everything = CopyPasteConfig(targets=(100,) * 10)
+    paste, _ = make_paste(objects, configured(everything, num_sweeps))(empty, np.random.default_rng(0))
+    newest = long_frame.points[long_frame.points[:, 4] < (num_sweeps - 0.5) / 20]
+    cut = {}
+    for box in long_frame.boxes:
+        inside = np.array([oracles.inside(p[:3].astype(float), box.astype(float)) for p in newest])
+        cut[box[:7].tobytes()] = newest[inside]
+    enough = {box for box, points in cut.items() if len(points) >= 5 and (points[:, 4] == 0).any()}
+    originals = [cut[box[:7].tobytes()] for box in paste.boxes]
+    assert sorted(map(len, originals)) == sorted(len(cut[box]) for box in enough) != []
+    assert paste.num_points.tolist() == [(points[:, 4] == 0).sum() for points in originals]
+    expected = np.concatenate([points[np.argsort(points[:, 4], kind="stable")] for points in originals])
+    np.testing.assert_array_equal(paste.points, expected)
+
+
+def test_more_sweeps_than_are_told_apart_are_refused(objects):
+    with pytest.raises(ValueError, match="num_sweeps: got 21, expected 1 to 20 for copy-paste"):
+        make_paste(objects, configured(SPEC, 21))
+
+
+def test_classes_are_matched_by_name(objects):
+    """The database has the ten classes; a detector of three, one of them its own, gets objects of two."""
+    config = configured(CopyPasteConfig(targets=(50, 50, 50)), classes=("pedestrian", "tram", "car"))
+    bare = dataclasses.replace(
+        toy_frame(0),
+        boxes=np.zeros((0, 9), np.float32),
+        labels=np.zeros(0, np.int32),
+        num_points=np.zeros(0, np.int32),
+    )
+    paste, _ = make_paste(objects, config)(bare, np.random.default_rng(0))
+    label_of = {row["box"][:7].tobytes(): objects.manifest.classes[row["label"]] for row in objects.table}
+    names = [label_of[box[:7].tobytes()] for box in paste.boxes]
+    assert set(names) == {"pedestrian", "car"}
+    assert [config.classes[label] for label in paste.labels] == names
+
+
+def test_a_database_of_other_classes_is_refused(objects):
+    with pytest.raises(ValueError, match=r"classes: got car, truck, .*, expected some of tram, boat"):
+        make_paste(objects, configured(CopyPasteConfig(), classes=("tram", "boat")))
+
+
+def test_a_database_of_larger_objects_is_refused(tmp_path):
+    objects = prepare_database(ToyFrames(1), tmp_path, min_points=9)
+    with pytest.raises(ValueError, match=r"copy_paste\.min_points: got 5, .* database's 9"):
+        make_paste(objects, configured(SPEC))

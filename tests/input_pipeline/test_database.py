@@ -1,0 +1,305 @@
+"""The ground-truth database: what is cut, that it survives kills, and that damage is seen."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import oracles
+import pytest
+from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
+
+from fcos_lidar_jax.input_pipeline.database import DatabaseError, open_database, prepare_database, shards_by_scene
+from fcos_lidar_jax.types import CLASSES
+
+SCENES = (("scene-b", (0, 1, 2)), ("scene-a", (3,)), ("scene-c", (6, 4)))
+
+
+def build(folder, frames=None, *, scenes=SCENES, source="f", **options):
+    return prepare_database(SceneFrames(frames or ToyFrames(), scenes, source), folder, **options)
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in sorted(Path(folder).iterdir())}
+
+
+def test_every_box_of_enough_points_is_cut_with_its_points(tmp_path):
+    objects = build(tmp_path)
+    expected = []
+    for index, toy in enumerate((0, 1, 2, 3, 6, 4)):
+        frame = toy_frame(toy)
+        for box, label in zip(frame.boxes, frame.labels, strict=True):
+            inside = frame.points[[oracles.inside(p[:3].astype(float), box.astype(float)) for p in frame.points]]
+            if len(inside) >= 5:
+                expected.append((index, label, box, inside))
+    assert len(objects) == len(expected) > 30
+    for i, (index, label, box, inside) in enumerate(expected):
+        row = objects.table[i]
+        assert (row["frame"], row["label"], row["count"]) == (index, label, len(inside))
+        assert row["newest"][:3].tolist() == [(inside[:, 4] <= lag).sum() for lag in np.float32([0, 0.05, 0.1])]
+        assert (row["newest"][3:] == len(inside)).all()
+        np.testing.assert_array_equal(row["box"], box)
+        np.testing.assert_array_equal(objects.points(i), inside)
+    assert {len(p[3]) for p in expected} != {5}
+    assert (objects.num_points(1) < objects.num_points(2)).any()
+    assert objects.manifest.classes == list(CLASSES)
+
+
+def test_absurd_points_are_not_cut(tmp_path):
+    """A damaged lag would also count as a sweep, and move the others."""
+    frame = toy_frame(0)
+    points = frame.points.copy()
+    first = np.flatnonzero([oracles.inside(p[:3].astype(float), frame.boxes[0].astype(float)) for p in points])
+    points[first[:2], 3], points[first[2], 4] = 1e30, -1.0
+    objects = build(
+        tmp_path / "a", ListedFrames((dataclasses.replace(frame, points=points),)), scenes=(("s", (0,)),)
+    )
+    clean = dataclasses.replace(frame, points=np.delete(frame.points, first[:3], axis=0))
+    build(tmp_path / "b", ListedFrames((clean,)), scenes=(("s", (0,)),))
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    assert len(objects)
+
+
+def test_an_absurd_box_is_one_line(tmp_path):
+    frame = toy_frame(0)
+    frame.boxes[3, 4] = 0
+    with pytest.raises(ValueError, match=r"frame 'frame 1': box 3: got .*, expected finite .* sizes above 0$"):
+        build(tmp_path, ListedFrames((toy_frame(1), frame)), scenes=(("s", (0, 1)),))
+
+
+def test_shards_are_scenes(tmp_path):
+    """Frames of a scene need not follow each other, those of none are cut by the hundred; names fit file names."""
+    frames = SceneFrames(
+        ToyFrames(), (("", (0,)), ("a/b", (1, 2)), ("", (3,)), (".c", (4,)), ("a/b", (5,)), ("..", (6,)))
+    )
+    shards = {"frames_000000": [0, 3], "a_b": [1, 2, 5], "_c": [4], "_.": [6]}
+    assert shards_by_scene(frames) == shards
+    assert list(shards_by_scene(ToyFrames(201))) == [f"frames_000{i}00" for i in range(3)]
+    objects = prepare_database(frames, tmp_path)
+    assert [shard.name for shard in objects.manifest.shards] == list(shards)
+    assert objects.manifest.source == frames.fingerprint()
+    assert list(dict.fromkeys(objects.table["frame"].tolist())) == [0, 3, 1, 2, 5, 4, 6]
+
+
+def test_min_points_and_empty_shards(tmp_path):
+    scenes = (("one", (1,)), ("bare", (0,)))
+    bare = toy_frame(1)
+    frames = ListedFrames((type(bare)(bare.points, bare.boxes[:0], bare.labels[:0], bare.num_points[:0]), bare))
+    objects = build(tmp_path, frames, scenes=scenes, min_points=25)
+    assert [s.objects for s in objects.manifest.shards] == [len(objects), 0]
+    assert objects.table["count"].min() >= 25
+    assert len(objects) < len(build(tmp_path / "more", frames, scenes=scenes, min_points=5))
+    assert len(build(tmp_path / "empty", frames, scenes=())) == 0
+
+
+def test_same_bytes_for_any_number_of_workers(tmp_path):
+    build(tmp_path / "one")
+    reports = []
+    build(tmp_path / "two", workers=2, report=lambda done, total: reports.append((done, total)))
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+    assert reports[0] == (0, 6)
+    assert reports[-1] == (6, 6)
+    assert len(reports) == 4
+
+
+class Interrupted(Exception):
+    pass
+
+
+def interrupt_after(count):
+    def report(done, _):
+        if done >= count:
+            raise Interrupted
+
+    return report
+
+
+@pytest.mark.parametrize("done", [0, 1, 4, 6])
+def test_an_interrupted_build_goes_on_to_the_same_bytes(tmp_path, done):
+    build(tmp_path / "whole")
+    with pytest.raises(Interrupted):
+        build(tmp_path / "parts", report=interrupt_after(done))
+    with pytest.raises(DatabaseError, match=r"manifest\.json: no such file"):
+        open_database(tmp_path / "parts")
+    before = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "parts").iterdir()}
+    reports = []
+    build(tmp_path / "parts", report=lambda d, _: reports.append(d))
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    assert reports[0] >= done
+    for name, stamp in before.items():  # what was there is not made again
+        assert (tmp_path / "parts" / name).stat().st_mtime_ns == stamp
+
+
+def ends(group):
+    """Whether no process of a group is left, soon."""
+    for _ in range(200):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_a_build_over_an_older_one_has_no_manifest_until_it_is_finished(tmp_path):
+    build(tmp_path, source="old")
+    with pytest.raises(Interrupted):
+        build(tmp_path, report=interrupt_after(1))
+    with pytest.raises(DatabaseError, match=r"manifest\.json: no such file"):
+        open_database(tmp_path)
+
+
+KILLED = """
+import sys
+from fcos_lidar_jax.input_pipeline.database import prepare_database
+from toy_frames import SceneFrames, ToyFrames
+if __name__ == "__main__":
+    scenes = tuple((f"scene-{i}", (i, i + 1)) for i in range(99))
+    print("began", flush=True)
+    prepare_database(SceneFrames(ToyFrames(99, 0.03), scenes), sys.argv[1], workers=int(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize(("workers", "sent"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGINT)])
+def test_a_killed_build_goes_on_to_the_same_bytes(tmp_path, workers, sent):
+    script = tmp_path / "build.py"
+    script.write_text(KILLED)
+    folder = tmp_path / "objects"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(folder), str(workers)],
+        env=environment,
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60
+    while len(list(folder.glob("*.npz"))) < 4 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    if sent == signal.SIGINT:  # as a terminal does: to all of them
+        os.killpg(process.pid, sent)
+    else:
+        process.send_signal(sent)
+    error = process.communicate(timeout=60)[1]
+    assert 4 <= len(list(folder.glob("*.npz"))) < 99
+    assert not (folder / "manifest.json").exists()
+    assert error.count("Traceback") <= 1  # the workers say nothing
+    assert ends(process.pid)
+    scenes = tuple((f"scene-{i}", (i, i + 1)) for i in range(99))
+    build(folder, ToyFrames(99), scenes=scenes)
+    build(tmp_path / "whole", ToyFrames(99), scenes=scenes)
+    assert contents(folder) == contents(tmp_path / "whole")
+
+
+def test_other_data_or_another_plan_replace_what_was_there(tmp_path):
+    build(tmp_path / "a", source="old")
+    (tmp_path / "a" / ".0123456789ab.f32").write_bytes(b"half")
+    build(tmp_path / "a", scenes=SCENES[:2], source="new", min_points=9)
+    build(tmp_path / "b", scenes=SCENES[:2], source="new", min_points=9)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    assert len(contents(tmp_path / "a")) == 5
+
+
+def test_a_finished_build_is_left_as_it_is(tmp_path):
+    build(tmp_path)
+    stamps = {p.name: p.stat().st_mtime_ns for p in tmp_path.iterdir() if p.name != "manifest.json"}
+    build(tmp_path)
+    assert stamps == {p.name: p.stat().st_mtime_ns for p in tmp_path.iterdir() if p.name != "manifest.json"}
+
+
+def flip(file, position):
+    data = bytearray(file.read_bytes())
+    data[position] ^= 1
+    file.write_bytes(data)
+
+
+def cut(file, size):
+    file.write_bytes(file.read_bytes()[:size])
+
+
+def edit(file, **changes):
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def recount(file, field):
+    shards = json.loads(file.read_text())["shards"]
+    shards[0][field] += 1
+    edit(file, shards=shards)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda f: (f / "manifest.json").unlink(), r"manifest.json: no such file, expected a finished"),
+        (lambda f: cut(f / "manifest.json", 100), r"manifest.json: .*truncated"),
+        (
+            lambda f: edit(f / "manifest.json", version=1),
+            r"manifest.json: got .* version 1, expected .* version 2; build it anew",
+        ),
+        (lambda f: edit(f / "manifest.json", format="x"), r"manifest.json: got 'x' version 2"),
+        (lambda f: edit(f / "manifest.json", shards=3), r"manifest.json: Expected `array`, got `int`"),
+        (lambda f: edit(f / "manifest.json", shards=[{}]), r"missing required field `name` - at `\$.shards\[0\]`"),
+        (
+            lambda f: edit(f / "manifest.json", classes=["car"]),
+            r"manifest.json: classes: got \['car'\], expected at least \d",
+        ),
+        (
+            lambda f: recount(f / "manifest.json", "objects"),
+            r"manifest.json: scene-b: got \d+ objects of \d+ points",
+        ),
+        (lambda f: recount(f / "manifest.json", "points"), r"expected \d+ of \d+ as in its table; build it anew"),
+        (lambda f: flip(f / "scene-b.objects.npz", 700), r"scene-b.objects.npz: checksum differs"),
+        (lambda f: cut(f / "scene-b.objects.npz", 700), r"scene-b.objects.npz: checksum differs"),
+        (lambda f: (f / "scene-a.objects.npz").unlink(), r"scene-a.objects.npz: No such file"),
+        (lambda f: (f / "scene-c.points.f32").unlink(), r"scene-c.points.f32: got no file, expected \d+ bytes"),
+        (lambda f: cut(f / "scene-c.points.f32", 700), r"scene-c.points.f32: got 700 bytes, expected \d+ bytes"),
+    ],
+)
+def test_damage_is_one_line_when_opened(tmp_path, damage, message):
+    build(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(DatabaseError, match=message) as caught:
+        open_database(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+    build(tmp_path)  # and building again repairs it
+    build(tmp_path.with_name("other"))
+    assert contents(tmp_path) == contents(tmp_path.with_name("other"))
+
+
+def test_an_altered_point_is_one_line_when_its_object_is_read(tmp_path):
+    objects = build(tmp_path)
+    flip(tmp_path / "scene-b.points.f32", 20 * int(objects.table["start"][2]) + 7)
+    objects = open_database(tmp_path)
+    objects.points(1)
+    with pytest.raises(DatabaseError, match=re.escape(f"{tmp_path}/scene-b.points.f32: object 2: checksum")):
+        objects.points(2)
+    build(tmp_path).points(2)  # building again repairs it
+
+
+def test_other_data_are_refused(tmp_path):
+    build(tmp_path)
+    open_database(tmp_path, fingerprint="f")
+    with pytest.raises(DatabaseError, match=r"source: got 'f', expected 'g': built from other data"):
+        open_database(tmp_path, fingerprint="g")
+
+
+def test_columns_must_agree(tmp_path):
+    frames = ListedFrames((toy_frame(0), toy_frame(1, columns=6)))
+    with pytest.raises(ValueError, match="frame 1: points: got 6 columns, expected 5"):
+        build(tmp_path / "a", frames, scenes=(("s", (0, 1)),))
+    with pytest.raises(ValueError, match="shard 't': points: got 6 columns, expected 5"):
+        build(tmp_path / "b", frames, scenes=(("s", (0,)), ("t", (1,))))
+    assert build(tmp_path / "c", frames, scenes=(("t", (1,)),)).points(0).shape[1] == 6
+
+
+def test_workers_pass_on_errors(tmp_path):
+    with pytest.raises(IndexError):
+        build(tmp_path, ListedFrames((toy_frame(0),)), scenes=(("s", (0,)), ("t", (1,))), workers=2)
+    assert {p.name for p in tmp_path.iterdir()} <= {"s.points.f32", "s.objects.npz"}

@@ -1,0 +1,360 @@
+"""The training pipeline: the same bits however it is run, and every sample what it should be."""
+
+import dataclasses
+import itertools
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import oracles
+import pytest
+from toy_frames import ListedFrames, ToyFrames, toy_frame
+
+from fcos_lidar_jax.config import CopyPasteConfig
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.input_pipeline.database import prepare_database
+from fcos_lidar_jax.input_pipeline.loader import SampleOrder, make_batches, steps_per_epoch
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, QUICKSTART
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+
+CONFIG = dataclasses.replace(
+    QUICKSTART,
+    num_sweeps=3,
+    max_points=3000,
+    max_boxes=64,
+    copy_paste=CopyPasteConfig(),
+    class_balanced=False,
+    fade_epochs=1,
+    optimizer=dataclasses.replace(QUICKSTART.optimizer, batch_size=4, epochs=3),
+)
+PLAIN = dataclasses.replace(CONFIG, copy_paste=None)
+STEPS = 6  # three epochs of seven frames in batches of four
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("objects")
+    return prepare_database(ToyFrames(20), folder)
+
+
+def run(frames=None, config=PLAIN, *, count=None, seed=0, num_steps=STEPS, threads=0, **options):
+    frames = frames or ToyFrames()
+    with make_batches(frames, config, seed=seed, num_steps=num_steps, threads=threads, **options) as batches:
+        return list(itertools.islice(batches, count))
+
+
+def assert_same(found, expected):
+    assert len(found) == len(expected)
+    assert [b.counts for b in found] == [b.counts for b in expected]
+    assert [b.names for b in found] == [b.names for b in expected]
+    leaves = (jax.tree.leaves([b.batch for b in batches]) for batches in (found, expected))
+    for a, b in zip(*leaves, strict=True):
+        assert type(a) is type(b) is np.ndarray  # and no view of memory that workers share
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+
+
+@pytest.mark.parametrize("class_balanced", [False, True])
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_threads_do_not_change_a_bit(objects, threads, class_balanced):
+    config = dataclasses.replace(CONFIG, class_balanced=class_balanced)
+    alone = run(config=config, objects=objects)
+    assert len(alone) == STEPS
+    assert_same(run(config=config, objects=objects, threads=threads), alone)
+
+
+@pytest.mark.parametrize(("workers", "threads", "first_step"), [(1, 0, 3), (2, 2, 0), (4, 0, 1)])
+def test_worker_processes_do_not_change_a_bit(objects, workers, threads, first_step):
+    alone = run(config=CONFIG, objects=objects)[first_step:]
+    how = {"workers": workers, "threads": threads, "first_step": first_step}
+    assert_same(run(config=CONFIG, objects=objects, **how), alone)
+
+
+def test_a_run_goes_on_at_any_step_with_the_same_bits(objects):
+    alone = run(config=CONFIG, objects=objects)
+    for step in range(STEPS + 1):
+        assert_same(run(config=CONFIG, objects=objects, first_step=step, threads=step % 3), alone[step:])
+
+
+@pytest.mark.parametrize("num_processes", [2, 4])
+def test_the_parts_of_all_processes_are_the_whole(objects, num_processes):
+    whole = run(config=CONFIG, objects=objects)
+    parts = [
+        run(config=CONFIG, objects=objects, num_processes=num_processes, process_index=i)
+        for i in range(num_processes)
+    ]
+    for step, batch in enumerate(whole):
+        joined = jax.tree.map(lambda *rows: np.concatenate(rows), *(p[step].batch for p in parts))
+        for a, b in zip(jax.tree.leaves(joined), jax.tree.leaves(batch.batch), strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert batch.counts == {name: sum(p[step].counts[name] for p in parts) for name in batch.counts}
+
+
+def seen_frames(batches, size=7):
+    """Which toy frame every sample shows, by its first point."""
+    first = {tuple(toy_frame(i).points[0].tolist()): i for i in range(size)}
+    return [first[tuple(np.asarray(points[0]).tolist())] for b in batches for points in b.batch.points]
+
+
+def test_every_epoch_shows_every_frame_once_in_another_order():
+    seen = seen_frames(run(num_steps=7))  # 28 samples: four epochs of seven
+    epochs = [seen[7 * i : 7 * i + 7] for i in range(4)]
+    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) == 4
+    assert [name for b in run(num_steps=7) for name in b.names] == [f"toy {i}" for i in seen]
+    assert seen != seen_frames(run(num_steps=7, seed=1))
+    assert seen[7:] != seen_frames(run(num_steps=7, seed=1))[:-7]  # neighbouring seeds do not share epochs
+
+
+def test_class_balanced_epochs_are_redrawn_and_a_resumed_run_sees_the_same():
+    config = dataclasses.replace(PLAIN, class_balanced=True)
+    order, an_epoch = SampleOrder(ToyFrames(), config, seed=0), steps_per_epoch(ToyFrames(), config)
+    steps = 2 * an_epoch
+    seen = seen_frames(run(config=config, num_steps=steps))
+    assert seen == [order[position] for position in range(4 * steps)]
+    size = order.epoch_size
+    assert sorted(seen[:size]) != sorted(seen[size : 2 * size])
+    assert seen_frames(run(config=config, num_steps=steps, first_step=an_epoch + 1)) == seen[4 * (an_epoch + 1) :]
+
+
+def test_a_sample_is_its_frame():
+    [batch] = run(count=1)
+    hidden = 0
+    for row, index in enumerate(seen_frames([batch])):
+        frame = toy_frame(index)
+        shown = frame.num_points >= 1
+        hidden += int((~shown).sum())
+        np.testing.assert_array_equal(batch.batch.points[row][batch.batch.valid[row]], frame.points)
+        np.testing.assert_array_equal(batch.batch.boxes[row][batch.batch.box_valid[row]], frame.boxes[shown])
+        np.testing.assert_array_equal(batch.batch.labels[row][batch.batch.box_valid[row]], frame.labels[shown])
+    assert hidden > 0
+    assert np.isnan(batch.batch.boxes).any()  # unknown velocities stay unknown
+    assert batch.counts == {"truncated_points": 0, "truncated_boxes": 0, "invalid_points": 0, "pasted_objects": 0}
+
+
+def test_pasted_objects_arrive_with_their_points_and_nothing_shows_through(objects):
+    [batch] = run(config=CONFIG, objects=objects, count=1)
+    assert batch.counts["pasted_objects"] > 20
+    total = 0
+    for row, index in enumerate(seen_frames([batch])):
+        frame, truth = toy_frame(index), np.asarray(batch.batch.boxes[row])[batch.batch.box_valid[row]]
+        points = np.asarray(batch.batch.points[row])
+        pasted = truth[int((frame.num_points >= 1).sum()) :]
+        total += len(pasted)
+        scene = points[: len(frame.points)][batch.batch.valid[row][: len(frame.points)]]
+        added = points[len(frame.points) :][batch.batch.valid[row][len(frame.points) :]]
+        for box in pasted.astype(float):
+            assert not any(oracles.inside(p, box) for p in scene[:, :3].astype(float))
+            assert sum(oracles.inside(p, box) for p in added[:, :3].astype(float)) >= 5
+    assert total == batch.counts["pasted_objects"]
+
+
+def test_single_sweep_models_get_current_points_alone(objects):
+    frames = ListedFrames(tuple(only_current(toy_frame(i)) for i in range(4)))
+    [batch] = run(frames, dataclasses.replace(CONFIG, num_sweeps=1), objects=objects, count=1)
+    assert batch.counts["pasted_objects"] > 5
+    assert not np.asarray(batch.batch.points)[np.asarray(batch.batch.valid)][:, 4].any()
+    [fused] = run(frames, CONFIG, objects=objects, count=1)
+    assert np.asarray(fused.batch.points)[np.asarray(fused.batch.valid)][:, 4].any()
+
+
+def only_current(frame):
+    return dataclasses.replace(frame, points=frame.points[frame.points[:, 4] == 0])
+
+
+def test_pasting_fades_out_by_the_step_alone(objects):
+    # Seven frames in batches of four: two steps an epoch; three epochs, the last without.
+    counts = [b.counts["pasted_objects"] > 0 for b in run(config=CONFIG, objects=objects)]
+    assert counts == [True] * 4 + [False] * 2
+    assert not run(config=CONFIG, objects=objects, first_step=5)[0].counts["pasted_objects"]
+    plain, faded = run(first_step=4), run(config=CONFIG, objects=objects, first_step=4)
+    assert_same(faded, plain)
+
+
+def test_every_sample_has_its_own_draw(objects):
+    """One frame again and again, and no two samples, of a step or of several, with the same objects."""
+    frames = ListedFrames((toy_frame(0),))
+    own = int((toy_frame(0).num_points >= 1).sum())
+    batches = run(frames, dataclasses.replace(CONFIG, fade_epochs=0), objects=objects, count=3)
+    pasted = [np.asarray(boxes)[own:].tobytes() for b in batches for boxes in b.batch.boxes]
+    assert len(set(pasted)) == len(pasted) == 12
+
+
+@pytest.mark.parametrize("pasting", [False, True])
+def test_the_oldest_points_go_first_and_are_counted(objects, pasting):
+    config = CONFIG if pasting else PLAIN
+    roomy = run(config=config, objects=objects, count=1)[0]
+    tight = run(config=dataclasses.replace(config, max_points=1200), objects=objects, count=1)[0]
+    lost = 0
+    for row in range(4):
+        every = np.asarray(roomy.batch.points[row])[roomy.batch.valid[row]]
+        kept = np.asarray(tight.batch.points[row])[tight.batch.valid[row]]
+        assert len(kept) == 1200 < len(every)
+        lost += len(every) - 1200
+        oldest = kept[:, 4].max()
+        assert oldest > 0
+        np.testing.assert_array_equal(kept[kept[:, 4] < oldest], every[every[:, 4] < oldest])
+        last = {point.tobytes() for point in every[every[:, 4] == oldest]}
+        chosen = [point.tobytes() for point in kept[kept[:, 4] == oldest]]
+        assert len(set(chosen)) == len(chosen) < len(last)
+        assert set(chosen) <= last
+    assert tight.counts["truncated_points"] == lost
+    assert roomy.counts["truncated_points"] == 0
+
+
+def test_absurd_points_reach_no_batch_and_are_counted():
+    """One intensity of 1e30 would leave an infinite running variance in the checkpoint."""
+    frame = toy_frame(0)
+    points = frame.points.copy()
+    points[5, 3], points[6, 0], points[7, 4], points[8, 4] = 1e30, np.nan, -0.1, 1e9
+    [batch] = run(ListedFrames((dataclasses.replace(frame, points=points),)), count=1)
+    assert batch.counts["invalid_points"] == 4 * 4
+    for row in range(4):
+        kept = np.asarray(batch.batch.points[row])[batch.batch.valid[row]]
+        np.testing.assert_array_equal(kept, np.delete(frame.points, range(5, 9), axis=0))
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [(0, np.nan), (2, np.inf), (4, np.nan), (6, np.nan), (3, 0), (5, -1)]
+)
+def test_absurd_boxes_stop_the_run_with_their_line(column, value):
+    frame = toy_frame(0)
+    frame.boxes[7, column] = value
+    with pytest.raises(
+        ValueError, match=r"^frame 'frame 0': box 7: got [^\n]*, expected finite x, y, z, l, w, h, yaw"
+    ):
+        run(ListedFrames((frame,)), count=1)
+
+
+def test_boxes_with_the_fewest_points_go_and_are_counted():
+    tight = run(config=dataclasses.replace(PLAIN, max_boxes=5), count=1)[0]
+    lost = 0
+    for row, index in enumerate(seen_frames([tight])):
+        frame = toy_frame(index)
+        ranks = sorted(range(len(frame.boxes)), key=lambda i: (-frame.num_points[i], i))
+        best = sorted(i for i in ranks[:5] if frame.num_points[i] >= 1)
+        np.testing.assert_array_equal(tight.batch.boxes[row][tight.batch.box_valid[row]], frame.boxes[best])
+        np.testing.assert_array_equal(tight.batch.labels[row][: len(best)], frame.labels[best])
+        lost += max(int((frame.num_points >= 1).sum()) - 5, 0)
+    assert tight.counts["truncated_boxes"] == lost > 4
+
+
+def test_a_laser_column_travels_too(objects):
+    frames = ListedFrames((toy_frame(0, columns=6),))
+    [batch] = run(frames, count=1)
+    assert batch.batch.points.shape == (4, 3000, 6)
+    with pytest.raises(ValueError, match="got points of 5 columns, expected 6 as in the frames"):
+        run(frames, CONFIG, objects=objects, count=1)
+
+
+def test_frames_without_boxes_or_points():
+    nothing = Frame(np.zeros((0, 5), np.float32), np.zeros((0, 9), np.float32), *[np.zeros(0, np.int32)] * 2)
+    [batch] = run(ListedFrames((nothing,)), count=1)
+    assert not np.asarray(batch.batch.valid).any()
+    assert not np.asarray(batch.batch.box_valid).any()
+
+
+LEFT_EARLY = """
+import dataclasses, sys
+sys.path[:0] = sys.argv[1:]
+from test_loader import PLAIN, STEPS, ToyFrames, make_batches
+if __name__ == "__main__":
+    large = dataclasses.replace(PLAIN, max_points=300_000)  # shared memory that takes its time to be freed
+    with make_batches(ToyFrames(), large, seed=0, num_steps=STEPS, workers=1) as batches:
+        print(len(next(batches).names), len(next(batches).names))
+"""
+
+
+def test_leaving_early_leaves_nothing_behind(tmp_path):
+    script = tmp_path / "leave.py"
+    script.write_text(LEFT_EARLY)
+    command = [sys.executable, str(script), str(Path(__file__).parent), str(Path(__file__).parents[1] / "support")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "4 4\n", "")
+
+
+def test_the_training_step_takes_a_batch(objects):
+    """Points and boxes reach the device with their bits, in the shapes and types that the step is made for."""
+    config = dataclasses.replace(CONFIG, num_sweeps=1)
+    frames = ListedFrames(tuple(only_current(toy_frame(i)) for i in range(4)))
+    [host] = run(frames, config, objects=objects, count=1)
+    batch = jax.device_put(host.batch)
+    for there, here in zip(jax.tree.leaves(batch), jax.tree.leaves(host.batch), strict=True):
+        assert (there.dtype, there.weak_type) == (here.dtype, False)
+        np.testing.assert_array_equal(there, here)
+    detector, optimizer = build_detector(config, TINY), make_optimizer(config.optimizer, STEPS)
+    step = make_train_step(detector, optimizer)
+    state = jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(0))
+    after, metrics = jax.eval_shape(step, state, batch)
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+    assert metrics["loss/total"].shape == ()
+
+
+def test_workers_need_shared_memory(monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(64 << 20, 0, 64 << 20))
+    config = dataclasses.replace(PLAIN, max_points=300_000)
+    # Five batches of four rows of 300,000 points of 25 bytes, and the boxes.
+    with pytest.raises(ValueError, match="workers: got 2, for which /dev/shm has 64 MiB free, expected 143 MiB"):
+        run(config=config, workers=2)
+    assert len(run(config=config, threads=1, count=1)) == 1
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("preset", [NUSCENES, NUSCENES_SINGLE])
+def test_real_samples_fit_the_presets(real_data, tmp_path, preset):
+    data = NuScenes(real_data / "nuscenes_scene0523", "v1.0-scene0523")
+    frames = NuScenesFrames(data, tuple(data.split("scene0523")[-6:]), preset.num_sweeps)
+    objects = prepare_database(frames, tmp_path)
+    config = dataclasses.replace(preset, optimizer=dataclasses.replace(preset.optimizer, batch_size=3))
+    for batch in run(frames, config, objects=objects, count=2):
+        assert batch.counts["truncated_points"] == batch.counts["truncated_boxes"] == 0
+        assert batch.counts["pasted_objects"] > 3
+        points, valid = np.asarray(batch.batch.points), np.asarray(batch.batch.valid)
+        filled = valid.sum(axis=1) / preset.max_points
+        assert (filled > 0.5).all()  # ten sweeps leave no room for twice as many
+        lags = [len(np.unique(cloud[row][:, 4])) for cloud, row in zip(points, valid, strict=True)]
+        assert all(lag >= preset.num_sweeps for lag in lags)
+        assert preset.num_sweeps > 1 or lags == [1, 1, 1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Broken(ToyFrames):
+    def frame(self, index):
+        raise ValueError(f"sweeps/{index}.bin: got 3 bytes, expected 20")
+
+
+@pytest.mark.parametrize(("threads", "workers"), [(0, 0), (2, 0), (0, 1)])
+def test_an_unreadable_file_stops_the_run_with_its_line(threads, workers):
+    with pytest.raises(ValueError, match=r"sweeps/\d.bin") as caught:
+        run(Broken(), threads=threads, workers=workers)
+    assert re.fullmatch(r"sweeps/\d.bin: got 3 bytes, expected 20", str(caught.value))
+
+
+@pytest.mark.parametrize(
+    ("frames", "config", "options", "message"),
+    [
+        (ToyFrames(0), PLAIN, {}, "training frames: got none"),
+        (ToyFrames(), CONFIG, {}, "copy_paste: got no ground-truth database"),
+        (
+            ToyFrames(),
+            PLAIN,
+            {"num_processes": 3},
+            "process 0 of 3: expected a number that divides the batch of 4",
+        ),
+        (ToyFrames(), PLAIN, {"num_processes": 2, "process_index": 2}, "process 2 of 2"),
+        (ToyFrames(), PLAIN, {"num_processes": 0}, "process 0 of 0"),
+        (ToyFrames(), PLAIN, {"first_step": 2}, "first_step: got 2, expected 0 to 1"),
+        (ToyFrames(), PLAIN, {"workers": -1}, "workers: got -1, expected at least 0"),
+        (ToyFrames(), PLAIN, {"threads": -1}, "threads: got -1, expected at least 0"),
+    ],
+)
+def test_what_cannot_run_is_refused_before_it_begins(frames, config, options, message):
+    with pytest.raises(ValueError, match=message), make_batches(frames, config, seed=0, num_steps=1, **options):
+        pass

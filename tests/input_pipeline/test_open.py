@@ -1,0 +1,181 @@
+"""Layouts are recognised, splits chosen, options that do not fit refused, each in one line."""
+
+import dataclasses
+import os
+import re
+import shutil
+
+import numpy as np
+import pytest
+from made_argoverse2 import make_argoverse2
+from made_folder import CLASSES, make_folder
+from made_kitti import make_kitti
+from made_nuscenes import VERSION, make_tables, token, write
+
+from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
+from fcos_lidar_jax.data.classes import MappedFrames
+from fcos_lidar_jax.data.folder import FolderFrames
+from fcos_lidar_jax.data.kitti import KittiFrames
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.input_pipeline.open import LayoutError, default_split, find_layout, open_frames
+from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
+
+COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
+READERS = {
+    "nuscenes": NuScenesFrames,
+    "kitti": KittiFrames,
+    "argoverse2": Argoverse2Frames,
+    "folder": FolderFrames,
+}
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory):
+    """A data set of every format."""
+    folder = tmp_path_factory.mktemp("formats")
+    return {
+        "nuscenes": write(folder / "nuscenes", *make_tables()),
+        "kitti": make_kitti(folder / "kitti", train=2, val=1, sensor=TINY),
+        "argoverse2": make_argoverse2(folder / "argoverse2", sweeps=2, sensor=COARSE),
+        "folder": make_folder(folder / "folder", train=2, val=1),
+    }
+
+
+FORMATS = ("nuscenes", "kitti", "argoverse2", "folder")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_layout_is_recognised_and_its_frames_offer_the_contract(roots, format):
+    assert find_layout(roots[format]).format == format
+    frames = open_frames(roots[format])
+    assert type(frames) is READERS[format]
+    assert len(frames) == {"nuscenes": 8, "kitti": 3, "argoverse2": 4, "folder": 3}[format]
+    for i in range(len(frames)):
+        frame = frames.frame(i)
+        assert frame.points.shape[1] == frames.sensor.point_columns
+        assert (frame.points[:, 4] == 0).all()  # one sweep unless more are asked for
+        assert len(frame.boxes) == len(frame.labels) == len(frame.num_points)
+        assert frame.labels.dtype == np.int32
+        assert frame.labels.max(initial=0) < len(frames.classes)
+        assert frames.name(i)
+    assert len({frames.name(i) for i in range(len(frames))}) == len(frames)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_split_is_a_part(roots, format):
+    split = {"nuscenes": "scene-1"}.get(format, "train")
+    whole, part = open_frames(roots[format]), open_frames(roots[format], split=split)
+    assert len(part) == {"nuscenes": 4}.get(format, 2) < len(whole)
+    assert {part.name(i) for i in range(len(part))} < {whole.name(i) for i in range(len(whole))}
+
+
+def test_options_reach_the_readers(roots):
+    frames = open_frames(roots["nuscenes"], split="scene-1", num_sweeps=3, remove_close="none", sensor=TINY)
+    data = NuScenes(roots["nuscenes"], VERSION)
+    sample = token("sample", 1, 3)
+    np.testing.assert_array_equal(frames.frame(3).points, data.sweeps(sample, 3, remove_close="none"))
+    np.testing.assert_array_equal(frames.pose(3), data.sensor_to_global(sample))
+    assert (frames.sensor, frames.name(3), frames.scene(3)) == (TINY, sample, "scene-1")
+    assert frames.time_us(3) == 1_600_000_000_000_000 + 10**8 + 9 * 50_000
+    for format in FORMATS:
+        close = [open_frames(roots[format], remove_close=mode, close_m=6.0).frame(0) for mode in ("all", "sweeps")]
+        kept, all_of_them = (len(frame.points) for frame in close)
+        assert kept + close[0].num_close == all_of_them + close[1].num_close
+        assert kept < all_of_them
+
+
+def test_a_class_map_translates(roots):
+    frames = open_frames(roots["folder"], class_map={"person": None, "post": "pole"})
+    assert frames.classes == ("pole", "vehicle")
+    plain = open_frames(roots["folder"])
+    assert plain.classes == CLASSES
+    for i in range(3):
+        own = [plain.classes[label] for label in plain.labels(i)]
+        translated = [{"post": "pole"}.get(name, name) for name in own if name != "person"]
+        assert [frames.classes[label] for label in frames.labels(i)] == translated
+    assert MappedFrames(frames, ("vehicle",)).left_out().keys() == {"pole"}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_fingerprint_follows_from_files_and_options(roots, tmp_path, format):
+    root = shutil.copytree(roots[format], tmp_path / "copy")
+    same = open_frames(root).fingerprint()
+    assert open_frames(root).fingerprint() == same
+    if format != "nuscenes":  # whose index is what counts: copied trees have other times there
+        assert open_frames(roots[format]).fingerprint() == same
+    split = {"nuscenes": "scene-1"}.get(format, "train")
+    prints = [same, *(open_frames(root, **o).fingerprint() for o in ({"split": split}, {"close_m": 2.0}))]
+    names = {"nuscenes": "sample_annotation.json", "kitti": "label_2/000000.txt", "folder": "boxes/000.json"}
+    file = next(root.rglob(names.get(format, "annotations.feather")))
+    if format == "nuscenes":
+        file.write_text(file.read_text().replace('"size": [\n1.5', '"size": [\n1.6'))
+    else:
+        os.utime(file, (1, 1))
+    prints.append(open_frames(root).fingerprint())
+    assert len(set(prints)) == 4
+
+
+BAD = {
+    "nothing": ({}, "no known data set, expected one of */sample.json (nuscenes), training/velodyne (kitti)"),
+    "gone": ({"root": "gone"}, "gone: no such folder, expected a data set"),
+    "format": ({"root": "kitti", "format": "kiti"}, "format: got 'kiti', expected kitti"),
+    "version of kitti": ({"root": "kitti", "version": "v1"}, "version: got 'v1', expected none"),
+    "index of a folder": ({"root": "folder", "index": "x"}, "index: got x, expected none"),
+    "splits of kitti": ({"root": "kitti", "splits": "x"}, "splits: got x, expected none"),
+    "missing sweeps": ({"root": "kitti", "allow_missing_sweeps": True}, "allow_missing_sweeps: got True"),
+    "no such version": ({"root": "nuscenes", "version": "v9"}, "v9: no such folder, expected one of v1.0-made"),
+    "sweeps": ({"root": "kitti", "num_sweeps": 0}, "num_sweeps: got 0, expected at least 1"),
+    "class map": ({"root": "kitti", "class_map": {"Lorry": "truck"}}, "class map: got 'Lorry', expected Car"),
+    "other reader": ({"root": "kitti", "format": "folder"}, "no such folder, expected one with .pcd.bin"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_does_not_fit_gets_one_line(roots, tmp_path, case):
+    options, message = BAD[case]
+    root = roots.get(options.get("root"), tmp_path / options.get("root", ""))
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        open_frames(root, **{name: value for name, value in options.items() if name != "root"})
+    assert "\n" not in str(caught.value)
+
+
+def test_several_formats_or_versions_are_to_be_named(roots, tmp_path):
+    root = shutil.copytree(roots["nuscenes"], tmp_path / "both")
+    shutil.copytree(root / VERSION, root / "v2")
+    with pytest.raises(LayoutError, match=r"got versions v1.0-made, v2, expected one: name it"):
+        open_frames(root)
+    assert len(open_frames(root, version="v2")) == 8
+    (root / "clouds").mkdir()
+    with pytest.raises(LayoutError, match="looks like nuscenes and folder, expected one format: name it"):
+        open_frames(root, version="v2")
+    assert len(open_frames(root, format="nuscenes", version="v2")) == 8
+
+
+def test_default_splits(roots, tmp_path):
+    def split(root, purpose, required=True, **more):
+        return default_split(find_layout(root), purpose, required=required, **more)
+
+    for format in ("kitti", "argoverse2", "folder"):
+        assert (split(roots[format], "train"), split(roots[format], "val", required=False)) == ("train", "val")
+    root = shutil.copytree(roots["nuscenes"], tmp_path / "nuscenes")
+    with pytest.raises(LayoutError, match="got splits all, scene-0, scene-1, none, lost, none is train: name one"):
+        split(root, "train")
+    assert split(root, "val", required=False) is None
+    own = root / VERSION / "splits.json"
+    own.write_text('{"only": ["scene-0"]}')
+    assert (split(root, "train"), split(root, "val"), split(root, "val", required=False)) == ("only", "only", None)
+    (tmp_path / "own.json").write_text('{"train": ["scene-1"], "other": []}')
+    assert split(root, "train", splits=tmp_path / "own.json") == "train"
+    own.unlink()
+    assert (split(root, "train"), split(root, "val", required=False)) == ("train", "val")
+    (root / VERSION).rename(root / "v1.0-mini")
+    assert (split(root, "train"), split(root, "val")) == ("mini_train", "mini_val")
+    root = shutil.copytree(roots["kitti"], tmp_path / "kitti")
+    shutil.rmtree(root / "ImageSets")
+    assert (split(root, "train"), split(root, "val")) == (None, None)
+    root = shutil.copytree(roots["folder"], tmp_path / "folder")
+    (root / "splits.json").unlink()
+    assert split(root, "train") is None
+    with pytest.raises(ValueError, match=r"gone.json: no such file, expected splits"):
+        split(root, "train", splits=root / "gone.json")

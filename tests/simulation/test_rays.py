@@ -1,0 +1,162 @@
+"""The ray-caster against a slow oracle: marching through level functions written from the shapes' definitions."""
+
+import numpy as np
+import pytest
+
+from fcos_lidar_jax.simulation.ground import Ground
+from fcos_lidar_jax.simulation.raycast import Fan, cast
+from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, WHEEL, make_solids
+
+FAR_BELOW = Ground(np.array([[0, 0, -500.0]]), 7, 900, 7, 0.0, 3, (0.1, 0.2, 0.2))
+HILLS = Ground(
+    np.array([[0.01, -0.008, -1.8], [0.03, -0.008, -2.6], [0.01, 0.02, -2.3]]), 6, 15, 5, 0.13, 3, (0.1, 0.2, 0.3)
+)
+SLACK_M = 4e-3
+
+
+def level(solid, points):
+    """How far out points [n, 3] are, of the surface's 1; by the definition of each kind, in float64."""
+    offset = points - solid["center"]
+    c, s = np.cos(solid["yaw"]), np.sin(solid["yaw"])
+    along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+    along = along - solid["lean"] * offset[:, 2]
+    u, v, w = along / solid["half"][0], across / solid["half"][1], offset[:, 2] / solid["half"][2]
+    if solid["kind"] == BALL:
+        return np.sqrt(u**2 + v**2 + w**2)
+    if solid["kind"] == WHEEL:
+        return np.maximum(np.hypot(u, w), np.abs(v))
+    # From 1 at the base (w = -1) to the taper at the top.
+    narrow = [1 + (t - 1) * (np.clip(w, -1, 1) + 1) / 2 for t in solid["taper"]]
+    if solid["kind"] == DRUM:
+        return np.maximum(np.hypot(u, v) / narrow[0], np.abs(w))
+    return np.maximum(np.maximum(np.abs(u) / narrow[0], np.abs(v) / narrow[1]), np.abs(w))
+
+
+def ground_height(ground, x, y):
+    """Planes, the highest of them, and a kerb's height more off the two carriageways."""
+    plane = np.max([a * x + b * y + c for a, b, c in ground.planes], axis=0)
+    road = (np.abs(y) < ground.half_width) | (np.abs(x - ground.crossing_x) < ground.crossing_half_width)
+    return plane + np.where(road, 0, ground.kerb)
+
+
+def random_solids(rng, number):
+    angle, far = rng.uniform(-np.pi, np.pi, number), rng.uniform(3, 20, number)
+    center = np.stack([far * np.cos(angle), far * np.sin(angle), far * rng.uniform(-0.8, 0.8, number)], axis=1)
+    solids = make_solids(BOX, center, rng.uniform(0.2, 2.0, (number, 3)))
+    solids["kind"] = rng.integers(0, 4, number)
+    solids["yaw"] = rng.uniform(-4, 4, number)
+    solids["lean"] = rng.choice([0, 0.3, -0.6], number)
+    solids["taper"] = rng.choice([1.0, 0.8, 0.3, 1.2], (number, 2))
+    flat = rng.random(number) < 0.3  # so that rays are steeper than cones
+    solids["half"][flat] *= [2, 2, 0.2]
+    return solids
+
+
+def tilt(x, y):
+    c, s, d, e = np.cos(x), np.sin(x), np.cos(y), np.sin(y)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ np.array([[d, -e, 0], [e, d, 0], [0, 0, 1]])
+
+
+def make_fan(columns=90, start=2.9):
+    # One more turn than a full one, and lasers that fire one after the other.
+    rows = np.radians(np.linspace(50, -50, 12))
+    return Fan(rows, columns, start, 2 * np.pi / columns * 1.02, np.linspace(0, 0.8, 12))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("ground", [FAR_BELOW, HILLS], ids=["air", "hills"])
+def test_rays_end_where_marching_first_meets_something(seed, ground):
+    rng = np.random.default_rng(seed)
+    solids, fan, turn = random_solids(rng, 25), make_fan(), tilt(0.05, 1.0)
+    eye = np.array([0.3, -0.4, 0.2])
+    hits = cast(fan, turn, eye, solids, ground, rng)
+    directions = turn @ fan.directions.astype(np.float64)
+    way = np.arange(0.02, 45, 0.02)
+    met = 0
+    for ray in rng.permutation(directions.shape[1])[:450]:
+        d, reach, winner = directions[:, ray], hits.range_m.ravel()[ray], hits.solid.ravel()[ray]
+        path = eye + way[:, None] * d
+        full = np.array([level(s, path) <= 1 for s in solids])
+        full = np.vstack([full, path[:, 2] <= ground_height(ground, *path[:, :2].T)]).any(axis=0)
+        first = way[np.argmax(full)] if full.any() else np.inf
+        assert reach <= first + SLACK_M, (ray, reach, first)
+        if reach > way[-1]:
+            continue
+        met += 1
+        end = (eye + reach * d)[None]
+        if winner >= 0:
+            # In metres: a level is at least the distance over the largest half extent, leaning included.
+            assert abs(level(solids[winner], end)[0] - 1) < SLACK_M / solids["half"][winner].min() * 2
+        else:
+            drop = end[0, 2] - ground_height(ground, *end.T[:2])[0]
+            beside, along = abs(end[0, 1]), abs(end[0, 0] - ground.crossing_x)
+            edge = min(abs(beside - ground.half_width), abs(along - ground.crossing_half_width))
+            on_kerb_face = edge < SLACK_M and abs(drop) < ground.kerb + SLACK_M
+            assert abs(drop) < SLACK_M or on_kerb_face, drop
+    assert met > 30
+
+
+def test_every_kind_is_met_and_the_nearest_wins():
+    solids = make_solids(BOX, [[6 + 4 * k, 0, 0] for k in range(4)], [1, 1, 1])
+    solids["kind"] = BOX, DRUM, BALL, WHEEL
+    straight = Fan(np.array([0.0]), 1, 0.0, 1e-3, np.zeros(1))
+    rng = np.random.default_rng(0)
+    for first in range(4):
+        hits = cast(straight, np.eye(3), np.zeros(3), solids[first:], FAR_BELOW, rng)
+        assert (hits.solid[0, 0], hits.range_m[0, 0]) == (0, pytest.approx(5 + 4 * first))
+        assert hits.cosine[0, 0] == pytest.approx(1)
+    backwards = cast(straight, np.eye(3), np.zeros(3), solids[::-1], FAR_BELOW, rng)
+    assert backwards.solid[0, 0] == 3
+
+
+@pytest.mark.parametrize("kind", [BOX, DRUM, BALL, WHEEL])
+def test_incidence_is_that_of_the_level_functions_gradient(kind):
+    rng = np.random.default_rng(kind)
+    checked = 0
+    for _ in range(12):
+        solid = random_solids(rng, 1)
+        solid["kind"] = kind
+        if kind == WHEEL:
+            solid["taper"] = 1
+        middle = solid["center"][0]
+        fan = Fan(np.radians(np.linspace(20, -20, 21)), 60, np.arctan2(*middle[1::-1]) + 0.5, 1 / 60, np.zeros(21))
+        hits = cast(fan, np.eye(3), np.zeros(3), solid, FAR_BELOW, rng)
+        ends = fan.directions.T.astype(float)
+        for ray in np.flatnonzero(hits.solid.ravel() == 0)[::7]:
+            at = ends[ray] * hits.range_m.ravel()[ray]
+            steps = [1e-4 * np.eye(3)[i] for i in range(3)]
+            slopes = [
+                [(level(solid[0], (at + s * e)[None])[0] - level(solid[0], at[None])[0]) / s for e in steps]
+                for s in (1, -1)
+            ]
+            if np.abs(np.subtract(*slopes)).max() > 0.01 * np.abs(slopes).max():
+                continue  # at an edge
+            expected = abs(slopes[0] @ ends[ray]) / np.linalg.norm(slopes[0])
+            assert hits.cosine.ravel()[ray] == pytest.approx(expected, abs=0.02)
+            checked += 1
+    assert checked > 50
+
+
+def test_porous_solids_let_rays_through_by_their_depth():
+    ball = make_solids(BALL, [10, 0, 0], 2.0, density=0.4)
+    fan = Fan(np.zeros(1), 4000, 1e-3, 1e-9, np.zeros(1))
+    hits = cast(fan, np.eye(3), np.zeros(3), ball, FAR_BELOW, np.random.default_rng(0))
+    stopped = np.isfinite(hits.range_m)
+    expected = 1 - np.exp(-0.4 * 4)
+    assert stopped.mean() == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 4000))
+    assert hits.range_m[stopped].min() >= 8 - 1e-3
+    assert hits.range_m[stopped].max() <= 12 + 1e-3
+
+
+def test_reachable_counts_rays_that_others_stop():
+    """A post before a wall takes rays that would reach it."""
+    solids = make_solids(BOX, [[20, 0, 0], [10, 1, 0]], [[0.1, 4, 4], [0.1, 1, 4]], owner=np.array([0, 1]))
+    fan = Fan(np.zeros(1), 400, 0.35, 0.7 / 400, np.zeros(1))
+    hits = cast(fan, np.eye(3), np.zeros(3), solids, FAR_BELOW, np.random.default_rng(0))
+    owners = np.bincount(hits.reachable // 400, minlength=2)
+    seen = np.bincount(hits.solid[hits.solid >= 0], minlength=2)
+    step = 0.7 / 400
+    wide = 2 * np.arctan2(4, 19.9)
+    behind = np.arctan2(2, 9.9)  # the post's far edge; its near one is straight ahead
+    np.testing.assert_allclose(owners, [wide / step, behind / step], atol=1.01)
+    assert seen[0] == pytest.approx((wide - behind) / step, abs=1.51)

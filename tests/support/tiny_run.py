@@ -1,0 +1,85 @@
+"""A run so small that its step compiles in seconds; every test that trains shares it, and so its program."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from fcos_lidar_jax.config import InferenceConfig, StemConfig
+from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.trainer import Schedule, train
+from fcos_lidar_jax.types import Batch, TrainState
+
+STEPS = 4
+SENSOR = dataclasses.replace(TINY, num_columns=64)
+CONFIG = dataclasses.replace(
+    QUICKSTART,
+    max_points=1024,
+    copy_paste=None,
+    class_balanced=False,
+    model=dataclasses.replace(
+        QUICKSTART.model,
+        row_upscale=1,
+        stem=StemConfig(channels_per_type=2, out_channels=8, dilations=(1,), num_convs=1),
+        backbone_blocks=(1, 1, 1, 1),
+        backbone_widths=(8, 8, 8, 8),
+        fpn_channels=8,
+        head_channels=8,
+        head_convs=1,
+    ),
+    inference=InferenceConfig(max_detections=20, candidates_per_level=20),
+    optimizer=dataclasses.replace(QUICKSTART.optimizer, batch_size=2, ema_decay=0.9),
+)
+NETWORK_OPTIONS = """
+    --no-class-balanced --inference.max-detections 20 --inference.candidates-per-level 20
+    --optimizer.batch-size 2 --optimizer.ema-decay 0.9 --projection.num-rounds 1 --model.row-upscale 1
+    --model.stem.channels-per-type 2 --model.stem.out-channels 8 --model.stem.dilations 1
+    --model.stem.num-convs 1 --model.backbone-blocks 1 1 1 1 --model.backbone-widths 8 8 8 8
+    --model.fpn-channels 8 --model.head-channels 8 --model.head-convs 1
+""".split()  # noqa: SIM905
+"""The options of ``fcos-lidar train`` that make a preset this network."""
+FRAMES = SimulatedFrames(SENSOR, 12)
+TESTS = SimulatedFrames(SENSOR, 2, 1000)
+
+
+@functools.cache
+def weights():
+    """Random ones, made without compiling anything."""
+    shapes = jax.eval_shape(build_detector(CONFIG, SENSOR).init, jax.random.key(0))
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(lambda leaf: rng.normal(0, 0.3, leaf.shape).astype(leaf.dtype), shapes["params"])
+    statistics = jax.tree.map(lambda leaf: np.ones(leaf.shape, leaf.dtype), shapes["batch_stats"])
+    return jax.tree.map(jax.numpy.asarray, {"params": params, "batch_stats": statistics})
+
+
+def train_tiny(folder: Path, *, save: int = 1, evaluate: int = 100, **options) -> TrainState:
+    """A run of four steps on simulated frames, that saves after each."""
+    options = {"config": CONFIG, "frames": FRAMES, "steps": STEPS, **options}
+    return train(out=folder, schedule=Schedule(save, evaluate), threads=0, **options)
+
+
+def batches(first_step: int = 0):
+    """Its batches."""
+    return make_batches(FRAMES, CONFIG, seed=0, num_steps=STEPS, first_step=first_step, threads=0)
+
+
+def host_batch(step: int = 0) -> Batch:
+    """One of its batches."""
+    with batches(step) as stream:
+        return next(stream).batch
+
+
+def bits(tree) -> list[bytes]:
+    """All leaves, to compare bit by bit; random keys as numbers."""
+
+    def raw(leaf):
+        key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if key else leaf).tobytes()
+
+    return [raw(leaf) for leaf in jax.tree.leaves(tree)]

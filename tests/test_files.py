@@ -1,0 +1,85 @@
+"""Atomic writes and file locks: what other processes see of them."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from fcos_lidar_jax.files import atomic_write, file_lock
+
+
+def test_atomic_write_replaces_a_file_whole(tmp_path):
+    file = tmp_path / "new" / "folder" / "a.pcd.bin"
+    atomic_write(file, lambda temporary: temporary.write_text("first"))
+    seen = []
+
+    def write(temporary):
+        temporary.write_text("sec")
+        seen.append((file.read_text(), temporary.parent, temporary.suffix))
+        temporary.write_text("second")
+
+    atomic_write(str(file), write)
+    assert seen == [("first", file.parent, ".bin")], "the old file stands until the new one is whole"
+    assert [(f.name, f.read_text()) for f in file.parent.iterdir()] == [("a.pcd.bin", "second")]
+    mask = os.umask(0o022)
+    os.umask(mask)
+    assert file.stat().st_mode & 0o777 == 0o666 & ~mask, "permissions of any new file"
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path, error):
+    file = tmp_path / "a.json"
+    file.write_text("old")
+
+    def write(temporary):
+        temporary.write_text("half")
+        raise error
+
+    with pytest.raises(error):
+        atomic_write(file, write)
+    assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [("a.json", "old")]
+
+
+def test_a_folder_is_not_replaced(tmp_path):
+    with pytest.raises(IsADirectoryError, match="found a folder, expected a file to write"):
+        atomic_write(tmp_path, lambda temporary: temporary.write_text(""))
+
+
+_HOLDER = """
+import sys
+from fcos_lidar_jax.files import file_lock
+with file_lock(sys.argv[1]) as held:
+    print(held, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_lock_excludes_other_processes_until_its_holder_is_killed(tmp_path):
+    file = tmp_path / "new" / "run.lock"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", _HOLDER, str(file)], **pipes) as other:
+        try:
+            assert other.stdout.readline() == "True\n"
+            with file_lock(file) as held:
+                assert not held
+        finally:
+            other.kill()
+    with file_lock(file) as held:
+        assert held
+    with file_lock(file, wait=True) as held, file_lock(file) as second:
+        assert (held, second) == (True, False), "a lock left earlier is free again"
+
+
+def test_waiting_for_a_lock_ends_when_it_is_given_up(tmp_path):
+    file = tmp_path / "run.lock"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    source = _HOLDER.replace("(sys.argv[1])", "(sys.argv[1], wait=True)")
+    with subprocess.Popen([sys.executable, "-c", _HOLDER, str(file)], **pipes) as first:
+        assert first.stdout.readline() == "True\n"
+        with subprocess.Popen([sys.executable, "-c", source, str(file)], **pipes) as second:
+            second.stdin.close()
+            with pytest.raises(subprocess.TimeoutExpired):
+                second.wait(1)
+            first.stdin.close()
+            assert second.stdout.read() == "True\n"

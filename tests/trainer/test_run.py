@@ -1,0 +1,251 @@
+"""A run in a folder: what it leaves there, how it is stopped and resumed, and what it refuses."""
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
+
+from fcos_lidar_jax.input_pipeline import loader
+from fcos_lidar_jax.trainer import run as runs
+from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
+from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
+from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.types import CLASSES
+
+
+@pytest.fixture(scope="module", autouse=True)
+def traces():
+    """All runs of this module share one step; how often it was traced."""
+    found, made = [], {}
+    with pytest.MonkeyPatch.context() as patch:
+        make_train_step = runs.make_train_step
+
+        def shared_step(*args):
+            step = make_train_step(*args)
+
+            def counted(state, batch):
+                found.append(1)
+                return step(state, batch)
+
+            return made.setdefault("step", counted)
+
+        patch.setattr(runs, "make_train_step", shared_step)
+        yield found
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, traces):
+    """A run that was left alone: its folder, its last state, and how often its step was traced."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    state = train_tiny(folder, evaluate=2, tests=TESTS, weights=weights())
+    return folder, state, len(traces)
+
+
+def test_the_step_is_compiled_once(finished):
+    _, state, traces = finished
+    assert int(state.step) == STEPS
+    assert traces == 1
+
+
+def test_all_that_is_promised_is_recorded(finished):
+    lines = read_metrics(finished[0])
+    steps = [line for line in lines if "loss/total" in line]
+    tests = [line for line in lines if "test/mAP" in line]
+    assert [line["step"] for line in steps] == [1, 2, 3, 4]
+    assert [line["step"] for line in tests] == [2, 4]
+    parts = ("total", "classification", "l1", "iou", "iou_prediction")
+    for line in steps:
+        weighed = sum(
+            getattr(CONFIG.loss, f"{part}_weight") * line[f"loss/{part}"] for part in parts if part != "total"
+        )
+        assert line["loss/total"] == pytest.approx(weighed, rel=1e-5)
+        assert sum(line["positives_per_level"]) == line["positives"] > 0
+        assert line["unique_positives"] <= line["positives"]
+        assert line["mean_k"] == pytest.approx(line["positives"] / line["owned_boxes"])
+        assert 0 <= line["positive_iou"] <= 1
+        assert line["gradient_norm"] > 0
+        assert line["samples_per_second"] == pytest.approx(CONFIG.optimizer.batch_size / line["seconds"])
+        assert 0 <= line["waiting_seconds"] <= line["seconds"]
+        assert {
+            "truncated_points",
+            "truncated_boxes",
+            "invalid_points",
+            "pasted_objects",
+            "dropped_points",
+        } <= line.keys()
+    peak = CONFIG.optimizer.peak_learning_rate
+    # Four steps: the first at a tenth of the peak, the second at the peak.
+    np.testing.assert_allclose([line["learning_rate"] for line in steps[:2]], [peak / 10, peak], rtol=1e-5)
+    np.testing.assert_allclose([line["b1"] for line in steps[:2]], [0.95, 0.85], rtol=1e-5)
+    for line in tests:
+        aps = [line[f"test/AP/{name}"] for name in CLASSES if f"test/AP/{name}" in line]
+        assert line["test/mAP"] == pytest.approx(np.mean(aps))
+        assert "test/NDS" not in line
+
+
+def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished):
+    folder, state, _ = finished
+    assert {path.name for path in folder.iterdir()} == {
+        ".lock",
+        "run.json",
+        "metrics.jsonl",
+        "tensorboard",
+        "checkpoints",
+        "pictures",
+        "loss.png",
+        "scores.png",
+    }
+    assert json.loads((folder / "run.json").read_text())["steps"] == STEPS
+    scores = {line["step"]: line["test/mAP"] for line in read_metrics(folder) if "test/mAP" in line}
+    best = max(scores, key=lambda step: (scores[step], step))
+    kept = sorted(path.name for path in (folder / "checkpoints").iterdir())
+    assert kept == [f"{step:08d}" for step in sorted({3, 4, best})]
+    frames = [f"step_{step:06d}_frame_{index}.png" for step in (2, 4) for index in (0, 1)]
+    assert sorted(path.name for path in (folder / "pictures").iterdir()) == frames
+    for picture in folder.rglob("*.png"):
+        assert picture.read_bytes().startswith(b"\x89PNG")
+    last = load_checkpoint(folder / "checkpoints" / "00000004")
+    spec = json.loads((folder / "run.json").read_text())
+    assert (spec["data"], spec["frames"]) == (FRAMES.fingerprint(), 12)
+    assert (last.step, last.score, json.loads(last.data)) == (
+        4,
+        read_metrics(folder)[-1]["test/mAP"],
+        {name: spec[name] for name in ("data", "frames", "weights")},
+    )
+    # Detection gets the running mean of the weights.
+    assert bits(last.variables) == bits({"params": state.ema, "batch_stats": state.batch_stats})
+    assert bits(load_state(folder / "checkpoints" / "00000004", state)) == bits(state)
+
+
+def test_a_finished_run_says_so_and_nothing_changes(finished, capsys):
+    folder, state, _ = finished
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    again = train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+    assert bits(again) == bits(state)
+    assert "the run has done all of its 4 steps" in capsys.readouterr().err
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+
+
+def disturb(monkeypatch, at: int, how) -> None:
+    """Something happens while one of the batches is made."""
+    make_batches = loader.make_batches
+
+    @contextmanager
+    def disturbed(*args, **kwargs):
+        with make_batches(*args, **kwargs) as stream:
+            first = kwargs["first_step"]
+            yield (how(host) if step == at else host for step, host in enumerate(stream, start=first))
+
+    monkeypatch.setattr(runs, "make_batches", disturbed)
+
+
+def signalled(number: int):
+    def ask(host):
+        os.kill(os.getpid(), number)
+        return host
+
+    return ask
+
+
+def broken(host):
+    points = host.batch.points.copy()
+    points[1, :, 3] = 3e38  # finite, until the network adds it up
+    return dataclasses.replace(host, batch=dataclasses.replace(host.batch, points=points))
+
+
+def test_stopped_failed_and_resumed_it_ends_where_the_run_left_alone_ended(
+    finished, tmp_path, capsys, monkeypatch
+):
+    whole, state, _ = finished
+    folder = tmp_path / "run"
+
+    def train(at, how, **kwargs):
+        disturb(monkeypatch, at, how)
+        return train_tiny(folder, evaluate=2, tests=TESTS, save=10, **kwargs)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(0, signalled(signal.SIGINT), weights=weights())
+    assert "stopped after step 1, which is saved" in capsys.readouterr().err
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["00000001"]
+    with pytest.raises(SystemExit) as stopped:
+        train(2, signalled(signal.SIGTERM), resume=True)
+    assert stopped.value.code == 143
+    newest = folder / "checkpoints" / "00000003"
+    (newest / "checkpoint.json").write_text((newest / "checkpoint.json").read_text()[:-9])
+    told = (
+        r"^step 3: not finite: .*; samples: seed \d+, seed \d+; "
+        r"the last checkpoint is .*checkpoints/0000000[23]$"
+    )
+    with pytest.raises(NonFiniteLossError, match=told):
+        train(2, broken, resume=True)
+    assert "going back to the checkpoint before" in capsys.readouterr().err
+    assert bits(train(-1, None, resume=True)) == bits(state)
+    wanted, found = read_metrics(whole), read_metrics(folder)
+    timed = ("seconds", "waiting_seconds", "samples_per_second")
+    assert [{k: v for k, v in line.items() if k not in timed} for line in found] == [
+        {k: v for k, v in line.items() if k not in timed} for line in wanted
+    ]
+
+
+def altered(folder: Path, change) -> Path:
+    file = folder / "run.json"
+    spec = json.loads(file.read_text())
+    change(spec)
+    file.write_text(json.dumps(spec))
+    return folder
+
+
+@pytest.fixture
+def begun(finished, tmp_path) -> Path:
+    """A folder with the spec of the run alone."""
+    folder = tmp_path / "begun"
+    folder.mkdir()
+    shutil.copy(finished[0] / "run.json", folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda spec: spec["config"]["loss"].update(l1_weight=9.0), r"config.loss.l1_weight: was 9.0, got 0.25"),
+        (lambda spec: spec["sensor"].update(num_columns=8), "sensor.num_columns: was 8, got 64"),
+        (lambda spec: spec.update(steps=5), "steps: was 5, got 4"),
+        (lambda spec: spec.update(seed=1), "seed: was 1, got 0"),
+        (lambda spec: spec.pop("seed"), "seed: was None, got 0"),
+        (lambda spec: spec.update(data="other frames"), "data: was 'other frames', got "),
+    ],
+)
+def test_another_specification_is_refused_and_the_field_is_named(begun, change, told):
+    altered(begun, change)
+    with pytest.raises(ValueError, match=rf"run.json: {told}.*: only the same run can be resumed$"):
+        train_tiny(begun, resume=True)
+    assert [path.name for path in begun.iterdir()] == ["run.json"]
+
+
+def test_what_is_no_run_or_another_one_is_refused(begun, tmp_path):
+    with pytest.raises(ValueError, match="holds a run, expected --resume or another folder"):
+        train_tiny(begun)
+    with pytest.raises(ValueError, match=r"run.json: found nothing, expected the run to resume"):
+        train_tiny(tmp_path / "nothing", resume=True)
+    assert not (tmp_path / "nothing").exists()
+    (begun / "run.json").write_text("{")
+    with pytest.raises(ValueError, match=r"run.json: not JSON, expected the specification of a run"):
+        train_tiny(begun, resume=True)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="found a file, expected a folder"):
+        train_tiny(tmp_path / "file")
+
+
+def test_with_damaged_checkpoints_alone_the_run_is_not_begun_anew(finished, tmp_path):
+    folder = shutil.copytree(finished[0], tmp_path / "run")
+    for description in folder.glob("checkpoints/*/checkpoint.json"):
+        description.unlink()
+    with pytest.raises(CheckpointError, match=r"all \d checkpoints are damaged"):
+        train_tiny(folder, evaluate=2, tests=TESTS, resume=True)

@@ -1,0 +1,125 @@
+"""Data parallelism on the devices of the tests; the equality of 1 to 8 devices is in tests/equivalence."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fcos_lidar_jax.training.sharding import (
+    check_batch_size,
+    jit_step,
+    make_mesh,
+    pmap_step,
+    replicate,
+    shard_batch,
+)
+
+
+@pytest.fixture
+def mesh():
+    return make_mesh(jax.devices()[:1])
+
+
+def tree():
+    return {"w": np.arange(6, dtype=np.float32).reshape(2, 3), "step": jnp.int32(3), "key": jax.random.key(5)}
+
+
+def toy_step(state, batch):
+    """Sums over the whole batch; as every training step, it keeps the state's structure."""
+    noise = jax.random.uniform(jax.random.fold_in(state["key"], state["step"]))
+    gained = batch["x"].sum(axis=0) + noise
+    new = {"w": state["w"] + gained, "step": state["step"] + 1, "key": state["key"]}
+    return new, {"total": batch["x"].sum(), "per_level": batch["x"].sum(axis=0).astype(jnp.int32)}
+
+
+def test_the_mesh_is_one_axis_over_the_given_devices(mesh):
+    assert mesh.axis_names == ("data",)
+    assert make_mesh().size == jax.device_count()
+    assert list(make_mesh(jax.devices()[:1]).devices.flat) == jax.devices()[:1]
+
+
+def test_replicated_arrays_are_equal_copies_that_may_be_given_away(mesh):
+    given = jax.tree.map(lambda leaf: leaf, tree())
+    placed = replicate(given, mesh)
+    for name in ("w", "step"):
+        np.testing.assert_array_equal(placed[name], given[name])
+        assert placed[name].dtype == given[name].dtype
+    assert placed["key"].dtype == given["key"].dtype
+    assert jax.random.uniform(placed["key"]) == jax.random.uniform(given["key"])
+    assert all(leaf.sharding.is_fully_replicated for leaf in (placed["w"], placed["step"]))
+    before = given["w"].copy()
+    jax.jit(lambda t: t["w"] * 0 - 7, donate_argnums=0)({"w": placed["w"]}).block_until_ready()
+    assert placed["w"].is_deleted()
+    np.testing.assert_array_equal(given["w"], before)
+
+
+def test_the_state_is_given_away_and_what_it_was_copied_from_is_not(mesh):
+    original = jax.tree.map(jnp.asarray, {"w": tree()["w"], "step": tree()["step"]}) | {"key": tree()["key"]}
+    placed = replicate(original, mesh)
+    jit_step(toy_step, mesh)(placed, shard_batch({"x": np.ones((4, 3), np.float32)}, mesh))
+    assert placed["w"].is_deleted()
+    np.testing.assert_array_equal(original["w"], tree()["w"])
+
+
+def test_a_sharded_batch_is_the_batch(mesh):
+    batch = {"x": np.arange(12).reshape(4, 3), "valid": np.array([True, False, True, True])}
+    placed = shard_batch(batch, mesh)
+    for name, leaf in batch.items():
+        np.testing.assert_array_equal(placed[name], leaf)
+        assert placed[name].dtype == jnp.asarray(leaf).dtype
+
+
+def check_pmap_form(mesh) -> None:
+    """Two steps of the pmap form are two steps of the jit form."""
+    rng = np.random.default_rng(0)
+    state, stacked = (
+        replicate(tree(), mesh),
+        jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (mesh.size, *leaf.shape)), tree()),
+    )
+    one, many = jit_step(toy_step, mesh), pmap_step(toy_step, mesh)
+    for _ in range(2):
+        batch = {"x": rng.normal(size=(4, 3)).astype(np.float32)}
+        state, metrics = one(state, shard_batch(batch, mesh))
+        stacked, told = many(stacked, {"x": batch["x"].reshape(mesh.size, -1, 3)})
+        for i in range(mesh.size):
+            np.testing.assert_array_equal(stacked["w"][i], state["w"])
+            np.testing.assert_array_equal(told["total"][i], metrics["total"])
+            np.testing.assert_array_equal(told["per_level"][i], metrics["per_level"])
+        assert stacked["w"].shape == (mesh.size, 2, 3)
+
+
+def check_odd_batch(mesh) -> None:
+    """Three samples are too few for two devices, or too many."""
+    check_batch_size(4, mesh)
+    with pytest.raises(ValueError, match=r"^batch_size: got 3, expected a multiple of the 2 devices$"):
+        check_batch_size(3, mesh)
+
+
+def test_the_pmap_form_is_the_same_step(mesh):
+    check_pmap_form(mesh)
+
+
+def test_two_devices_share_a_batch_in_both_forms():
+    code = (
+        "import jax, numpy as np, test_sharding as t; mesh = t.make_mesh(); assert mesh.size == 2; "
+        "t.check_pmap_form(mesh); t.check_odd_batch(mesh); "
+        "x = t.shard_batch({'x': np.arange(12.).reshape(4, 3)}, mesh)['x']; "
+        "assert [s.data.shape for s in x.addressable_shards] == [(2, 3)] * 2; "
+        "np.testing.assert_array_equal(x, np.arange(12).reshape(4, 3)); "
+        "add = jax.jit(lambda w: w + 1, donate_argnums=0); "
+        "x = np.zeros(10**5, np.float32); placed = [add(t.replicate({'w': x}, mesh)['w']) for _ in range(20)]; "
+        "assert all((np.asarray(s.data) == 1).all() for p in placed for s in p.addressable_shards) and not x.any()"
+    )
+    environment = {
+        **os.environ,
+        "JAX_NUM_CPU_DEVICES": "2",
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
