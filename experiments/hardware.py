@@ -18,10 +18,8 @@ def hardware() -> dict[str, Any]:
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    git = ["git", "describe", "--always", "--dirty"]
-    told = subprocess.run(
-        git, cwd=Path(fcos_lidar_jax.__file__).parent, capture_output=True, text=True, check=False
-    )
+    git = ["git", "-C", str(Path(fcos_lidar_jax.__file__).parent), "describe", "--always", "--dirty"]
+    described = subprocess.run(git, capture_output=True, text=True, check=False)
     return {
         "device": jax.devices()[0].device_kind,
         "processor": names[0] if names else platform.machine(),
@@ -29,7 +27,7 @@ def hardware() -> dict[str, Any]:
         "jax": jax.__version__,
         "python": platform.python_version(),
         "fcos_lidar_jax": fcos_lidar_jax.__version__,
-        "git": told.stdout.strip() or "unknown",
+        "git": described.stdout.strip() or "unknown",
     }
 
 

@@ -1,5 +1,6 @@
 """What the scripts share: options, one line for a failure, the real data's folder, the record of a measurement."""
 
+import dataclasses
 import json
 import os
 import sys
@@ -16,28 +17,50 @@ from fcos_lidar_jax.files import atomic_write
 T = TypeVar("T")
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every script that measures; its own are a subclass."""
+
+    out: Path | None = None  # JSON file of the figures; default: outputs/SCRIPT.json.
+
+
+OptionsT = TypeVar("OptionsT", bound=Options)
+
+
 def run_script(work: Callable[[T], object], options: type[T], description: str | None) -> NoReturn:
     """Parse the options, do the work and leave with the exit code; a foreseeable failure is one line.
 
-    Args:
-        work: what to do with the options.
-        options: dataclass of the options.
-        description: of the script, for ``--help``.
+    The description, a script's docstring, is for ``--help``.
     """
     name = Path(sys.argv[0]).name
     sys.exit(exit_code(name, lambda: work(tyro.cli(options, description=description))))
 
 
-def real_data(folder: Path | None, *parts: str, option: str = "--data") -> Path | None:
-    """A file or folder of the real data.
+def run_measurement(
+    measure: Callable[[OptionsT], dict[str, Any]],
+    options: type[OptionsT],
+    description: str | None,
+    as_text: Callable[[dict[str, Any]], str] | None = None,
+) -> NoReturn:
+    """As :func:`run_script`, for work whose result is a record, which is printed (as text, if given) and saved."""
 
-    Args:
-        folder: of the real data; None for the one that the environment names, if it does.
-        parts: of the path below it.
-        option: that names the folder, for the message.
+    def work(args: OptionsT) -> None:
+        record = measure(args)
+        save(record, args.out, as_text(record) if as_text else None)
 
-    Returns:
-        its path; None where no folder is named at all.
+    run_script(work, options, description)
+
+
+def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> None:
+    """Write a measurement as JSON, with the machine it was made on, and print it, or a text in its place."""
+    written = json.dumps({**record, **hardware()}, indent=1)
+    print(text or written, flush=True)
+    file = out or Path("outputs", f"{Path(sys.argv[0]).stem}.json")
+    atomic_write(file, lambda path: path.write_text(written + "\n", encoding="utf-8"))
+
+
+def find_real_data(folder: Path | None, *parts: str) -> Path | None:
+    """A file or folder of the real data, below the folder given or the one that the environment names, if any.
 
     Raises:
         ValueError: it is not there.
@@ -47,19 +70,14 @@ def real_data(folder: Path | None, *parts: str, option: str = "--data") -> Path 
         return None
     path = Path(root, *parts)
     if not path.exists():
-        name = "FCOS_LIDAR_REAL_DATA" if folder is None else option
+        name = "FCOS_LIDAR_REAL_DATA" if folder is None else "--data"
         raise ValueError(f"{name}: {root}: no {'/'.join(parts)} there")
     return path
 
 
-def save(record: dict[str, Any], out: Path, text: str | None = None) -> None:
-    """Write a measurement as JSON, with the machine it was made on, and print it.
-
-    Args:
-        record: what was measured.
-        out: file to write.
-        text: to print in place of the JSON.
-    """
-    written = json.dumps({**record, **hardware()}, indent=1)
-    print(text or written, flush=True)
-    atomic_write(out, lambda path: path.write_text(written + "\n", encoding="utf-8"))
+def real_data(folder: Path | None, part: str) -> Path:
+    """As :func:`find_real_data`, for scripts that cannot do without: ValueError where no folder is named."""
+    path = find_real_data(folder, part)
+    if path is None:
+        raise ValueError(f"--data: missing, expected the folder that holds {part}/")
+    return path

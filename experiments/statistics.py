@@ -2,16 +2,17 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 Call = Callable[[], Any]
 Times = dict[str, float]
+K = TypeVar("K")
 
 
-def interleaved(calls: Mapping[str, Call], repeats: int) -> dict[str, Times]:
+def interleaved(calls: Mapping[K, Call], repeats: int) -> dict[K, Times]:
     """Median and 99th percentile of calls that take turns, in milliseconds, after one run each that compiles.
 
     The speed of a machine drifts: turns keep comparisons fair. With fewer than a hundred turns the percentile is
@@ -24,7 +25,7 @@ def interleaved(calls: Mapping[str, Call], repeats: int) -> dict[str, Times]:
         raise ValueError(f"repeats: got {repeats}, expected at least 1")
     for call in calls.values():
         jax.block_until_ready(call())
-    found: dict[str, list[float]] = {name: [] for name in calls}
+    found: dict[K, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
         for name, call in calls.items():
             began = time.perf_counter()

@@ -24,10 +24,8 @@ def owners(
     """The box that owns each point: the smallest that holds it, boundary included.
 
     Args:
-        points: metres.
-        present: False where there is no point.
-        boxes: ``x, y, z, l, w, h, yaw, ...``; anything where invalid.
-        box_valid: False for padding.
+        points, present: metres; False where there is no point.
+        boxes, box_valid: ``x, y, z, l, w, h, yaw, ...``, anything where invalid; False for padding.
 
     Returns:
         box index, -1 for none; equal volumes go to the lower index.
@@ -63,13 +61,7 @@ def dynamic_k(
 ) -> Int32[Array, "m"]:
     """K of every box: the rounded sum of its ``top_q`` highest IoUs (x.5 goes up).
 
-    At least 1, at most the number of candidates.
-
-    Args:
-        owner: box of every location, -1 for none.
-        iou: IoU of the predicted box with the owner.
-        num_boxes: m (static).
-        top_q: Q (static).
+    At least 1, at most the number of candidates. ``owner`` is -1 for locations without a box.
 
     >>> dynamic_k(jnp.array([0, 0, 0, -1]), jnp.array([0.9, 0.6, 0, 0]), num_boxes=2, top_q=20).tolist()
     [2, 0]
@@ -89,11 +81,6 @@ def cheapest(
     owner: Int32[Array, "l"], cost: Float32[Array, "l"], num_positive: Int32[Array, "m"]
 ) -> Bool[Array, "l"]:
     """The ``num_positive`` cheapest locations of every box; equal costs go to the lower index.
-
-    Args:
-        owner: box of every location, -1 for none.
-        cost: of the location for its owner.
-        num_positive: locations to take, by box.
 
     >>> cheapest(jnp.array([0, 0, -1]), jnp.array([3.0, 2.0, 1.0]), jnp.array([1])).tolist()
     [False, True, False]
@@ -123,8 +110,7 @@ def assign(
         owner: box of every location, -1 for none.
         classification_cost: cross-entropy of the owner's class; anything where there is no owner.
         iou: IoU of the decoded box with the owner; likewise.
-        num_boxes: m (static).
-        top_q: Q (static).
+        num_boxes, top_q: m and Q (static).
 
     >>> owner = jnp.array([0, 0, -1])
     >>> assign(owner, jnp.array([1.0, 2.0, 0.0]), jnp.array([0.2, 0.3, 0.0]), num_boxes=1).positive.tolist()

@@ -97,14 +97,9 @@ def augment(
             flipped = flip(points, boxes)
             points, boxes = (jnp.where(drawn, a, b) for a, b in zip(flipped, (points, boxes), strict=True))
         reach = config.max_rotation_rad
-        points, boxes = rotate(points, boxes, _draw(keys[2], -reach, reach))
-        low, high = config.scale_range
-        points, boxes = scale(points, boxes, _draw(keys[3], low, high))
+        points, boxes = rotate(points, boxes, jax.random.uniform(keys[2], (), jnp.float32, -reach, reach))
+        points, boxes = scale(points, boxes, jax.random.uniform(keys[3], (), jnp.float32, *config.scale_range))
         return points.at[:, :3].add(origin), boxes.at[:, :3].add(origin)
-
-
-def _draw(key: Key, low: float, high: float) -> Float32[Array, ""]:
-    return jax.random.uniform(key, (), jnp.float32, low, high)
 
 
 def sample_key(key: Key, step: Int[Array, ""], index: Int[Array, ""]) -> Key:

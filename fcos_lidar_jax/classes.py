@@ -1,21 +1,12 @@
 """Class names of the data sets that are known, and what follows from a name."""
 
 NUSCENES_CLASSES = (
-    "car",
-    "truck",
-    "bus",
-    "trailer",
-    "construction_vehicle",
-    "pedestrian",
-    "motorcycle",
-    "bicycle",
-    "traffic_cone",
-    "barrier",
+    *("car", "truck", "bus", "trailer", "construction_vehicle"),
+    *("pedestrian", "motorcycle", "bicycle", "traffic_cone", "barrier"),
 )
 """The ten classes of the nuScenes detection benchmark, in the order of the paper's tables."""
 
-KITTI_CLASSES = ("Car", "Pedestrian", "Cyclist")
-"""The three classes of the KITTI benchmark."""
+KITTI_CLASSES = ("Car", "Pedestrian", "Cyclist")  # The three classes of the KITTI benchmark.
 
 ARGOVERSE2_CLASSES = (
     *("REGULAR_VEHICLE", "PEDESTRIAN", "BOLLARD", "CONSTRUCTION_CONE", "CONSTRUCTION_BARREL", "STOP_SIGN"),
@@ -33,13 +24,11 @@ RANGES_M = {
     **dict.fromkeys(ARGOVERSE2_CLASSES, 100.0),
 }
 """Class -> greatest distance at which it is evaluated, in metres: nuScenes' are the benchmark's."""
-DEFAULT_RANGE_M = 50.0
-"""For every other class."""
+DEFAULT_RANGE_M = 50.0  # For every other class.
 
 PASTE_TARGETS = {
     **dict(zip(NUSCENES_CLASSES, (2, 3, 4, 6, 7, 2, 6, 6, 2, 2), strict=True)),
     **dict(zip(KITTI_CLASSES, (15, 10, 10), strict=True)),
 }
 """Reading: class -> boxes that copy-paste fills a frame up to."""
-DEFAULT_PASTE_TARGET = 2
-"""For every other class."""
+DEFAULT_PASTE_TARGET = 2  # For every other class.

@@ -9,8 +9,7 @@ from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.geometry import atan2, wrap_angle
 
-LOG_SIZE_LIMIT = 5.0
-"""Log sizes are clipped to plus and minus this: an untrained exponent must not overflow."""
+LOG_SIZE_LIMIT = 5.0  # Log sizes are clipped to plus and minus this: an untrained exponent must not overflow.
 
 
 def encode(
@@ -20,8 +19,8 @@ def encode(
 
     Args:
         boxes: ``x, y, z, l, w, h, yaw, vx, vy``.
-        points: the location's 3D point, metres.
-        azimuth_rad: its azimuth.
+        points: the locations' 3D points, metres.
+        azimuth_rad: their azimuth.
 
     >>> box = jnp.array([2, 0, 0, 1, 1, 1, 0.5, 3, 0], jnp.float32)
     >>> encode(box, jnp.array([1.0, 0, 0]), jnp.float32(0.5)).tolist()
@@ -48,17 +47,14 @@ def _unit(sin: Array, cos: Array) -> tuple[Array, Array]:
     return jnp.where(regular, sin / norm, 0.0), jnp.where(regular, cos / norm, 1.0)
 
 
+def _size(regression: Array) -> Array:
+    return jnp.exp(jnp.clip(regression[..., 3:6], -LOG_SIZE_LIMIT, LOG_SIZE_LIMIT))
+
+
 def decode_oriented(
-    regression: Float32[Array, "*l 10"],
-    points: Float32[Array, "*l 3"],
-    azimuth_rad: Float32[Array, "*l"],
+    regression: Float32[Array, "*l 10"], points: Float32[Array, "*l 3"], azimuth_rad: Float32[Array, "*l"]
 ) -> Float32[Array, "*l 8"]:
     """Predicted boxes as ``x, y, z, l, w, h, cos yaw, sin yaw``: differentiable, without an inverse tangent.
-
-    Args:
-        regression: the ten numbers of one class.
-        points: the location's 3D point, metres.
-        azimuth_rad: its azimuth.
 
     >>> numbers = jnp.array([1, 0, 0, 0, 0, 0, 0, 2, 3, 0], jnp.float32)
     >>> decode_oriented(numbers, jnp.zeros(3), jnp.float32(0)).tolist()
@@ -67,21 +63,13 @@ def decode_oriented(
     sin, cos = _unit(regression[..., 6], regression[..., 7])
     base_sin, base_cos = jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
     heading = jnp.stack([base_cos * cos - base_sin * sin, base_sin * cos + base_cos * sin], axis=-1)
-    size = jnp.exp(jnp.clip(regression[..., 3:6], -LOG_SIZE_LIMIT, LOG_SIZE_LIMIT))
-    return jnp.concatenate([regression[..., :3] + points, size, heading], axis=-1)
+    return jnp.concatenate([regression[..., :3] + points, _size(regression), heading], axis=-1)
 
 
 def decode(
-    regression: Float32[Array, "*l 10"],
-    points: Float32[Array, "*l 3"],
-    azimuth_rad: Float32[Array, "*l"],
+    regression: Float32[Array, "*l 10"], points: Float32[Array, "*l 3"], azimuth_rad: Float32[Array, "*l"]
 ) -> Float32[Array, "*l 9"]:
-    """Predicted boxes ``x, y, z, l, w, h, yaw, vx, vy``; the inverse of :func:`encode`.
-
-    Args:
-        regression: the ten numbers of one class.
-        points: the location's 3D point, metres.
-        azimuth_rad: its azimuth.
+    """Predicted boxes ``x, y, z, l, w, h, yaw, vx, vy`` from the ten numbers; the inverse of :func:`encode`.
 
     >>> box = jnp.array([2, 0, 0, 1, 1, 1, 0.5, 3, 0], jnp.float32)
     >>> here, angle = jnp.array([1.0, 0, 0]), jnp.float32(0.25)
@@ -89,5 +77,5 @@ def decode(
     True
     """
     yaw = wrap_angle(atan2(regression[..., 6], regression[..., 7]) + azimuth_rad)
-    size = jnp.exp(jnp.clip(regression[..., 3:6], -LOG_SIZE_LIMIT, LOG_SIZE_LIMIT))
-    return jnp.concatenate([regression[..., :3] + points, size, yaw[..., None], regression[..., 8:10]], axis=-1)
+    parts = [regression[..., :3] + points, _size(regression), yaw[..., None], regression[..., 8:10]]
+    return jnp.concatenate(parts, axis=-1)

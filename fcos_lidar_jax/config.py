@@ -17,6 +17,11 @@ def _check(condition: bool, field: str, got: object, expected: str) -> None:
         raise ValueError(f"{field}: got {got!r}, expected {expected}")
 
 
+def _check_least(config: Any, least: int, *fields: str) -> None:
+    for field in fields:
+        _check(getattr(config, field) >= least, field, getattr(config, field), f"at least {least}")
+
+
 def _check_choices(config: Any) -> None:
     """Every ``Literal`` field of a configuration holds one of its choices."""
     for name, hint in get_type_hints(type(config)).items():
@@ -30,19 +35,15 @@ def _check_choices(config: Any) -> None:
 class ProjectionConfig:
     """Points to range image (paper, sections 3.1 and 3.2)."""
 
-    num_rounds: int = 5
-    """Rounds of the multi-round projection."""
-    prioritize_current: bool = True
-    """Points of the current sweep win every collision with older ones (table 2)."""
+    num_rounds: int = 5  # Rounds of the multi-round projection.
+    prioritize_current: bool = True  # Points of the current sweep win every collision with older ones (table 2).
     remove_close: Literal["all", "sweeps", "none"] = "sweeps"
     """Reading: drop the points on the ego vehicle, ``|x|, |y| < close_m``, of all sweeps, of the older sweeps only
     (which gives the paper's numbers of points), or not at all."""
-    close_m: float = 1.0
-    """Reading: half the side of the square that ``remove_close`` empties, metres."""
+    close_m: float = 1.0  # Reading: half the side of the square that ``remove_close`` empties, metres.
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
-        _check(self.num_rounds >= 1, "num_rounds", self.num_rounds, "at least 1")
+        _check_least(self, 1, "num_rounds")
         _check(self.close_m > 0, "close_m", self.close_m, "a positive number of metres")
         _check_choices(self)
 
@@ -53,34 +54,20 @@ class StemConfig:
 
     groups: Literal["types", "modalities", "all"] = "types"
     """9 groups by channel type, 5 by modality, or one group (table 3)."""
-    group_rounds: bool = True
-    """All rounds of a channel type share a group (table 3, last row: False)."""
-    num_convs: int = 2
-    """3x3 grouped convolutions a branch (table 4)."""
-    dilations: tuple[int, ...] = (1, 3, 6)
-    """One parallel branch each, summed (table 5)."""
-    channels_per_type: int = 32
-    """Features of one channel type."""
-    out_channels: int = 64
-    """Channels after the 1x1 merge."""
+    group_rounds: bool = True  # All rounds of a channel type share a group (table 3, last row: False).
+    num_convs: int = 2  # 3x3 grouped convolutions a branch (table 4).
+    dilations: tuple[int, ...] = (1, 3, 6)  # One parallel branch each, summed (table 5).
+    channels_per_type: int = 32  # Features of one channel type.
+    out_channels: int = 64  # Channels after the 1x1 merge.
     merge: Literal["per_branch", "shared"] = "per_branch"
     """Reading: every branch has its own 1x1 merge, or one is shared."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
-        _check(self.num_convs >= 1, "num_convs", self.num_convs, "at least 1")
-        _check(
-            len(self.dilations) >= 1 and min(self.dilations) >= 1,
-            "dilations",
-            self.dilations,
-            "one or more integers of at least 1",
-        )
-        _check(
-            self.group_rounds or self.groups == "types",
-            "group_rounds",
-            self.group_rounds,
-            "True unless groups is 'types'",
-        )
+        _check_least(self, 1, "num_convs")
+        several = len(self.dilations) >= 1 and min(self.dilations) >= 1
+        _check(several, "dilations", self.dilations, "one or more integers of at least 1")
+        possible = self.group_rounds or self.groups == "types"
+        _check(possible, "group_rounds", self.group_rounds, "True unless groups is 'types'")
         _check_choices(self)
 
 
@@ -88,54 +75,39 @@ class StemConfig:
 class ModelConfig:
     """LiDAR-Net, feature pyramid and heads (paper, section 3.4)."""
 
-    stem: StemConfig = StemConfig()
-    """Modality-wise convolutions."""
+    stem: StemConfig = StemConfig()  # Modality-wise convolutions.
     precision: Literal["float32", "bfloat16"] = "float32"
     """Of the convolutions behind the first layer; geometry, statistics, predictions, assignment and losses are
     float32 in any case."""
-    row_upscale: int = 2
-    """Rows are repeated this many times (paper, section 4)."""
+    remat: bool = False
+    """Compute the activations of the stem and of the backbone's first stage again in the backward pass instead of
+    keeping them: the same result with less memory and more time, except on CPUs, where XLA undoes it."""
+    row_upscale: int = 2  # Rows are repeated this many times (paper, section 4).
     circular_width: bool = False
     """Reading: wrap every convolution around the azimuth instead of the paper's zero padding; the azimuth is
     then binned into a width divisible by 32."""
-    backbone_blocks: tuple[int, int, int, int] = (4, 4, 1, 1)
-    """Bottlenecks a stage."""
+    backbone_blocks: tuple[int, int, int, int] = (4, 4, 1, 1)  # Bottlenecks a stage.
     backbone_widths: tuple[int, int, int, int] = (64, 128, 128, 128)
     """Bottleneck widths; a stage puts out four times as many channels."""
-    fpn_channels: int = 256
-    """Reading: channels of P2..P7."""
-    head_channels: int = 64
-    """Channels of both towers (128 for the test set)."""
-    head_convs: int = 4
-    """3x3 convolutions a tower."""
-    tied_heads: bool = False
-    """Share the heads between the levels (table 6)."""
-    background_prior: float = 0.99
-    """Reading: the background's probability at the start."""
+    fpn_channels: int = 256  # Reading: channels of P2..P7.
+    head_channels: int = 64  # Channels of both towers (128 for the test set).
+    head_convs: int = 4  # 3x3 convolutions a tower.
+    tied_heads: bool = False  # Share the heads between the levels (table 6).
+    background_prior: float = 0.99  # Reading: the background's probability at the start.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Reading: subtracted from the nine channels in the preprocessing."""
     channel_scale: tuple[float, ...] = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
     """Reading: the nine channels are divided by it."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
-        _check(self.row_upscale >= 1, "row_upscale", self.row_upscale, "at least 1")
+        _check_least(self, 1, "row_upscale", "head_convs")
         _check(len(self.backbone_blocks) == 4, "backbone_blocks", self.backbone_blocks, "four stages")
         _check(len(self.backbone_widths) == 4, "backbone_widths", self.backbone_widths, "four stages")
-        _check(self.head_convs >= 1, "head_convs", self.head_convs, "at least 1")
-        _check(
-            0 < self.background_prior < 1,
-            "background_prior",
-            self.background_prior,
-            "a probability between 0 and 1",
-        )
+        prior = self.background_prior
+        _check(0 < prior < 1, "background_prior", prior, "a probability between 0 and 1")
         _check(len(self.channel_mean) == 9, "channel_mean", self.channel_mean, "nine numbers")
-        _check(
-            len(self.channel_scale) == 9 and min(self.channel_scale) > 0,
-            "channel_scale",
-            self.channel_scale,
-            "nine positive numbers",
-        )
+        nine = len(self.channel_scale) == 9 and min(self.channel_scale) > 0
+        _check(nine, "channel_scale", self.channel_scale, "nine positive numbers")
         _check_choices(self)
 
 
@@ -143,35 +115,22 @@ class ModelConfig:
 class LossConfig:
     """Assignment and losses (paper, section 3.4)."""
 
-    top_q: int = 20
-    """Q: K of a box is the rounded sum of its Q highest IoUs."""
+    top_q: int = 20  # Q: K of a box is the rounded sum of its Q highest IoUs.
     regress_on: Literal["positives", "candidates"] = "positives"
     """Reading: box and IoU losses act on, and are divided by, the positives, or all locations inside a box."""
     iou_loss: Literal["iou", "log_iou", "giou", "diou"] = "iou"
     """Reading: 1 - IoU, UnitBox's -ln IoU, or the generalised and distance forms."""
-    classification_weight: float = 1.0
-    """Reading: of the cross-entropy."""
-    l1_weight: float = 0.25
-    """Reading: of the L1 loss."""
-    iou_weight: float = 1.0
-    """Reading: of the IoU loss."""
-    iou_prediction_weight: float = 1.0
-    """Reading: of the binary cross-entropy of the predicted IoU."""
-    velocity_weight: float = 0.2
-    """Reading: of the two velocity numbers within the L1 loss."""
+    classification_weight: float = 1.0  # Reading: of the cross-entropy.
+    l1_weight: float = 0.25  # Reading: of the L1 loss.
+    iou_weight: float = 1.0  # Reading: of the IoU loss.
+    iou_prediction_weight: float = 1.0  # Reading: of the binary cross-entropy of the predicted IoU.
+    velocity_weight: float = 0.2  # Reading: of the two velocity numbers within the L1 loss.
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
-        _check(self.top_q >= 1, "top_q", self.top_q, "at least 1")
-        for name in (
-            "classification_weight",
-            "l1_weight",
-            "iou_weight",
-            "iou_prediction_weight",
-            "velocity_weight",
-        ):
-            value = getattr(self, name)
-            _check(math.isfinite(value) and value >= 0, name, value, "a finite number of at least 0")
+        _check_least(self, 1, "top_q")
+        for name, value in vars(self).items():
+            if name.endswith("_weight"):
+                _check(math.isfinite(value) and value >= 0, name, value, "a finite number of at least 0")
         _check_choices(self)
 
 
@@ -179,23 +138,16 @@ class LossConfig:
 class InferenceConfig:
     """Predictions to detections (paper, section 3.4)."""
 
-    min_probability: float = 0.01
-    """Candidates need a class probability above this, before the IoU factor."""
-    iou_threshold: float = 0.2
-    """NMS suppresses what overlaps a better box of its class by more than this."""
-    max_detections: int = 500
-    """Boxes kept."""
-    candidates_per_level: int = 1000
-    """Reading: (location, class) pairs that enter NMS from each level."""
-    nms_overlap: Literal["bev", "3d"] = "bev"
-    """Reading: rotated IoU in the ground plane, or of the boxes."""
+    min_probability: float = 0.01  # Candidates need a class probability above this, before the IoU factor.
+    iou_threshold: float = 0.2  # NMS suppresses what overlaps a better box of its class by more than this.
+    max_detections: int = 500  # Boxes kept.
+    candidates_per_level: int = 1000  # Reading: (location, class) pairs that enter NMS from each level.
+    nms_overlap: Literal["bev", "3d"] = "bev"  # Reading: rotated IoU in the ground plane, or of the boxes.
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
         _check(0 <= self.min_probability < 1, "min_probability", self.min_probability, "within [0, 1)")
         _check(0 <= self.iou_threshold <= 1, "iou_threshold", self.iou_threshold, "within [0, 1]")
-        _check(self.max_detections >= 1, "max_detections", self.max_detections, "at least 1")
-        _check(self.candidates_per_level >= 1, "candidates_per_level", self.candidates_per_level, "at least 1")
+        _check_least(self, 1, "max_detections", "candidates_per_level")
         _check_choices(self)
 
 
@@ -203,20 +155,15 @@ class InferenceConfig:
 class AugmentConfig:
     """On-device augmentation of points and boxes together (paper, section 4)."""
 
-    flip_x_probability: float = 0.5
-    """Reading: of x -> -x."""
-    flip_y_probability: float = 0.5
-    """Reading: of y -> -y, drawn independently."""
-    max_rotation_rad: float = math.pi
-    """The rotation about z is uniform within plus and minus this."""
-    scale_range: tuple[float, float] = (0.95, 1.05)
-    """The scale is uniform within it."""
+    flip_x_probability: float = 0.5  # Reading: of x -> -x.
+    flip_y_probability: float = 0.5  # Reading: of y -> -y, drawn independently.
+    max_rotation_rad: float = math.pi  # The rotation about z is uniform within plus and minus this.
+    scale_range: tuple[float, float] = (0.95, 1.05)  # The scale is uniform within it.
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
         for name in ("flip_x_probability", "flip_y_probability"):
             _check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
-        _check(self.max_rotation_rad >= 0, "max_rotation_rad", self.max_rotation_rad, "at least 0")
+        _check_least(self, 0, "max_rotation_rad")
         low, high = self.scale_range
         _check(0 < low <= high, "scale_range", self.scale_range, "(low, high) with 0 < low <= high")
 
@@ -228,51 +175,37 @@ class CopyPasteConfig:
     targets: tuple[int, ...] = ()
     """Reading: boxes of each class that a frame is filled up to, those present included; (): by the class's name,
     see ``classes.PASTE_TARGETS``."""
-    min_points: int = 5
-    """Points an object needs, counted over the sweeps that are pasted."""
+    min_points: int = 5  # Points an object needs, counted over the sweeps that are pasted.
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
         _check(min(self.targets, default=0) >= 0, "targets", self.targets, "counts of at least 0")
-        _check(self.min_points >= 1, "min_points", self.min_points, "at least 1")
+        _check_least(self, 1, "min_points")
 
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
     """One-cycle AdamW (paper, section 4)."""
 
-    peak_learning_rate: float = 1e-2
-    """At the end of the warm-up."""
-    initial_divisor: float = 10.0
-    """The first learning rate is the peak divided by it."""
-    final_divisor: float = 1e4
-    """The last learning rate is the first divided by it."""
-    warmup_fraction: float = 0.4
-    """Part of the steps on the way up."""
+    peak_learning_rate: float = 1e-2  # At the end of the warm-up.
+    initial_divisor: float = 10.0  # The first learning rate is the peak divided by it.
+    final_divisor: float = 1e4  # The last learning rate is the first divided by it.
+    warmup_fraction: float = 0.4  # Part of the steps on the way up.
     b1_range: tuple[float, float] = (0.85, 0.95)
     """Momentum: high at both ends, low at the peak of the learning rate; cosine (reading)."""
-    b2: float = 0.99
-    """Reading: decay of the second moment."""
-    weight_decay: float = 0.01
-    """On all parameters (reading)."""
-    max_gradient_norm: float = 35.0
-    """Reading: global-norm clipping."""
-    batch_size: int = 32
-    """Reading: samples a step over all devices."""
+    b2: float = 0.99  # Reading: decay of the second moment.
+    weight_decay: float = 0.01  # On all parameters (reading).
+    max_gradient_norm: float = 35.0  # Reading: global-norm clipping.
+    batch_size: int = 32  # Reading: samples a step over all devices.
     accumulate: int = 1
     """Micro-batches a step; gradients and counts are summed and divided once, batch norm sees a micro-batch."""
-    ema_decay: float = 0.0
-    """Decay of the running mean of the weights, which detection then uses; 0 for none (paper)."""
-    epochs: int = 40
-    """Passes over the training set."""
+    ema_decay: float = 0.0  # Of the running mean of the weights, which detection then uses; 0 for none (paper).
+    epochs: int = 40  # Passes over the training set.
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
         _check(self.peak_learning_rate > 0, "peak_learning_rate", self.peak_learning_rate, "above 0")
         _check(0 < self.warmup_fraction < 1, "warmup_fraction", self.warmup_fraction, "between 0 and 1")
         _check(self.max_gradient_norm > 0, "max_gradient_norm", self.max_gradient_norm, "above 0")
-        _check(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
-        _check(self.epochs >= 1, "epochs", self.epochs, "at least 1")
+        _check_least(self, 1, "batch_size", "epochs")
         divides = self.accumulate >= 1 and self.batch_size % self.accumulate == 0
         _check(divides, "accumulate", self.accumulate, f"a divisor of the batch size {self.batch_size}")
         _check(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "within [0, 1)")
@@ -289,45 +222,28 @@ class Config:
     (3, False)
     """
 
-    name: str = "nuscenes"
-    """Preset it started from."""
-    sensor: str = "nuscenes_hdl32e"
-    """Sensor preset, or the path of a sensor file."""
+    name: str = "nuscenes"  # Preset it started from.
+    sensor: str = "nuscenes_hdl32e"  # Sensor preset, or the path of a sensor file.
     classes: tuple[str, ...] = NUSCENES_CLASSES
     """Names of the classes that are detected, one logit each and one more, last, for the background."""
     class_ranges_m: tuple[float, ...] = ()
     """Greatest distance at which each class is evaluated; (): by the class's name, see ``classes.RANGES_M``."""
-    num_sweeps: int = 10
-    """Sweeps fused into one cloud, the current one included."""
-    max_points: int = 300_000
-    """Reading: rows a fused cloud is padded to."""
-    max_boxes: int = 256
-    """Reading: rows the ground truth is padded to."""
-    fade_epochs: int = 0
-    """Last epochs without copy-paste (paper, section 4.5: 5 for the test set)."""
-    copy_paste: CopyPasteConfig | None = CopyPasteConfig()
-    """Copy-paste from the ground-truth database; None for none."""
-    class_balanced: bool = True
-    """Reading: frames are resampled so that every class is drawn for equally often (CBGS)."""
-    projection: ProjectionConfig = ProjectionConfig()
-    """Points to range image."""
-    model: ModelConfig = ModelConfig()
-    """The network."""
-    loss: LossConfig = LossConfig()
-    """Assignment and losses."""
-    inference: InferenceConfig = InferenceConfig()
-    """Predictions to detections."""
-    augment: AugmentConfig | None = AugmentConfig()
-    """Augmentation of a training step; None for none."""
-    optimizer: OptimizerConfig = OptimizerConfig()
-    """Optimizer and schedule."""
+    num_sweeps: int = 10  # Sweeps fused into one cloud, the current one included.
+    max_points: int = 300_000  # Reading: rows a fused cloud is padded to.
+    max_boxes: int = 256  # Reading: rows the ground truth is padded to.
+    fade_epochs: int = 0  # Last epochs without copy-paste (paper, section 4.5: 5 for the test set).
+    copy_paste: CopyPasteConfig | None = CopyPasteConfig()  # From the ground-truth database; None for none.
+    class_balanced: bool = True  # Reading: frames are resampled so that every class is drawn equally often (CBGS).
+    projection: ProjectionConfig = ProjectionConfig()  # Points to range image.
+    model: ModelConfig = ModelConfig()  # The network.
+    loss: LossConfig = LossConfig()  # Assignment and losses.
+    inference: InferenceConfig = InferenceConfig()  # Predictions to detections.
+    augment: AugmentConfig | None = AugmentConfig()  # Augmentation of a training step; None for none.
+    optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
 
     def __post_init__(self) -> None:
-        """Refuse what cannot run."""
-        _check(self.num_sweeps >= 1, "num_sweeps", self.num_sweeps, "at least 1")
-        _check(self.max_points >= 1, "max_points", self.max_points, "at least 1")
-        _check(self.max_boxes >= 1, "max_boxes", self.max_boxes, "at least 1")
-        _check(self.fade_epochs >= 0, "fade_epochs", self.fade_epochs, "at least 0")
+        _check_least(self, 1, "num_sweeps", "max_points", "max_boxes")
+        _check_least(self, 0, "fade_epochs")
         names = self.classes
         _check(len(names) >= 1 and all(names), "classes", names, "one or more names")
         _check(len(set(names)) == len(names), "classes", names, "different names")
@@ -364,8 +280,7 @@ def config_from_json(record: Any, where: str = "config") -> Config:
     """A configuration from the JSON object that :func:`config_to_json` wrote.
 
     Args:
-        record: the parsed JSON value.
-        where: what to call the source in messages.
+        record, where: the parsed JSON value, and what to call its source in messages.
 
     Raises:
         ValueError: naming ``where``, the field, what was found and what was expected.

@@ -1,13 +1,18 @@
-"""Files that several processes may write: whole or not at all, locks between them, and checksums."""
+"""Files: written whole or not at all, locked against other processes, JSON that is checked, and checksums."""
 
 import contextlib
 import fcntl
 import hashlib
+import json
 import os
+import re
 import secrets
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 
 def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
@@ -75,6 +80,52 @@ def file_lock(path: str | Path, *, wait: bool = False) -> Iterator[bool]:
             yield True
 
 
+def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
+    """What a JSON file holds, checked against a type.
+
+    Args:
+        path: of the file, in UTF-8. NaN and infinities are let through, so that they can be refused by name.
+        kind: any type that msgspec can check.
+        what: is expected at the path, for the message where nothing is.
+
+    Raises:
+        ValueError: one line with the file and, where the type does not fit, the place, what was found there and
+            what was expected.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "a.json"
+    >>> _ = file.write_text('["a", 3]')
+    >>> read_json(file, list[str])  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ValueError: ...a.json: $[1]: got 3, expected str
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file, expected {what}")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not JSON: {error}") from None
+    try:
+        return msgspec.convert(content, kind)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{path}: {_explain(str(error), content)}") from None
+
+
+def _explain(message: str, content: Any) -> str:
+    """msgspec's message with what was found at its place; as it is where the place names no key (``$[...]``)."""
+    problem, _, place = message.partition(" - at `")
+    place = place.removesuffix("`")
+    if not re.fullmatch(r"(\$(\.\w+|\[\d+\])*)?", place):
+        return message
+    for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", place):
+        content = content[key or int(index)]
+    found = shown if len(shown := repr(content)) <= 60 else f"{shown[:57]}..."
+    wanted = re.fullmatch(r"Expected (.+?)(, got .*)?", problem.replace("`", ""))
+    return f"{place or '$'}: {f'got {found}, expected {wanted[1]}' if wanted else f'{problem}, got {found}'}"
+
+
 def checksum(data: bytes) -> str:
     """BLAKE2b of 16 bytes, in hexadecimal.
 
@@ -90,7 +141,7 @@ def folder_lock(folder: Path, doing: str) -> Iterator[None]:
 
     Args:
         folder: made if missing.
-        doing: what this process does there, for the message of another one.
+        doing: what this process does there, for the other processes' messages.
 
     Raises:
         OSError: another process works there; with its number and its machine.

@@ -1,4 +1,4 @@
-"""Angles, rotations, corners, points in boxes: finite values and gradients on every input."""
+"""Angles, rotations, points in boxes: finite values and gradients on every input."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,16 +51,10 @@ def atan2(y: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(jnp.signbit(y), -angle, angle)
 
 
-def spherical(
-    xyz: Float[Array, "*n 3"],
-) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Range, azimuth and inclination of points (paper, equation 1).
+def spherical(xyz: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
+    """Range, azimuth in [-pi, pi] and inclination in [-pi/2, pi/2] of points (paper, equation 1).
 
-    Args:
-        xyz: metres, relative to the sensor.
-
-    Returns:
-        range in metres, azimuth in [-pi, pi], inclination in [-pi/2, pi/2]; zeros at the origin.
+    As seen from the origin, where all three are zero.
 
     >>> [round(float(v), 4) for v in spherical(jnp.array([0.0, 2.0, 0.0]))]
     [2.0, 1.5708, 0.0]
@@ -100,11 +94,7 @@ def rotation_matrix(rotation: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray
 def pose_matrix(
     rotation: Float64[np.ndarray, "*n 4"], translation: Float64[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n 4 4"]:
-    """Poses on homogeneous column vectors, on the host.
-
-    Args:
-        rotation: quaternions w, x, y, z.
-        translation: metres.
+    """Poses on homogeneous column vectors from quaternions w, x, y, z and metres, on the host.
 
     >>> pose_matrix(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]))[:3, 3].tolist()
     [1.0, 2.0, 3.0]
@@ -114,41 +104,12 @@ def pose_matrix(
     return matrix
 
 
-def box_corners(boxes: Float[Array, "*m c"]) -> Float[Array, "*m 8 3"]:
-    """The eight corners of upright boxes.
-
-    Args:
-        boxes: ``x, y, z, l, w, h, yaw, ...``.
-
-    Returns:
-        the bottom four, counter-clockwise from the front right, then the top four.
-
-    >>> box_corners(jnp.array([0, 0, 0, 4, 2, 2, 0.0])).shape
-    (8, 3)
-    """
-    signs = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]] * 2) / 2
-    along = boxes[..., 3, None] * signs[:, 0]
-    across = boxes[..., 4, None] * signs[:, 1]
-    up = boxes[..., 5, None] * np.repeat([-0.5, 0.5], 4)
-    cos, sin = jnp.cos(boxes[..., 6, None]), jnp.sin(boxes[..., 6, None])
-    return jnp.stack(
-        [
-            boxes[..., 0, None] + cos * along - sin * across,
-            boxes[..., 1, None] + sin * along + cos * across,
-            boxes[..., 2, None] + up,
-        ],
-        axis=-1,
-    )
-
-
 def points_in_box(
     points: Float[Array | np.ndarray, "*n 3"], box: Float[Array | np.ndarray, "*m c"]
 ) -> Bool[Array | np.ndarray, "*o"]:
-    """Whether points lie in boxes, boundary included; elementwise with broadcasting; NumPy or JAX.
+    """Whether points lie in boxes ``x, y, z, l, w, h, yaw, ...``, boundary included.
 
-    Args:
-        points: metres.
-        box: ``x, y, z, l, w, h, yaw, ...``.
+    Elementwise with broadcasting; NumPy or JAX.
 
     >>> bool(points_in_box(jnp.array([2.0, 1.0, 0.0]), jnp.array([0, 0, 0, 4, 2, 2, 0.0])))
     True

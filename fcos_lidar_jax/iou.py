@@ -20,20 +20,15 @@ _COINCIDENT_M = 1e-5
 """An edge that runs along a side within this distance counts as inside, so that rounding does not decide the
 gradient of coincident edges."""
 
-Rectangle = tuple[Array, Array, Array, Array, Array, Array]
-"""x, y, l, w, cos yaw, sin yaw: arrays of one shape."""
+Rectangle = tuple[Array, Array, Array, Array, Array, Array]  # x, y, l, w, cos yaw, sin yaw: arrays of one shape.
 
 
 def _corners(rectangle: Rectangle) -> tuple[list[Array], list[Array]]:
     """Abscissas and ordinates of the four corners, counter-clockwise from the front right."""
     x, y, l, w, cos, sin = rectangle
     lx, ly, wx, wy = 0.5 * l * cos, 0.5 * l * sin, -0.5 * w * sin, 0.5 * w * cos
-    return [x + lx - wx, x + lx + wx, x - lx + wx, x - lx - wx], [
-        y + ly - wy,
-        y + ly + wy,
-        y - ly + wy,
-        y - ly - wy,
-    ]
+    xs = [x + lx - wx, x + lx + wx, x - lx + wx, x - lx - wx]
+    return xs, [y + ly - wy, y + ly + wy, y - ly + wy, y - ly - wy]
 
 
 def _corners_in_frame(rectangle: Rectangle, frame: Rectangle) -> tuple[list[Array], list[Array]]:
@@ -41,15 +36,8 @@ def _corners_in_frame(rectangle: Rectangle, frame: Rectangle) -> tuple[list[Arra
     fx, fy, _, _, fcos, fsin = frame
     x, y, l, w, cos, sin = rectangle
     dx, dy = x - fx, y - fy
-    local = (
-        fcos * dx + fsin * dy,
-        fcos * dy - fsin * dx,
-        l,
-        w,
-        fcos * cos + fsin * sin,
-        fcos * sin - fsin * cos,
-    )
-    return _corners(local)
+    turned = fcos * cos + fsin * sin, fcos * sin - fsin * cos
+    return _corners((fcos * dx + fsin * dy, fcos * dy - fsin * dx, l, w, *turned))
 
 
 def _crossing(start: Array, step: Array, half: Array) -> tuple[Array, Array]:
@@ -135,11 +123,6 @@ def _area_tangent(rectangles: tuple[Rectangle, Rectangle], tangents: tuple[Any, 
 _area.defjvp(_area_tangent, symbolic_zeros=True)
 
 
-def _columns(boxes: Float[Array, "*m c"]) -> list[Array]:
-    """The columns of oriented boxes, sliced: indexing with an array would make the gradient a scatter."""
-    return [boxes[..., i] for i in range(8)]
-
-
 def oriented(boxes: Float[Array | np.ndarray, "*m c"]) -> Float[Array, "*m 8"]:
     """Boxes ``x, y, z, l, w, h, yaw, ...`` as ``x, y, z, l, w, h, cos yaw, sin yaw``.
 
@@ -155,8 +138,7 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
     """Intersection and union of oriented boxes, as areas or volumes; elementwise with broadcasting.
 
     Args:
-        a: ``x, y, z, l, w, h, cos yaw, sin yaw``.
-        b: likewise.
+        a, b: ``x, y, z, l, w, h, cos yaw, sin yaw``.
         vertical: volumes instead of ground-plane areas (static).
 
     >>> box = oriented(jnp.array([0, 0, 0, 4, 2, 1, 0.0]))
@@ -165,8 +147,9 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
     """
     common = jnp.promote_types(a.dtype, b.dtype)
     a, b = jnp.broadcast_arrays(a.astype(common), b.astype(common))
-    ax, ay, az, al, aw, ah, acos, asin = _columns(a)
-    bx, by, bz, bl, bw, bh, bcos, bsin = _columns(b)
+    # Sliced: indexing with an array would make the gradient a scatter.
+    ax, ay, az, al, aw, ah, acos, asin = (a[..., i] for i in range(8))
+    bx, by, bz, bl, bw, bh, bcos, bsin = (b[..., i] for i in range(8))
     # In the frame of a's centre the numbers stay small wherever the boxes are.
     zero = jnp.zeros_like(ax)
     intersection = _area((zero, zero, al, aw, acos, asin), (bx - ax, by - ay, bl, bw, bcos, bsin))
@@ -198,12 +181,8 @@ def rotated_iou_bev(
 ) -> Float[Array, "*o"]:
     """IoU in the ground plane; elementwise with broadcasting, differentiable in forward and reverse mode.
 
-    Args:
-        a: ``x, y, z, l, w, h, yaw, ...``, metres and radians.
-        b: likewise.
-
-    Returns:
-        values in [0, 1]; 0 where both areas are zero. Gradients are finite everywhere.
+    Boxes are ``x, y, z, l, w, h, yaw, ...`` in metres and radians. Values are in [0, 1], 0 where both areas are
+    zero; gradients are finite everywhere.
 
     >>> a, b = jnp.array([0, 0, 0, 4, 2, 1, 0.0]), jnp.array([2, 0, 0, 4, 2, 1, 0.0])
     >>> round(float(rotated_iou_bev(a, b)), 4)
@@ -215,14 +194,7 @@ def rotated_iou_bev(
 def rotated_iou_3d(
     a: Float[Array | np.ndarray, "*m c"], b: Float[Array | np.ndarray, "*n d"]
 ) -> Float[Array, "*o"]:
-    """IoU of upright boxes; elementwise with broadcasting, differentiable in forward and reverse mode.
-
-    Args:
-        a: ``x, y, z, l, w, h, yaw, ...``, metres and radians, z of the gravity centre.
-        b: likewise.
-
-    Returns:
-        values in [0, 1]; 0 where both volumes are zero. Gradients are finite everywhere.
+    """IoU of upright boxes, z that of the gravity centre; otherwise as :func:`rotated_iou_bev`.
 
     >>> a, b = jnp.array([0, 0, 0, 4, 2, 1, 0.0]), jnp.array([0, 0, 0.5, 4, 2, 1, jnp.pi])
     >>> round(float(rotated_iou_3d(a, b)), 4)

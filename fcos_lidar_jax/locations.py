@@ -1,4 +1,4 @@
-"""Where the feature levels look: the padded image, and the pixel and 3D point of every location.
+"""The locations of the feature levels: the padded image, and the pixel and 3D point of every location.
 
 Paper, sections 3.4 and 4: rows are repeated, a location's pixel is its index times the level's stride, and
 its 3D point is the first-round point there.
@@ -15,8 +15,7 @@ from fcos_lidar_jax.config import ModelConfig
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Locations, RangeImage
 
-STRIDES = (1, 2, 4, 8, 16, 32)
-"""Of P2 ... P7 against the padded image."""
+STRIDES = (1, 2, 4, 8, 16, 32)  # Of P2 ... P7 against the padded image.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +23,7 @@ class ImageLayout:
     """Sizes of the image that the network sees.
 
     Attributes:
-        rows: of the sensor's image.
-        columns: of the sensor's image.
+        rows, columns: of the sensor's image.
         row_upscale: row i of the network's image is row ``i // row_upscale`` of the sensor's.
         height: rows of the network's image, padded with empty rows to a multiple of 32.
         width: columns, padded on the right with copies of the first ones to a multiple of 32.
@@ -37,12 +35,10 @@ class ImageLayout:
 
     @property
     def height(self) -> int:
-        """Padded rows."""
         return _up_to_stride(self.rows * self.row_upscale)
 
     @property
     def width(self) -> int:
-        """Padded columns."""
         return _up_to_stride(self.columns)
 
     @property
@@ -112,11 +108,7 @@ def location_cells(layout: ImageLayout) -> np.ndarray:
 
 
 def locate(image: RangeImage, layout: ImageLayout) -> Locations:
-    """What every location of one sample looks at.
-
-    Args:
-        image: of one sample.
-        layout: sizes.
+    """The point, azimuth and cell of every location of one sample.
 
     >>> image = RangeImage(jnp.zeros((16, 256, 9, 1)), jnp.full((16, 256, 1), -1), jnp.int32(0))
     >>> int(locate(image, ImageLayout(16, 256, 2)).occupied.sum())
@@ -126,9 +118,4 @@ def locate(image: RangeImage, layout: ImageLayout) -> Locations:
     first = image.features[..., 0].reshape(layout.rows * layout.columns, 9)
     inside = cells >= 0
     seen = jnp.where(inside[:, None], first[np.maximum(cells, 0)], 0.0)
-    return Locations(
-        points=seen[:, :3],
-        azimuth_rad=seen[:, 4],
-        cell=jnp.asarray(cells),
-        occupied=seen[:, 7] > 0,
-    )
+    return Locations(points=seen[:, :3], azimuth_rad=seen[:, 4], cell=jnp.asarray(cells), occupied=seen[:, 7] > 0)

@@ -33,12 +33,7 @@ def cross_entropy(logits: Float32[Array, "l c"], labels: Int32[Array, "l"]) -> F
 def classification_loss(
     logits: Float32[Array, "l c"], labels: Int32[Array, "l"], mask: Bool[Array, "l"]
 ) -> SumCount:
-    """Cross-entropy over the locations in ``mask``.
-
-    Args:
-        logits: k classes and the background.
-        labels: class index, k for background.
-        mask: locations that count: the non-empty ones.
+    """Cross-entropy over the locations in ``mask``, the non-empty ones; label k is the background.
 
     >>> total, count = classification_loss(jnp.zeros((2, 2)), jnp.array([0, 1]), jnp.array([True, False]))
     >>> round(float(total), 4), int(count)
@@ -73,17 +68,12 @@ def l1_loss(
 
 
 def iou_loss(
-    prediction: Float32[Array, "l 8"],
-    target: Float32[Array, "l 8"],
-    mask: Bool[Array, "l"],
-    *,
-    kind: str = "iou",
+    prediction: Float32[Array, "l 8"], target: Float32[Array, "l 8"], mask: Bool[Array, "l"], *, kind: str = "iou"
 ) -> SumCount:
     """Loss of the rotated 3D IoU of predicted and true boxes.
 
     Args:
-        prediction: ``x, y, z, l, w, h, cos yaw, sin yaw``.
-        target: likewise.
+        prediction, target: ``x, y, z, l, w, h, cos yaw, sin yaw``.
         mask: locations that count.
         kind: ``"iou"`` 1 - IoU; ``"log_iou"`` -ln IoU (UnitBox); ``"giou"`` and ``"diou"`` with the smallest
             box around both that is aligned with the target.
@@ -134,11 +124,6 @@ def _enclosing(prediction: Array, target: Array) -> Array:
 
 def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], mask: Bool[Array, "l"]) -> SumCount:
     """Binary cross-entropy of the predicted IoU against the measured one, which is not differentiated.
-
-    Args:
-        logits: predicted IoU of the true class, before the sigmoid.
-        iou: IoU of the decoded box with its truth.
-        mask: locations that count.
 
     >>> total, _ = iou_prediction_loss(jnp.zeros(1), jnp.ones(1), jnp.ones(1, bool))
     >>> round(float(total), 4)

@@ -66,14 +66,7 @@ def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
 
 
 def _by_rows(
-    boxes: Array,
-    scores: Array,
-    valid: Array,
-    labels: Array,
-    *,
-    threshold: float,
-    max_outputs: int,
-    vertical: bool,
+    boxes: Array, scores: Array, valid: Array, labels: Array, *, threshold: float, max_outputs: int, vertical: bool
 ) -> tuple[Array, Array]:
     def unfinished(state: tuple[Array, Array, Array]) -> Array:
         count, alive, _ = state
@@ -93,14 +86,7 @@ def _by_rows(
 
 
 def _by_matrix(
-    boxes: Array,
-    scores: Array,
-    valid: Array,
-    labels: Array,
-    *,
-    threshold: float,
-    max_outputs: int,
-    vertical: bool,
+    boxes: Array, scores: Array, valid: Array, labels: Array, *, threshold: float, max_outputs: int, vertical: bool
 ) -> tuple[Array, Array]:
     number = scores.shape[0]
     # Valid boxes first, by falling score, equal ones by index.

@@ -20,10 +20,7 @@ NUSCENES_SINGLE = dataclasses.replace(NUSCENES, name="nuscenes_single", num_swee
 """The paper's single-frame detector: the same network on one sweep, five rounds too."""
 
 NUSCENES_TEST = dataclasses.replace(
-    NUSCENES,
-    name="nuscenes_test",
-    fade_epochs=5,
-    model=dataclasses.replace(NUSCENES.model, head_channels=128),
+    NUSCENES, name="nuscenes_test", fade_epochs=5, model=dataclasses.replace(NUSCENES.model, head_channels=128)
 )
 """The paper's test-set model "c128" (section 4.5): wider heads, fade strategy."""
 

@@ -16,7 +16,6 @@ class Progress:
     """
 
     def __init__(self, unit: str, total: int, *, every_s: float = 10.0) -> None:
-        """Nothing is printed yet."""
         self.unit, self.total, self.every_s = unit, total, every_s
         self._began: tuple[float, int] | None = None
         self._next = 0.0

@@ -23,11 +23,7 @@ def close_to_sensor(
 ) -> Bool[Array | np.ndarray, "n"]:
     """Points on the ego vehicle: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
 
-    Args:
-        points: x, y, z, ... in metres, NumPy or JAX; the answer is of the same kind, so that clouds of any
-            length can be filtered on the host without compiling.
-        sensor: gives the origin.
-        close_m: half the side of the square.
+    NumPy gives NumPy, so that clouds of any length can be filtered on the host without compiling.
 
     >>> close_to_sensor(jnp.zeros((1, 5)), Sensor("two", (0.1, 0.0), 8)).tolist()
     [True]
@@ -48,13 +44,10 @@ def remove_close(
 
     Args:
         points: x, y, z, intensity, time lag; NumPy or JAX, as is the answer.
-        valid: rows that count.
-        sensor: gives the origin.
-        mode: ``"all"`` drops them from all sweeps, ``"sweeps"`` from the older ones, ``"none"`` not at all.
+        valid, sensor: rows that count, and the sensor, which gives the origin.
+        mode: ``"all"`` drops them from all sweeps, ``"sweeps"`` from the older ones, ``"none"`` not at all; else
+            there is a ValueError.
         close_m: half the side of the square that is emptied.
-
-    Raises:
-        ValueError: unknown mode.
 
     >>> me = jnp.zeros((1, 5))
     >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), mode="all").tolist()
@@ -79,11 +72,6 @@ def image_cells(
     Rows are bin centres (the beams), the top row the highest beam; columns run clockwise from azimuth pi.
     Points that are invalid, non-finite, outside the limits or more than half a row outside the field of view
     get the sentinel cell ``num_rows * num_columns``.
-
-    Args:
-        points: x, y, z, intensity, time lag and, for sensors that need it, the laser number.
-        valid: rows that count.
-        sensor: the image's geometry.
 
     Returns:
         row-major cells, and (range, azimuth, inclination) as seen from the sensor, finite everywhere.
@@ -138,11 +126,8 @@ def priority_keys(
 def winners(cell: Int32[Array, "n"], keys: Array, *, num_cells: int, num_rounds: int) -> Int32[Array, "s r"]:
     """The point that each cell keeps in each round (paper, section 3.2).
 
-    Args:
-        cell: cell of every point, ``num_cells`` for points that take no part.
-        keys: uint32, smaller is better; equal keys are settled by the lower index.
-        num_cells: cells of the image.
-        num_rounds: rounds.
+    ``cell`` is ``num_cells`` for points that take no part. Of the ``keys``, uint32, smaller ones are better; equal
+    ones are settled by the lower index.
 
     Returns:
         point index for every cell and round, -1 where nothing is left.
@@ -185,8 +170,7 @@ def project_points(
         points: x, y, z (metres), intensity (0-255), time lag (seconds, exactly 0 for the current sweep), and
             the laser number as a sixth column for sensors whose rows come from it.
         valid: rows that count.
-        sensor: the image's geometry (static).
-        num_rounds: rounds (static).
+        sensor, num_rounds: the image's geometry, and its rounds (static).
         prioritize_current: points of the current sweep win every collision with older ones (static).
 
     Returns:

@@ -42,7 +42,6 @@ class Sensor:
     row_source: Literal["inclination", "laser"] = "inclination"
 
     def __post_init__(self) -> None:
-        """Refuse a sensor that no image can be built from."""
         table = np.asarray(self.inclinations_rad, np.float64)
         if table.ndim != 1 or table.size < 2:
             raise ValueError(f"inclinations_rad: got {table.size} beams, expected at least 2")
@@ -162,8 +161,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     spaced, as ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}``.
 
     Args:
-        record: the parsed JSON value.
-        where: what to call the source in messages.
+        record, where: the parsed JSON value, and what to call its source in messages.
 
     Raises:
         ValueError: naming ``where``, the field, what was found and what was expected.
@@ -179,11 +177,10 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
         even = record.pop("inclinations_deg")
         if not isinstance(even, dict) or set(even) != {"lowest", "highest", "rows"}:
             raise ValueError(f"{where}: inclinations_deg: expected an object with lowest, highest and rows")
-        _expect_number(even["lowest"], f"{where}: inclinations_deg.lowest")
-        _expect_number(even["highest"], f"{where}: inclinations_deg.highest")
+        low, high = (_number(even[end], f"{where}: inclinations_deg.{end}") for end in ("lowest", "highest"))
         if not isinstance(even["rows"], int) or even["rows"] < 2:
             raise ValueError(f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected an integer >= 2")
-        record["inclinations_rad"] = even_inclinations(even["lowest"], even["highest"], even["rows"])
+        record["inclinations_rad"] = even_inclinations(low, high, even["rows"])
     fields = {f.name: f for f in dataclasses.fields(Sensor)}
     unknown = sorted(set(record) - set(fields))
     if unknown:
@@ -197,16 +194,10 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
         if name in ("inclinations_rad", "origin_m", "limit_z_m"):
             if not isinstance(value, list | tuple):
                 raise ValueError(f"{where}: {name}: got {value!r}, expected a list of numbers")
-            for v in value:
-                _expect_number(v, f"{where}: {name}")
-            record[name] = tuple(float(v) for v in value)
+            record[name] = tuple(_number(v, f"{where}: {name}") for v in value)
         elif name in ("limit_xy_m", "intensity_scale"):
-            _expect_number(value, f"{where}: {name}")
-            record[name] = float(value)
-        elif name == "num_columns":
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise ValueError(f"{where}: {name}: got {value!r}, expected an integer")
-        elif not isinstance(value, str):
+            record[name] = _number(value, f"{where}: {name}")
+        elif name == "name" and not isinstance(value, str):
             raise ValueError(f"{where}: {name}: got {value!r}, expected a string")
     try:
         return Sensor(**record)
@@ -238,6 +229,7 @@ def load_sensor(path: str | Path) -> Sensor:
     return sensor_from_json(record, str(path))
 
 
-def _expect_number(value: Any, where: str) -> None:
+def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{where}: got {value!r}, expected a finite number")
+    return float(value)

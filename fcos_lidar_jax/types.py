@@ -14,8 +14,6 @@ from typing import Any
 import jax
 from jaxtyping import Array, Bool, Float32, Int32
 
-from fcos_lidar_jax.classes import NUSCENES_CLASSES as CLASSES  # noqa: F401
-
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
 """The nine channel types of a range image (paper, section 3.1)."""
 
@@ -27,8 +25,7 @@ class RangeImage:
 
     features: Float32[Array, "*b h w 9 r"]
     """Raw units, channels in the order of :data:`CHANNELS`; zero in all nine where a slot is empty."""
-    point_index: Int32[Array, "*b h w r"]
-    """Row of the input points that fills the slot, -1 where empty."""
+    point_index: Int32[Array, "*b h w r"]  # Row of the input points that fills the slot, -1 where empty.
     num_dropped: Int32[Array, "*b"]
     """Valid input rows that were non-finite, beyond the sensor's limits or outside its field of view."""
 
@@ -41,27 +38,20 @@ class Batch:
     points: Float32[Array, "b n c"]
     """x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a sixth
     column for sensors whose rows come from it; anything where invalid."""
-    valid: Bool[Array, "b n"]
-    """False for padding."""
-    boxes: Float32[Array, "b m 9"]
-    """Boxes as the module describes; anything where invalid."""
-    labels: Int32[Array, "b m"]
-    """Index into the classes."""
-    box_valid: Bool[Array, "b m"]
-    """False for padding."""
+    valid: Bool[Array, "b n"]  # False for padding.
+    boxes: Float32[Array, "b m 9"]  # Boxes as the module describes; anything where invalid.
+    labels: Int32[Array, "b m"]  # Index into the classes.
+    box_valid: Bool[Array, "b m"]  # False for padding.
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class HostBatch:
-    """A batch on its way to the device, with what is to be told about it."""
+    """A batch on its way to the device, with what is to be reported about it."""
 
-    batch: Batch
-    """NumPy arrays of this process's rows."""
-    counts: dict[str, int]
-    """To be recorded beside the metrics, such as ``truncated_points``."""
-    names: tuple[str, ...]
-    """Of the samples' frames, for messages."""
+    batch: Batch  # NumPy arrays of this process's rows.
+    counts: dict[str, int]  # To be recorded beside the metrics, such as ``truncated_points``.
+    names: tuple[str, ...]  # Of the samples' frames, for messages.
 
 
 @jax.tree_util.register_dataclass
@@ -69,14 +59,10 @@ class HostBatch:
 class Locations:
     """What every location of the feature levels looks at (paper, section 3.4)."""
 
-    points: Float32[Array, "*b l 3"]
-    """First-round point of the location's pixel, metres; zero where empty."""
-    azimuth_rad: Float32[Array, "*b l"]
-    """Azimuth of that point; zero where empty."""
-    cell: Int32[Array, "l"]
-    """Row-major cell of the sensor's own image (rows not doubled, columns not padded)."""
-    occupied: Bool[Array, "*b l"]
-    """False where the pixel is empty or a pad column."""
+    points: Float32[Array, "*b l 3"]  # First-round point of the location's pixel, metres; zero where empty.
+    azimuth_rad: Float32[Array, "*b l"]  # Azimuth of that point; zero where empty.
+    cell: Int32[Array, "l"]  # Row-major cell of the sensor's own image (rows not doubled, columns not padded).
+    occupied: Bool[Array, "*b l"]  # False where the pixel is empty or a pad column.
 
 
 @jax.tree_util.register_dataclass
@@ -84,12 +70,10 @@ class Locations:
 class Outputs:
     """Raw predictions of the network at all locations."""
 
-    logits: Float32[Array, "*b l c"]
-    """Class logits, k classes and the background last."""
+    logits: Float32[Array, "*b l c"]  # Class logits, k classes and the background last.
     regression: Float32[Array, "*b l 10 k"]
     """Per class: centre offset 3, log size 3, sin and cos of the relative yaw, velocity 2 (equation 2)."""
-    iou_logits: Float32[Array, "*b l k"]
-    """Logit of the predicted IoU, per class."""
+    iou_logits: Float32[Array, "*b l k"]  # Logit of the predicted IoU, per class.
 
 
 @jax.tree_util.register_dataclass
@@ -97,12 +81,9 @@ class Outputs:
 class Targets:
     """The outcome of the assignment for one sample."""
 
-    owner: Int32[Array, "*b l"]
-    """Box whose points the location sees, -1 for none."""
-    positive: Bool[Array, "*b l"]
-    """Among the K cheapest locations of its owner."""
-    num_positive: Int32[Array, "*b m"]
-    """K of every box (0 for a box without candidates)."""
+    owner: Int32[Array, "*b l"]  # Box whose points the location sees, -1 for none.
+    positive: Bool[Array, "*b l"]  # Among the K cheapest locations of its owner.
+    num_positive: Int32[Array, "*b m"]  # K of every box (0 for a box without candidates).
 
 
 @jax.tree_util.register_dataclass
@@ -110,16 +91,11 @@ class Targets:
 class Detections:
     """Final boxes, best first, padded to a fixed count."""
 
-    boxes: Float32[Array, "*b d 9"]
-    """Boxes as the module describes; zero where invalid."""
-    scores: Float32[Array, "*b d"]
-    """Class probability times predicted IoU; zero where invalid."""
-    labels: Int32[Array, "*b d"]
-    """Index into the classes; zero where invalid."""
-    valid: Bool[Array, "*b d"]
-    """False for padding."""
-    num_dropped: Int32[Array, "*b"]
-    """As in :class:`RangeImage`."""
+    boxes: Float32[Array, "*b d 9"]  # Boxes as the module describes; zero where invalid.
+    scores: Float32[Array, "*b d"]  # Class probability times predicted IoU; zero where invalid.
+    labels: Int32[Array, "*b d"]  # Index into the classes; zero where invalid.
+    valid: Bool[Array, "*b d"]  # False for padding.
+    num_dropped: Int32[Array, "*b"]  # As in :class:`RangeImage`.
 
 
 @jax.tree_util.register_dataclass
@@ -127,15 +103,9 @@ class Detections:
 class TrainState:
     """All that training carries from step to step: arrays, no functions."""
 
-    step: Int32[Array, ""]
-    """Updates done."""
-    params: Any
-    """Trainable arrays of the network."""
-    batch_stats: Any
-    """Running means and variances of the network's batch norms."""
-    opt_state: Any
-    """State of the optax optimizer."""
-    ema: Any
-    """Running mean of ``params``, or None."""
-    key: Any
-    """The run's random key; every draw is ``fold_in(key, step)``, so a resumed run repeats itself."""
+    step: Int32[Array, ""]  # Updates done.
+    params: Any  # Trainable arrays of the network.
+    batch_stats: Any  # Running means and variances of the network's batch norms.
+    opt_state: Any  # State of the optax optimizer.
+    ema: Any  # Running mean of ``params``, or None.
+    key: Any  # The run's random key; every draw is ``fold_in(key, step)``, so a resumed run repeats itself.

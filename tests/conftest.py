@@ -24,6 +24,24 @@ jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
+# Most of the time goes to compilation. Where the question is what a command or a run does, not how it rounds, the
+# programs are compiled without optimisation, in these folders.
+_QUICK = ("cli", "experiments", "models", "trainer", "training")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What is compiled without optimisation comes first, for a change of the mode forgets all programs."""
+    items.sort(key=lambda item: item.path.parent.name not in _QUICK)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _optimisation(request: pytest.FixtureRequest) -> None:
+    quick = request.path.parent.name in _QUICK
+    if jax.config.read("jax_disable_most_optimizations") != quick:
+        jax.config.update("jax_disable_most_optimizations", quick)
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder with real LiDAR data; the test is skipped where there is none."""

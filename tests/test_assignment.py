@@ -1,5 +1,7 @@
 """Owners and dynamic K against loops, on random and degenerate input."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,9 @@ def f32(x):
 
 def i32(x):
     return jnp.asarray(x, jnp.int32)
+
+
+compute = jax.jit(assign, static_argnames=("num_boxes", "top_q"))
 
 
 @pytest.mark.parametrize("num_boxes", [1, 40, 256])
@@ -49,9 +54,7 @@ def test_assignment_equals_the_matrix_form(seed, num_boxes):
     iou = np.round(iou * 4) / 4 if seed % 2 else iou  # sums of quarters: exact halves to round
     iou = iou.astype(np.float32)
     expected, ks = oracles.assign(owner, cost, iou, num_boxes, 20)
-    targets = jax.jit(assign, static_argnames=("num_boxes", "top_q"))(
-        i32(owner), f32(cost), f32(iou), num_boxes=num_boxes
-    )
+    targets = compute(i32(owner), f32(cost), f32(iou), num_boxes=num_boxes)
     np.testing.assert_array_equal(targets.num_positive, ks)
     np.testing.assert_array_equal(targets.positive, expected)
 
@@ -70,16 +73,16 @@ def test_equal_costs_go_to_the_lower_index():
 
 
 def test_no_boxes_all_padding_and_one_point():
-    none = assign(i32([-1] * 5), f32([0] * 5), f32([1] * 5), num_boxes=3)
+    none = compute(i32([-1] * 5), f32([0] * 5), f32([1] * 5), num_boxes=3)
     assert none.num_positive.tolist() == [0, 0, 0]
     assert not none.positive.any()
-    one = assign(i32([1]), f32([9]), f32([0]), num_boxes=2)
+    one = compute(i32([1]), f32([9]), f32([0]), num_boxes=2)
     assert one.positive.tolist() == [True]
     assert one.num_positive.tolist() == [0, 1]
 
 
 def test_a_diverging_prediction_is_chosen_last():
-    targets = assign(i32([0, 0, 0]), f32([np.nan, 5, np.inf]), f32([0.0, 0.0, 0.0]), num_boxes=1)
+    targets = compute(i32([0, 0, 0]), f32([np.nan, 5, np.inf]), f32([0.0, 0.0, 0.0]), num_boxes=1)
     assert targets.positive.tolist() == [False, True, False]
 
 
@@ -87,15 +90,13 @@ def test_maps_over_a_batch_and_has_no_gradient():
     rng = np.random.default_rng(0)
     owner, cost, iou = i32(rng.integers(-1, 4, (3, 50))), f32(rng.random((3, 50))), f32(rng.random((3, 50)))
 
-    def go(o, c, i):
-        return assign(o, c, i, num_boxes=4)
-
-    batched = jax.vmap(go)(owner, cost, iou)
+    go = functools.partial(compute, num_boxes=4)
+    batched = jax.jit(jax.vmap(go))(owner, cost, iou)
     for b in range(3):
         np.testing.assert_array_equal(batched.positive[b], go(owner[b], cost[b], iou[b]).positive)
 
     def value(c):
         return jnp.where(go(owner[0], c, iou[0]).positive, c, 0.0).sum()
 
-    gradient = jax.grad(value)(cost[0])
+    gradient = jax.jit(jax.grad(value))(cost[0])
     np.testing.assert_array_equal(gradient, go(owner[0], cost[0], iou[0]).positive.astype(jnp.float32))

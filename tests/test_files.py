@@ -1,5 +1,6 @@
 """Atomic writes and file locks: what other processes see of them."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -55,16 +56,24 @@ with file_lock(sys.argv[1]) as held:
 """
 
 
+@contextlib.contextmanager
+def holding(file, arguments=""):
+    """Another process that locks a file and keeps it until it is killed or its input ends."""
+    source = _HOLDER.replace("(sys.argv[1])", f"(sys.argv[1]{arguments})")
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", source, str(file)], **pipes) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 def test_a_lock_excludes_other_processes_until_its_holder_is_killed(tmp_path):
     file = tmp_path / "new" / "run.lock"
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", _HOLDER, str(file)], **pipes) as other:
-        try:
-            assert other.stdout.readline() == "True\n"
-            with file_lock(file) as held:
-                assert not held
-        finally:
-            other.kill()
+    with holding(file) as other:
+        assert other.stdout.readline() == "True\n"
+        with file_lock(file) as held:
+            assert not held
     with file_lock(file) as held:
         assert held
     with file_lock(file, wait=True) as held, file_lock(file) as second:
@@ -72,14 +81,11 @@ def test_a_lock_excludes_other_processes_until_its_holder_is_killed(tmp_path):
 
 
 def test_waiting_for_a_lock_ends_when_it_is_given_up(tmp_path):
-    file = tmp_path / "run.lock"
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    source = _HOLDER.replace("(sys.argv[1])", "(sys.argv[1], wait=True)")
-    with subprocess.Popen([sys.executable, "-c", _HOLDER, str(file)], **pipes) as first:
-        assert first.stdout.readline() == "True\n"
-        with subprocess.Popen([sys.executable, "-c", source, str(file)], **pipes) as second:
+    with contextlib.ExitStack() as first:
+        assert first.enter_context(file_lock(tmp_path / "run.lock"))
+        with holding(tmp_path / "run.lock", ", wait=True") as second:
             second.stdin.close()
             with pytest.raises(subprocess.TimeoutExpired):
                 second.wait(1)
-            first.stdin.close()
+            first.close()
             assert second.stdout.read() == "True\n"

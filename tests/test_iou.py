@@ -10,6 +10,12 @@ from fcos_lidar_jax.iou import oriented_iou_3d, rotated_iou_3d, rotated_iou_bev
 
 NUMBER = 20_000
 IDENTICAL = slice(5000, 6000)
+BOTH = pytest.mark.parametrize("function", [rotated_iou_3d, rotated_iou_bev])
+# Compiled once for all tests: every call of jax.jit on a new derivative compiles it anew.
+VALUE = {f: jax.jit(f) for f in (rotated_iou_3d, rotated_iou_bev)}
+GRADIENT = {f: jax.jit(jax.grad(lambda a, b, f=f: f(a, b).sum(), argnums=(0, 1))) for f in VALUE}
+TANGENT = {f: jax.jit(lambda a, b, da, db, f=f: jax.jvp(f, (a, b), (da, db))[1]) for f in VALUE}
+FORWARD = {f: jax.jit(jax.jacfwd(f, argnums=(0, 1))) for f in VALUE}
 
 
 @pytest.fixture(scope="module")
@@ -29,71 +35,58 @@ def pairs():
 @pytest.mark.parametrize(("function", "vertical"), [(rotated_iou_3d, True), (rotated_iou_bev, False)])
 def test_equals_shapely_on_20000_pairs(pairs, function, vertical):
     expected = oracles.iou(*pairs, vertical=vertical)
-    error = np.abs(np.asarray(jax.jit(function)(*pairs)) - expected).max()
-    print(f"\n{function.__name__}: largest error {error:.2e}, {(expected > 0).sum()} pairs overlap")
-    assert error < 1e-5
-    assert np.abs(np.asarray(function(*pairs)) - expected).max() < 1e-5
+    for compute in (VALUE[function], function):
+        assert np.abs(np.asarray(compute(*pairs)) - expected).max() < 1e-5
 
 
-def gradients(function, a, b):
-    return jax.jit(jax.grad(lambda a, b: function(a, b).sum(), argnums=(0, 1)))(a, b)
+def in_float64(*arrays):
+    return [jnp.asarray(array, jnp.float64) for array in arrays]
 
 
-@pytest.mark.parametrize("function", [rotated_iou_3d, rotated_iou_bev])
-def test_float32_gradients_equal_float64_and_finite_differences(pairs, function):
-    single = [np.asarray(g) for g in gradients(function, *pairs)]
-    assert all(np.isfinite(g).all() for g in single)
-    with jax.enable_x64(True):
-        a, b = (jnp.asarray(p, jnp.float64) for p in pairs)
-        double = [np.asarray(g) for g in gradients(function, a, b)]
-        value = jax.jit(function)
-        step = 1e-6
-        differences = np.stack(
-            [(value(a.at[:, k].add(step), b) - value(a.at[:, k].add(-step), b)) / (2 * step) for k in range(7)], 1
-        )
-    regular = np.ones(NUMBER, bool)
-    regular[IDENTICAL] = False  # a kink: there is no derivative to compare with
-    error = max(np.abs(s - d).max() for s, d in zip(single, double, strict=True))
-    against = np.abs(double[0] - differences)[regular].max()
-    print(f"\n{function.__name__}: float32 against float64 {error:.1e}, against differences {against:.1e}")
-    assert error < 1e-3
-    assert against < 1e-4
+def central_difference(function, a, b, da, db, step=1e-6):
+    after, before = (VALUE[function](a + s * da, b + s * db) for s in (step, -step))
+    return np.asarray(after - before) / (2 * step)
 
 
-def tangents(function, a, b, da, db):
-    return jax.jit(lambda *boxes: jax.jvp(function, boxes, (da, db))[1])(a, b)
-
-
-@pytest.mark.parametrize("function", [rotated_iou_3d, rotated_iou_bev])
-def test_forward_mode_equals_float64_and_finite_differences(pairs, function):
-    rng = np.random.default_rng(2)
-    directions = rng.normal(0, 1, (NUMBER, 14))
-    directions = np.split((directions / np.linalg.norm(directions, axis=1)[:, None]).astype(np.float32), 2, axis=1)
-    single = np.asarray(tangents(function, *pairs, *directions))
-    with jax.enable_x64(True):
-        a, b, da, db = (jnp.asarray(p, jnp.float64) for p in (*pairs, *directions))
-        double = np.asarray(tangents(function, a, b, da, db))
-        value, step = jax.jit(function), 1e-6
-        after, before = value(a + step * da, b + step * db), value(a - step * da, b - step * db)
-        differences = np.asarray(after - before) / (2 * step)
+def assert_close(single, double, differences):
+    """float32 against float64, and float64 against differences but for identical boxes, where there is a kink."""
     regular = np.ones(NUMBER, bool)
     regular[IDENTICAL] = False
-    against = np.abs(double - differences)[regular].max()
-    error = np.abs(single - double).max()
-    print(f"\n{function.__name__}: float32 against float64 {error:.1e}, against differences {against:.1e}")
-    assert error < 1e-3
-    assert against < 1e-4
+    assert max(np.abs(s - d).max() for s, d in zip(single, double, strict=True)) < 1e-3
+    assert np.abs(double[0] - differences)[regular].max() < 1e-4
 
 
-@pytest.mark.parametrize("function", [rotated_iou_3d, rotated_iou_bev])
+@BOTH
+def test_float32_gradients_equal_float64_and_finite_differences(pairs, function):
+    single = [np.asarray(g) for g in GRADIENT[function](*pairs)]
+    assert all(np.isfinite(g).all() for g in single)
+    with jax.enable_x64(True):
+        a, b = in_float64(*pairs)
+        double = [np.asarray(g) for g in GRADIENT[function](a, b)]
+        differences = [central_difference(function, a, b, axis, 0.0) for axis in np.eye(7)]
+    assert_close(single, double, np.stack(differences, 1))
+
+
+@BOTH
+def test_forward_mode_equals_float64_and_finite_differences(pairs, function):
+    directions = np.random.default_rng(2).normal(0, 1, (NUMBER, 14))
+    directions = np.split((directions / np.linalg.norm(directions, axis=1)[:, None]).astype(np.float32), 2, axis=1)
+    single = np.asarray(TANGENT[function](*pairs, *directions))
+    with jax.enable_x64(True):
+        arguments = in_float64(*pairs, *directions)
+        double = np.asarray(TANGENT[function](*arguments))
+        differences = central_difference(function, *arguments)
+    assert_close([single], [double], differences)
+
+
+@BOTH
 def test_forward_and_reverse_mode_agree_also_mapped(pairs, function):
     pairs = [jnp.asarray(p[4900:5200]) for p in pairs]  # nearly equal and identical ones
-    forward, reverse = (
-        jax.jit(jax.vmap(jacobian(function, argnums=(0, 1))))(*pairs) for jacobian in (jax.jacfwd, jax.jacrev)
-    )
+    reverse = jax.jacrev(function, argnums=(0, 1))
+    forward, reverse = (jax.jit(jax.vmap(jacobian))(*pairs) for jacobian in (FORWARD[function], reverse))
     for one, other in zip(forward, reverse, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
-    alone = [jax.jacfwd(function)(a, b) for a, b in zip(pairs[0][98:102], pairs[1][98:102], strict=True)]
+    alone = [FORWARD[function](a, b)[0] for a, b in zip(pairs[0][98:102], pairs[1][98:102], strict=True)]
     np.testing.assert_allclose(forward[0][98:102], alone, rtol=1e-4, atol=1e-5)
     assert float(jnp.abs(forward[0]).max()) > 0.1
 
@@ -125,30 +118,28 @@ DEGENERATE = {
 def test_degenerate_pairs(name):
     a, b, expected = DEGENERATE[name]
     a, b = jnp.array(a, jnp.float32), jnp.array(b, jnp.float32)
-    value, gradient = jax.jit(jax.value_and_grad(rotated_iou_3d, argnums=(0, 1)))(a, b)
-    assert abs(float(value) - expected) < 1e-5
-    assert abs(float(rotated_iou_3d(b, a)) - expected) < 1e-5
+    value, gradient = VALUE[rotated_iou_3d], GRADIENT[rotated_iou_3d](a, b)
+    assert abs(float(value(a, b)) - expected) < 1e-5
+    assert abs(float(value(b, a)) - expected) < 1e-5
     assert all(bool(jnp.isfinite(g).all()) for g in gradient)
     assert max(float(jnp.abs(g).max()) for g in gradient) < 1e3
-    forward = jax.jit(jax.jacfwd(rotated_iou_3d, argnums=(0, 1)))(a, b)
-    for one, other in zip(forward, gradient, strict=True):
+    for one, other in zip(FORWARD[rotated_iou_3d](a, b), gradient, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * max(1.0, float(jnp.abs(other).max())))
 
 
 def test_broadcasts_and_maps_like_loops(pairs):
     a, b = jnp.asarray(pairs[0][:6]), jnp.asarray(pairs[1][:5])
-    matrix = rotated_iou_bev(a[:, None], b[None])
-    loops = np.array([[float(rotated_iou_bev(x, y)) for y in b] for x in a])
-    np.testing.assert_allclose(matrix, loops, atol=1e-6)
-    mapped = jax.vmap(rotated_iou_3d)(a[:5], b)
-    np.testing.assert_allclose(mapped, rotated_iou_3d(a[:5], b), atol=1e-6)
+    bev, in_space = VALUE[rotated_iou_bev], VALUE[rotated_iou_3d]
+    loops = np.array([[float(bev(x, y)) for y in b] for x in a])
+    np.testing.assert_allclose(bev(a[:, None], b[None]), loops, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.vmap(rotated_iou_3d))(a[:5], b), in_space(a[:5], b), atol=1e-6)
 
 
 def test_broadcast_gradients_are_summed():
     box = jnp.array(BASE, jnp.float32)
     others = jnp.asarray(oracles.random_boxes(np.random.default_rng(1), 8, 1.0), jnp.float32)
-    total = jax.grad(lambda x: rotated_iou_3d(x, others).sum())(box)
-    single = sum(jax.grad(lambda x, o=o: rotated_iou_3d(x, o))(box) for o in others)
+    gradient = GRADIENT[rotated_iou_3d]
+    total, single = gradient(box, others)[0], sum(gradient(box, other)[0] for other in others)
     np.testing.assert_allclose(total, single, atol=1e-5)
 
 

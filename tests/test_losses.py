@@ -1,6 +1,7 @@
 """Every loss against NumPy, and finite where nothing is."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,19 @@ from fcos_lidar_jax.iou import oriented
 from fcos_lidar_jax.losses import classification_loss, combine, iou_loss, iou_prediction_loss, l1_loss
 
 NUMBER = 50
+KINDS = ("iou", "log_iou", "giou", "diou")
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def iou_gradient(prediction, target, mask, kind):
+    """((Sum, count), gradient by the prediction)."""
+
+    def loss(prediction):
+        total, count = iou_loss(prediction, target, mask, kind=kind)
+        return total, (total, count)
+
+    gradient, found = jax.grad(loss, has_aux=True)(prediction)
+    return found, gradient
 
 
 @pytest.fixture
@@ -57,26 +71,15 @@ def pairs(rng):
     return a, b
 
 
-@pytest.mark.parametrize("kind", ["iou", "log_iou", "giou", "diou"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_iou_losses_by_shapely_and_corners(rng, kind):
     a, b = pairs(rng)
     mask = rng.random(NUMBER) < 0.8
     iou = oracles.iou(a, b, vertical=True)
-    extents, unions = [], []
-    for p, t, value in zip(a, b, iou, strict=True):
-        c, s = np.cos(t[6]), np.sin(t[6])
-        corners = []
-        for box in (p, t):
-            bc, bs = np.cos(box[6]), np.sin(box[6])
-            for i in (-1, 1):
-                for j in (-1, 1):
-                    x = box[0] + bc * i * box[3] / 2 - bs * j * box[4] / 2 - t[0]
-                    y = box[1] + bs * i * box[3] / 2 + bc * j * box[4] / 2 - t[1]
-                    corners += [(c * x + s * y, c * y - s * x, box[2] + k * box[5] / 2) for k in (-1, 1)]
-        extents.append(np.ptp(np.array(corners), axis=0))
-        volumes = np.prod(p[3:6]) + np.prod(t[3:6])
-        unions.append(volumes / (1 + value))
-    extents, unions = np.array(extents), np.array(unions)
+    unions = (a[:, 3:6].prod(1) + b[:, 3:6].prod(1)) / (1 + iou)
+    corners = np.concatenate([oracles.corners(a), oracles.corners(b)], axis=1)
+    turned = np.einsum("nij,nci->ncj", oracles.turns(b[:, 6]), corners)  # along the axes of the target
+    extents = np.ptp(turned, axis=1)
     volume = extents.prod(1)
     distance = ((a[:, :3] - b[:, :3]) ** 2).sum(1)
     expected = {
@@ -86,20 +89,18 @@ def test_iou_losses_by_shapely_and_corners(rng, kind):
         "diou": 1 - iou + distance / (extents**2).sum(1),
     }[kind]
     prediction, target = oriented(f32(a)), oriented(f32(b))
-    total, count = iou_loss(prediction, target, jnp.asarray(mask), kind=kind)
+    (total, count), gradient = iou_gradient(prediction, target, jnp.asarray(mask), kind)
     np.testing.assert_allclose(total, expected[mask].sum(), rtol=2e-4)
     assert int(count) == mask.sum()
-    gradient = jax.jit(jax.grad(lambda p: iou_loss(p, target, jnp.asarray(mask), kind=kind)[0]))(prediction)
     assert np.isfinite(gradient).all()
     assert not np.asarray(gradient)[~mask].any()
 
 
 def test_masked_out_rubbish_does_not_reach_the_gradient():
-    rubbish = jnp.full((2, 8), jnp.inf).at[1].set(jnp.nan)
-    box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]] * 2))
-    for kind in ("iou", "log_iou", "giou", "diou"):
-        gradient = jax.grad(lambda p, kind=kind: iou_loss(p, box, jnp.zeros(2, bool), kind=kind)[0])(rubbish)
-        assert not np.asarray(gradient).any()
+    rubbish = f32([[np.inf] * 8, [np.nan] * 8] * (NUMBER // 2))
+    box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]] * NUMBER))
+    for kind in KINDS:
+        assert not np.asarray(iou_gradient(rubbish, box, jnp.zeros(NUMBER, bool), kind)[1]).any()
 
 
 def test_iou_prediction_is_the_binary_cross_entropy_and_leaves_the_iou_alone(rng):

@@ -11,6 +11,7 @@ from fcos_lidar_jax.nms import rotated_nms
 
 FORMS = pytest.mark.parametrize("form", ["rows", "matrix"])
 OPTIONS = {"iou_threshold": 0.2, "max_outputs": 50}
+compute = jax.jit(rotated_nms, static_argnames=("iou_threshold", "max_outputs", "overlap", "form"))
 
 
 def clusters(seed: int, number: int = 200):
@@ -23,11 +24,9 @@ def clusters(seed: int, number: int = 200):
 
 
 def keep(boxes, scores, valid, labels, **options):
-    kept, used = rotated_nms(
-        jnp.asarray(boxes), jnp.asarray(scores), jnp.asarray(valid), labels=jnp.asarray(labels), **options
-    )
-    assert not np.asarray(kept)[~np.asarray(used)].any()
-    return np.asarray(kept)[np.asarray(used)].tolist()
+    kept, used = map(np.asarray, compute(boxes, scores, valid, labels=labels, **options))
+    assert not kept[~used].any()
+    return kept[used].tolist()
 
 
 @FORMS
@@ -79,8 +78,9 @@ def test_same_under_jit_and_vmap(form):
         return rotated_nms(boxes, scores, valid, labels=labels, **OPTIONS, form=form)
 
     kept, used = jax.jit(jax.vmap(go))(*stacked)
+    alone = jax.jit(go)
     for i in range(3):
-        single, single_used = go(*(s[i] for s in stacked))
+        single, single_used = alone(*(s[i] for s in stacked))
         np.testing.assert_array_equal(kept[i], single)
         np.testing.assert_array_equal(used[i], single_used)
 

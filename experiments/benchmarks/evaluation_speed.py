@@ -5,199 +5,80 @@
     python -m experiments.benchmarks.evaluation_speed
 
 Generates a data set and a results file of the size of nuScenes val (6,019 keyframes in 150 scenes, 30 annotations
-and 200 predictions each), then evaluates it with both, one after the other in processes of their own. Every number
-of both must be the same. Two times are compared: from the tables in memory to the summary, which is the devkit's
-``DetectionEval`` without curves; and the whole process, from the start of Python to its end. The command
-``fcos-lidar evaluate --results FILE`` is run too, for its time and memory.
+and 200 predictions each), evaluates it with both in processes of their own, and expects the same numbers. Compared
+are the time from the tables in memory to the summary (the devkit's ``DetectionEval`` without curves) and that of
+the whole process. The command ``fcos-lidar evaluate --results FILE`` is measured too.
 
-Cost: about five minutes, 1.5 GB of disk, 3 GB of memory. Expected: at least 20 times as fast from the tables on,
-and below 2 GiB.
+Cost: five minutes, 1.5 GB of disk, 3 GB of memory. Expected: 20 times as fast from the tables on, below 2 GiB.
 """
 
 import dataclasses
 import json
-import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.script import run_script, save
-from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
+from experiments.benchmarks.made_tables import Row, annotations, class_of, write_tables
+from experiments.script import Options, run_script, save
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.evaluation.boxes import CLASS_ATTRIBUTES
 from fcos_lidar_jax.evaluation.results import LIDAR_META
-from fcos_lidar_jax.types import CLASSES
 
 VERSION, SPLIT = "v1.0-trainval", "val"
-SHARES = np.array([0.43, 0.08, 0.02, 0.02, 0.02, 0.2, 0.02, 0.02, 0.09, 0.1])
-"""Of the classes, about as in nuScenes."""
-Rows = list[dict[str, Any]]
+TRUTHS, PREDICTIONS = 30, 200  # of every keyframe
 
 
 @dataclasses.dataclass(frozen=True)
-class Args:
-    """How large, and where."""
+class Args(Options):
+    """How large, and how often."""
 
-    samples: int = 6019
-    """Keyframes, spread over the split's scenes."""
-    truths: int = 30
-    """Annotations of each."""
-    predictions: int = 200
-    """Predictions for each."""
-    repeats: int = 3
-    """Runs of ours, of which the median counts; the devkit runs once."""
-    folder: Path | None = None
-    """For the generated files; by default a temporary one."""
-    out: Path = Path("outputs/evaluation_speed.json")
-    """Where the figures go."""
+    samples: int = 6019  # Keyframes, spread over the split's scenes.
+    repeats: int = 3  # Runs of ours, of which the median counts; the devkit runs once.
 
 
-def make_files(root: Path, args: Args) -> None:
-    """Tables and ``results.json``."""
-    tables = root / VERSION
-    tables.mkdir(parents=True)
-    scenes = scenes_of_split(SPLIT, tables)
+def _make_files(root: Path, samples: int) -> None:
+    names = scenes_of_split(SPLIT, root / VERSION)
+    keyframes = [len(part) for part in np.array_split(np.arange(samples), len(names))]
+    write_tables(root / VERSION, dict(zip(names, keyframes, strict=True)), {"LIDAR_TOP": 1}, objects=TRUTHS)
     rng = np.random.default_rng(0)
-    rows: dict[str, Rows] = {"scene": [], "sample": [], "sample_data": [], "ego_pose": []}
-    rows |= {"instance": [], "sample_annotation": []}
-    category = {name: kind for kind, name in reversed(CATEGORY_TO_CLASS.items())}
-    names = sorted({a for known in CLASS_ATTRIBUTES.values() for a in known})
     with (root / "results.json").open("w") as stream:
         stream.write(f'{{"meta": {json.dumps(LIDAR_META)}, "results": {{')
-        for s, part in enumerate(np.array_split(np.arange(args.samples), len(scenes))):
-            boxes = make_scene(rows, rng, f"{s:03d}", scenes[s], len(part), args)
-            for token, found in boxes.items():
-                stream.write(f"{'' if token == '000-000' else ','}\n{json.dumps(token)}: {json.dumps(found)}")
-        stream.write("}}\n")
-    fixed: dict[str, Rows] = {
-        "category": [{"token": name, "name": kind, "description": ""} for name, kind in category.items()],
-        "attribute": [{"token": name, "name": name, "description": ""} for name in names],
-        "visibility": [],
-        "sensor": [{"token": "lidar", "channel": "LIDAR_TOP", "modality": "lidar"}],
-        "calibrated_sensor": [
-            {
-                "token": "mount",
-                "sensor_token": "lidar",
-                "translation": [0.9, 0.0, 1.8],
-                "rotation": [1.0, 0.0, 0.0, 0.0],
-                "camera_intrinsic": [],
-            }
-        ],
-        "log": [],
-        "map": [{"token": "map", "log_tokens": [], "category": "semantic_prior", "filename": "map.png"}],
-    }
-    (root / "map.png").touch()
-    for name, table in {**fixed, **rows}.items():
-        (tables / f"{name}.json").write_text(json.dumps(table))
+        for scene, number in enumerate(keyframes):
+            truths: defaultdict[str, list[tuple[str, Row]]] = defaultdict(list)
+            for o in range(TRUTHS):
+                for row in annotations(scene, o, number, number):
+                    truths[row["sample_token"]].append((class_of(scene, o), row))
+            found = {token: list(make_predictions(rng, rows)) for token, rows in truths.items()}
+            stream.write(("," if scene else "") + json.dumps(found)[1:-1])
+        stream.write("}}")
 
 
-def make_scene(
-    rows: dict[str, Rows], rng: np.random.Generator, s: str, name: str, length: int, args: Args
-) -> dict[str, Rows]:
-    """One scene's rows are appended; its predictions returned."""
-    samples = [f"{s}-{k:03d}" for k in range(length)]
-    rows["scene"].append({"token": s, "name": name, "log_token": "", "first_sample_token": samples[0]})
-    egos = rng.uniform(300, 2000, 3) + np.cumsum(rng.normal(0, 3, (length, 3)), axis=0)
-    kinds = rng.choice(len(CLASSES), args.truths, p=SHARES)
-    starts = egos[0] + np.pad(rng.normal(0, 22, (args.truths, 2)), ((0, 0), (0, 1)))
-    speeds = rng.choice([0.0, 4.0], (args.truths, 1)) * rng.normal(0, 1, (args.truths, 2))
-    sizes = rng.uniform(0.5, 4.5, (args.truths, 3))
-    turns = quaternions(rng.uniform(-np.pi, np.pi, args.truths))
-    for o, kind in enumerate(kinds):
-        rows["instance"].append({"token": f"{s}o{o:02d}", "category_token": CLASSES[kind]})
-    results: dict[str, Rows] = {}
-    for k, token in enumerate(samples):
-        around = {"prev": samples[k - 1] if k else "", "next": samples[k + 1] if k + 1 < length else ""}
-        time_us = 1_530_000_000_000_000 + int(s) * 10**9 + k * 500_000
-        rows["sample"].append({"token": token, "timestamp": time_us, "scene_token": s, **around})
-        rows["ego_pose"].append(
-            {
-                "token": token,
-                "timestamp": time_us,
-                "translation": egos[k].tolist(),
-                "rotation": [1.0, 0.0, 0.0, 0.0],
-            }
-        )
-        rows["sample_data"].append(
-            {
-                "token": token,
-                "sample_token": token,
-                "ego_pose_token": token,
-                "calibrated_sensor_token": "mount",
-                "timestamp": time_us,
-                "fileformat": "pcd",
-                "is_key_frame": True,
-                "filename": f"samples/LIDAR_TOP/{token}.pcd.bin",
-                **around,
-            }
-        )
-        centres = starts + np.pad(speeds * k / 2, ((0, 0), (0, 1)))
-        for o, kind in enumerate(kinds):
-            known = CLASS_ATTRIBUTES[CLASSES[kind]]
-            rows["sample_annotation"].append(
-                {
-                    "token": f"{token}o{o:02d}",
-                    "sample_token": token,
-                    "instance_token": f"{s}o{o:02d}",
-                    "visibility_token": "",
-                    "attribute_tokens": [known[o % len(known)]] if known else [],
-                    "translation": centres[o].tolist(),
-                    "size": sizes[o].tolist(),
-                    "rotation": turns[o].tolist(),
-                    "prev": f"{around['prev']}o{o:02d}" if k else "",
-                    "next": f"{around['next']}o{o:02d}" if around["next"] else "",
-                    "num_lidar_pts": int(rng.integers(0, 40)),
-                    "num_radar_pts": 0,
-                }
-            )
-        results[token] = make_predictions(rng, token, kinds, centres, sizes, turns, args.predictions)
-    return results
-
-
-def quaternions(yaw: np.ndarray) -> np.ndarray:
-    """w, x, y, z of turns about the vertical."""
-    return np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
-
-
-def make_predictions(
-    rng: np.random.Generator,
-    token: str,
-    kinds: np.ndarray,
-    centres: np.ndarray,
-    sizes: np.ndarray,
-    turns: np.ndarray,
-    number: int,
-) -> Rows:
-    """Boxes about the truths, near and far, the nearer the likelier to score high."""
-    source = rng.integers(0, len(kinds), number)
-    away = rng.exponential(2.0, (number, 1)) * rng.normal(0, 1, (number, 3)) * [1, 1, 0.1]
-    score = np.clip(np.exp(-np.linalg.norm(away, axis=1)) * rng.beta(4, 2, number), 1e-3, None)
-    where = centres[source] + away
-    size = sizes[source] * rng.uniform(0.8, 1.25, (number, 3))
-    velocity = rng.normal(0, 2, (number, 2))
-    boxes = []
-    for i, o in enumerate(source):
-        name = CLASSES[kinds[o]]
+def make_predictions(rng: np.random.Generator, truths: list[tuple[str, Row]]) -> Iterator[Row]:
+    """Boxes about the truths of a keyframe, near and far, the nearer the likelier to score high."""
+    away = rng.exponential(2.0, (PREDICTIONS, 1)) * rng.normal(0, [1, 1, 0.1], (PREDICTIONS, 3))
+    score = np.clip(np.exp(-np.linalg.norm(away, axis=1)) * rng.beta(4, 2, PREDICTIONS), 1e-3, None)
+    scale, velocity = rng.uniform(0.8, 1.25, (PREDICTIONS, 3)), rng.normal(0, 2, (PREDICTIONS, 2))
+    for i, o in enumerate(rng.integers(0, len(truths), PREDICTIONS)):
+        name, truth = truths[o]
         known = CLASS_ATTRIBUTES[name]
-        boxes.append(
-            {
-                "sample_token": token,
-                "translation": where[i].tolist(),
-                "size": size[i].tolist(),
-                "rotation": turns[o].tolist(),
-                "velocity": velocity[i].tolist(),
-                "detection_name": name,
-                "detection_score": float(score[i]),
-                "attribute_name": known[i % len(known)] if known else "",
-            }
-        )
-    return boxes
+        yield {
+            "sample_token": truth["sample_token"],
+            "translation": (truth["translation"] + away[i]).tolist(),
+            "size": (truth["size"] * scale[i]).tolist(),
+            "rotation": truth["rotation"],
+            "velocity": velocity[i].tolist(),
+            "detection_name": name,
+            "detection_score": float(score[i]),
+            "attribute_name": known[i % len(known)] if known else "",
+        }
 
 
 OURS = """
@@ -251,9 +132,8 @@ def run(command: list[str]) -> tuple[str, dict[str, float]]:
 
 
 def staged(name: str, code: str, arguments: list[str]) -> dict[str, float]:
-    """The times that a program tells, its wall time and its memory."""
-    code = f"{STAGED}{code}print(json.dumps(stages))"
-    line, figures = run([sys.executable, "-c", code, *arguments])
+    """The times that a program reports, its wall time and its memory."""
+    line, figures = run([sys.executable, "-c", f"{STAGED}{code}print(json.dumps(stages))", *arguments])
     figures |= json.loads(line)
     for unit in ("s", "cpu_s"):
         figures[f"from_tables_{unit}"] = figures[f"load_{unit}"] + figures[f"evaluate_{unit}"]
@@ -261,30 +141,23 @@ def staged(name: str, code: str, arguments: list[str]) -> dict[str, float]:
     return figures
 
 
-def rounded(figures: dict[str, float]) -> dict[str, float]:
-    """To hundredths."""
-    return {key: round(value, 2) for key, value in figures.items()}
-
-
 def differences(ours: Any, theirs: Any, path: str = "") -> list[str]:
     """Where two summaries are not the same to 1e-9."""
     if isinstance(theirs, dict):
         if list(ours) != list(theirs):
             return [f"{path}: keys"]
-        return [
-            d for key in theirs if key != "eval_time" for d in differences(ours[key], theirs[key], f"{path}/{key}")
-        ]
+        keys = [key for key in theirs if key != "eval_time"]
+        return [d for key in keys for d in differences(ours[key], theirs[key], f"{path}/{key}")]
     if isinstance(theirs, float):
-        same = math.isnan(ours) if math.isnan(theirs) else abs(ours - theirs) <= 1e-9
-        return [] if same else [path]
+        return [] if np.isclose(ours, theirs, rtol=0, atol=1e-9, equal_nan=True) else [path]
     return [] if ours == theirs else [path]
 
 
 def main(args: Args) -> None:
     """Generate, run both, compare, write the figures."""
-    with tempfile.TemporaryDirectory(dir=args.folder) as folder:
+    with tempfile.TemporaryDirectory() as folder:
         root, began = Path(folder), time.perf_counter()
-        make_files(root, args)
+        _make_files(root, args.samples)
         size = (root / "results.json").stat().st_size
         print(f"generated in {time.perf_counter() - began:.0f} s, results.json of {size / 1e6:.0f} MB", flush=True)
         place = [folder, f"{folder}/official", VERSION, SPLIT]
@@ -294,28 +167,18 @@ def main(args: Args) -> None:
         flags = ["--data-root", folder, "--version", VERSION, "--split", SPLIT, "--no-report"]
         flags += ["--results", f"{folder}/results.json", "--out", f"{folder}/ours"]
         _, command = run([sys.executable, "-m", "fcos_lidar_jax", "evaluate", *flags])
-        print("command:", json.dumps(command), flush=True)
-        summary = json.loads((root / "ours" / "metrics_summary.json").read_text())
-        official = json.loads((root / "official" / "metrics_summary.json").read_text())
+        files = (root / whose / "metrics_summary.json" for whose in ("ours", "official"))
+        summary, official = (json.loads(file.read_text()) for file in files)
     unequal = differences(summary, official)
-    record = {
-        "samples": args.samples,
-        "truths_a_sample": args.truths,
-        "predictions_a_sample": args.predictions,
-        "results_mb": round(size / 1e6),
-        "ours": rounded(ours),
-        "devkit": rounded(theirs),
-        "command": rounded(command),
-        "times_as_fast": {
-            "from the tables in memory": round(theirs["from_tables_s"] / ours["from_tables_s"], 1),
-            "from the tables in memory, processor time": round(
-                theirs["from_tables_cpu_s"] / ours["from_tables_cpu_s"], 1
-            ),
-            "whole process": round(theirs["process_s"] / ours["process_s"], 1),
-        },
-        "nd_score": summary["nd_score"],
-        "numbers_that_differ_by_more_than_1e-9": unequal,
-    }
+    compared = {"from the tables in memory": "from_tables_s", "whole process": "process_s"}
+    compared["from the tables in memory, processor time"] = "from_tables_cpu_s"
+    record: dict[str, Any] = {"samples": args.samples, "truths_a_sample": TRUTHS}
+    record |= {"predictions_a_sample": PREDICTIONS, "results_mb": round(size / 1e6)}
+    for name, figures in (("ours", ours), ("devkit", theirs), ("command", command)):
+        record[name] = {key: round(value, 2) for key, value in figures.items()}
+    record["times_as_fast"] = {name: round(theirs[key] / ours[key], 1) for name, key in compared.items()}
+    record["nd_score"] = summary["nd_score"]
+    record["numbers_that_differ_by_more_than_1e-9"] = unequal
     save(record, args.out)
     if unequal:
         raise ValueError(f"not the official numbers: {', '.join(unequal)}")

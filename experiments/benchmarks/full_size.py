@@ -3,13 +3,15 @@
     python -m experiments.benchmarks.full_size --data FOLDER  # on the real keyframe of scene-0061
     python -m experiments.benchmarks.full_size  # on a simulated frame
     python -m experiments.benchmarks.full_size --peer net_jax.py  # the forward pass against another program too
+    python -m experiments.benchmarks.full_size --memory-only --out experiments/results/training_memory.json
 
-Of a peer (see ``peers.py``), ``fwd`` is timed; it is told the channels of the pyramid by the variable ``FPN``.
+Of a peer (see ``peers.py``), ``fwd`` is timed; the variable ``FPN`` gives it the channels of the pyramid.
 
 Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameters; the network is 99 % of the path.
 """
 
 import dataclasses
+import functools
 import json
 import resource
 import time
@@ -20,10 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.benchmarks.peers import Peer, turn_by_turn
-from experiments.benchmarks.stages import make_stages
-from experiments.script import real_data, run_script, save
+from experiments.benchmarks.peers import turn_by_turn
+from experiments.benchmarks.stages import Stages, training_steps
+from experiments.script import Options, find_real_data, run_measurement
 from experiments.statistics import Call, interleaved
+from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.inference import make_detect
@@ -34,60 +37,77 @@ from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
-from fcos_lidar_jax.training.objective import sample_losses
+from fcos_lidar_jax.training.objective import make_sums, sample_losses
+from fcos_lidar_jax.types import Batch
 
 
 @dataclasses.dataclass(frozen=True)
-class Args:
+class Args(Options):
     """What to measure."""
 
-    preset: Literal["nuscenes", "nuscenes_single", "quickstart"] = "nuscenes"
-    """Configuration preset."""
+    preset: Literal["nuscenes", "nuscenes_single", "quickstart"] = "nuscenes"  # Configuration preset.
     data: Path | None = None
     """Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated frame."""
-    repeats: int = 15
-    """Turns, of which the median counts."""
-    peer: Path | None = None
-    """Program to time the forward pass against, turn by turn."""
-    out: Path = Path("outputs/full_size.json")
-    """Where the figures go."""
+    repeats: int = 15  # Turns, of which the median counts.
+    memory_only: bool = False
+    """Nothing is run: only the memory of a training step is measured, without and with ``model.remat``."""
+    peer: Path | None = None  # Program to time the forward pass against, turn by turn.
+
+
+def training_memory(config: Config) -> dict[str, dict[str, float]]:
+    """GiB of a training step of one frame, without and with ``model.remat``: what is kept for the backward pass
+    (by both forms of the stem), and what the compiled program needs beside state and batch."""
+    sensor, found = load_sensor(config.sensor), {}
+    points, boxes = (1, config.max_points), (1, config.max_boxes)
+    shapes = (*points, sensor.point_columns), points, (*boxes, 9), boxes, boxes
+    types = jnp.float32, jnp.bool_, jnp.float32, jnp.int32, jnp.bool_
+    arrays: list[Any] = list(map(jax.ShapeDtypeStruct, shapes, types))
+    batch = Batch(*arrays)
+    for remat in (False, True):
+        model = dataclasses.replace(config.model, remat=remat)
+        detector = build_detector(dataclasses.replace(config, model=model), sensor)
+        optimizer, sums = make_optimizer(config.optimizer, 100), make_sums(detector)
+        state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
+
+        def pull_back(params: Any, statistics: Any, batch: Batch, sums: Any = sums) -> Any:
+            return jax.vjp(lambda params: sums(params, statistics, batch), params, has_aux=True)[1]
+
+        kept = jax.tree.leaves(jax.eval_shape(pull_back, state.params, state.batch_stats, batch))
+        step = jax.jit(make_train_step(detector, optimizer), donate_argnums=0)
+        memory: Any = step.lower(state, batch).compile().memory_analysis()
+        size = sum(leaf.size * leaf.dtype.itemsize for leaf in kept)
+        sizes = {"kept": size, "temporary": memory.temp_size_in_bytes}
+        found["remat" if remat else "plain"] = {name: round(size / 2**30, 2) for name, size in sizes.items()}
+    return found
 
 
 def measure(args: Args) -> dict[str, Any]:
     """All figures of the preset on one frame."""
     config = PRESETS[args.preset]
+    if args.memory_only:
+        return {"preset": config.name, "training_gib": training_memory(config)}
     sensor = load_sensor(config.sensor)
     layout = image_layout(sensor, config.model)
-    folder = real_data(args.data, "nuscenes_scene0061") if sensor == NUSCENES_HDL32E else None
-    frame = read_keyframe(folder, sensor) if folder else make_frame(0, sensor)
-    frame = without_close(frame, sensor)
-    batch = jax.tree.map(
-        jnp.asarray, make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes)
-    )
+    folder = find_real_data(args.data, "nuscenes_scene0061") if sensor == NUSCENES_HDL32E else None
+    frame = without_close(read_keyframe(folder, sensor) if folder else make_frame(0, sensor), sensor)
+    batch = jax.device_put(make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes))
     detector = build_detector(config, sensor)
     variables = detector.init(jax.random.key(0))
-    record: dict[str, Any] = {
-        "preset": config.name,
-        "frame": "scene-0061, real" if folder else "simulated",
-        "parameters": count_parameters(variables["params"]),
-        "locations": layout.num_locations,
-        "boxes": len(frame.boxes),
-    }
+    record: dict[str, Any] = {"preset": config.name, "frame": "scene-0061, real" if folder else "simulated"}
+    record |= {"parameters": count_parameters(variables["params"]), "locations": layout.num_locations}
+    record["boxes"] = len(frame.boxes)
     print(json.dumps(record), flush=True)
 
-    stages = make_stages(config, sensor)
+    stages = Stages(config, sensor)
     image = stages.project(batch.points[0], batch.valid[0])
     seen = stages.preprocess(image.features[None])
     after_stem = stages.stem(variables, seen)
     levels = stages.backbone(variables, after_stem)
     pyramid = stages.fpn(variables, levels)
-    outputs = jax.tree.map(lambda leaf: leaf[0], stages.heads(variables, pyramid))
-    boxes, labels, box_valid = batch.boxes[0], batch.labels[0], batch.box_valid[0]
-
-    def objective(outputs: Any, image: Any) -> Any:
-        return sample_losses(outputs, image, boxes, labels, box_valid, config=config.loss, layout=layout)
-
-    losses, assignment = (jax.jit(lambda o, i, part=part: objective(o, i)[part]) for part in (0, 1))
+    outputs = stages.outputs(variables, image)
+    truth = batch.boxes[0], batch.labels[0], batch.box_valid[0]
+    objective = functools.partial(sample_losses, config=config.loss, layout=layout)
+    losses, assignment = (jax.jit(lambda o, i, part=part: objective(o, i, *truth)[part]) for part in (0, 1))
     # A trained detector is sure of little: as many candidates as the threshold lets through is the worst case.
     eager = dataclasses.replace(outputs, logits=outputs.logits.at[:, -1].add(-4.0))
     detect = jax.jit(make_detect(detector))
@@ -107,26 +127,20 @@ def measure(args: Args) -> dict[str, Any]:
     times = interleaved(calls, args.repeats)
     record["milliseconds"] = {name: times[name]["median_ms"] for name in calls}
     if args.peer is not None:
-        with Peer(args.peer, "fwd", {"FPN": str(config.model.fpn_channels)}) as peer:
-            record["forward_against_peer_s"] = turn_by_turn(calls["forward"], peer, args.repeats)
+        peer = {"peer": args.peer, "name": "fwd", "environment": {"FPN": config.model.fpn_channels}}
+        record["forward_against_peer_s"] = turn_by_turn(calls["forward"], args.repeats, **peer)
         print(json.dumps(record["forward_against_peer_s"]), flush=True)
 
-    key = jax.random.key(0)
-    optimizer = make_optimizer(config.optimizer, 100)
-    step = jax.jit(make_train_step(detector, optimizer), donate_argnums=0)
-    state, metrics = jax.block_until_ready(step(make_state(detector, optimizer, key, variables=variables), batch))
+    step = training_steps(config, sensor, [frame])
+    jax.block_until_ready(step())
     began = time.perf_counter()
-    state, metrics = jax.block_until_ready(step(state, batch))
+    metrics = jax.block_until_ready(step())
     record["milliseconds"]["train step"] = round(1e3 * (time.perf_counter() - began), 1)
     record["train_metrics"] = {name: np.asarray(value).tolist() for name, value in metrics.items()}
     record["peak_memory_gib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
+    record["training_gib"] = training_memory(config)
     return record
 
 
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    save(measure(args), args.out)
-
-
 if __name__ == "__main__":
-    run_script(main, Args, __doc__)
+    run_measurement(measure, Args, __doc__)

@@ -2,18 +2,16 @@
 
     python -m experiments.benchmarks.mrv_figures  # the cloud of FCOS_LIDAR_REAL_DATA, else a simulated one
     python -m experiments.benchmarks.mrv_figures --data FOLDER  # FOLDER/ten_sweep_cloud/cloud.f16.bin
-    python -m experiments.benchmarks.mrv_figures --repeats 10  # a look
 
 Counts: points kept by 1, 3, 5 and 7 rounds with and without priority of the current sweep, and how many cells of
-round 1 the current sweep holds; with the points on the vehicle, and without. What each round keeps does not depend
-on how many rounds follow, and the priority decides which points are kept, not how many. Times: one sweep and ten,
-all rounds in turns, beside table 1's, as ratios to one round.
-
-Cost: half a minute on two CPU cores. Expected of the paper (section 3.2): ~240K points, ~28K of them kept by one
-round, more than 50 % by five; seven rounds hardly slower than one (0.76 and 0.66 ms on its GPU).
+round 1 the current sweep holds; with the points on the vehicle, and without. Times: one sweep and ten, all rounds
+in turns, beside table 1's, as ratios to one round. Cost: half a minute on two CPU cores. Expected of the paper
+(section 3.2): ~240K points, ~28K of them kept by one round, more than 50 % by five; seven rounds hardly slower
+than one (0.76 and 0.66 ms on its GPU).
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ import numpy as np
 from experiments.benchmarks.latency import ROWS, fused_cloud, padded
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
-from experiments.script import run_script, save
+from experiments.script import Options, run_measurement
 from experiments.statistics import interleaved
 from fcos_lidar_jax.projection import project_points, remove_close
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
@@ -33,32 +31,26 @@ ROUNDS = (1, 3, 5, 7)
 
 
 @dataclasses.dataclass(frozen=True)
-class Args:
+class Args(Options):
     """On which cloud, and how often."""
 
     data: Path | None = None
     """Folder with ten_sweep_cloud/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated cloud."""
-    repeats: int = 100
-    """Turns of the times."""
-    out: Path = Path("outputs/mrv_figures.json")
-    """Where the figures go."""
+    repeats: int = 100  # Turns of the times.
 
 
 def kept_by_rounds(
     points: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, close: str = "all"
 ) -> dict[str, Any]:
-    """Points of a fused cloud that so many rounds keep, with and without priority of the current sweep.
+    """Points of a fused cloud f32[n, c] that so many rounds keep, with and without priority of the current sweep.
 
-    Args:
-        points: f32[n, c]; a point is current if its time lag is 0.
-        sensor: the image's geometry.
-        rounds: counts of rounds.
-        close: ``"none"`` keeps the points on the vehicle, ``"all"`` drops them, judged in the current frame.
+    A point is current if its time lag is 0; ``close`` is ``"none"`` to keep the points on the vehicle, or
+    ``"all"``.
 
     Returns:
         ``in_range`` and ``in_view``, points within the sensor's limits and, of those, in its field of view; for
-        ``prioritized`` and ``not prioritized``: ``kept`` and ``percent`` (of those in range) by rounds, and
-        ``current``, how many of the kept are current.
+        ``prioritized`` and ``not prioritized``, by rounds: ``kept``, ``percent`` of those in range, ``current`` of
+        the kept.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
@@ -67,17 +59,15 @@ def kept_by_rounds(
     ({'1': 1, '2': 2}, {'1': 1, '2': 1}, {'1': 0, '2': 1})
     """
     valid = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, mode=close))
-    x, y, z = np.abs(points[:, 0]), np.abs(points[:, 1]), points[:, 2]
-    inside = (x < sensor.limit_xy_m) & (y < sensor.limit_xy_m)
-    inside &= (z > sensor.limit_z_m[0]) & (z < sensor.limit_z_m[1])
+    (low, high), z = sensor.limit_z_m, points[:, 2]
+    inside = (np.abs(points[:, :2]) < sensor.limit_xy_m).all(axis=1) & (z > low) & (z < high)
     in_range = int((inside & valid).sum())
     found: dict[str, Any] = {"in_range": in_range}
     for name, priority in (("prioritized", True), ("not prioritized", False)):
         image = project_points(points, valid, sensor, num_rounds=max(rounds), prioritize_current=priority)
         index = np.asarray(image.point_index).reshape(-1, max(rounds))
-        filled = index >= 0
-        current = filled & (points[np.maximum(index, 0), 4] == 0)
-        kept, newest = filled.sum(0).cumsum(), current.sum(0).cumsum()
+        current = (index >= 0) & (points[np.maximum(index, 0), 4] == 0)
+        kept, newest = (index >= 0).sum(0).cumsum(), current.sum(0).cumsum()
         found["in_view"] = int(valid.sum()) - int(image.num_dropped)
         found[name] = {
             "kept": {str(r): int(kept[r - 1]) for r in rounds},
@@ -92,7 +82,7 @@ def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[st
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
-    >>> mean_kept([cloud, cloud[:1]], TINY)["prioritized"]["percent"]["1"]
+    >>> mean_kept([cloud, cloud * np.float32([[1], [99]])], TINY)["prioritized"]["percent"]["1"]
     75.0
     """
     found = [kept_by_rounds(cloud, sensor) for cloud in clouds]
@@ -108,38 +98,22 @@ def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[st
 def mrv_times(
     cloud: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, repeats: int = 100
 ) -> dict[str, Any]:
-    """Times of the projection by setting and rounds, all in turns.
-
-    Args:
-        cloud: ten fused sweeps, f32[n, 5].
-        sensor: the image's geometry.
-        rounds: counts of rounds.
-        repeats: turns.
+    """Times of the projection of ten fused sweeps f32[n, 5], and of the current one, padded as by the presets.
 
     Returns:
-        ``{"single" | "multi": {rounds: {"median_ms", "p99_ms", "ratio"}}}``, the ratio to the first of ``rounds``;
-        clouds are padded as by the presets.
+        ``{"single" | "multi": {rounds: {"median_ms", "p99_ms", "ratio"}}}``, the ratio to the first of ``rounds``.
     """
     calls = {}
     for setting in ROWS:
         ready = padded(cloud, setting, sensor)
         points, valid = jax.device_put((ready.points, ready.valid))
         for r in rounds:
-            calls[setting, r] = lambda p=points, v=valid, r=r: project_points(p, v, sensor, num_rounds=r)
-    names = {f"{setting}, {r}": (setting, r) for setting, r in calls}
-    found = interleaved({name: calls[key] for name, key in names.items()}, repeats)
-    times: dict[str, Any] = {setting: {} for setting in ROWS}
-    for name, (setting, r) in names.items():
-        first = found[f"{setting}, {rounds[0]}"]["median_ms"]
-        times[setting][str(r)] = {**found[name], "ratio": round(found[name]["median_ms"] / first, 3)}
-    return times
-
-
-def paper_times() -> dict[str, dict[str, float]]:
-    """Times of table 1 by rounds, and their ratios to one round."""
-    rows = PAPER["tables"]["table1"]["rows"]
-    times = {str(r): rows[f"multi, {r}"]["time_ms"] for r in ROUNDS}
-    return {r: {"median_ms": ms, "ratio": round(ms / times["1"], 3)} for r, ms in times.items()}
+            calls[setting, r] = functools.partial(project_points, points, valid, sensor, num_rounds=r)
+    record: dict[str, Any] = {setting: {} for setting in ROWS}
+    for (setting, r), own in (found := interleaved(calls, repeats)).items():
+        ratio = round(own["median_ms"] / found[setting, rounds[0]]["median_ms"], 3)
+        record[setting][str(r)] = {**own, "ratio": ratio}
+    return record
 
 
 def as_text(record: dict[str, Any]) -> str:
@@ -172,30 +146,23 @@ def as_text(record: dict[str, Any]) -> str:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """Counts and times."""
-    sensor = NUSCENES_HDL32E
+    """Counts and times, and the times of table 1."""
+    rows, sensor = PAPER["tables"]["table1"]["rows"], NUSCENES_HDL32E
+    paper = {str(r): rows[f"multi, {r}"]["time_ms"] for r in ROUNDS}
     cloud, label = fused_cloud(args.data, sensor)
-    now = cloud[cloud[:, 4] == 0]
     return {
         "cloud": label,
         "points": len(cloud),
         "kept": {
-            "ten sweeps, with close points": kept_by_rounds(cloud, sensor, close="none"),
-            "ten sweeps, without close points": kept_by_rounds(cloud, sensor),
-            "one sweep, with close points": kept_by_rounds(now, sensor, close="none"),
-            "one sweep, without close points": kept_by_rounds(now, sensor),
+            f"{sweeps}, {which} close points": kept_by_rounds(points, sensor, close=close)
+            for sweeps, points in (("ten sweeps", cloud), ("one sweep", cloud[cloud[:, 4] == 0]))
+            for which, close in (("with", "none"), ("without", "all"))
         },
         "repeats": args.repeats,
         "times": mrv_times(cloud, sensor, repeats=args.repeats),
-        "paper_times": paper_times(),
+        "paper_times": {r: {"median_ms": ms, "ratio": round(ms / paper["1"], 3)} for r, ms in paper.items()},
     }
 
 
-def main(args: Args) -> None:
-    """Measure, print, write."""
-    record = measure(args)
-    save(record, args.out, as_text(record))
-
-
 if __name__ == "__main__":
-    run_script(main, Args, __doc__)
+    run_measurement(measure, Args, __doc__, as_text)

@@ -21,13 +21,11 @@ BLOCKS, WIDTHS, STRIDES = (4, 4, 1, 1), tuple(w // OVER for w in (64, 128, 128, 
 
 def conv(inputs: int, outputs: int, size: int, **options: int) -> nn.Conv2d:
     """Without bias, padded to keep the size."""
-    return nn.Conv2d(
-        inputs, outputs, size, padding=options.get("dilation", 1) * (size // 2), bias=False, **options
-    )
+    padding = options.get("dilation", 1) * (size // 2)
+    return nn.Conv2d(inputs, outputs, size, padding=padding, bias=False, **options)
 
 
-def normed(*args: int, **options: int) -> nn.Sequential:
-    """Convolution, batch norm, ReLU."""
+def _normed(*args: int, **options: int) -> nn.Sequential:
     layer = conv(*args, **options)
     return nn.Sequential(layer, nn.BatchNorm2d(layer.out_channels), nn.ReLU(inplace=True))
 
@@ -36,15 +34,9 @@ class Bottleneck(nn.Module):
     """1x1, 3x3, 1x1 with a shortcut."""
 
     def __init__(self, inputs: int, width: int, stride: int, project: bool) -> None:
-        """Its layers."""
         super().__init__()
-        wide = 4 * width
-        self.body = nn.Sequential(
-            normed(inputs, width, 1),
-            normed(width, width, 3, stride=stride),
-            conv(width, wide, 1),
-            nn.BatchNorm2d(wide),
-        )
+        wide, narrow = 4 * width, (_normed(inputs, width, 1), _normed(width, width, 3, stride=stride))
+        self.body = nn.Sequential(*narrow, conv(width, wide, 1), nn.BatchNorm2d(wide))
         shortcut = nn.Sequential(conv(inputs, wide, 1, stride=stride), nn.BatchNorm2d(wide))
         self.shortcut = shortcut if project else nn.Identity()
 
@@ -53,11 +45,10 @@ class Bottleneck(nn.Module):
         return F.relu(self.body(x) + self.shortcut(x))
 
 
-def tower() -> nn.Sequential:
-    """Four convolutions with group norm."""
+def _tower() -> nn.Sequential:
     layers = []
-    for i in range(4):
-        layers += [conv(FPN if i == 0 else HEAD, HEAD, 3), nn.GroupNorm(min(32, HEAD // 2), HEAD), nn.ReLU(True)]
+    for inputs in (FPN, HEAD, HEAD, HEAD):
+        layers += [conv(inputs, HEAD, 3), nn.GroupNorm(min(32, HEAD // 2), HEAD), nn.ReLU(True)]
     return nn.Sequential(*layers)
 
 
@@ -65,28 +56,25 @@ class Network(nn.Module):
     """Stem, backbone, pyramid and heads."""
 
     def __init__(self) -> None:
-        """Its layers."""
         super().__init__()
         self.branches = nn.ModuleList(
             nn.Sequential(
-                normed(45, 9 * TYPE, 3, dilation=d, groups=9),
-                normed(9 * TYPE, 9 * TYPE, 3, dilation=d, groups=9),
+                _normed(45, 9 * TYPE, 3, dilation=d, groups=9),
+                _normed(9 * TYPE, 9 * TYPE, 3, dilation=d, groups=9),
                 conv(9 * TYPE, STEM, 1),
             )
             for d in (1, 3, 6)
         )
-        self.merged, self.first = nn.Sequential(nn.BatchNorm2d(STEM), nn.ReLU(True)), normed(STEM, STEM, 7)
+        self.merged, self.first = nn.Sequential(nn.BatchNorm2d(STEM), nn.ReLU(True)), _normed(STEM, STEM, 7)
         self.stages, inputs = nn.ModuleList(), STEM
         for count, width, stride in zip(BLOCKS, WIDTHS, STRIDES, strict=True):
-            blocks = []
-            for i in range(count):
-                blocks.append(Bottleneck(inputs, width, stride if i == 0 else 1, i == 0))
-                inputs = 4 * width
-            self.stages.append(nn.Sequential(*blocks))
+            later = (Bottleneck(4 * width, width, 1, False) for _ in range(count - 1))
+            self.stages.append(nn.Sequential(Bottleneck(inputs, width, stride, True), *later))
+            inputs = 4 * width
         self.laterals = nn.ModuleList(nn.Conv2d(4 * w, FPN, 1) for w in WIDTHS)
         self.outputs = nn.ModuleList(nn.Conv2d(FPN, FPN, 3, 1 if i < 4 else 2, 1) for i in range(6))
         self.heads = nn.ModuleList(
-            nn.ModuleList([tower(), nn.Conv2d(HEAD, 11, 3, 1, 1), tower(), nn.Conv2d(HEAD, 110, 3, 1, 1)])
+            nn.ModuleList([_tower(), nn.Conv2d(HEAD, 11, 3, 1, 1), _tower(), nn.Conv2d(HEAD, 110, 3, 1, 1)])
             for _ in range(6)
         )
 
@@ -115,8 +103,7 @@ images = torch.randn(BATCH, 45, HEIGHT, WIDTH).contiguous(memory_format=torch.ch
 def train() -> None:
     """One forward and one backward pass."""
     network.zero_grad(set_to_none=True)
-    loss = torch.stack([y.abs().mean() for y in network(images)]).sum()
-    loss.backward()
+    torch.stack([y.abs().mean() for y in network(images)]).sum().backward()
 
 
 FNS = {"train": train}

@@ -1,13 +1,8 @@
 """All tables of the paper, one after the other: ``python -m experiments.paper_tables --scale smoke``.
 
-Every table prints our figure beside the paper's, writes Markdown, JSON and a picture below ``--out``, and can be
-stopped and started again. The same command in several processes shares the cells: one a GPU, by
-
-    for i in 0 1 2 3; do CUDA_VISIBLE_DEVICES=$i python -m experiments.paper_tables --scale simulated & done
-
-Times want a machine that does nothing else: once all cells are there, the command again measures them anew.
-On two CPU cores ``--scale smoke`` takes a quarter of an hour. ``--scale simulated`` has 66 cells of 1200 steps for
-all tables, ``--scale nuscenes`` needs the data.
+Every table prints our figure beside the paper's, and writes Markdown, JSON and a picture below ``--out``.
+README.md says what the scales cost, and how several processes share the cells. Times want a machine that does
+nothing else: once all cells are there, the command again measures them anew.
 """
 
 from experiments.paper_tables.table1_mrv_rounds import TABLE as TABLE_1
@@ -18,7 +13,8 @@ from experiments.paper_tables.table5_dilations import TABLE as TABLE_5
 from experiments.paper_tables.table6_untied_heads import TABLE as TABLE_6
 from experiments.paper_tables.table7_latency import TABLE as TABLE_7
 from experiments.paper_tables.table8_test_submission import TABLE as TABLE_8
-from experiments.paper_tables.tables import Args, command, run_table
+from experiments.paper_tables.tables import Args, run_table
+from experiments.script import run_script
 
 TABLES = (TABLE_1, TABLE_2, TABLE_3, TABLE_4, TABLE_5, TABLE_6, TABLE_7, TABLE_8)
 
@@ -30,4 +26,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    command(main, __doc__)
+    run_script(main, Args, __doc__)

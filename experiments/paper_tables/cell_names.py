@@ -16,6 +16,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from flax.traverse_util import flatten_dict, unflatten_dict
+
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.sensors import Sensor
@@ -34,49 +36,32 @@ _SECTIONS = {
     "optimizer": "peak_learning_rate initial_divisor final_divisor warmup_fraction b1_range b2 weight_decay "
     "max_gradient_norm batch_size accumulate ema_decay epochs",
 }
-FIELDS = frozenset(
-    f"{section}.{name}".strip(".") for section, names in _SECTIONS.items() for name in names.split()
-)
+FIELDS = frozenset(f"{part}.{name}".strip(".") for part, names in _SECTIONS.items() for name in names.split())
 """Fields that name a cell; ``copy_paste`` and ``augment`` themselves where they are null."""
 CONSTANTS = {"name": "", "model.stem.form": "split", "inference.nms_form": "rows"}
 """First fields that never changed a result."""
 ADDED: dict[str, Any] = {"classes": NUSCENES_CLASSES, "class_ranges_m": ()}
 """Later fields, and their values in older cells."""
-IGNORED = frozenset({*CONSTANTS, "model.remat"})
-"""Fields that cannot change a result."""
-SENSOR_FIELDS = [
-    "name",
-    "inclinations_rad",
-    "num_columns",
-    "origin_m",
-    "limit_xy_m",
-    "limit_z_m",
-    "intensity_scale",
-    "row_source",
-]
-"""Of a scale's description."""
+IGNORED = frozenset({*CONSTANTS, "model.remat"})  # Fields that cannot change a result.
+_SENSOR = "name inclinations_rad num_columns origin_m limit_xy_m limit_z_m intensity_scale row_source"
+SENSOR_FIELDS = tuple(_SENSOR.split())  # Of a scale's description.
 
 
 def cell_name(config: Config, trained_on: Mapping[str, Any], seed: int) -> str:
-    """The name of a cell.
-
-    Args:
-        config: that is trained.
-        trained_on: the scale's description: on what and how long.
-        seed: of the training.
+    """The name of a cell: configuration, the scale's description of data and length of the training, and seed.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> other = dataclasses.replace(QUICKSTART, name="another name")
     >>> cell_name(QUICKSTART, {}, 0) == cell_name(other, {}, 0) != cell_name(QUICKSTART, {}, 1)
     True
     """
-    today = _flat(config_to_json(config))
+    today = flatten_dict(config_to_json(config), sep=".")
     named = {field: value for field, value in today.items() if field in FIELDS}
     named |= {**CONSTANTS, "model.num_classes": len(config.classes)}
     if config.copy_paste is not None:
         named["copy_paste.targets"] = config.paste_targets
     named |= {field: today[field] for field, before in ADDED.items() if today[field] != before}
-    text = json.dumps([_nested(named), trained_on, seed], sort_keys=True)
+    text = json.dumps([unflatten_dict(named, sep="."), trained_on, seed], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
@@ -87,34 +72,14 @@ def describe_sensor(sensor: Sensor) -> dict[str, Any]:
     return {name: getattr(sensor, name) for name in (*SENSOR_FIELDS, *changed)}
 
 
-def config_of_cell(record: Mapping[str, Any]) -> Config:
+def config_of_cell(record: dict[str, Any]) -> Config:
     """The configuration in a cell's file, of whatever age.
 
     Raises:
         ValueError: naming the field, what was found and what was expected.
     """
-    today = _flat(config_to_json(Config()))
+    today = flatten_dict(config_to_json(Config()), sep=".")
     gone = {*CONSTANTS, "model.num_classes"} - today.keys()
-    kept = {field: value for field, value in _flat(record).items() if field not in gone}
+    kept = {field: value for field, value in flatten_dict(record, sep=".").items() if field not in gone}
     later = {field: value for field, value in today.items() if field in IGNORED} | ADDED
-    return config_from_json(_nested(later | kept), "cell")
-
-
-def _flat(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """``{"a": {"b": 1}}`` as ``{"a.b": 1}``."""
-    found: dict[str, Any] = {}
-    for name, value in record.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
-
-
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of :func:`_flat`."""
-    record: dict[str, Any] = {}
-    for path, value in flat.items():
-        *sections, name = path.split(".")
-        part = record
-        for section in sections:
-            part = part.setdefault(section, {})
-        part[name] = value
-    return record
+    return config_from_json(unflatten_dict(later | kept, sep="."), "cell")

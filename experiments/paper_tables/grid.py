@@ -6,11 +6,9 @@ Processes that share the folders, one a GPU or a core, share the cells. The code
 it stands in the file.
 """
 
-import dataclasses
-import functools
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +19,15 @@ from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
 from fcos_lidar_jax.training import NonFiniteLossError
 
-_PATIENCE_S = 5.0
-"""Between looks at what other processes train."""
+_PATIENCE_S = 5.0  # Between looks at what other processes train.
 
 
 def run_cells(
     cells: Sequence[tuple[Config, int]], scale: Scale, *, results: Path, runs: Path
 ) -> list[dict[str, Any]]:
-    """The records of configurations with seeds, each from its file or by training it.
+    """The records of configurations with seeds, in their order, each from its file or by training it.
 
     A cell that another process trains is left to it and looked at again when the others are done.
-
-    Args:
-        cells: configuration and seed of each.
-        scale: where and how long.
-        results: folder of the cells' files.
-        runs: folder of the training runs.
     """
     found: dict[int, dict[str, Any]] = {}
     while len(found) < len(cells):
@@ -51,20 +42,10 @@ def run_cells(
 
 
 def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Path) -> dict[str, Any] | None:
-    """The record of a cell, from its file or by training it; None while another process trains it.
+    """What a cell's file holds, trained if need be, and its ``name``; None while another process trains it.
 
     A run whose loss stopped being finite is a result too: ``diverged`` in place of ``scores``, and what was said.
     ``git`` names the revisions of all processes that took part, in their order.
-
-    Args:
-        config: of the row.
-        scale: where and how long.
-        seed: of weights, order and augmentation.
-        results: folder of the cells' files.
-        runs: folder of the training runs.
-
-    Returns:
-        what its file holds, and its ``name``.
     """
     name = cell_name(config, scale.describe(), seed)
     file = results / f"{name}.json"
@@ -78,48 +59,17 @@ def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Pa
             outcome: dict[str, Any] = {"scores": scale.score(config, seed, runs / name)}
         except NonFiniteLossError as error:
             outcome = {"diverged": str(error)}
-        record = {
-            **outcome,
-            "seed": seed,
-            "scale": scale.describe(),
-            "config": config_to_json(config),
-            **hardware(),
-            "git": ", then ".join(revisions),
-        }
+        record = {**outcome, "seed": seed, "scale": scale.describe(), "config": config_to_json(config)}
+        record |= {**hardware(), "git": ", then ".join(revisions)}
         text = json.dumps(record, indent=1)
         atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
         return {"name": name, **json.loads(text)}
 
 
 def _join(folder: Path, revision: str) -> list[str]:
-    """Note in a run's folder who works on it now; all who did."""
+    """Record in a run's folder the revision that works on it now; all that did."""
     file = folder / "revisions.txt"
     before = file.read_text(encoding="utf-8").split() if file.is_file() else []
     revisions = before if before[-1:] == [revision] else [*before, revision]
     atomic_write(file, lambda path: path.write_text("\n".join(revisions), encoding="utf-8"))
     return revisions
-
-
-Change = Callable[[Config], Config]
-"""A row of a table as a change of the base."""
-
-
-def change(**fields: Any) -> Change:
-    """Replace fields of a configuration; dots are double underscores.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> change(projection__num_rounds=3, num_sweeps=1)(QUICKSTART).projection.num_rounds
-    3
-    """
-
-    def apply(config: Config) -> Config:
-        return functools.reduce(lambda c, item: _replaced(c, item[0].split("__"), item[1]), fields.items(), config)
-
-    return apply
-
-
-def _replaced(config: Any, path: list[str], value: Any) -> Any:
-    first, *rest = path
-    return dataclasses.replace(
-        config, **{first: _replaced(getattr(config, first), rest, value) if rest else value}
-    )

@@ -10,12 +10,14 @@
 
 import dataclasses
 import functools
+import operator
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
+from experiments.changes import change
 from experiments.paper_tables.cell_names import describe_sensor
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
@@ -29,12 +31,8 @@ from fcos_lidar_jax.evaluation.results import read_results, result_entries, writ
 from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.files import checksum, file_lock
 from fcos_lidar_jax.inference import TrainedDetector
-from fcos_lidar_jax.input_pipeline.database import (
-    GroundTruthDatabase,
-    objects_folder,
-    open_database,
-    prepare_database,
-)
+from fcos_lidar_jax.input_pipeline import database
+from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import SHORT_RANGE, TINY, Sensor
@@ -42,34 +40,7 @@ from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.lidar import SWEEP_S
 from fcos_lidar_jax.trainer.results import write_predictions
 
-_BONNET_M = 2.1
-"""Nearer points are on the ego vehicle's bonnet, which would leave a trail when sweeps are fused."""
-
-
-class Scale(Protocol):
-    """Where and how long cells are trained."""
-
-    @property
-    def name(self) -> str:
-        """As on the command line."""
-        ...
-
-    @property
-    def base(self) -> Config:
-        """What the tables' rows are changes of."""
-        ...
-
-    def check(self, config: Config) -> None:
-        """Refuse a row that cannot be trained here, or that would change nothing: ValueError."""
-        ...
-
-    def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """What of the scale decides a cell's result, as JSON."""
-        ...
+_BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, which would leave a trail when sweeps are fused.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,13 +50,11 @@ class NewestSweeps(FramesOf):
     num_sweeps: int
 
     def frame(self, index: int) -> Frame:
-        """One frame without the older sweeps."""
         frame = self.frames.frame(index)
         newest = frame.points[:, 4] < (self.num_sweeps - 0.5) * SWEEP_S
         return dataclasses.replace(frame, points=frame.points[newest])
 
     def fingerprint(self) -> str:
-        """Checksum of the frames' own and of the number of sweeps."""
         return checksum(repr((self.frames.fingerprint(), self.num_sweeps)).encode())
 
 
@@ -94,17 +63,15 @@ class Simulated:
     """Simulated streets, ten sweeps a frame, the same frames for every cell."""
 
     name: str
-    base: Config
+    base: Config  # What the rows of the tables are changes of.
     sensor: Sensor
     train_frames: int
     test_frames: int
-    cache: Path
-    """Frames are simulated once and kept here."""
-    fast_traffic: bool = True
-    """The ego vehicle drives at 10 to 20 m/s, and nearly all objects that can move do."""
+    cache: Path  # Frames are simulated once and kept here.
+    fast_traffic: bool = True  # The ego vehicle drives at 10 to 20 m/s, and nearly all objects that can move do.
 
     def describe(self) -> dict[str, Any]:
-        """Streets and sensor."""
+        """What of the scale decides a cell's result, as JSON."""
         return {
             "scale": self.name,
             "sensor": describe_sensor(self.sensor),
@@ -116,24 +83,16 @@ class Simulated:
         }
 
     def check(self, config: Config) -> None:
-        """The streets' sensor, sweeps and close points are those of the base."""
-        if not 1 <= config.num_sweeps <= self.base.num_sweeps:
-            raise ValueError(
-                f"num_sweeps: got {config.num_sweeps}, expected 1 to {self.base.num_sweeps} at scale {self.name}"
-            )
-        ours, base = (
-            {
-                "sensor": c.sensor,
-                "projection.remove_close": c.projection.remove_close,
-                "projection.close_m": c.projection.close_m,
-            }
-            for c in (config, self.base)
-        )
-        for field, value in ours.items():
-            if value != base[field]:
-                raise ValueError(f"{field}: got {value!r}, expected {base[field]!r} at scale {self.name}")
+        """Refuse a row that cannot be trained here, or that would change nothing: ValueError."""
+        sweeps = self.base.num_sweeps
+        if not 1 <= config.num_sweeps <= sweeps:
+            raise ValueError(f"num_sweeps: got {config.num_sweeps}, expected 1 to {sweeps} at scale {self.name}")
+        for field in ("sensor", "projection.remove_close", "projection.close_m"):
+            value, base = (operator.attrgetter(field)(c) for c in (config, self.base))
+            if value != base:
+                raise ValueError(f"{field}: got {value!r}, expected {base!r} at scale {self.name}")
 
-    def frames(self, split: str, num_sweeps: int) -> "NewestSweeps":
+    def frames(self, split: str, num_sweeps: int) -> NewestSweeps:
         """Training or test streets; the same, and the same sweeps, however many of them are fused."""
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, UNSEEN_SEED)}[split]
         sweeps = self.base.num_sweeps
@@ -146,21 +105,19 @@ class Simulated:
         calm = "" if self.fast_traffic else "_calm"
         return self.cache / f"{self.sensor.name}_{what}_{num_sweeps}_sweeps{calm}"
 
-    def clouds(self, num_sweeps: int, number: int = 20) -> list[np.ndarray]:
-        """The first test clouds, f32[n, 5], for figures that need no training."""
+    def clouds(self, num_sweeps: int) -> list[np.ndarray]:
+        """The first twenty test clouds, f32[n, 5], for figures that need no training."""
         frames = self.frames("test", num_sweeps)
-        return [frames.frame(i).points for i in range(min(number, len(frames)))]
+        return [frames.frame(i).points for i in range(min(20, len(frames)))]
 
     def objects(self, num_sweeps: int) -> GroundTruthDatabase:
-        """For copy-paste."""
-        frames = self.frames("train", num_sweeps)
         folder = self._folder(f"objects_{self.train_frames}", num_sweeps)
         # Two builders would sweep away each other's files.
         with file_lock(folder.with_suffix(".lock"), wait=True):
-            return prepare_database(frames, folder)
+            return database.prepare_database(self.frames("train", num_sweeps), folder)
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train on the training streets, evaluate on the test streets."""
+        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``."""
         frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
         steps = config.optimizer.epochs * steps_per_epoch(frames, config)
@@ -172,37 +129,26 @@ class Simulated:
 class Layout:
     """Options of --scale nuscenes."""
 
-    data_root: Path | None = None
-    """Folder of a data set in the nuScenes layout that fcos-lidar prepare has seen."""
-    version: str = "v1.0-trainval"
-    """Folder of its tables."""
+    data_root: Path | None = None  # Folder of a data set in the nuScenes layout that fcos-lidar prepare has seen.
+    version: str = "v1.0-trainval"  # Folder of its tables.
     index: Path | None = None
     """Where fcos-lidar prepare has put the index; default: DATA_ROOT/.fcos_lidar/VERSION."""
-    splits: Path | None = None
-    """File {name: [scene, ...]} with own splits."""
-    train_split: str | None = None
-    """Default: mini_train for a version that ends in mini, else train."""
-    val_split: str | None = None
-    """Default: mini_val or val."""
+    splits: Path | None = None  # File {name: [scene, ...]} with own splits.
+    train_split: str | None = None  # Default: mini_train for a version that ends in mini, else train.
+    val_split: str | None = None  # Default: mini_val or val.
     test_version: str | None = None
     """Version whose split test table 8 writes a results file for, such as v1.0-test."""
-    allow_missing_sweeps: bool = False
-    """Go on with fewer sweeps where files of older sweeps are missing."""
-    steps: int | None = None
-    """Updates of every cell, instead of the preset's epochs."""
-    accumulate: int = 1
-    """Parts that a batch is cut into where it does not fit; changes batch norm alone."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the convolutions behind the first."""
-    threads: int = 2
-    """That prepare batches."""
-    workers: int = 0
-    """Processes that prepare batches, beside the threads."""
+    allow_missing_sweeps: bool = False  # Go on with fewer sweeps where files of older sweeps are missing.
+    steps: int | None = None  # Updates of every cell, instead of the preset's epochs.
+    accumulate: int = 1  # Parts that a batch is cut into where it does not fit; changes batch norm alone.
+    precision: Literal["float32", "bfloat16"] = "float32"  # Of the convolutions behind the first.
+    threads: int = 2  # That prepare batches.
+    workers: int = 0  # Processes that prepare batches, beside the threads.
 
 
 @dataclasses.dataclass(frozen=True)
 class NuScenesLayout:
-    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
+    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen; methods as of :class:`Simulated`.
 
     Raises:
         ValueError: at construction, where data, index or splits are not there.
@@ -212,18 +158,18 @@ class NuScenesLayout:
     name: str = "nuscenes"
 
     def __post_init__(self) -> None:
-        """Look before anything is trained."""
         if self.layout.data_root is None:
             raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")
         if self.layout.test_version is not None:
-            tables = self.layout.data_root / self.layout.test_version
+            tables = self.data_root / self.layout.test_version
             if not tables.is_dir():
                 raise ValueError(f"--test-version: {tables}: no such folder, expected the version's tables")
+        if (self.data_root / self.layout.version).is_dir() and not has_index(self.index):
+            raise ValueError(f"{self.index}: no index here, expected one: run fcos-lidar prepare")
         self.describe()
 
     @property
     def data_root(self) -> Path:
-        """Of the data set."""
         assert self.layout.data_root is not None
         return self.layout.data_root
 
@@ -236,12 +182,8 @@ class NuScenesLayout:
 
     @property
     def base(self) -> Config:
-        """The paper's detector."""
-        return dataclasses.replace(
-            NUSCENES,
-            model=dataclasses.replace(NUSCENES.model, precision=self.layout.precision),
-            optimizer=dataclasses.replace(NUSCENES.optimizer, accumulate=self.layout.accumulate),
-        )
+        layout = self.layout
+        return change(model__precision=layout.precision, optimizer__accumulate=layout.accumulate)(NUSCENES)
 
     @property
     def index(self) -> Path:
@@ -250,28 +192,19 @@ class NuScenesLayout:
 
     @functools.cache  # noqa: B019 - a handful of scales a process
     def _data(self, version: str) -> NuScenes:
-        layout = self.layout
-        index = self.index if version == layout.version else None
-        return NuScenes(self.data_root, version, index=index, allow_missing_sweeps=layout.allow_missing_sweeps)
+        index = self.index if version == self.layout.version else None
+        missing = self.layout.allow_missing_sweeps
+        return NuScenes(self.data_root, version, index=index, allow_missing_sweeps=missing)
 
     def frames(self, split: str, config: Config, version: str | None = None) -> NuScenesFrames:
-        """Keyframes of a split, fused as a configuration wants it.
-
-        Args:
-            split: official or own one.
-            config: of the detector.
-            version: default: the layout's.
-        """
+        """Keyframes of a split, of the layout's version or another, fused as a configuration wants it."""
         data = self._data(version or self.layout.version)
         tokens, projection = data.split(split, file=self.layout.splits), config.projection
         return NuScenesFrames(data, tuple(tokens), config.num_sweeps, projection.remove_close, projection.close_m)
 
     @functools.cache  # noqa: B019
     def describe(self) -> dict[str, Any]:
-        """Data, splits and steps."""
         layout = self.layout
-        if (self.data_root / layout.version).is_dir() and not has_index(self.index):
-            raise ValueError(f"{self.index}: no index here, expected one: run fcos-lidar prepare")
         return {
             "scale": self.name,
             "version": layout.version,
@@ -282,59 +215,42 @@ class NuScenesLayout:
             **({"allow_missing_sweeps": True} if layout.allow_missing_sweeps else {}),
         }
 
-    def check(self, config: Config) -> None:
-        """All can be trained here."""
-
     def objects(self, frames: NuScenesFrames) -> GroundTruthDatabase:
-        """What fcos-lidar prepare has cut from the frames, or from more sweeps of them.
-
-        Args:
-            frames: of the training split.
+        """What fcos-lidar prepare has cut from the training frames, or from more sweeps of them.
 
         Raises:
             ValueError: there is no such database.
         """
-        folder = objects_folder(self.index, self.splits[0])
+        folder = database.objects_folder(self.index, self.splits[0])
         if not folder.is_dir():
             raise ValueError(f"{folder}: no objects here, expected some: run fcos-lidar prepare")
-        database, prepared = open_database(folder), NuScenesFrames(frames.nuscenes, frames.tokens)
+        objects, prepared = database.open_database(folder), NuScenesFrames(frames.nuscenes, frames.tokens)
         sweeps = range(frames.num_sweeps, NUSCENES.num_sweeps + 1)
         known = [dataclasses.replace(prepared, num_sweeps=n).fingerprint() for n in sweeps]
-        if database.manifest.source not in known:
-            raise ValueError(
-                f"{folder}: cut from other frames than {self.splits[0]}: run fcos-lidar prepare again"
-            )
-        return database
+        if objects.manifest.source not in known:
+            origin = f"cut from other frames than {self.splits[0]}"
+            raise ValueError(f"{folder}: {origin}: run fcos-lidar prepare again")
+        return objects
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """Train and evaluate as the benchmark does; the results file stays in the folder."""
         layout, (train_split, val_split) = self.layout, self.splits
         frames, tests = self.frames(train_split, config), self.frames(val_split, config)
-        detector = trained(
-            folder,
-            config,
-            frames,
-            steps=layout.steps or config.optimizer.epochs * steps_per_epoch(frames, config),
-            seed=seed,
-            objects=None if config.copy_paste is None else self.objects(frames),
-            devices=jax.devices(),
-            threads=layout.threads,
-            workers=layout.workers,
-        )
+        steps = layout.steps or config.optimizer.epochs * steps_per_epoch(frames, config)
+        objects = None if config.copy_paste is None else self.objects(frames)
+        options = {"devices": jax.devices(), "threads": layout.threads, "workers": layout.workers}
+        detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
         file = folder / f"results_{val_split}.json"
         write_submission(detector, tests, file)
         truth = split_truth(tests.nuscenes, list(tests.tokens))
         return _scores(evaluate(read_results(file, truth.tokens).boxes, truth).summary)
 
 
-def write_submission(detector: TrainedDetector, frames: NuScenesFrames, file: Path) -> None:
-    """Detect in keyframes and write the benchmark's results file; an interrupted call resumes.
+Scale = Simulated | NuScenesLayout  # Where and how long cells are trained.
 
-    Args:
-        detector: of the benchmark's classes.
-        frames: to detect in.
-        file: to write.
-    """
+
+def write_submission(detector: TrainedDetector, frames: NuScenesFrames, file: Path) -> None:
+    """Detect in keyframes and write the benchmark's results file; an interrupted call resumes."""
     data, tokens = frames.nuscenes, frames.tokens
     file.parent.mkdir(parents=True, exist_ok=True)
 
@@ -349,8 +265,7 @@ def _scores(summary: dict[str, Any]) -> dict[str, Any]:
     return {"mAP": round(summary["mean_ap"], 5), "NDS": round(summary["nd_score"], 5), "AP": aps}
 
 
-_TEN_SWEEPS = dataclasses.replace(
-    QUICKSTART,
+_TEN_SWEEPS = change(
     name="small",
     num_sweeps=10,
     max_points=40_960,
@@ -358,27 +273,20 @@ _TEN_SWEEPS = dataclasses.replace(
     class_balanced=False,
     augment=None,
     projection=dataclasses.replace(NUSCENES.projection, remove_close="all"),
-    model=dataclasses.replace(
-        QUICKSTART.model,
-        # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
-        stem=StemConfig(channels_per_type=5, out_channels=16),
-    ),
-    optimizer=dataclasses.replace(QUICKSTART.optimizer, epochs=2),
+    # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
+    model__stem=StemConfig(channels_per_type=5, out_channels=16),
+    optimizer__epochs=2,
+)(QUICKSTART)
+small_network = change(
+    model__backbone_blocks=(1, 1, 1, 1),
+    model__backbone_widths=(8, 8, 8, 8),
+    model__fpn_channels=8,
+    model__head_channels=8,
+    model__head_convs=1,
 )
-_TOY = dataclasses.replace(
-    _TEN_SWEEPS,
-    name="toy",
-    max_points=10_240,
-    model=dataclasses.replace(
-        _TEN_SWEEPS.model,
-        stem=StemConfig(channels_per_type=5, out_channels=8),
-        backbone_blocks=(1, 1, 1, 1),
-        backbone_widths=(8, 8, 8, 8),
-        fpn_channels=8,
-        head_channels=8,
-        head_convs=1,
-    ),
-    inference=InferenceConfig(max_detections=50, candidates_per_level=100),
+_OF_TOY = InferenceConfig(max_detections=50, candidates_per_level=100)
+_TOY = change(name="toy", max_points=10_240, model__stem__out_channels=8, inference=_OF_TOY)(
+    small_network(_TEN_SWEEPS)
 )
 
 

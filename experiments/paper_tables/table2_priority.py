@@ -1,8 +1,6 @@
 """Table 2: do the points of the current sweep win every collision?
 
-    python -m experiments.paper_tables.table2_priority  # smoke: minutes, a toy
     python -m experiments.paper_tables.table2_priority --scale simulated  # 2 cells, three seeds
-    python -m experiments.paper_tables.table2_priority --scale nuscenes --data-root DIR
 
 How many points of the current sweep are kept, of the scale's simulated clouds, needs no training:
 ``--only-figures``. Expected of the paper: without priority ten sweeps lose 2.8 points of mAP.
@@ -11,8 +9,9 @@ How many points of the current sweep are kept, of the scale's simulated clouds, 
 from typing import Any
 
 from experiments.benchmarks import mrv_figures
-from experiments.paper_tables.grid import change
-from experiments.paper_tables.tables import Args, Row, Table, command, run_table, simulated_scale
+from experiments.changes import change
+from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
+from experiments.script import run_script
 
 
 def figures(args: Args) -> dict[str, Any]:
@@ -22,12 +21,8 @@ def figures(args: Args) -> dict[str, Any]:
         return {}
     mean = mrv_figures.mean_kept(scale.clouds(scale.base.num_sweeps), scale.sensor)
     rows = {"without priority": "not prioritized", "with priority": "prioritized"}
-    rounds = str(scale.base.projection.num_rounds)
-    return {
-        "columns": {
-            row: {"current points kept, this scale": mean[name]["current"][rounds]} for row, name in rows.items()
-        }
-    }
+    current = {row: mean[name]["current"][str(scale.base.projection.num_rounds)] for row, name in rows.items()}
+    return {"columns": {row: {"current points kept, this scale": number} for row, number in current.items()}}
 
 
 TABLE = Table(
@@ -41,6 +36,5 @@ TABLE = Table(
     figures=figures,
 )
 
-
 if __name__ == "__main__":
-    command(lambda args: run_table(TABLE, args), __doc__)
+    run_script(lambda args: run_table(TABLE, args), Args, __doc__)

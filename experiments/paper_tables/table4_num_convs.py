@@ -1,8 +1,6 @@
 """Table 4: grouped convolutions a branch.
 
-    python -m experiments.paper_tables.table4_num_convs  # smoke: minutes, a toy
     python -m experiments.paper_tables.table4_num_convs --scale simulated  # 3 cells, three seeds
-    python -m experiments.paper_tables.table4_num_convs --scale nuscenes --data-root DIR
 
 The latency of the module by variant needs no training: ``--only-figures``. Expected of the paper: two beat one by
 1.3 points of mAP, a third does not help.
@@ -10,8 +8,9 @@ The latency of the module by variant needs no training: ``--only-figures``. Expe
 
 from functools import partial
 
-from experiments.paper_tables.grid import change
-from experiments.paper_tables.tables import Row, Table, command, run_table, stem_times
+from experiments.changes import change
+from experiments.paper_tables.tables import Args, Row, Table, run_table, stem_times
+from experiments.script import run_script
 
 TABLE = Table(
     "table4",
@@ -21,6 +20,5 @@ TABLE = Table(
     figures=partial(stem_times, {"1": "1 convolution", "2": "9 types", "3": "3 convolutions"}),
 )
 
-
 if __name__ == "__main__":
-    command(lambda args: run_table(TABLE, args), __doc__)
+    run_script(lambda args: run_table(TABLE, args), Args, __doc__)

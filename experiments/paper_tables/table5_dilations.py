@@ -1,14 +1,13 @@
 """Table 5: dilation rates of the parallel branches.
 
-    python -m experiments.paper_tables.table5_dilations  # smoke: minutes, a toy
     python -m experiments.paper_tables.table5_dilations --scale simulated  # 4 cells, three seeds
-    python -m experiments.paper_tables.table5_dilations --scale nuscenes --data-root DIR
 
 Expected of the paper: (1, 3, 6) beats (1,) by 1.2 points of mAP, and three equal branches by 0.45.
 """
 
-from experiments.paper_tables.grid import change
-from experiments.paper_tables.tables import Row, Table, command, run_table
+from experiments.changes import change
+from experiments.paper_tables.tables import Args, Row, Table, run_table
+from experiments.script import run_script
 
 TABLE = Table(
     "table5",
@@ -20,6 +19,5 @@ TABLE = Table(
     reference="(1,)",
 )
 
-
 if __name__ == "__main__":
-    command(lambda args: run_table(TABLE, args), __doc__)
+    run_script(lambda args: run_table(TABLE, args), Args, __doc__)

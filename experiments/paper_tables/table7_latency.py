@@ -1,8 +1,6 @@
 """Table 7: where the time goes from raw sweeps to boxes, one sweep and ten, batch 1.
 
-    python -m experiments.paper_tables.table7_latency  # smoke: the quickstart preset, a few turns
     python -m experiments.paper_tables.table7_latency --scale simulated  # the paper's preset; 2 cells, three seeds
-    python -m experiments.paper_tables.table7_latency --scale nuscenes --data-root DIR
 
 The times need no training (``--only-figures``) and are those of ``latency.py``, which says how the stages are cut.
 The paper's are of a 3090Ti: on other hardware only the shares compare. Expected of the paper: the projection is a
@@ -12,21 +10,16 @@ fiftieth of the time, and ten sweeps cost no more than one.
 from typing import Any
 
 from experiments.benchmarks import latency
-from experiments.paper_tables.grid import change
-from experiments.paper_tables.tables import Args, Row, Table, command, run_table
+from experiments.changes import change
+from experiments.paper_tables.tables import Args, Row, Table, run_table
+from experiments.script import run_script
 
 
 def figures(args: Args) -> dict[str, Any]:
     """Times of the stages."""
-    small = args.scale == "smoke"
-    measured = latency.measure(
-        latency.Args(
-            preset="quickstart" if small else "nuscenes",
-            precision=args.nuscenes.precision,
-            data=args.data,
-            repeats=3 if small else 15,
-        )
-    )
+    preset, repeats = ("quickstart", 3) if args.scale == "smoke" else ("nuscenes", 15)
+    options = latency.Args(preset=preset, precision=args.nuscenes.precision, data=args.data, repeats=repeats)
+    measured = latency.measure(options)
     columns = {
         f"{setting}-frame": {f"{stage}, ms": times["median_ms"] for stage, times in of_setting.items()}
         for setting, of_setting in measured["times"].items()
@@ -45,6 +38,5 @@ TABLE = Table(
     figures=figures,
 )
 
-
 if __name__ == "__main__":
-    command(lambda args: run_table(TABLE, args), __doc__)
+    run_script(lambda args: run_table(TABLE, args), Args, __doc__)

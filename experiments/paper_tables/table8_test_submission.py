@@ -9,16 +9,16 @@ simulated one otherwise. The other systems' rows are the paper's quotations. Exp
 about 0.6 points of mAP, on the validation set; fade about 2, of which set it does not say.
 """
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
+from experiments.changes import change
 from experiments.paper import PAPER
 from experiments.paper_tables.cell_names import cell_name
-from experiments.paper_tables.grid import change
 from experiments.paper_tables.scales import NuScenesLayout, write_submission
-from experiments.paper_tables.tables import Args, Row, Table, command, make_scale, run_table
+from experiments.paper_tables.tables import Args, Row, Table, make_scale, run_table
+from experiments.script import run_script
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -29,19 +29,17 @@ from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.trainer.run import RUN_SPEC
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints
 
-_PART_FADED = 8
-"""The paper's five epochs of forty."""
+_PART_FADED = 8  # The paper's five epochs of forty.
 
 
 def pasting(config: Config) -> Config:
     """With copy-paste, where the scale does without."""
-    return config if config.copy_paste else dataclasses.replace(config, copy_paste=QUICKSTART.copy_paste)
+    return config if config.copy_paste else change(copy_paste=QUICKSTART.copy_paste)(config)
 
 
 def faded(config: Config) -> Config:
     """Without copy-paste in the last eighth of the epochs, at least one."""
-    epochs = max(config.optimizer.epochs // _PART_FADED, 1)
-    return dataclasses.replace(pasting(config), fade_epochs=epochs)
+    return change(fade_epochs=max(config.optimizer.epochs // _PART_FADED, 1))(pasting(config))
 
 
 def wide(config: Config) -> Config:
@@ -57,8 +55,7 @@ def finished(run: Path) -> bool:
 
 def submission(args: Args) -> list[str]:
     """Write the results file of the trained c128 with fade, and say where."""
-    scale = make_scale(args)
-    seed = args.seeds[0] if args.seeds else 0
+    scale, seed = make_scale(args), args.seeds[0] if args.seeds else 0
     config = wide(faded(scale.base))
     name = cell_name(config, scale.describe(), seed)
     cell = json.loads((args.out / args.scale / "cells" / f"{name}.json").read_text(encoding="utf-8"))
@@ -84,12 +81,8 @@ def submission(args: Args) -> list[str]:
 def figures(args: Args) -> dict[str, Any]:
     """The paper's rows, and the results file."""
     quoted = PAPER["tables"]["table8"]["rows"]
-    lines = [
-        "Test set, paper (quoted there from the systems' own papers):",
-        "",
-        "| method | mAP | NDS |",
-        "|---|---|---|",
-    ]
+    lines = ["Test set, paper (quoted there from the systems' own papers):", ""]
+    lines += ["| method | mAP | NDS |", "|---|---|---|"]
     lines += [f"| {name} | {row['mAP']} | {row['NDS']} |" for name, row in quoted.items()]
     return {"lines": [*lines, "", *([] if args.only_figures else submission(args))]}
 
@@ -107,6 +100,5 @@ TABLE = Table(
     figures=figures,
 )
 
-
 if __name__ == "__main__":
-    command(lambda args: run_table(TABLE, args), __doc__)
+    run_script(lambda args: run_table(TABLE, args), Args, __doc__)

@@ -1,8 +1,8 @@
 """What all tables of the paper share: rows, the record, Markdown and the picture."""
 
 import dataclasses
+import functools
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -11,12 +11,12 @@ import tyro
 
 from experiments.benchmarks import module_latency
 from experiments.benchmarks.latency import real_cloud
+from experiments.changes import Change
 from experiments.hardware import hardware
 from experiments.paper import PAPER
-from experiments.paper_tables.grid import Change, run_cells
+from experiments.paper_tables.grid import run_cells
 from experiments.paper_tables.scales import Layout, NuScenesLayout, Scale, Simulated, calm, simulated, smoke
 from experiments.statistics import interval
-from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
 
@@ -29,17 +29,13 @@ class Args:
 
     scale: Literal["smoke", "simulated", "calm", "nuscenes"] = "smoke"
     """Minutes on a toy; the quickstart on simulated streets in fast or in light traffic; the real thing."""
-    seeds: tuple[int, ...] = ()
-    """Of every cell; default: 0 for smoke, else 0, 1 and 2."""
-    out: Path = Path("outputs/tables")
-    """Folder of tables and cells; a folder of the scale's name below it."""
-    runs: Path = Path("outputs/runs")
-    """Folder of the training runs and of the simulated frames."""
+    seeds: tuple[int, ...] = ()  # Of every cell; default: 0 for smoke, else 0, 1 and 2.
+    out: Path = Path("outputs/tables")  # Folder of tables and cells; a folder of the scale's name below it.
+    runs: Path = Path("outputs/runs")  # Folder of the training runs and of the simulated frames.
     data: Path | None = None
     """Folder with ten_sweep_cloud/ for the figures of a real cloud (not those of table 7 at scale smoke, which has
     another sensor); default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated one."""
-    only_figures: bool = False
-    """What needs no training alone, in files of its own."""
+    only_figures: bool = False  # What needs no training alone, in files of its own.
     nuscenes: tyro.conf.OmitArgPrefixes[Layout] = dataclasses.field(default_factory=Layout)
     """Data set and training of --scale nuscenes."""
 
@@ -48,47 +44,42 @@ class Args:
 class Row:
     """A row of a table."""
 
-    label: str
-    """As it is printed."""
-    change: Change
-    """What it changes in the scale's base."""
-    paper: str | None = None
-    """Key of the paper's row."""
-    gain: str | None = None
-    """Key among the paper's texts of a gain in mAP that it states without a row."""
-    reference: str | None = None
-    """Label of the row that its differences are taken from; default: the table's."""
+    label: str  # As it is printed.
+    change: Change  # What it changes in the scale's base.
+    paper: str | None = None  # Key of the paper's row.
+    gain: str | None = None  # Key among the paper's texts of a gain in mAP that it states without a row.
+    reference: str | None = None  # Label of the row that its differences are taken from; default: the table's.
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
     """A table of the paper, as an experiment."""
 
-    name: str
-    """Key in ``paper.json``, if it is one of the paper's."""
-    title: str
-    """What it asks."""
-    rows: tuple[Row, ...]
-    """In the paper's order."""
-    reference: str
-    """Label of the row that differences are taken from, unless a row names its own."""
+    name: str  # Key in ``paper.json``, if it is one of the paper's.
+    title: str  # What it asks.
+    rows: tuple[Row, ...]  # In the paper's order.
+    reference: str  # Label of the row that differences are taken from, unless a row names its own.
     figures: Callable[[Args], dict[str, Any]] | None = None
     """Measured without training: ``{"columns": {label: {column: value}}, "lines": [text], ...}``."""
 
     def __post_init__(self) -> None:
         """Refuse names that would be missed after hours of training."""
         labels = [row.label for row in self.rows]
-        for label in labels:
-            if labels.count(label) > 1:
-                raise ValueError(f"table {self.name}: got two rows {label!r}, expected different labels")
-        for reference in (self.reference, *(row.reference for row in self.rows)):
-            if reference is not None and reference not in labels:
-                raise ValueError(f"table {self.name}: reference: got {reference!r}, expected one of {labels}")
-        theirs, gains = PAPER["tables"].get(self.name, {"rows": {}})["rows"], PAPER["text"]
+        theirs, gains = self.paper_rows, PAPER["text"]
+        if self.reference not in labels:
+            raise ValueError(f"table {self.name}: reference: got {self.reference!r}, expected one of {labels}")
         for row in self.rows:
-            for field, key, known in (("paper", row.paper, theirs), ("gain", row.gain, gains)):
+            if labels.count(row.label) > 1:
+                raise ValueError(f"table {self.name}: got two rows {row.label!r}, expected different labels")
+            for field, known in (("reference", labels), ("paper", theirs), ("gain", gains)):
+                key = getattr(row, field)
                 if key is not None and key not in known:
                     raise ValueError(f"row {row.label!r}: {field}: got {key!r}, expected one of {list(known)}")
+
+    @property
+    def paper_rows(self) -> dict[Any, Any]:
+        """The paper's rows, none where the table is not the paper's."""
+        return PAPER["tables"].get(self.name, {"rows": {}})["rows"]
 
 
 def simulated_scale(args: Args) -> Simulated | None:
@@ -103,12 +94,7 @@ def make_scale(args: Args) -> Simulated | NuScenesLayout:
 
 
 def stem_times(variants: dict[str, str], args: Args) -> dict[str, Any]:
-    """Figures of a table about the stem.
-
-    Args:
-        variants: label of a row -> its variant in ``benchmarks/module_latency.py``.
-        args: of the table.
-    """
+    """Figures of a table about the stem, from its rows' labels with their variants in ``module_latency.py``."""
     repeats = 2 if args.scale == "smoke" else 15
     return module_latency.figures(
         variants, module_latency.Args(repeats=repeats, precision=args.nuscenes.precision)
@@ -125,21 +111,21 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
     file = folder / f"{table.name}{'_figures' if args.only_figures else ''}"
     # One process at a time: what is timed is not to be disturbed by the others of the same table.
     with file_lock(args.runs / args.scale / f"{file.name}.lock", wait=True):
-        figures = table.figures(args) if table.figures else {}
         record = {
             "table": table.name,
             "scale": args.scale,
             "seeds": list(seeds) if cells else [],
             "trained_on": None if scale is None else {**scale.describe(), "base": config_to_json(scale.base)},
             "rows": [_row_record(table, row, cells) for row in table.rows],
-            "figures": figures,
-            "cells_of": _cells_of(cells),
+            "figures": table.figures(args) if table.figures else {},
+            "cells_of": sorted({f"{c['git']} on {c['device']}" for row in cells.values() for c in row}),
             **here,
         }
         text = as_markdown(table, record)
         print(text, flush=True)
-        atomic_write(file.with_suffix(".json"), lambda path: path.write_text(json.dumps(record, indent=1)))
-        atomic_write(file.with_suffix(".md"), lambda path: path.write_text(text, encoding="utf-8"))
+        for suffix, content in ((".json", json.dumps(record, indent=1)), (".md", text)):
+            write = functools.partial(Path.write_text, data=content, encoding="utf-8")
+            atomic_write(file.with_suffix(suffix), write)
         picture = file.with_suffix(".png")
         if len(seeds) > 1 and cells:
             draw(table, record, picture)
@@ -165,36 +151,30 @@ def _cells(
 ) -> dict[str, list[dict[str, Any]]]:
     """The records of every row's cells, by seed."""
     configs = {row.label: row.change(scale.base) for row in table.rows}
-    for config in configs.values():
-        scale.check(config)
+    if isinstance(scale, Simulated):
+        for config in configs.values():
+            scale.check(config)
     wanted = [(config, seed) for config in configs.values() for seed in seeds]
     found = iter(run_cells(wanted, scale, results=results, runs=args.runs / args.scale))
     return {label: [next(found) for _ in seeds] for label in configs}
 
 
-def _cells_of(cells: dict[str, list[dict[str, Any]]]) -> list[str]:
-    """Revisions and devices that trained the cells."""
-    return sorted({f"{cell['git']} on {cell['device']}" for row in cells.values() for cell in row})
-
-
 def _row_record(table: Table, row: Row, cells: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Scores of a row, their difference to the reference, seed by seed, and the paper's."""
-    paper = PAPER["tables"].get(table.name, {"rows": {}})["rows"]
     reference = next(r for r in table.rows if r.label == (row.reference or table.reference))
-    theirs, base_of_theirs = paper.get(row.paper, {}), paper.get(reference.paper, {})
-    record: dict[str, Any] = {"label": row.label, "reference": reference.label, "paper": theirs}
-    record["paper_difference"] = {
+    theirs, base_of_theirs = (table.paper_rows.get(r.paper, {}) for r in (row, reference))
+    differences = {
         s: round(theirs[s] - base_of_theirs[s], 2) for s in SCORES if s in theirs and s in base_of_theirs
     }
     if row.gain is not None:
-        record["paper_difference"] = {"mAP": PAPER["text"][row.gain]["value"]}
+        differences = {"mAP": PAPER["text"][row.gain]["value"]}
+    record: dict[str, Any] = {"label": row.label, "reference": reference.label, "paper": theirs}
+    record["paper_difference"] = differences
     if row.label in cells:
-        record["cells"] = [cell["name"] for cell in cells[row.label]]
-        mine, base = ([cell.get("scores") for cell in cells[label]] for label in (row.label, reference.label))
-        record["scores"] = mine
-        record["diverged"] = [
-            f"seed {cell['seed']}: {cell['diverged']}" for cell in cells[row.label] if "diverged" in cell
-        ]
+        own, base = cells[row.label], [cell.get("scores") for cell in cells[reference.label]]
+        record["cells"] = [cell["name"] for cell in own]
+        record["scores"] = mine = [cell.get("scores") for cell in own]
+        record["diverged"] = [f"seed {cell['seed']}: {cell['diverged']}" for cell in own if "diverged" in cell]
         for s in SCORES:
             record[s] = _summary([100 * cell[s] for cell in mine if cell])
             pairs = [(cell, other) for cell, other in zip(mine, base, strict=True) if cell and other]
@@ -215,47 +195,38 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     for s in SCORES:
         header += [f"{s}, ours", "difference, ours"] if trained else []
         header += [f"{s}, paper", "difference, paper"]
-    told = f"; {_told_scale(record['trained_on'])}" if trained else ""
-    lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}{told}.", ""]
+    note = f"; {_training_text(record['trained_on'])}" if trained else ""
+    lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}{note}.", ""]
     lines += ["| " + " | ".join([*header, *extra]) + " |", "|---" * (len(header) + len(extra)) + "|"]
     for row in record["rows"]:
         cells, itself = [row["label"]], row["label"] == row["reference"]
         for s in SCORES:
             ours, theirs = row.get(f"{s}_difference"), row["paper_difference"].get(s)
             if trained:
-                cells += [_told(row.get(s)), "-" if itself else _told(ours, sign=True)]
+                cells += [_text(row.get(s)), "-" if itself else _text(ours, sign=True)]
             cells += [_number(row["paper"].get(s)), "-" if itself else _number(theirs, sign=True)]
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         lines.append("| " + " | ".join(cells) + " |")
-    references = " or ".join(f'"{name}"' for name in _references(record))
     drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
-    lines += ["", f"Differences are to {references}{drawn}.", ""]
-    lines += [f"{row['label']}: {told}" for row in record["rows"] for told in row.get("diverged", ())]
+    lines += ["", f"Differences are to {_references(record)}{drawn}.", ""]
+    lines += [f"{row['label']}: {line}" for row in record["rows"] for line in row.get("diverged", ())]
     if trained:
         lines += [f"Trained by revision {'; '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
 
 
-def _told_scale(trained_on: dict[str, Any]) -> str:
+def _training_text(trained_on: dict[str, Any]) -> str:
     """What a row that changes nothing is trained on, and how long."""
-    base = trained_on["base"]
-    told = {
-        **{name: value for name, value in trained_on.items() if isinstance(value, int | float | str)},
-        "splits": " and ".join(trained_on.get("splits", ())) or None,
-        "epochs": None if trained_on.get("steps") else base["optimizer"]["epochs"],
-        "batch_size": base["optimizer"]["batch_size"],
-        "accumulate": base["optimizer"]["accumulate"],
-        "precision": base["model"]["precision"],
-    }
-    return "; ".join(
-        f"{name.replace('_', ' ')} {str(value).lower()}"
-        for name, value in told.items()
-        if value is not None and name != "scale"
-    )
+    optimizer, precision = trained_on["base"]["optimizer"], trained_on["base"]["model"]["precision"]
+    shown = {name: value for name, value in trained_on.items() if isinstance(value, int | float | str)}
+    shown |= {"scale": None, "splits": " and ".join(trained_on.get("splits", ())) or None}
+    shown["epochs"] = None if trained_on.get("steps") else optimizer["epochs"]
+    shown |= {**{name: optimizer[name] for name in ("batch_size", "accumulate")}, "precision": precision}
+    return "; ".join(f"{n.replace('_', ' ')} {str(v).lower()}" for n, v in shown.items() if v is not None)
 
 
-def _references(record: dict[str, Any]) -> list[str]:
-    return list(dict.fromkeys(row["reference"] for row in record["rows"]))
+def _references(record: dict[str, Any]) -> str:
+    return " or ".join(dict.fromkeys(f'"{row["reference"]}"' for row in record["rows"]))
 
 
 def _number(value: Any, sign: bool = False) -> str:
@@ -264,14 +235,11 @@ def _number(value: Any, sign: bool = False) -> str:
     return f"{value:+.2f}" if sign else f"{value:.2f}"
 
 
-def _told(value: dict[str, Any] | None, sign: bool = False) -> str:
+def _text(value: dict[str, Any] | None, sign: bool = False) -> str:
     if value is None:
         return "-"
-    text = _number(value["mean"], sign)
-    if value["interval"] is None:
-        return text
-    _, low, high = value["interval"]
-    return f"{text} [{_number(low, sign)}, {_number(high, sign)}]"
+    mean, *bounds = (_number(v, sign) for v in (value["interval"] or [value["mean"]]))
+    return f"{mean} [{', '.join(bounds)}]" if bounds else mean
 
 
 def draw(table: Table, record: dict[str, Any], path: Path) -> None:
@@ -283,29 +251,19 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     axis = figure.add_subplot()
     for i, row in enumerate(rows):
         ours, theirs = row["mAP_difference"], row["paper_difference"].get("mAP")
-        if ours is not None and ours["interval"] is not None:
-            _, low, high = ours["interval"]
-            axis.plot([low, high], [i, i], color="#0072b2", linewidth=2, solid_capstyle="butt")
         if ours is not None:
-            axis.plot(ours["mean"], i, "o", color="#0072b2", label="ours, 95 % interval")
+            mean, low, high = ours["interval"] or [ours["mean"]] * 3
+            bars = {"xerr": [[mean - low], [high - mean]], "fmt": "o", "color": "#0072b2"}
+            axis.errorbar(mean, i, **bars, label="ours, 95 % interval")
         if theirs is not None:
             axis.plot(theirs, i, "D", color="#d55e00", markersize=5, label="paper")
     axis.axvline(0, color="#888888", linewidth=0.8)
     axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
     axis.set_ylim(len(rows) - 0.5, -0.5)
-    axis.set_xlabel("mAP, points more than " + " or ".join(f'"{name}"' for name in _references(record)))
+    axis.set_xlabel(f"mAP, points more than {_references(record)}")
     axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds)", fontsize=11)
     handles, labels = axis.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
     axis.legend(kinds.values(), kinds.keys(), fontsize=9, frameon=False)
     axis.spines[["top", "right"]].set_visible(False)
     save_png(figure, path)
-
-
-def command(work: Callable[[Args], object], description: str | None) -> None:
-    """Parse the options, do the work, and leave with the exit code; a failure is one line."""
-
-    def run() -> None:
-        work(tyro.cli(Args, description=description))
-
-    sys.exit(exit_code(Path(sys.argv[0]).name, run))

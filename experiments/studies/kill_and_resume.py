@@ -3,57 +3,53 @@
     python -m experiments.studies.kill_and_resume
 
 A small detector is trained on simulated frames, saving after every step. Each of the runs is killed with SIGKILL
-at a random moment, every third one as soon as a checkpoint is being written, and resumed, with another number of
-threads. Expected: the same hash of parameters, statistics, optimizer state and running mean for all. About twenty
-seconds a run on two cores, after a minute for the first.
+at a random moment, every third one while a checkpoint is being written, and resumed with another number of
+threads. Expected: the same hash of all state. Twenty seconds a run on two cores, after a minute for the first.
 """
 
 import dataclasses
 import hashlib
 import json
+import multiprocessing
 import os
 import random
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from experiments.script import run_script, save
+import jax
+import numpy as np
+
+from experiments.changes import change
+from experiments.script import Options, run_script, save
+from experiments.studies.device_equivalence import CONFIG, SENSOR, draw_variables
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.trainer import Schedule, train
+from fcos_lidar_jax.trainer.run import RUN_SPEC
 
 STEPS = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class Args:
-    """How often, and where to."""
+class Args(Options):
+    """How often."""
 
-    runs: int = 20
-    """Runs that are killed."""
-    out: Path = Path("outputs/kill_and_resume.json")
-    """Where the figures go."""
+    runs: int = 20  # Runs that are killed.
 
 
-def train_and_hash(folder: str, threads: int) -> None:
+def train_and_hash(out: Path, threads: int) -> None:
     """Begin the run, or resume it, and write the hash of its last state into its folder."""
-    import jax
-    import numpy as np
-
-    from experiments.studies.device_equivalence import CONFIG, SENSOR
-    from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    from fcos_lidar_jax.trainer import Schedule, train
-    from fcos_lidar_jax.trainer.run import RUN_SPEC
-
-    out, optimizer = Path(folder), dataclasses.replace(CONFIG.optimizer, batch_size=2)
-    config = dataclasses.replace(CONFIG, copy_paste=None, class_balanced=False, optimizer=optimizer)
+    config = change(copy_paste=None, class_balanced=False, optimizer__batch_size=2)(CONFIG)
     state = train(
         config,
         SimulatedFrames(SENSOR, 12),
         out,
         steps=STEPS,
         resume=(out / RUN_SPEC).exists(),
+        weights=draw_variables(build_detector(config, SENSOR), "float32"),
         schedule=Schedule(save_every=1, evaluate_every=STEPS),
         threads=threads,
     )
@@ -65,67 +61,54 @@ def train_and_hash(folder: str, threads: int) -> None:
     (out / "hash.txt").write_text(whole.hexdigest())
 
 
-def start(folder: Path, threads: int, cache: Path) -> subprocess.Popen[bytes]:
-    """A process that trains."""
-    cached = {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    work = f"from {__spec__.name} import train_and_hash; train_and_hash({str(folder)!r}, {threads})"
-    with (folder.parent / f"{folder.name}.log").open("ab") as log:
-        return subprocess.Popen([sys.executable, "-c", work], env=cached | os.environ, stdout=log, stderr=log)
+def _start(folder: Path, threads: int) -> BaseProcess:
+    process = multiprocessing.get_context("spawn").Process(target=train_and_hash, args=(folder, threads))
+    process.start()
+    return process
 
 
-def finish(folder: Path, threads: int, cache: Path) -> str:
-    """Train to the end and say where it ended."""
-    process = start(folder, threads, cache)
-    if process.wait() != 0:
-        raise RuntimeError((folder.parent / f"{folder.name}.log").read_text()[-3000:])
+def _finish(folder: Path, threads: int) -> str:
+    process = _start(folder, threads)
+    process.join()
+    if process.exitcode:
+        raise RuntimeError(f"{folder.name}: ended with {process.exitcode}")
     return (folder / "hash.txt").read_text()
 
 
-def kill(folder: Path, cache: Path, *, in_save: bool, chance: random.Random) -> dict[str, object]:
+def kill(folder: Path, *, in_save: bool, chance: random.Random) -> dict[str, object]:
     """Start a run and kill it: while it saves, or at a random moment after its first steps."""
-    process = start(folder, 1, cache)
-    checkpoints = folder / "checkpoints"
-    wanted = chance.randrange(1, STEPS - 1)
-    until = time.monotonic() + 300
+    process, checkpoints = _start(folder, 1), folder / "checkpoints"
+    wanted, until = chance.randrange(1, STEPS - 1), time.monotonic() + 300
 
-    def saved() -> list[int]:
-        return sorted(int(path.name) for path in checkpoints.glob("[0-9]*"))
+    def newest() -> int | None:
+        return max((int(path.name) for path in checkpoints.glob("[0-9]*")), default=None)
 
-    while process.poll() is None and time.monotonic() < until:
-        if saved()[-1:] >= [wanted] and not in_save:
-            time.sleep(chance.uniform(0, 0.3))
-            break
-        if saved()[-1:] >= [wanted] and list(checkpoints.glob(".*")):
+    while process.is_alive() and time.monotonic() < until:
+        if (newest() or 0) >= wanted and (not in_save or list(checkpoints.glob(".*"))):
+            time.sleep(0 if in_save else chance.uniform(0, 0.3))
             break
         time.sleep(0.001)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    newest = saved()[-1] if saved() else None
-    return {"newest_checkpoint": newest, "unfinished_checkpoints": len(list(checkpoints.glob(".*")))}
+    process.kill()
+    process.join()
+    return {"newest_checkpoint": newest(), "unfinished_checkpoints": len(list(checkpoints.glob(".*")))}
 
 
 def main(args: Args) -> None:
     """Kill, resume, compare."""
-    chance = random.Random(0)
+    chance, runs = random.Random(0), []
     with tempfile.TemporaryDirectory() as home:
-        cache = Path(home) / "cache"
-        expected = finish(Path(home) / "alone", 1, cache)
-        runs = []
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(home, "cache")))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+        expected = _finish(Path(home, "alone"), 1)
         for number in range(args.runs):
-            folder = Path(home) / f"run{number}"
-            killed = kill(folder, cache, in_save=number % 3 == 0, chance=chance)
-            same = finish(folder, number % 3, cache) == expected
-            runs.append({**killed, "same": same})
+            folder = Path(home, f"run{number}")
+            killed = kill(folder, in_save=number % 3 == 0, chance=chance)
+            runs.append({**killed, "same": _finish(folder, number % 3) == expected})
             print(f"run {number}: {runs[-1]}", flush=True)
             shutil.rmtree(folder)
-    same = sum(run["same"] for run in runs)
-    record = {
-        "steps": STEPS,
-        "runs": len(runs),
-        "killed_while_saving": sum(run["unfinished_checkpoints"] > 0 for run in runs),
-        "ended_the_same": same,
-        "each": runs,
-    }
+    same, saving = sum(run["same"] for run in runs), sum(run["unfinished_checkpoints"] > 0 for run in runs)
+    record = {"steps": STEPS, "runs": len(runs), "killed_while_saving": saving}
+    record = {**record, "ended_the_same": same, "each": runs}
     save(record, args.out, f"{same} of {len(runs)} ended in exactly the state of the run that was left alone")
     if same != len(runs):
         raise ValueError(f"got {len(runs) - same} runs that ended elsewhere, expected none")

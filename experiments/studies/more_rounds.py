@@ -4,18 +4,18 @@
     python -m experiments.studies.more_rounds --scale simulated  # 5 cells, two of them three times as long
 
 In fast traffic and after two epochs, five rounds of ten sweeps score less than one (table 1 at scale simulated),
-where the paper gains 2.1 points. The first table asks the same of light traffic, the second after three times the
-epochs. Expected of the paper: five rounds win in both. The result is in README.md.
+where the paper gains 2.1 points. The first table has light traffic, the second three times the epochs. Expected of
+the paper: five rounds win in both. The result is in README.md.
 """
 
 import dataclasses
 
-from experiments.paper_tables.grid import change
-from experiments.paper_tables.tables import Args, Row, Table, command, run_table
+from experiments.changes import change
+from experiments.paper_tables.tables import Args, Row, Table, run_table
+from experiments.script import run_script
 from fcos_lidar_jax.config import Config
 
-_LONGER = 3
-"""Times the epochs of the scale."""
+_LONGER = 3  # Times the epochs of the scale.
 
 
 def _longer(rounds: int) -> Row:
@@ -31,12 +31,8 @@ _ONE = Row("1 round", change(projection__num_rounds=1))
 _FIVE = Row("5 rounds", change(projection__num_rounds=5))
 _MIXED = Row("5 rounds, no priority", change(projection__prioritize_current=False), reference="5 rounds")
 TRAFFIC = Table("rounds_and_traffic", "Rounds and traffic", (_ONE, _FIVE, _MIXED), reference="1 round")
-LENGTH = Table(
-    "rounds_and_length",
-    "Rounds and length of the training",
-    (_ONE, _FIVE, _longer(1), _longer(5)),
-    reference="1 round",
-)
+_ROWS = (_ONE, _FIVE, _longer(1), _longer(5))
+LENGTH = Table("rounds_and_length", "Rounds and length of the training", _ROWS, reference="1 round")
 
 
 def main(args: Args) -> None:
@@ -48,4 +44,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    command(main, __doc__)
+    run_script(main, Args, __doc__)

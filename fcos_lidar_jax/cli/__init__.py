@@ -10,8 +10,6 @@ import tyro
 
 from fcos_lidar_jax.cli import demo, detect, evaluate, prepare, project, synthesize, train
 
-_DESCRIPTION = "FCOS-LiDAR in JAX: 3D object detection on LiDAR range images."
-
 _COMMANDS = {
     "demo": (demo.Demo, demo.run),
     "synthesize": (synthesize.Synthesize, synthesize.run),
@@ -20,23 +18,19 @@ _COMMANDS = {
     "evaluate": (evaluate.Evaluate, evaluate.run),
     "detect": (detect.Detect, detect.run),
     "project": (project.Project, project.run),
-}
-"""Name -> its options and what it does."""
+}  # name -> its options and what it does
 
 Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _) in _COMMANDS.items()))
 
-
 _LESS_MEMORY = (
-    "in training --optimizer.accumulate N takes a batch in N parts, and --model.precision bfloat16 halves the "
-    "activations; elsewhere --batch-size 1 needs the least"
+    "in training --optimizer.accumulate N takes a batch in N parts, --model.precision bfloat16 halves the "
+    "activations, and --model.remat computes the largest ones again instead of keeping them; elsewhere "
+    "--batch-size 1 needs the least"
 )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command.
-
-    Args:
-        argv: arguments without the program's name; the process's by default.
+    """Run a command, by default that of the process's arguments (``argv`` is without the program's name).
 
     Returns:
         exit code: 0, 1 after a failure that one line on standard error explains, 130 when interrupted. Usage
@@ -45,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = tyro.cli(
         Command,
         prog="fcos-lidar",
-        description=_DESCRIPTION,
+        description="FCOS-LiDAR in JAX: 3D object detection on LiDAR range images.",
         args=argv,
         config=(tyro.conf.CascadeSubcommandArgs,),  # a command's options may stand behind its preset
     )  # type: ignore[call-overload]
@@ -54,11 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def exit_code(program: str, work: Callable[[], object]) -> int:
-    """Do the work; one line on standard error, from the program of that name, tells why it failed.
-
-    Args:
-        program: name for the line.
-        work: what to do; its result is dropped.
+    """Call ``work``; one line on standard error, which begins with the program's name, says why it failed.
 
     Returns:
         0, 1 after a foreseeable failure, 130 when interrupted.
@@ -70,17 +60,17 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
         work()
     except (ValueError, OSError, ArithmeticError) as error:
         line = " ".join(str(error).split())
-        print(f"{program}: error: {line}", file=sys.stderr)
-        return 1
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        print(f"{program}: error: out of memory: {_LESS_MEMORY}", file=sys.stderr)
-        return 1
+        line = f"out of memory: {_LESS_MEMORY}"
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130
-    return 0
+    else:
+        return 0
+    print(f"{program}: error: {line}", file=sys.stderr)
+    return 1
 
 
 if __name__ == "__main__":

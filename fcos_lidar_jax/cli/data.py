@@ -4,7 +4,7 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.classes import ClassMap, MappedFrames
@@ -18,28 +18,22 @@ from fcos_lidar_jax.sensors import Sensor, load_sensor
 class DataOptions:
     """Which data set, and how it is read."""
 
-    data_root: Path | None = None
-    """Folder of the data set; --format simulated needs none."""
-    format: Format | None = None
-    """Layout of the data set; recognised by default."""
+    data_root: Path | None = None  # Folder of the data set; --format simulated needs none.
+    format: Format | None = None  # Layout of the data set; recognised by default.
     version: str | None = None
     """nuScenes: folder of the tables, such as v1.0-trainval; may be left out where there is one."""
     index: Path | None = None
     """nuScenes: where fcos-lidar prepare puts the index; default: DATA_ROOT/.fcos_lidar/VERSION."""
     splits: Path | None = None
     """JSON file with own splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
-    class_map: Path | None = None
-    """JSON file {name in the data: name to use, or null for objects to leave out}."""
-    allow_missing_sweeps: bool = False
-    """nuScenes: go on with fewer sweeps where files of older sweeps are missing."""
+    class_map: Path | None = None  # JSON file {name in the data: name to use, or null for objects to leave out}.
+    allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps where files of older sweeps are missing.
 
     def layout(self) -> Layout:
-        """What kind of data set it is.
-
-        Raises:
-            ValueError: in one line.
-        """
         return find_layout(self.data_root, self.format, self.version)
+
+    def split(self, purpose: Literal["train", "val"], *, required: bool = True) -> str | None:
+        return default_split(self.layout(), purpose, required=required, splits=self.splits)
 
     def open(
         self,
@@ -57,44 +51,30 @@ class DataOptions:
         Args:
             config: sweeps, close points and classes.
             split: which part; None for all.
-            samples: ranges of the frames, see :func:`parse_ranges`; None for all.
-            sensor: for layouts that do not tell theirs; default: the configuration's.
-            option: where ``samples`` is from, for messages.
+            samples: ranges of the frames, see :func:`parse_ranges`, as given by ``option``; None for all.
+            sensor: for layouts that do not define theirs; default: the configuration's.
         """
-        projection = config.projection
         frames = self.open_whole(
             split,
             num_sweeps=config.num_sweeps,
-            remove_close=projection.remove_close,
-            close_m=projection.close_m,
+            remove_close=config.projection.remove_close,
+            close_m=config.projection.close_m,
             sensor=sensor or load_sensor(config.sensor),
         )
         if samples is not None:
             frames = ChosenFrames(frames, tuple(parse_ranges(samples, len(frames), option)))
         mapped = MappedFrames(frames, config.classes)
-        lost = mapped.left_out() if set(frames.classes) - set(config.classes) else {}
-        if lost:
-            told = ", ".join(f"{count} {name}" for name, count in lost.items())
-            print(f"boxes of classes that the detector does not have are left out: {told}", file=sys.stderr)
+        if lost := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
+            counts = ", ".join(f"{count} {name}" for name, count in lost.items())
+            print(f"boxes of classes that the detector does not have are left out: {counts}", file=sys.stderr)
         return mapped
 
     def open_whole(
-        self,
-        split: str | None,
-        *,
-        num_sweeps: int,
-        remove_close: Literal["all", "sweeps", "none"] = "all",
-        close_m: float = 1.0,
-        sensor: Sensor | None = None,
+        self, split: str | None, *, num_sweeps: int, sensor: Sensor | None = None, **options: Any
     ) -> FrameSet:
         """Frames with all of their own classes; by default as the ground-truth database is made of them.
 
-        Args:
-            split: which part; None for all.
-            num_sweeps: as in :func:`open_frames`, as are the next two.
-            remove_close: of which sweeps.
-            close_m: within which distance.
-            sensor: for layouts that do not tell theirs.
+        ``options`` are ``remove_close`` and ``close_m`` of :func:`open_frames`; by default all close points go.
         """
         layout = self.layout()
         frames = open_frames(
@@ -104,22 +84,17 @@ class DataOptions:
             split=split,
             sensor=None if layout.format == "folder" else sensor,
             num_sweeps=num_sweeps,
-            remove_close=remove_close,
-            close_m=close_m,
             class_map=read_class_map(self.class_map),
             index=self.index,
             splits=self.splits,
             allow_missing_sweeps=self.allow_missing_sweeps,
+            **{"remove_close": "all", **options},
         )
         if isinstance(frames, NuScenesFrames):
             missing = frames.nuscenes.missing_sweeps(list(frames.tokens), num_sweeps)
             if missing:
                 print(f"{missing} sweep files of split {split!r} are missing", file=sys.stderr)
         return frames
-
-    def split(self, purpose: Literal["train", "val"], *, required: bool = True) -> str | None:
-        """The split that is meant where none is named."""
-        return default_split(self.layout(), purpose, required=required, splits=self.splits)
 
 
 def read_class_map(file: Path | None) -> ClassMap | None:
@@ -140,15 +115,10 @@ def read_class_map(file: Path | None) -> ClassMap | None:
 
 
 def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]:
-    """Indices of ``FIRST:LAST[,FIRST:LAST...]``, each range without its end.
-
-    Args:
-        text: ranges in any order that do not overlap.
-        number: of what is counted.
-        option: where the text is from, for messages.
+    """Indices of ``FIRST:LAST[,FIRST:LAST...]``: ranges of ``number`` frames in any order, without their ends.
 
     Raises:
-        ValueError: with the range that cannot be.
+        ValueError: naming the option and the range that is malformed, out of bounds or overlaps.
 
     >>> parse_ranges("0:2,5:7", 7)
     [0, 1, 5, 6]

@@ -13,7 +13,7 @@ from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.inference.cloud import expect_points
 from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.progress import Progress
-from fcos_lidar_jax.trainer.prediction import Prediction, predict
+from fcos_lidar_jax.trainer import predict
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,13 +29,11 @@ class Detect:
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")]
     """Trained detector: a checkpoint; a run, which stands for its last one, RUN/best for its best; or
     `quickstart`, which comes with the package."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """Where the JSON goes."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]  # Where the JSON goes.
     sweeps: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
     """Instead of files: a list of sweeps to fuse, [{"file", "timestamp_us", "sensor_to_world": 4x4}], the first
     is the current one."""
-    min_score: float = 0.0
-    """Leave out boxes below this score."""
+    min_score: float = 0.0  # Leave out boxes below this score.
     remove_close: Literal["all", "sweeps", "none"] | None = None
     """Drop points within a metre of the sensor in x and y: of all sweeps, of the older ones, or none. Default:
     as the detector was trained."""
@@ -43,10 +41,8 @@ class Detect:
     """Also draw every cloud with its boxes, from above."""
     columns: int | None = None
     """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
-    dtype: Literal["float16", "float32", "float64"] | None = None
-    """Number type of a raw file of another layout."""
-    batch_size: int = 1
-    """Clouds that a device takes at once; more than one changes boxes and scores by rounding."""
+    dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
+    batch_size: int = 1  # Clouds that a device takes at once; more than one changes boxes and scores by rounding.
 
 
 def run(args: Detect) -> None:
@@ -67,40 +63,23 @@ def run(args: Detect) -> None:
     results: list[dict[str, Any]] = []
     for prediction in predict(detector, clouds, batch_size=args.batch_size):
         file, found, cloud = clouds.files[prediction.index], prediction.detections, prediction.cloud
+        assert prediction.frame is not None
         assert cloud is not None
         expect_points(file, cloud, int(found.num_dropped), detector.sensor)
         boxes = as_records(found, detector.classes, min_score=args.min_score)
-        results.append(
-            {
-                "file": str(file),
-                "num_points": cloud.num_points,
-                "num_dropped": int(found.num_dropped) + cloud.num_removed,
-                "num_close": cloud.num_close,
-                "num_invalid": cloud.num_invalid,
-                "num_truncated": cloud.num_truncated,
-                "boxes": boxes,
-            }
-        )
+        dropped = int(found.num_dropped) + cloud.num_removed
+        record = {"file": str(file), "num_points": cloud.num_points, "num_dropped": dropped}
+        record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
+        results.append(record | {"boxes": boxes})
         if args.pictures is not None:
-            _draw(args, file, prediction, detector.sensor.limit_xy_m, detector.classes)
+            from fcos_lidar_jax.visualization.bev import draw_bev
+
+            args.pictures.mkdir(parents=True, exist_ok=True)
+            path, least = args.pictures / f"{len(results):04d}_{file.name}.png", max(args.min_score, 0.1)
+            shown, limit_m = confident(found, least), detector.sensor.limit_xy_m
+            title = f"{path.stem}: boxes of score {least:g} and more"
+            points, classes = prediction.frame.points, detector.classes
+            draw_bev(points, path, detections=shown, limit_m=limit_m, classes=classes, title=title)
         progress.show(len(results), f"{file}: {len(boxes)} boxes")
-    record = {"files": results}
-    atomic_write(args.out, lambda path: path.write_text(json.dumps(record, indent=1), encoding="utf-8"))
-
-
-def _draw(args: Detect, file: Path, prediction: Prediction, limit_m: float, classes: tuple[str, ...]) -> None:
-    from fcos_lidar_jax.visualization.bev import draw_bev
-
-    assert args.pictures is not None
-    assert prediction.frame is not None
-    least = max(args.min_score, 0.1)
-    args.pictures.mkdir(parents=True, exist_ok=True)
-    path = args.pictures / f"{prediction.index + 1:04d}_{file.name}.png"
-    draw_bev(
-        prediction.frame.points,
-        path,
-        detections=confident(prediction.detections, least),
-        limit_m=limit_m,
-        classes=classes,
-        title=f"{path.stem}: boxes of score {least:g} and more",
-    )
+    text = json.dumps({"files": results}, indent=1)
+    atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))

@@ -5,12 +5,15 @@ import dataclasses
 import shutil
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -25,10 +28,12 @@ from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import TrainedDetector, load_detector
 from fcos_lidar_jax.inference.records import as_records
+from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.trainer.results import write_predictions
+from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.evaluation_report import Example, write_evaluation_report
 
 
@@ -44,10 +49,8 @@ class Evaluate:
     the same command resumes.
     """
 
-    data: tyro.conf.OmitArgPrefixes[DataOptions]
-    """The data set."""
-    out: Path
-    """Folder for the numbers and the report."""
+    data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
+    out: Path  # Folder for the numbers and the report.
     split: str | None = None
     """Split to evaluate on; default: val or mini_val; all frames where the data have no splits."""
     samples: str | None = None
@@ -55,16 +58,12 @@ class Evaluate:
     checkpoint: Path | None = None
     """Trained detector to run: a checkpoint; a run, which stands for its last one, RUN/best for its best; or
     `quickstart`, which comes with the package."""
-    results: Path | None = None
-    """Results file to evaluate: the benchmark's, or detections.json."""
+    results: Path | None = None  # Results file to evaluate: the benchmark's, or detections.json.
     ground_truth: Path | None = None
     """Truth as JSON, instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
-    batch_size: int = 1
-    """Frames that a device takes at once; more than one changes boxes and scores by rounding."""
-    bootstrap: int = 0
-    """Sets of samples to draw for the 95 % intervals of mAP and NDS; a few hundred will do."""
-    report: bool = True
-    """Write report.html and its pictures."""
+    batch_size: int = 1  # Frames that a device takes at once; more than one changes boxes and scores by rounding.
+    bootstrap: int = 0  # Sets of samples to draw for the 95 % intervals of mAP and NDS; a few hundred will do.
+    report: bool = True  # Write report.html and its pictures.
     sensor: str = "nuscenes_hdl32e"
     """Sensor of the range images of a results file: preset or file; a checkpoint knows its own."""
 
@@ -77,144 +76,33 @@ def run(args: Evaluate) -> None:
     with contextlib.ExitStack() as locked:
         if detector is not None:
             locked.enter_context(folder_lock(args.out, "evaluating"))
-        subject = _files(args) if args.ground_truth is not None else _data_set(args, detector, sensor)
+        compared = _compared(args, detector, sensor)
         if detector is None:  # nothing is written before the files are read and found good
             locked.enter_context(folder_lock(args.out, "evaluating"))
         file = args.out / "results_nusc.json"
-        given = args.results if subject.metric.benchmark else None
+        given = args.results if compared.metric.benchmark else None
         if given is not None and not (file.exists() and file.samefile(given)):
             atomic_write(file, lambda path: shutil.copyfile(given, path))
-        evaluation = evaluate(subject.predictions, subject.truth, subject.metric)
+        evaluation = evaluate(compared.predictions, compared.truth, compared.metric)
         progress = Progress("sets", args.bootstrap)
         intervals = write_evaluation(
-            args.out, evaluation, subject.meta, repeats=args.bootstrap, report=progress.show
+            args.out, evaluation, compared.meta, repeats=args.bootstrap, report=progress.show
         )
         report = args.out / "report.html"
         report.unlink(missing_ok=True)  # of other numbers
         if args.report:
             write_evaluation_report(
                 args.out,
-                title=f"{(args.checkpoint or args.results or Path()).name} on {subject.name}",
-                num_samples=len(subject.truth.tokens),
-                examples=_examples(evaluation, subject),
+                title=f"{(args.checkpoint or args.results or Path()).name} on {compared.name}",
+                num_samples=len(compared.truth.tokens),
+                examples=_examples(evaluation, compared),
                 sensor=sensor,
-                global_axes=subject.frames is None,
+                global_axes=compared.frames is None,
             )
-    for line in warnings(evaluation, len(subject.predictions)):
+    for line in warnings(evaluation, len(compared.predictions)):
         print(line, file=sys.stderr)
     print(describe(evaluation, intervals))
     print(f"look at {report if args.report else args.out / 'metrics_summary.json'}")
-
-
-@dataclasses.dataclass(frozen=True)
-class _Subject:
-    """What is evaluated against what."""
-
-    name: str
-    predictions: BoxColumns
-    truth: GroundTruth
-    metric: Metric
-    meta: dict[str, object]
-    frames: FrameSet | None = None
-
-
-def _files(args: Evaluate) -> _Subject:
-    """A results file and a file of ground truth."""
-    assert args.ground_truth is not None
-    truth = read_truth(args.ground_truth)
-    return _official(args, truth, str(args.ground_truth), args.ground_truth.name)
-
-
-def _official(args: Evaluate, truth: GroundTruth, of: str, name: str, frames: FrameSet | None = None) -> _Subject:
-    """The official results file, given or just written, against some truth."""
-    file = args.out / "results_nusc.json"
-    results = read_results(args.results or file, truth.tokens, of=of)
-    for line in results.warnings:
-        print(f"warning: {line}", file=sys.stderr)
-    return _Subject(name, results.boxes, truth, NUSCENES_METRIC, results.meta, frames)
-
-
-def _data_set(args: Evaluate, detector: TrainedDetector | None, sensor: Sensor) -> _Subject:
-    layout = args.data.layout()
-    split = args.split or args.data.split("val")
-    name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), layout.version, split)))
-    if layout.format == "nuscenes" and (detector is None or set(detector.classes) <= set(NUSCENES_CLASSES)):
-        return _benchmark(args, detector, sensor, split, name)
-    if detector is None:
-        raise ValueError("--results: expected --checkpoint too: its classes are those of detections.json")
-    frames = args.data.open(detector.config, split=split, samples=args.samples, sensor=detector.sensor)
-    file = args.out / "detections.json"
-    if args.results is None:
-        removed = write_predictions(
-            detector,
-            frames,
-            file,
-            entries=lambda _, found: as_records(found, detector.classes),
-            write=lambda path, samples: write_detections(path, samples, detector.classes),
-            batch_size=args.batch_size,
-        )
-        _tell_removed(removed)
-    names = [frames.name(index) for index in range(len(frames))]
-    found = read_detections(args.results or file, names, detector.classes)
-    predictions, truth = frame_columns(found, (frames.frame(i) for i in range(len(frames))))
-    metric = metric_of(detector.classes, tuple(detector.config.ranges_m.values()))
-    return _Subject(name, predictions, truth, metric, {}, frames)
-
-
-def _benchmark(
-    args: Evaluate, detector: TrainedDetector | None, sensor: Sensor, split: str | None, name: str
-) -> _Subject:
-    """nuScenes: the official results file against the official truth."""
-    options, layout = args.data, args.data.layout()
-    assert layout.version is not None
-    data = NuScenes(
-        layout.root, layout.version, index=options.index, allow_missing_sweeps=options.allow_missing_sweeps
-    )
-    tokens = data.sample_tokens if split is None else data.split(split, file=options.splits)
-    if args.samples is not None:
-        tokens = [tokens[i] for i in parse_ranges(args.samples, len(tokens))]
-    config = NUSCENES_SINGLE if detector is None else detector.config
-    projection = config.projection
-    frames = NuScenesFrames(
-        data, tuple(tokens), config.num_sweeps, projection.remove_close, projection.close_m, sensor
-    )
-    if detector is not None:
-        _tell_removed(
-            write_predictions(
-                detector,
-                frames,
-                args.out / "results_nusc.json",
-                entries=lambda i, found: result_entries(
-                    found, tokens[i], data.sensor_to_global(tokens[i]), detector.classes
-                ),
-                write=write_results,
-                batch_size=args.batch_size,
-            )
-        )
-    return _official(args, split_truth(data, tokens), name, name, frames)
-
-
-def _tell_removed(removed: dict[str, int]) -> None:
-    """Points that were lost but for those on the ego vehicle."""
-    if removed["truncated"]:
-        print(f"{removed['truncated']} points truncated: more than the detector's max_points", file=sys.stderr)
-    if removed["invalid"]:
-        print(f"{removed['invalid']} points dropped: not finite, or beyond physical limits", file=sys.stderr)
-
-
-def _examples(evaluation: Evaluation, subject: _Subject) -> Iterator[Example]:
-    """The best, a typical and the worst sample; without a data set in the global frame, and without points."""
-    chosen = choose_examples(evaluation)
-    for kind, row in chosen.rows.items():
-        pose, points = np.eye(4), np.zeros((0, 5), np.float32)
-        pose[:3, 3] = subject.truth.ego_translation[row]
-        if subject.frames is not None:
-            points = subject.frames.frame(row).points
-            points = points[points[:, 4] == 0]
-            own_pose = subject.frames.pose(row) if subject.metric is NUSCENES_METRIC else None
-            pose = np.eye(4) if own_pose is None else own_pose
-        found, true = sensor_boxes(evaluation, row, pose, min_score=chosen.min_score)
-        yield Example(kind, subject.truth.tokens[row], points, found, true)
 
 
 def _check(args: Evaluate) -> None:
@@ -228,8 +116,103 @@ def _check(args: Evaluate) -> None:
             raise ValueError("--ground-truth: expected no data set with it")
     elif args.data.data_root is None and args.data.format is None:
         raise ValueError("evaluate: expected --data-root, or --results with --ground-truth")
-    for name, least in (("batch_size", 1), ("bootstrap", 0)):
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name.replace('_', '-')}: got {getattr(args, name)}, expected at least {least}")
-    if args.out.exists() and not args.out.is_dir():
-        raise ValueError(f"--out: {args.out}: found a file, expected a folder")
+    check_at_least(args, 1, "batch_size")
+    check_at_least(args, 0, "bootstrap")
+    check_out_folder(args.out)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Compared:
+    """Predictions, the truth that they are compared with, and how."""
+
+    name: str
+    predictions: BoxColumns
+    truth: GroundTruth
+    metric: Metric
+    meta: dict[str, object]
+    frames: FrameSet | None
+
+
+def _compared(args: Evaluate, detector: TrainedDetector | None, sensor: Sensor) -> _Compared:
+    if args.ground_truth is not None:
+        truth = read_truth(args.ground_truth)
+        return _official(args, truth, None, of=str(args.ground_truth), name=args.ground_truth.name)
+    layout = args.data.layout()
+    split = args.split or args.data.split("val")
+    name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), layout.version, split)))
+    if layout.format == "nuscenes" and (detector is None or set(detector.classes) <= set(NUSCENES_CLASSES)):
+        frames = _keyframes(args, layout, detector, sensor, split)
+        if detector is not None:
+            _detect_keyframes(args, detector, frames)
+        return _official(args, split_truth(frames.nuscenes, list(frames.tokens)), frames, of=name, name=name)
+    if detector is None:
+        raise ValueError("--results: expected --checkpoint too: its classes are those of detections.json")
+    frames = args.data.open(detector.config, split=split, samples=args.samples, sensor=detector.sensor)
+    file = args.out / "detections.json"
+    if args.results is None:
+
+        def records(_: int, found: Detections) -> list[dict[str, Any]]:
+            return as_records(found, detector.classes)
+
+        _detect(args, detector, frames, file, records, partial(write_detections, classes=detector.classes))
+    names = [frames.name(index) for index in range(len(frames))]
+    found = read_detections(args.results or file, names, detector.classes)
+    predictions, truth = frame_columns(found, (frames.frame(i) for i in range(len(frames))))
+    metric = metric_of(detector.classes, tuple(detector.config.ranges_m.values()))
+    return _Compared(name, predictions, truth, metric, {}, frames)
+
+
+def _official(args: Evaluate, truth: GroundTruth, frames: FrameSet | None, *, of: str, name: str) -> _Compared:
+    """The official results file, given or just written, against the truth that stands in ``of``."""
+    results = read_results(args.results or args.out / "results_nusc.json", truth.tokens, of=of)
+    for line in results.warnings:
+        print(f"warning: {line}", file=sys.stderr)
+    return _Compared(name, results.boxes, truth, NUSCENES_METRIC, results.meta, frames)
+
+
+def _keyframes(
+    args: Evaluate, layout: Layout, detector: TrainedDetector | None, sensor: Sensor, split: str | None
+) -> NuScenesFrames:
+    missing = args.data.allow_missing_sweeps
+    data = NuScenes(layout.root, str(layout.version), index=args.data.index, allow_missing_sweeps=missing)
+    tokens = data.sample_tokens if split is None else data.split(split, file=args.data.splits)
+    if args.samples is not None:
+        tokens = [tokens[i] for i in parse_ranges(args.samples, len(tokens))]
+    config = NUSCENES_SINGLE if detector is None else detector.config
+    close = config.projection
+    return NuScenesFrames(data, tuple(tokens), config.num_sweeps, close.remove_close, close.close_m, sensor)
+
+
+def _detect_keyframes(args: Evaluate, detector: TrainedDetector, frames: NuScenesFrames) -> None:
+    def entries(index: int, found: Detections) -> list[dict[str, Any]]:
+        token = frames.tokens[index]
+        return result_entries(found, token, frames.nuscenes.sensor_to_global(token), detector.classes)
+
+    _detect(args, detector, frames, args.out / "results_nusc.json", entries, write_results)
+
+
+def _detect(
+    args: Evaluate, detector: TrainedDetector, frames: FrameSet, file: Path, entries: Any, write: Any
+) -> None:
+    """Write the detections, and report what was removed of the points but for those on the ego vehicle."""
+    options = {"entries": entries, "write": write, "batch_size": args.batch_size}
+    removed = write_predictions(detector, frames, file, **options)
+    if removed["truncated"]:
+        print(f"{removed['truncated']} points truncated: more than the detector's max_points", file=sys.stderr)
+    if removed["invalid"]:
+        print(f"{removed['invalid']} points dropped: not finite, or beyond physical limits", file=sys.stderr)
+
+
+def _examples(evaluation: Evaluation, compared: _Compared) -> Iterator[Example]:
+    """The best, a typical and the worst sample; without a data set in the global frame, and without points."""
+    chosen = choose_examples(evaluation)
+    for kind, row in chosen.rows.items():
+        pose, points = np.eye(4), np.zeros((0, 5), np.float32)
+        pose[:3, 3] = compared.truth.ego_translation[row]
+        if compared.frames is not None:
+            points = compared.frames.frame(row).points
+            points = points[points[:, 4] == 0]
+            own_pose = compared.frames.pose(row) if compared.metric is NUSCENES_METRIC else None
+            pose = np.eye(4) if own_pose is None else own_pose
+        found, true = sensor_boxes(evaluation, row, pose, min_score=chosen.min_score)
+        yield Example(kind, compared.truth.tokens[row], points, found, true)

@@ -3,12 +3,13 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
 import tyro
 
+from fcos_lidar_jax.cli.checks import check_at_least
 from fcos_lidar_jax.config import Config, ProjectionConfig
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import atomic_write
@@ -27,50 +28,32 @@ class Project:
 
     file: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FILE")]]
     """Point file: .pcd.bin, .bin, .npy, .npz or .pcd."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE.npz")]
-    """Where the range image goes."""
-    png: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also draw the image, round by round."""
-    sensor: str = "nuscenes_hdl32e"
-    """Sensor preset, or a sensor file."""
-    rounds: int = 5
-    """Rounds of the projection."""
-    prioritize_current: bool = True
-    """Points of the current sweep win every collision with older ones."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.npz")]  # Where the range image goes.
+    png: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None  # Also draw the image, round by round.
+    sensor: str = "nuscenes_hdl32e"  # Sensor preset, or a sensor file.
+    rounds: int = 5  # Rounds of the projection.
+    prioritize_current: bool = True  # Points of the current sweep win every collision with older ones.
     remove_close: Literal["all", "sweeps", "none"] = "all"
     """Drop points within a metre of the sensor in x and y: of all sweeps, of the older ones, or none."""
     columns: int | None = None
     """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
-    dtype: Literal["float16", "float32", "float64"] | None = None
-    """Number type of a raw file of another layout."""
+    dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
 
 
 def run(args: Project) -> None:
-    """Do it."""
-    if args.rounds < 1:
-        raise ValueError(f"--rounds: got {args.rounds}, expected at least 1")
+    """Project the file, write the image, and print the counts."""
+    check_at_least(args, 1, "rounds")
     sensor = load_sensor(args.sensor)
     points = read_points(args.file, sensor, columns=args.columns, dtype=args.dtype)
     config = Config(max_points=max(len(points), 1), projection=ProjectionConfig(remove_close=args.remove_close))
     cloud = make_cloud(points, config, sensor=sensor)
-    image = jax.tree.map(
-        np.asarray,
-        project_points(
-            cloud.points,
-            cloud.valid,
-            sensor,
-            num_rounds=args.rounds,
-            prioritize_current=args.prioritize_current,
-        ),
-    )
+    rounds = {"num_rounds": args.rounds, "prioritize_current": args.prioritize_current}
+    image = jax.device_get(project_points(cloud.points, cloud.valid, sensor, **rounds))
     dropped = int(image.num_dropped)
     expect_points(args.file, cloud, dropped, sensor)
-    counts = {
-        "num_points": cloud.num_points,
-        "num_dropped": dropped + cloud.num_removed,
-        "num_close": cloud.num_close,
-        "kept_by_round": (image.point_index >= 0).sum(axis=(0, 1)).tolist(),
-    }
+    counts: dict[str, Any] = {"num_points": cloud.num_points, "num_dropped": dropped + cloud.num_removed}
+    kept = (image.point_index >= 0).sum(axis=(0, 1)).tolist()
+    counts |= {"num_close": cloud.num_close, "kept_by_round": kept}
 
     def save(path: Path) -> None:
         with path.open("wb") as stream:

@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 
+from fcos_lidar_jax.cli.checks import check_at_least
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset
@@ -17,33 +18,25 @@ class Synthesize:
     the official nuScenes layout.
 
     The same options give the same bytes, and a scene does not depend on how many there are. Ctrl-C, or a kill,
-    loses the scene at hand: the same command goes on. The last fifth of the scenes is the split val, the others
+    loses the scene at hand: the same command resumes. The last fifth of the scenes is the split val, the others
     are train; the official devkit, which reserves those names, knows them as synthetic_val and synthetic_train.
     """
 
-    out: Path
-    """Folder of the data set: new or empty, or where the same command was stopped."""
-    scenes: int
-    """How many; with the defaults a scene lasts 19.5 s and takes 272 MB."""
-    seed: int = 0
-    """Another seed gives other streets."""
-    keyframes: int = 40
-    """Annotated keyframes a scene, at 2 Hz, with nine sweeps between two of them."""
-    sensor: str = "nuscenes_hdl32e"
-    """Sensor preset, or a sensor file."""
+    out: Path  # Folder of the data set: new or empty, or where the same command was stopped.
+    scenes: int  # How many; with the defaults a scene lasts 19.5 s and takes 272 MB.
+    seed: int = 0  # Another seed gives other streets.
+    keyframes: int = 40  # Annotated keyframes a scene, at 2 Hz, with nine sweeps between two of them.
+    sensor: str = "nuscenes_hdl32e"  # Sensor preset, or a sensor file.
     rolling_shutter: bool = False
     """Car and objects move while the sensor turns, as they do in real data; takes about twice as long."""
-    workers: int = 1
-    """Processes."""
-    version: str = "v1.0-synthetic"
-    """Folder of the tables."""
+    workers: int = 1  # Processes.
+    version: str = "v1.0-synthetic"  # Folder of the tables.
 
 
 def run(args: Synthesize) -> None:
-    """Do it, and print what there is."""
-    for name, least in (("scenes", 1), ("keyframes", 1), ("workers", 1), ("seed", 0)):
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name}: got {getattr(args, name)}, expected at least {least}")
+    """Write the data set, and print what it holds."""
+    check_at_least(args, 1, "scenes", "keyframes", "workers")
+    check_at_least(args, 0, "seed")
     if not args.version or args.version.startswith(".") or Path(args.version).name != args.version:
         raise ValueError(f"--version: got {args.version!r}, expected a folder's name")
     if args.version in ("samples", "sweeps", "maps"):

@@ -12,18 +12,14 @@ import jax
 import tyro
 from jax.experimental import multihost_utils
 
+from fcos_lidar_jax.cli.checks import check_at_least
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
-from fcos_lidar_jax.input_pipeline.database import (
-    GroundTruthDatabase,
-    objects_folder,
-    open_database,
-    prepare_database,
-    read_manifest,
-)
+from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
+from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.trainer.run import Schedule, check_run, train
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of
@@ -36,16 +32,11 @@ _ABOUT = {
     "argoverse2": "one sweep of Argoverse 2, 26 classes",
     "quickstart": "small enough for two CPU cores",
 }
-_MOST_SWEEPS = 20
-_Preset: Any = reduce(
-    or_,
-    (
-        Annotated[
-            Config, tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT.get(name, ""))
-        ]
-        for name, preset in PRESETS.items()
-    ),
+_PRESETS: Any = (
+    tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT.get(name, ""))
+    for name, preset in PRESETS.items()
 )
+_Preset: Any = reduce(or_, (Annotated[Config, preset] for preset in _PRESETS))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,57 +45,37 @@ class Train:
     see fcos-lidar train PRESET --help.
 
     OUT gets checkpoints, metrics.jsonl, TensorBoard events, curves and pictures. All local devices share each
-    batch. Ctrl-C and SIGTERM save and stop; the same command with --resume goes on, to the bit.
+    batch. Ctrl-C and SIGTERM save and stop; the same command with --resume resumes, bit for bit.
     """
 
-    config: Annotated[
-        _Preset,  # type: ignore[valid-type]
-        tyro.conf.arg(name=""),
-        tyro.conf.AvoidSubcommands,
-    ]
+    config: Annotated[_Preset, tyro.conf.arg(name=""), tyro.conf.AvoidSubcommands]  # type: ignore[valid-type]
     """The preset, with its changes."""
-    data: tyro.conf.OmitArgPrefixes[DataOptions]
-    """The data set."""
-    out: Path
-    """Folder of the run."""
+    data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
+    out: Path  # Folder of the run.
     train_split: str | None = None
     """Default: train, or mini_train for a version that ends in mini; all frames where the data have no splits."""
     val_split: str | None = None
     """Evaluated on along the way; default: val or mini_val where there is one; "none" for no evaluation."""
     samples: str | None = None
     """FIRST:LAST: frames of the training split in their order, LAST excluded; several, separated by commas."""
-    val_samples: str | None = None
-    """Likewise, of the split that is evaluated on."""
-    resume: bool = False
-    """Go on from the newest checkpoint in OUT."""
-    weights: Path | None = None
-    """Begin with the weights of this checkpoint, or of the last of this run."""
-    steps: int | None = None
-    """Updates, instead of optimizer.epochs passes over the training set."""
-    seed: int = 0
-    """Of weights, order, pasted objects and augmentation."""
-    evaluate_every: int | None = None
-    """Steps between two evaluations; default: a tenth of the run."""
-    save_every: int | None = None
-    """Steps between two checkpoints; default: a fiftieth of the run."""
-    keep: int = 2
-    """Newest checkpoints that are kept beside the best."""
-    no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Without flips, rotations and scales."""
-    no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Without objects of other frames."""
-    threads: int = 2
-    """That prepare batches."""
-    workers: int = 0
-    """Processes that prepare batches, beside the threads."""
+    val_samples: str | None = None  # Likewise, of the split that is evaluated on.
+    resume: bool = False  # Go on from the newest checkpoint in OUT.
+    weights: Path | None = None  # Begin with the weights of this checkpoint, or of the last of this run.
+    steps: int | None = None  # Updates, instead of optimizer.epochs passes over the training set.
+    seed: int = 0  # Of weights, order, pasted objects and augmentation.
+    evaluate_every: int | None = None  # Steps between two evaluations; default: a tenth of the run.
+    save_every: int | None = None  # Steps between two checkpoints; default: a fiftieth of the run.
+    keep: int = 2  # Newest checkpoints that are kept beside the best.
+    no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without flips, rotations and scales.
+    no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without objects of other frames.
+    threads: int = 2  # That prepare batches.
+    workers: int = 0  # Processes that prepare batches, beside the threads.
     distributed: bool = False
-    """One of several processes, started by Slurm, Open MPI or a TPU pod, which tell JAX about each other."""
+    """One of several processes, started by Slurm, Open MPI or a TPU pod, which describe the cluster to JAX."""
     coordinator: str | None = None
-    """HOST:PORT of process 0, where nothing tells JAX; with --num-processes and --process-index."""
-    num_processes: int | None = None
-    """In all."""
-    process_index: int | None = None
-    """Which one this is, from 0."""
+    """HOST:PORT of process 0, where JAX cannot find it; with --num-processes and --process-index."""
+    num_processes: int | None = None  # In all.
+    process_index: int | None = None  # Which one this is, from 0.
 
 
 def run(args: Train) -> None:
@@ -124,13 +95,17 @@ def run(args: Train) -> None:
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
-    val_split = args.val_split or args.data.split("val", required=False)
-    tests: FrameSet | None = None
+    val_split, tests = args.val_split or args.data.split("val", required=False), None
     if val_split != "none" and (val_split or args.val_samples):
         tests = args.data.open(config, split=val_split, samples=args.val_samples, option="--val-samples")
-    steps = _num_steps(args, config, frames)
-    objects = None if config.copy_paste is None else _database(args, config, frames, split)
-    schedule = Schedule(args.save_every or -(-steps // 50), args.evaluate_every or -(-steps // 10), args.keep)
+    an_epoch = steps_per_epoch(frames, config)
+    steps = args.steps or config.optimizer.epochs * an_epoch
+    if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:
+        raise ValueError(
+            f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
+            f"{steps} steps: nothing would ever be pasted"
+        )
+    objects = None if config.copy_paste is None else _database(args, config, layout, frames, split)
     checkpoints = Checkpoints(args.out / CHECKPOINTS)
     try:
         state = train(
@@ -138,14 +113,10 @@ def run(args: Train) -> None:
             frames,
             args.out,
             steps=steps,
-            seed=args.seed,
             tests=tests,
             objects=objects,
-            resume=args.resume,
-            weights=args.weights,
-            schedule=schedule,
-            threads=args.threads,
-            workers=args.workers,
+            schedule=Schedule(args.save_every, args.evaluate_every, args.keep),
+            **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
         )
     except (KeyboardInterrupt, SystemExit):
         if jax.process_index() == 0 and checkpoints.paths():
@@ -154,59 +125,44 @@ def run(args: Train) -> None:
     if jax.process_index() == 0:
         paths = checkpoints.paths()
         best = best_of(paths)
-        told = {"run": str(args.out), "steps": int(state.step), "checkpoint": str(paths[-1])}
-        print(json.dumps(told | ({} if best is None else {"best": str(best)})))
+        record = {"run": str(args.out), "steps": int(state.step), "checkpoint": str(paths[-1])}
+        print(json.dumps(record | ({} if best is None else {"best": str(best)})))
 
 
 def _check(args: Train) -> None:
-    for name in ("steps", "evaluate_every", "save_every", "keep", "num_processes"):
-        value = getattr(args, name)
-        if value is not None and value < 1:
-            raise ValueError(f"--{name.replace('_', '-')}: got {value}, expected at least 1")
-    for name in ("threads", "workers", "seed"):
-        if getattr(args, name) < 0:
-            raise ValueError(f"--{name}: got {getattr(args, name)}, expected at least 0")
-    given = [args.coordinator is not None, args.num_processes is not None, args.process_index is not None]
+    check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep", "num_processes")
+    check_at_least(args, 0, "threads", "workers", "seed")
+    given = [option is not None for option in (args.coordinator, args.num_processes, args.process_index)]
     if any(given) and not all(given):
         raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
     if args.process_index is not None and not 0 <= args.process_index < (args.num_processes or 0):
         raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
 
 
-def _database(args: Train, config: Config, frames: FrameSet, split: str | None) -> GroundTruthDatabase:
+def _database(
+    args: Train, config: Config, layout: Layout, frames: FrameSet, split: str | None
+) -> database.GroundTruthDatabase:
     """The prepared objects of the split, or, of a part of it or simulated frames, objects of these alone."""
-    layout = args.data.layout()
     if args.samples is None and layout.format != "simulated":
-        folder = objects_folder(args.data.index or layout.index, split)
+        folder = database.objects_folder(args.data.index or layout.index, split)
         if not folder.is_dir():
             of = "" if split is None else f" --train-split {split}"
             raise ValueError(
                 f"{folder}: no objects here, expected those of the training frames: run fcos-lidar prepare{of}, "
                 "or train with --no-copy-paste"
             )
-        source = read_manifest(folder).source
+        source = database.read_manifest(folder).source
         # Objects of more sweeps than are fused will do: those too many are left out.
-        wanted = (args.data.open_whole(split, num_sweeps=n) for n in range(config.num_sweeps, _MOST_SWEEPS + 1))
-        if not any(source == each.fingerprint() for each in wanted):
+        sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
+        if not any(source == args.data.open_whole(split, num_sweeps=n).fingerprint() for n in sweeps):
             raise ValueError(
                 f"{folder}: cut from other frames than those of split {split!r}, or from fewer sweeps than "
                 f"{config.num_sweeps}, expected these: run fcos-lidar prepare again"
             )
-        return open_database(folder)
+        return database.open_database(folder)
     folder = args.out / "objects"
     if jax.process_count() > 1:  # one cuts, the others find it done
         if jax.process_index() == 0:
-            prepare_database(frames, folder)
+            database.prepare_database(frames, folder)
         multihost_utils.sync_global_devices("objects")
-    return prepare_database(frames, folder)
-
-
-def _num_steps(args: Train, config: Config, frames: FrameSet) -> int:
-    an_epoch = steps_per_epoch(frames, config)
-    steps = args.steps or config.optimizer.epochs * an_epoch
-    if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:
-        raise ValueError(
-            f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
-            f"{steps} steps: nothing would ever be pasted"
-        )
-    return steps
+    return database.prepare_database(frames, folder)

@@ -4,16 +4,10 @@ import numpy as np
 
 from fcos_lidar_jax.geometry import points_in_box
 
-LIMITS = {
-    **dict.fromkeys(("x", "y", "z"), 10_000.0),
-    **dict.fromkeys(("l", "w", "h"), 500.0),
-    "yaw": 1000.0,
-    **dict.fromkeys(("vx", "vy"), 500.0),
-}
+LIMITS = dict.fromkeys("xyz", 10_000.0) | dict.fromkeys("lwh", 500.0) | {"yaw": 1000.0, "vx": 500.0, "vy": 500.0}
 """Field of a box -> largest magnitude that is no mistake: metres, radians, metres a second."""
 _CELL_M = 0.5
-_MAX_CELLS = 1024
-"""Along a side: a box far away makes the cells larger, not the grid."""
+_MAX_CELLS = 1024  # along a side: a box far away makes the cells larger, not the grid
 _SLACK_M = 1e-3
 """Far above the rounding of float32 coordinates: the coarse tests never lose a point that lies inside."""
 
@@ -27,30 +21,27 @@ def find_bad_box(boxes: np.ndarray) -> tuple[int, str] | None:
     >>> find_bad_box(np.array([[8, 0, 0, 4, 2, 0, 0, np.nan, np.nan]]))
     (0, 'h: got 0, expected a size above 0 m')
     """
-    limits = np.array(list(LIMITS.values()))
-    good = (np.abs(boxes) <= limits) | (np.isnan(boxes) & np.isnan(boxes[:, 7:].sum(axis=1))[:, None])
-    good[:, :7] &= np.isfinite(boxes[:, :7])
-    good[:, 3:6] &= boxes[:, 3:6] > 0
+    finite, positive = np.isfinite(boxes), np.ones(boxes.shape, bool)
+    finite[:, 7:] |= np.isnan(boxes[:, 7:]).all(axis=1, keepdims=True)
+    positive[:, 3:6] = ~(boxes[:, 3:6] < np.finfo(np.float32).tiny)
+    near = ~(np.abs(boxes) > list(LIMITS.values()))
+    good = finite & positive & near
     if good.all():
         return None
     row, column = np.argwhere(~good)[0]
-    name, value = list(LIMITS)[column], boxes[row, column]
-    if name in ("l", "w", "h") and value <= 0:
-        return int(row), f"{name}: got {value:g}, expected a size above 0 m"
-    return int(row), f"{name}: got {value:g}, expected at most {LIMITS[name]:g}"
+    name = list(LIMITS)[column]
+    expected = f"at most {LIMITS[name]:g}" if positive[row, column] else "a size above 0 m"
+    expected = expected if finite[row, column] else "a finite number"
+    return int(row), f"{name}: got {boxes[row, column]:g}, expected {expected}"
 
 
 def footprints_overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Whether the rotated rectangles of boxes share some area; elementwise with broadcasting.
+    """Whether the rotated rectangles of boxes share some area, bool[...]; elementwise with broadcasting.
 
     Touching is no overlap. Separating axes, float64.
 
     Args:
-        a: [..., >= 7], ``x, y, z, l, w, h, yaw, ...``.
-        b: likewise.
-
-    Returns:
-        bool[...].
+        a, b: [..., >= 7], ``x, y, z, l, w, h, yaw, ...``.
 
     >>> car = np.array([0, 0, 0, 4, 2, 1.5, 0.0])
     >>> footprints_overlap(car, car + np.array([[3.0], [4.0]]) * [1, 0, 0, 0, 0, 0, 0]).tolist()
@@ -93,7 +84,7 @@ def count_inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 
 def points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
-    """Rows of the points inside each upright box, boundary included.
+    """Rows of the points inside each upright box, boundary included: one ascending i64 array a box.
 
     All points are looked up once in a coarse grid of the ground that marks where boxes are; only the few near a
     box are tested exactly, by :func:`inside_box`.
@@ -101,9 +92,6 @@ def points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
     Args:
         points: [n, >= 3], metres; non-finite ones are in no box.
         boxes: [m, >= 7], ``x, y, z, l, w, h, yaw, ...``.
-
-    Returns:
-        one i64 array a box, ascending.
 
     >>> box = np.array([[0, 0, 0, 4, 2, 2, 0.0]])
     >>> [rows.tolist() for rows in points_in_boxes(np.array([[1.0, 0, 0], [3.0, 0, 0], [-2.0, 1, 1]]), box)]

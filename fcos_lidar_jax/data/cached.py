@@ -10,19 +10,15 @@ import numpy as np
 
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf
-from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.files import atomic_write, read_json
 
 _DESCRIPTION = "frames.json"
 _ARRAYS = ("points", "boxes", "labels", "num_points")
 
 
-class CacheError(ValueError):
-    """A folder that cannot keep these frames; one line that says why."""
-
-
 @dataclasses.dataclass(frozen=True)
 class CachedFrames(FramesOf):
-    """A frame set that makes every frame once: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
+    """A frame set that makes every frame once.
 
     The folder holds ``frames.json``, which says whose frames they are, and an archive of NumPy arrays for every
     frame that was asked for. Threads and processes may share it: files appear whole, and whoever makes a frame
@@ -32,7 +28,7 @@ class CachedFrames(FramesOf):
     to be deleted.
 
     Raises:
-        CacheError: at construction, where the folder holds the frames of another set.
+        ValueError: at construction, where the folder holds the frames of another set.
         OSError: a file that cannot be written.
 
     >>> import tempfile
@@ -46,22 +42,19 @@ class CachedFrames(FramesOf):
     ['000001.npz', 'frames.json']
     """
 
-    frames: FrameSet
-    """What is kept: a dataclass whose fields JSON can hold."""
-    folder: Path
-    """New, empty, or begun with the same frames."""
+    frames: FrameSet  # what is kept: a dataclass whose fields JSON can hold
+    folder: Path  # new, empty, or begun with the same frames
 
     def __post_init__(self) -> None:
-        """Make the folder this set's, or check that it is."""
         super().__post_init__()
         wanted, file = _description(self.frames), self.folder / _DESCRIPTION
         if self.folder.exists() and not self.folder.is_dir():
-            raise CacheError(f"{self.folder}: found a file, expected a folder")
+            raise ValueError(f"{self.folder}: found a file, expected a folder")
         # In this order: another process may begin the same cache at this moment.
         stray = sorted(p.name for p in self.folder.glob("*.npz") if not p.name.startswith("."))
         if not file.is_file():
             if stray:
-                raise CacheError(f"{self.folder}: found {stray[0]} without {_DESCRIPTION}, expected a new folder")
+                raise ValueError(f"{self.folder}: found {stray[0]} without {_DESCRIPTION}, expected a new folder")
             atomic_write(file, lambda path: path.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8"))
         _compare(file, wanted)
 
@@ -82,35 +75,28 @@ class CachedFrames(FramesOf):
         atomic_write(file, lambda path: np.savez(path, **arrays))
         return frame
 
-    def labels(self, index: int) -> np.ndarray:
-        """Labels of a frame's boxes; the frame is made for it where it is not there yet."""
-        return self.frame(index).labels
+    labels = FrameSet.labels
 
 
 def _description(frames: FrameSet) -> dict[str, Any]:
     """What decides every byte of the frames, as JSON returns it."""
     kind = type(frames)
     if not dataclasses.is_dataclass(frames):
-        raise CacheError(f"frames: got {kind.__name__}, expected a dataclass")
+        raise ValueError(f"frames: got {kind.__name__}, expected a dataclass")
     try:
         fields = json.loads(json.dumps(dataclasses.asdict(frames)))
     except TypeError as error:
-        raise CacheError(f"frames: {kind.__name__}: expected fields that JSON can hold: {error}") from None
+        raise ValueError(f"frames: {kind.__name__}: expected fields that JSON can hold: {error}") from None
     return {"version": __version__, "kind": kind.__qualname__, **fields}
 
 
 def _compare(file: Path, wanted: dict[str, Any]) -> None:
     """Refuse the folder of another frame set."""
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError:
-        raise CacheError(f"{file}: not JSON, expected the description of the frames there") from None
-    if not isinstance(found, dict):
-        raise CacheError(f"{file}: got {type(found).__name__}, expected a JSON object")
+    found = read_json(file, dict[str, Any])
     for name in [*wanted, *(set(found) - set(wanted))]:
         if name not in found or name not in wanted or found[name] != wanted[name]:
             there, got = (_shown(record.get(name, "nothing")) for record in (found, wanted))
-            raise CacheError(f"{file}: {name}: found {there}, expected {got}: this folder keeps other frames")
+            raise ValueError(f"{file}: {name}: found {there}, expected {got}: this folder keeps other frames")
 
 
 def _shown(value: Any) -> Any:

@@ -14,15 +14,7 @@ ClassMap = Mapping[str, str | None]
 
 
 def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None = None) -> np.ndarray:
-    """Where each of some classes is among others, by name.
-
-    Args:
-        of: classes of the data.
-        to: classes that are wanted.
-        class_map: translates names of ``of``.
-
-    Returns:
-        i32[len(of)]: index into ``to``, -1 for classes that are left out.
+    """i32[len(of)]: index into ``to`` of each class ``of`` the data by name, translated first; -1 if left out.
 
     Raises:
         ValueError: the class map has a name that is none of the data's.
@@ -74,14 +66,10 @@ class MappedFrames(FramesOf):
     """
 
     frames: FrameSet
-    """Of any classes."""
-    wanted: tuple[str, ...]
-    """The classes from now on."""
-    class_map: ClassMap | None = None
-    """Translates the names of the frames' classes first."""
+    wanted: tuple[str, ...]  # the classes from now on
+    class_map: ClassMap | None = None  # translates the names of the frames' classes first
 
     def __post_init__(self) -> None:
-        """Compare the names."""
         super().__post_init__()
         object.__setattr__(self, "classes", self.wanted)
         if (self._table < 0).all():
@@ -95,16 +83,12 @@ class MappedFrames(FramesOf):
         return map_labels(self.frames.classes, self.wanted, self.class_map)
 
     def frame(self, index: int) -> Frame:
-        """One frame, read anew, without the boxes of other classes."""
         frame = self.frames.frame(index)
-        labels = self._table[frame.labels]
-        kept = labels >= 0
-        return dataclasses.replace(
-            frame, boxes=frame.boxes[kept], labels=labels[kept], num_points=frame.num_points[kept]
-        )
+        kept = (labels := self._table[frame.labels]) >= 0
+        rows = {"boxes": frame.boxes[kept], "labels": labels[kept], "num_points": frame.num_points[kept]}
+        return dataclasses.replace(frame, **rows)
 
     def labels(self, index: int) -> np.ndarray:
-        """i32[m]: labels of the frame's boxes that stay."""
         labels = self._table[self.frames.labels(index)]
         return labels[labels >= 0]
 

@@ -1,7 +1,7 @@
 """Annotated clouds, and what a data set of them offers."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -35,22 +35,18 @@ class FrameSet(Protocol):
     Readers inherit from it, so that what their data do not have (poses, times, scenes) has its default.
     """
 
-    classes: tuple[str, ...]
-    """What labels count, in their order."""
-    sensor: Sensor
-    """Whose points they are."""
+    classes: tuple[str, ...]  # what labels count, in their order
+    sensor: Sensor  # whose points they are
 
-    def __len__(self) -> int:
-        """Number of frames."""
-        ...
+    def __len__(self) -> int: ...
 
     def frame(self, index: int) -> Frame:
         """One frame, read anew: sweeps fused, close points removed, all boxes of the classes."""
         ...
 
     def labels(self, index: int) -> np.ndarray:
-        """i32[m]: labels of the frame's boxes, without reading its points."""
-        ...
+        """i32[m]: labels of the frame's boxes; without reading its points where the set can."""
+        return self.frame(index).labels
 
     def name(self, index: int) -> str:
         """What messages call a frame."""
@@ -84,30 +80,19 @@ class GivenFrames(FrameSet):
     """
 
     frames: tuple[Frame, ...]
-    """All of them."""
     sensor: Sensor
-    """Whose points they are."""
     classes: tuple[str, ...]
-    """What their labels count."""
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.frames)
 
     def frame(self, index: int) -> Frame:
-        """One of them, not copied."""
         return self.frames[index]
 
-    def labels(self, index: int) -> np.ndarray:
-        """i32[m]: labels of the frame's boxes."""
-        return self.frames[index].labels
-
     def name(self, index: int) -> str:
-        """Its number."""
         return f"frame {index}"
 
     def fingerprint(self) -> str:
-        """Checksum of all arrays."""
         arrays = (np.ascontiguousarray(a).tobytes() for frame in self.frames for a in vars(frame).values())
         return checksum(repr((self.classes, self.sensor, [checksum(data) for data in arrays])).encode())
 
@@ -117,12 +102,10 @@ class FramesOf(FrameSet):
     """A frame set made of another, from which it has whatever it does not define itself."""
 
     frames: FrameSet
-    """The other."""
     classes: tuple[str, ...] = dataclasses.field(init=False)
     sensor: Sensor = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        """Classes and sensor are those of the frames."""
         object.__setattr__(self, "classes", self.frames.classes)
         object.__setattr__(self, "sensor", self.frames.sensor)
 
@@ -131,35 +114,27 @@ class FramesOf(FrameSet):
         return index
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.frames)
 
     def frame(self, index: int) -> Frame:
-        """One frame, read anew."""
         return self.frames.frame(self._source(index))
 
     def labels(self, index: int) -> np.ndarray:
-        """i32[m]: labels of the frame's boxes."""
         return self.frames.labels(self._source(index))
 
     def name(self, index: int) -> str:
-        """What messages call a frame."""
         return self.frames.name(self._source(index))
 
     def fingerprint(self) -> str:
-        """That of the frames."""
         return self.frames.fingerprint()
 
     def pose(self, index: int) -> np.ndarray | None:
-        """As the frames tell."""
         return self.frames.pose(self._source(index))
 
     def time_us(self, index: int) -> int | None:
-        """As the frames tell."""
         return self.frames.time_us(self._source(index))
 
     def scene(self, index: int) -> str:
-        """As the frames tell."""
         return self.frames.scene(self._source(index))
 
 
@@ -174,17 +149,14 @@ class ChosenFrames(FramesOf):
     """
 
     indices: tuple[int, ...]
-    """Which ones."""
 
     def _source(self, index: int) -> int:
         return self.indices[index]
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.indices)
 
     def fingerprint(self) -> str:
-        """Checksum of that of the frames, and of which they are."""
         return checksum(repr((self.frames.fingerprint(), self.indices)).encode())
 
 
@@ -192,22 +164,39 @@ def files_fingerprint(files: Iterable[Path], root: Path, reading: object) -> str
     """Checksum of files by name, size and time of their last change, and of how they are read.
 
     Args:
-        files: that the frames are read from.
         root: names are relative to it, so that a data set may be moved as a whole.
-        reading: options of the reader, told apart by ``repr``.
+        reading: options of the reader, distinguished by ``repr``.
     """
     states = [(str(file.relative_to(root)), (s := file.stat()).st_size, s.st_mtime_ns) for file in sorted(files)]
     return checksum(repr((states, reading)).encode())
 
 
-def drop_close(points: np.ndarray, sensor: Sensor, *, mode: str, close_m: float) -> tuple[np.ndarray, int]:
-    """A cloud without the points on the ego vehicle, and how many they were.
+def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], where: str) -> tuple[str, ...]:
+    """Names of frames, each known and listed once, at least one.
 
     Args:
-        points: f32[n, c] of one frame.
-        sensor: gives the origin.
-        mode: as in :func:`fcos_lidar_jax.projection.remove_close`.
-        close_m: half the side of the square that is emptied, metres.
+        listed: where each is, for messages, and the name.
+        where: the list is, for messages.
+
+    Raises:
+        ValueError: naming the place, what was found and what was expected.
+    """
+    names: dict[str, None] = {}
+    for place, name in listed:
+        if name not in known:
+            raise ValueError(f"{place}: got {name!r}, expected the name of a cloud")
+        if name in names:
+            raise ValueError(f"{place}: got {name!r} a second time, expected every frame once")
+        names[name] = None
+    if not names:
+        raise ValueError(f"{where}: no frame in it, expected at least one")
+    return tuple(names)
+
+
+def drop_close(points: np.ndarray, sensor: Sensor, *, mode: str, close_m: float) -> tuple[np.ndarray, int]:
+    """A cloud f32[n, c] without the points on the ego vehicle, and how many they were.
+
+    Mode and metres are those of :func:`fcos_lidar_jax.projection.remove_close`.
     """
     kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, mode=mode, close_m=close_m))
     return points[kept], len(points) - int(kept.sum())

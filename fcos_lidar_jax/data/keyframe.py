@@ -1,17 +1,15 @@
 """One annotated keyframe: a cloud with its boxes in a JSON file beside it."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.box_geometry import find_bad_box
+from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
 from fcos_lidar_jax.data.frame import Frame
-from fcos_lidar_jax.data.point_files import PointFileError, read_points
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.sensors import Sensor
-
-_NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
 
 
 def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
@@ -23,30 +21,24 @@ def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
 
     Args:
         folder: holds ``boxes.json`` and the point file.
-        sensor: whose points they are.
         number: which record of a list.
 
     Raises:
-        PointFileError: naming the file and the field.
+        ValueError: naming the file and the field.
     """
     file = Path(folder) / "boxes.json"
-    if not file.is_file():
-        raise PointFileError(f"{file}: no such file, expected the boxes of a keyframe")
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise PointFileError(f"{file}: not JSON: {error}") from None
+    record = read_json(file, what="the boxes of a keyframe")
     try:
         record = record[number] if isinstance(record, list) else record
         rows = [b for b in record["boxes"] if b["class"] in NUSCENES_CLASSES]
-        boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in _NUMBERS] for b in rows], np.float32)
+        boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in LIMITS] for b in rows], np.float32)
         known = "num_lidar_pts" if all("num_lidar_pts" in b for b in rows) else "num_lidar_pts_at_key_frame"
         counts = np.array([int(b[known]) for b in rows], np.int32)
         cloud = file.parent / str(record["lidar_file"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise PointFileError(f"{file}: a field is missing or of another kind: {error}") from None
-    bad = find_bad_box(boxes.reshape(-1, 9))
-    if bad is not None:
-        raise PointFileError(f"{file}: box {bad[0]} of the ten classes: {bad[1]}")
+        raise ValueError(f"{file}: a field is missing or of another kind: {error}") from None
+    boxes = boxes.reshape(-1, 9)
+    if (bad := find_bad_box(boxes)) is not None:
+        raise ValueError(f"{file}: box {bad[0]} of the ten classes: {bad[1]}")
     labels = np.array([NUSCENES_CLASSES.index(b["class"]) for b in rows], np.int32)
-    return Frame(read_points(cloud, sensor), boxes.reshape(-1, 9), labels, counts)
+    return Frame(read_points(cloud, sensor), boxes, labels, counts)

@@ -5,10 +5,11 @@ from typing import Literal
 
 import numpy as np
 
-from fcos_lidar_jax.data.box_geometry import LIMITS, count_inside
+from fcos_lidar_jax.data.box_geometry import count_inside, find_bad_box
 from fcos_lidar_jax.data.classes import unknown_name
-from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
+from fcos_lidar_jax.data.frame import Frame, FrameSet, distinct_names, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.sweeps import is_rotation
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
 CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
@@ -34,12 +35,7 @@ _FIELDS = (
     *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
-_LIMITS = [LIMITS[name] for name in ("h", "w", "l", "x", "y", "z", "yaw")]
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
-
-
-class KittiError(ValueError):
-    """A KITTI folder that cannot be used: one line with the file, the line, the field, found and expected."""
 
 
 class KittiFrames(FrameSet):
@@ -58,13 +54,10 @@ class KittiFrames(FrameSet):
         split: frames and order from ``ImageSets/SPLIT.txt``, a name a line; all frames, sorted, without it.
         sensor: beam table, limits and intensity scale.
         image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.
-        remove_close: ``"all"`` drops the points on the ego vehicle; ``"sweeps"`` and ``"none"`` keep them, for a
-            frame is one sweep.
-        close_m: half the side of the square that is emptied, metres.
+        remove_close, close_m: as in :func:`~fcos_lidar_jax.data.sweeps.fuse_sweeps`; a frame is one sweep.
 
     Raises:
-        KittiError: here or on reading a frame, naming the file, the line, the field, found and expected.
-        ValueError: a point file that cannot be used, in the same form.
+        ValueError: here or on reading a frame, naming the file, the line, the field, found and expected.
     """
 
     classes = CLASSES
@@ -79,7 +72,6 @@ class KittiFrames(FrameSet):
         remove_close: Literal["all", "sweeps", "none"] = "all",
         close_m: float = 1.0,
     ) -> None:
-        """List the folder and see that every frame has its three files."""
         self.root, self.sensor, self.image_size = Path(root), sensor, image_size
         self.remove_close, self.close_m = remove_close, close_m
         clouds = _stems(self.root / "training" / "velodyne", ".bin")
@@ -89,10 +81,9 @@ class KittiFrames(FrameSet):
             present = _stems(self.root / "training" / kind, ".txt")
             for name in self.names:
                 if name not in present:
-                    raise KittiError(f"{self._file(kind, name)}: no such file, expected one for every cloud")
+                    raise ValueError(f"{self._file(kind, name)}: no such file, expected one for every cloud")
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.names)
 
     def frame(self, index: int) -> Frame:
@@ -109,15 +100,12 @@ class KittiFrames(FrameSet):
         return Frame(points, boxes, labels, count_inside(points, boxes), num_close)
 
     def labels(self, index: int) -> np.ndarray:
-        """i32[m]: labels of the frame's boxes, without reading its points."""
         return read_labels(self._file("label_2", self.names[index]))[1]
 
     def name(self, index: int) -> str:
-        """The frame's number, as in its file names."""
         return self.names[index]
 
     def fingerprint(self) -> str:
-        """Checksum of the files by name, size and time of change, and of the reading options."""
         files = (self._file(kind, name) for kind in ("velodyne", "label_2", "calib") for name in self.names)
         reading = self.names, self.sensor, self.image_size, self.remove_close, self.close_m
         return files_fingerprint(files, self.root, reading)
@@ -174,25 +162,21 @@ def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
     which count :data:`CLASSES`.
 
     Raises:
-        KittiError: naming the file, the line, the field, what was found and what was expected.
+        ValueError: naming the file, the line, the field, what was found and what was expected.
     """
     boxes, labels = [], []
     for where, words in _lines(file):
         if len(words) not in (15, 16):
-            raise KittiError(f"{where}: got {len(words)} values, expected 15, or 16 with a score")
+            raise ValueError(f"{where}: got {len(words)} values, expected 15, or 16 with a score")
         if words[0] not in (*CLASSES, "DontCare"):
-            raise KittiError(f"{where}: type: {unknown_name(words[0], CLASSES)}")
-        fields = dict(zip(_FIELDS, words[1:], strict=False))
-        numbers = {name: _number(word, f"{where}: {name}") for name, word in fields.items()}
+            raise ValueError(f"{where}: type: {unknown_name(words[0], CLASSES)}")
+        numbers = [_number(word, f"{where}: {name}") for name, word in zip(_FIELDS, words[1:], strict=False)]
         if words[0] == "DontCare":
             continue
-        for size in ("height", "width", "length"):
-            if numbers[size] <= 0:
-                raise KittiError(f"{where}: {size}: got {fields[size]}, expected a size above 0 m")
-        for field, limit in zip(_FIELDS[7:14], _LIMITS, strict=True):
-            if abs(numbers[field]) > limit:
-                raise KittiError(f"{where}: {field}: got {fields[field]}, expected at most {limit:g}")
-        boxes.append([numbers[name] for name in _FIELDS[7:14]])
+        h, w, l, x, y, z, yaw = box = numbers[7:14]
+        if (bad := find_bad_box(np.array([[x, y, z, l, w, h, yaw, np.nan, np.nan]]))) is not None:
+            raise ValueError(f"{where}: {bad[1]}")
+        boxes.append(box)
         labels.append(CLASSES.index(words[0]))
     return np.array(boxes, np.float64).reshape(-1, 7), np.array(labels, np.int32)
 
@@ -201,7 +185,7 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
     """``velo_to_rect`` f64[4, 4], metres to metres, and ``P2`` f64[3, 4], on to pixels of the left colour image.
 
     Raises:
-        KittiError: naming the file, the matrix, what was found and what was expected.
+        ValueError: naming the file, the matrix, what was found and what was expected.
     """
     found = {}
     for where, words in _lines(file):
@@ -210,44 +194,32 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
             continue
         rows, columns = _SHAPES[name]
         if len(words) - 1 != rows * columns:
-            raise KittiError(f"{where}: {name}: got {len(words) - 1} numbers, expected {rows * columns}")
+            raise ValueError(f"{where}: {name}: got {len(words) - 1} numbers, expected {rows * columns}")
         matrix = np.array([_number(word, f"{where}: {name}") for word in words[1:]]).reshape(rows, columns)
-        rotation = matrix[:, :3]
-        if name != "P2" and (
-            np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0
-        ):
-            raise KittiError(f"{where}: {name}: got no rotation in its 3x3, expected orthonormal rows")
+        if name != "P2" and not is_rotation(matrix[:, :3]):
+            raise ValueError(f"{where}: {name}: got no rotation in its 3x3, expected orthonormal rows")
         found[name] = np.eye(4)
         found[name][:rows, :columns] = matrix
     for name in _SHAPES:
         if name not in found:
-            raise KittiError(f"{file}: {name}: missing, expected {', '.join(_SHAPES)}")
+            raise ValueError(f"{file}: {name}: missing, expected {', '.join(_SHAPES)}")
     return {"velo_to_rect": found["R0_rect"] @ found["Tr_velo_to_cam"], "P2": found["P2"][:3]}
 
 
 def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
     splits = _stems(root / "ImageSets", ".txt")
     if split not in splits:
-        raise KittiError(f"{root / 'ImageSets'}: split: {unknown_name(split, sorted(splits))}")
-    names: dict[str, None] = {}
-    for where, words in _lines(root / "ImageSets" / f"{split}.txt"):
-        name = " ".join(words)
-        if name not in clouds:
-            raise KittiError(f"{where}: got {name!r}, expected the name of a cloud in training/velodyne")
-        if name in names:
-            raise KittiError(f"{where}: got {name!r} a second time, expected every frame once")
-        names[name] = None
-    if not names:
-        raise KittiError(f"{root / 'ImageSets' / split}.txt: no frame in it, expected a name a line")
-    return tuple(names)
+        raise ValueError(f"{root / 'ImageSets'}: split: {unknown_name(split, sorted(splits))}")
+    file = root / "ImageSets" / f"{split}.txt"
+    return distinct_names(((where, " ".join(words)) for where, words in _lines(file)), clouds, str(file))
 
 
 def _stems(folder: Path, ending: str) -> set[str]:
     if not folder.is_dir():
-        raise KittiError(f"{folder}: no such folder, expected one with {ending} files")
+        raise ValueError(f"{folder}: no such folder, expected one with {ending} files")
     stems = {file.stem for file in folder.iterdir() if file.suffix == ending}
     if not stems:
-        raise KittiError(f"{folder}: no {ending} file in it, expected at least one")
+        raise ValueError(f"{folder}: no {ending} file in it, expected at least one")
     return stems
 
 
@@ -256,9 +228,9 @@ def _lines(file: Path) -> list[tuple[str, list[str]]]:
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise KittiError(f"{file}: cannot be read: {error.strerror}") from None
+        raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
-        raise KittiError(f"{file}: got {error.reason} at byte {error.start}, expected text") from None
+        raise ValueError(f"{file}: got {error.reason} at byte {error.start}, expected text") from None
     return [(f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
 
 
@@ -268,5 +240,5 @@ def _number(word: str, where: str) -> float:
     except ValueError:
         value = np.nan
     if not abs(value) <= float(np.finfo(np.float32).max):
-        raise KittiError(f"{where}: got {word!r}, expected a finite number")
+        raise ValueError(f"{where}: got {word!r}, expected a finite number")
     return value

@@ -4,28 +4,17 @@ import dataclasses
 
 import numpy as np
 
-_COLUMNS = {
-    "x": ("x",),
-    "y": ("y",),
-    "z": ("z",),
-    "intensity": ("intensity",),
-    "time_lag": ("time_lag",),
-    "laser": ("laser_number", "laser", "ring"),
-}
+_COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "intensity", "time_lag")}
+_COLUMNS["laser"] = ("laser_number", "laser", "ring")
 """Column -> the field names it goes by, the most telling first. Other fields are skipped."""
 _KINDS = {"F": ("f", "248"), "I": ("i", "1248"), "U": ("u", "1248")}
 """TYPE -> NumPy's letter, and the sizes it comes in."""
-_MAX_COUNT = 1_000_000
-"""Values a field of one point may have; more is a damaged header."""
-_MAX_EXPANSION = 88
-"""Three bytes of LZF stand for 264 at most."""
+_MAX_COUNT = 1_000_000  # values a field of one point may have; more is a damaged header
+_MAX_EXPANSION = 88  # three bytes of LZF stand for 264 at most
 
 
 def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
-    """Named columns of a PCD file.
-
-    Args:
-        content: the whole file.
+    """Named columns of a PCD file, from the whole of it.
 
     Returns:
         x, y, z, and of intensity, time_lag and laser those that are there; one value a point each, in the
@@ -60,18 +49,16 @@ def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
 
 def _read_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
     """Entry -> its words, and what comes after the DATA line."""
-    header: dict[str, list[str]] = {}
-    position = 0
+    header, position = dict[str, list[str]](), 0
     while position < len(content) and len(header) <= 32:  # no header is that long: not a PCD file
         end = content.find(b"\n", position)
         line = content[position : len(content) if end < 0 else end]
         position += len(line) + 1
         words = line.decode("ascii", "replace").split()
-        if not words or words[0].startswith("#"):
-            continue
-        header[words[0].upper()] = words[1:]
-        if words[0].upper() == "DATA":
-            return header, content[position:]
+        if words and not words[0].startswith("#"):
+            header[words[0].upper()] = words[1:]
+            if words[0].upper() == "DATA":
+                return header, content[position:]
     raise ValueError("not a PCD file: no DATA line in its header")
 
 
@@ -88,6 +75,10 @@ class _Field:
         return self.dtype.itemsize * self.count
 
 
+def _size(fields: list[_Field]) -> int:
+    return sum(field.size for field in fields)
+
+
 def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
     fields = [name.lower() for name in header.get("FIELDS", [])]
     for axis in "xyz":
@@ -102,9 +93,8 @@ def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
     for field, size, kind, count in zip(fields, columns["SIZE"], columns["TYPE"], columns["COUNT"], strict=True):
         letter, sizes = _KINDS.get(kind.upper(), ("", ""))
         if not letter or size not in tuple(sizes):
-            raise ValueError(
-                f"TYPE and SIZE: got {kind} {size} for field {field}, expected F 2, 4, 8 or I, U 1, 2, 4, 8"
-            )
+            expected = "F 2, 4, 8 or I, U 1, 2, 4, 8"
+            raise ValueError(f"TYPE and SIZE: got {kind} {size} for field {field}, expected {expected}")
         if not count.isdecimal() or not 1 <= int(count) <= _MAX_COUNT:
             raise ValueError(f"COUNT: got {count} for field {field}, expected an integer of at least 1")
         found.append(_Field(field, np.dtype(f"<{letter}{size}"), int(count)))
@@ -114,10 +104,9 @@ def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
 def _num_points(header: dict[str, list[str]]) -> int:
     numbers = {}
     for name in ("POINTS", "WIDTH", "HEIGHT"):
-        words = header.get(name)
-        if words is not None and (len(words) != 1 or not words[0].isdecimal()):
-            raise ValueError(f"{name}: got {' '.join(words)!r}, expected an integer of at least 0")
-        if words is not None:
+        if (words := header.get(name)) is not None:
+            if len(words) != 1 or not words[0].isdecimal():
+                raise ValueError(f"{name}: got {' '.join(words)!r}, expected an integer of at least 0")
             numbers[name] = int(words[0])
     product = numbers["WIDTH"] * numbers["HEIGHT"] if {"WIDTH", "HEIGHT"} <= set(numbers) else None
     points = numbers.get("POINTS", product)
@@ -135,37 +124,23 @@ def _from_ascii(body: bytes, fields: list[_Field], number: int, chosen: list[int
         raise ValueError(f"DATA: {cause}: got {len(words)} values, expected {number} points of {width}")
     try:
         values = np.array(words, np.float64).reshape(number, width)
-    except ValueError:
-        raise ValueError(f"DATA: got {_first_non_number(words)!r} among the values, expected a number") from None
+    except ValueError as error:
+        raise ValueError(f"DATA: {error}, expected a number") from None
     return [values[:, sum(field.count for field in fields[:i])] for i in chosen]
-
-
-def _first_non_number(words: list[bytes]) -> str:
-    for word in words:
-        try:
-            float(word)
-        except ValueError:
-            return word.decode("ascii", "replace")
-    return ""
 
 
 def _from_binary(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
     """Points stored one after the other."""
-    record = sum(field.size for field in fields)
+    record = _size(fields)
     if len(body) < number * record:
-        raise ValueError(
-            f"DATA: truncated: got {len(body)} bytes, expected {number * record} ({number} points of {record})"
-        )
-    firsts = [sum(field.size for field in fields[:i]) for i in chosen]
-    return [
-        np.ndarray((number,), fields[i].dtype, body, first, (record,))
-        for i, first in zip(chosen, firsts, strict=True)
-    ]
+        expected = f"{number * record} ({number} points of {record})"
+        raise ValueError(f"DATA: truncated: got {len(body)} bytes, expected {expected}")
+    return [np.ndarray((number,), fields[i].dtype, body, _size(fields[:i]), (record,)) for i in chosen]
 
 
 def _from_compressed(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
     """Points stored field by field and packed by LZF, behind the packed and the plain size."""
-    expected = number * sum(field.size for field in fields)
+    expected = number * _size(fields)
     packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
     if len(body) < 8 + packed:
         raise ValueError(f"DATA: truncated: got {max(len(body) - 8, 0)} compressed bytes, expected {packed}")
@@ -174,10 +149,7 @@ def _from_compressed(body: bytes, fields: list[_Field], number: int, chosen: lis
     if plain > _MAX_EXPANSION * packed:
         raise ValueError(f"DATA: got {packed} compressed bytes, expected more: they cannot unpack to {plain}")
     content = _unpack_lzf(body[8 : 8 + packed], plain)
-    firsts = [number * sum(field.size for field in fields[:i]) for i in chosen]
-    return [
-        np.frombuffer(content, fields[i].dtype, number, first) for i, first in zip(chosen, firsts, strict=True)
-    ]
+    return [np.frombuffer(content, fields[i].dtype, number, number * _size(fields[:i])) for i in chosen]
 
 
 _FORMS = {"ascii": _from_ascii, "binary": _from_binary, "binary_compressed": _from_compressed}

@@ -3,7 +3,7 @@
 import io
 import math
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,30 +11,18 @@ import numpy as np
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.sensors import Sensor
 
-ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")
-"""File names that are read, the longest first."""
+ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # file names that are read, the longest first
 _RAW_COLUMNS = (3, 4, 5, 6)
-MAX_BYTES = 2**31
-"""Of one cloud, as a file and unpacked: more is no LiDAR's, and would exhaust the memory."""
+MAX_BYTES = 2**31  # of one cloud, as a file and unpacked: more is no LiDAR's, and would exhaust the memory
 _RAW_DTYPES = ("float16", "float32", "float64")
 
-# What tells a raw file that is read with the layout it was written with.
-_REACH_M = 300.0
-"""No LiDAR here sees farther."""
-_HEIGHT_M = (-15.0, 40.0)
-"""Between ditches and bridges; abscissas and intensities that slip into the third column leave it."""
-_FINEST_M = 1e-6
-"""Finer than any LiDAR resolves: text, or another number type."""
-_MARGIN = 0.15
-"""How much better another layout must fit before the one in use is refused."""
-_INSPECTED_VALUES = 240_000
-"""Values that are looked at; a multiple of every number of columns."""
-_MIN_VALUES = 200
-"""Below this the contrast of the columns is chance."""
-
-
-class PointFileError(ValueError):
-    """A point file that cannot be used: one line with the file, the finding and the expectation."""
+# Criteria of whether a raw file is read with the layout it was written with.
+_REACH_M = 300.0  # no LiDAR here sees farther
+_HEIGHT_M = (-15.0, 40.0)  # between ditches and bridges; other values that slip into the third column leave it
+_FINEST_M = 1e-6  # finer than any LiDAR resolves: text, or another number type
+_MARGIN = 0.15  # how much better another layout must fit before the one in use is refused
+_INSPECTED_VALUES = 240_000  # values that are looked at; a multiple of every number of columns
+_MIN_VALUES = 200  # below this the contrast of the columns is chance
 
 
 def read_points(
@@ -51,7 +39,6 @@ def read_points(
     metres, or when another layout fits them clearly better.
 
     Args:
-        path: the file.
         sensor: scales the intensity and says whether a laser number is needed.
         columns: values a point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
@@ -62,7 +49,7 @@ def read_points(
         non-finite values stay, to be dropped and counted by the projection.
 
     Raises:
-        PointFileError: naming the file, the field, what was found and what was expected.
+        ValueError: naming the file, the field, what was found and what was expected.
 
     >>> import tempfile
     >>> from fcos_lidar_jax.sensors import KITTI_HDL64E
@@ -74,28 +61,27 @@ def read_points(
     path = Path(path)
     kind = _kind(path)
     if columns is not None and columns not in _RAW_COLUMNS:
-        raise PointFileError(f"{path}: columns: got {columns}, expected 3, 4, 5 or 6")
+        raise ValueError(f"{path}: columns: got {columns}, expected 3, 4, 5 or 6")
     if dtype is not None and dtype not in _RAW_DTYPES:
-        raise PointFileError(f"{path}: dtype: got {dtype}, expected {', '.join(_RAW_DTYPES)}")
+        raise ValueError(f"{path}: dtype: got {dtype}, expected {', '.join(_RAW_DTYPES)}")
     if not kind.endswith(".bin") and (columns is not None or dtype is not None):
-        raise PointFileError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
+        raise ValueError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
     if kind == ".feather":
-        names = {"x": "x", "y": "y", "z": "z", "intensity": "intensity", "laser_number": "laser"}
-        table = read_feather(path, names)
-        return assemble_points(path, sensor, {names[name]: column for name, column in table.items()})
+        table = read_feather(path, dict.fromkeys(("x", "y", "z", "intensity", "laser_number"), "fiu"))
+        return _assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
     content = _read_whole(path)
     if kind == ".pcd":
         try:
             table = parse_pcd(content)
         except ValueError as error:
-            raise PointFileError(f"{path}: {error}") from None
-        return assemble_points(path, sensor, table)
+            raise ValueError(f"{path}: {error}") from None
+        return _assemble_points(path, sensor, table)
     if not kind.endswith(".bin"):
         return points_from_array(_read_numpy(path, content, kind), sensor, str(path))
     rows = _read_raw(path, content, columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32")
     if kind != ".pcd.bin":
         return points_from_array(rows, sensor, str(path))
-    return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
+    return _assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
 def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") -> np.ndarray:
@@ -103,11 +89,10 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
 
     Args:
         array: [n, 3 to 6]: x, y, z, intensity, time lag, laser number.
-        sensor: scales the intensity and says whether a laser number is needed.
         where: what to call the array in messages.
 
     Raises:
-        PointFileError: another shape or type, or a fifth column of whole numbers above 1, which is a ring.
+        ValueError: another shape or type, or a fifth column of whole numbers above 1, which is a ring.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> points_from_array(np.array([[8, 1, -1]]), TINY).tolist()
@@ -115,52 +100,50 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
     """
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         found = getattr(array, "dtype", type(array).__name__)
-        raise PointFileError(f"{where}: dtype: got {found}, expected real numbers")
+        raise ValueError(f"{where}: dtype: got {found}, expected real numbers")
     if array.ndim != 2 or array.shape[1] not in _RAW_COLUMNS:
-        raise PointFileError(f"{where}: shape: got {array.shape}, expected N x 3, 4, 5 or 6")
+        raise ValueError(f"{where}: shape: got {array.shape}, expected N x 3, 4, 5 or 6")
     lag = array[:, 4] if array.shape[1] > 4 else np.zeros(0)
     if len(lag) and np.isfinite(lag).all() and lag.max() > 1 and not (lag % 1).any():
-        raise PointFileError(
+        raise ValueError(
             f"{where}: fifth column: got whole numbers up to {lag.max():g}, which look like a ring, expected the "
             "time lag in seconds: leave the column out"
         )
     names = ("x", "y", "z", "intensity", "time_lag", "laser")
-    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
+    return _assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
 
 
-def read_feather(path: Path, names: Iterable[str], kinds: str = "fiu") -> dict[str, np.ndarray]:
+def read_feather(path: Path, kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Columns of an Apache Feather file (version 2); needs the extra ``argoverse2``.
 
     Args:
-        path: the file.
-        names: of the columns.
-        kinds: NumPy's letters of the types that will do: ``"fiu"`` numbers, ``"iu"`` whole ones, ``"O"`` texts.
+        kinds: column -> NumPy's letters of the types that will do: ``"fiu"`` numbers, ``"iu"`` whole ones, ``"O"``
+            texts.
 
     Raises:
-        PointFileError: not such a file, a column that is missing, of another type or without a value in some row,
-            or pyarrow is not installed.
+        ValueError: not such a file, a column that is missing, of another type or without a value in some row, or
+            pyarrow is not installed.
     """
     try:
         import pyarrow
     except ImportError:
-        raise PointFileError(
-            f"{path}: pyarrow is not installed, which reads .feather: pip install 'fcos-lidar-jax[argoverse2]'"
-        ) from None
+        how = "pip install 'fcos-lidar-jax[argoverse2]'"
+        raise ValueError(f"{path}: pyarrow is not installed, which reads .feather: {how}") from None
     found = {}
     try:
         table = pyarrow.ipc.open_file(_read_whole(path)).read_all()
-        for name in names:
+        for name, kind in kinds.items():
             if table.column_names.count(name) != 1:
-                raise PointFileError(f"{path}: got columns {', '.join(table.column_names)}, expected one {name}")
+                raise ValueError(f"{path}: got columns {', '.join(table.column_names)}, expected one {name}")
             column = table.column(name)
             column.validate(full=True)  # offsets and lengths, which a crafted file may have wrong
             found[name] = column.to_numpy()
-            if column.null_count or found[name].dtype.kind not in kinds:
+            if column.null_count or found[name].dtype.kind not in kind:
                 got = f"{column.null_count} rows without a value" if column.null_count else column.type
-                expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kinds]
-                raise PointFileError(f"{path}: {name}: got {got}, expected {expected}")
+                expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
+                raise ValueError(f"{path}: {name}: got {got}, expected {expected}")
     except pyarrow.ArrowException as error:
-        raise PointFileError(f"{path}: not a readable .feather file: {' '.join(str(error).split())}") from None
+        raise ValueError(f"{path}: not a readable .feather file: {' '.join(str(error).split())}") from None
     return found
 
 
@@ -169,24 +152,24 @@ def _read_whole(path: Path) -> bytes:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise PointFileError(f"{path}: got {size} bytes, expected at most {MAX_BYTES} for one cloud")
+            raise ValueError(f"{path}: got {size} bytes, expected at most {MAX_BYTES} for one cloud")
         content = path.read_bytes()
     except OSError as error:
-        raise PointFileError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     if not content:
-        raise PointFileError(f"{path}: empty file, expected points")
+        raise ValueError(f"{path}: empty file, expected points")
     return content
 
 
 def _kind(path: Path) -> str:
     if path.is_dir():
-        raise PointFileError(f"{path}: found a folder, expected a point file")
+        raise ValueError(f"{path}: found a folder, expected a point file")
     if not path.is_file():
-        raise PointFileError(f"{path}: no such file")
+        raise ValueError(f"{path}: no such file")
     for ending in ENDINGS:
         if path.name.lower().endswith(ending):
             return ending
-    raise PointFileError(f"{path}: unknown extension {path.suffix!r}, expected {', '.join(ENDINGS)}")
+    raise ValueError(f"{path}: unknown extension {path.suffix!r}, expected {', '.join(ENDINGS)}")
 
 
 def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarray:
@@ -195,12 +178,11 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
     hint += "" if better is None or better[1] == dtype else f" as {better[1]}"
     size, row = len(content), columns * np.dtype(dtype).itemsize
     if size % row:
-        raise PointFileError(
-            f"{path}: got {size} bytes, not a multiple of {row} ({columns} {dtype} values a point): truncated, or "
-            f"another layout{hint}, to be named by columns and dtype"
-        )
+        layout = f"{row} ({columns} {dtype} values a point)"
+        cause = f"truncated, or another layout{hint}, to be named by columns and dtype"
+        raise ValueError(f"{path}: got {size} bytes, not a multiple of {layout}: {cause}")
     if better is not None or _plausible_share(content, columns, dtype) < 0.5:
-        raise PointFileError(
+        raise ValueError(
             f"{path}: read with {columns} {dtype} columns most values are not plausible metres{hint}, "
             "expected a layout named by columns and dtype"
         )
@@ -209,16 +191,12 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
 
 def _better_layout(content: bytes, columns: int, dtype: str) -> tuple[int, str] | None:
     """Columns and number type that fit the content clearly better than those in use."""
-
-    def fits(layout: tuple[int, str]) -> bool:
-        return len(content) % (layout[0] * np.dtype(layout[1]).itemsize) == 0
-
-    share, contrast = 0.0, 0.0
-    divides = fits((columns, dtype))
+    layouts = [(c, d) for d in _RAW_DTYPES for c in _RAW_COLUMNS if len(content) % (c * np.dtype(d).itemsize) == 0]
+    divides, share, contrast = (columns, dtype) in layouts, 0.0, 0.0
     if divides:
         share, contrast = _plausible_share(content, columns, dtype), _column_contrast(content, columns, dtype)
     better = {}
-    for layout in filter(fits, ((c, d) for d in _RAW_DTYPES for c in _RAW_COLUMNS)):
+    for layout in layouts:
         other_share = _plausible_share(content, *layout)
         if other_share < 0.9:
             continue
@@ -266,12 +244,12 @@ def _column_contrast(content: bytes, columns: int, dtype: str) -> float:
 def _read_numpy(path: Path, content: bytes, kind: str) -> np.ndarray:
     magic = b"\x93NUMPY" if kind == ".npy" else b"PK"
     if not content.startswith(magic):
-        raise PointFileError(f"{path}: not a readable {kind} file: got {content[:6]!r}, expected {magic!r} first")
+        raise ValueError(f"{path}: not a readable {kind} file: got {content[:6]!r}, expected {magic!r} first")
     try:
         return _parse_npy(content if kind == ".npy" else _member(content))
     except Exception as error:  # damaged archives and headers fail in a dozen ways, down to the tokenizer's
         reason = " ".join(str(error).split())
-        raise PointFileError(f"{path}: not a readable {kind} file: {reason}") from None
+        raise ValueError(f"{path}: not a readable {kind} file: {reason}") from None
 
 
 def _member(content: bytes) -> bytes:
@@ -305,11 +283,11 @@ def _parse_npy(content: bytes) -> np.ndarray:
     return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
-def assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
+def _assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
     """The contract's columns from named ones."""
     number = len(table["x"])
     if number == 0:
-        raise PointFileError(f"{path}: no points in it, expected at least one")
+        raise ValueError(f"{path}: no points in it, expected at least one")
     points = np.zeros((number, sensor.point_columns), np.float32)
     # What is too large becomes infinite, and is dropped with the other non-finite values.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -320,7 +298,7 @@ def assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarra
     negative = np.flatnonzero(points[:, 4] < 0)
     if len(negative):
         found = f"{points[negative[0], 4]:g} in row {negative[0]}"
-        raise PointFileError(f"{path}: time_lag: got {found}, expected seconds of at least 0")
+        raise ValueError(f"{path}: time_lag: got {found}, expected seconds of at least 0")
     if sensor.row_source == "laser":
         points[:, 5] = _laser_numbers(path, sensor, table)
     return points
@@ -328,14 +306,11 @@ def assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarra
 
 def _laser_numbers(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
     if "laser" not in table:
-        raise PointFileError(
-            f"{path}: no laser number in it, expected one for every point, since sensor {sensor.name} needs it"
-        )
+        expected = f"one for every point, since sensor {sensor.name} needs it"
+        raise ValueError(f"{path}: no laser number in it, expected {expected}")
     laser = table["laser"].astype(np.float64)
     bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
     if len(bad):
-        found = f"{laser[bad[0]]:g} in row {bad[0]}"
-        raise PointFileError(
-            f"{path}: laser number: got {found}, expected whole numbers of 0 to {sensor.num_rows - 1}"
-        )
+        found, expected = f"{laser[bad[0]]:g} in row {bad[0]}", f"whole numbers of 0 to {sensor.num_rows - 1}"
+        raise ValueError(f"{path}: laser number: got {found}, expected {expected}")
     return laser

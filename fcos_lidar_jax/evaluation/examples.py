@@ -12,10 +12,8 @@ from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation
 class Examples:
     """Samples to draw, and the detections to draw in them."""
 
-    rows: dict[str, int]
-    """``best``, ``typical`` and ``worst`` -> row of the sample; fewer where there are fewer samples."""
-    min_score: float
-    """The score from which on the predictions of all samples together have the highest F1."""
+    rows: dict[str, int]  # best, typical and worst -> row of the sample; fewer where there are fewer samples
+    min_score: float  # the score from which on the predictions of all samples together have the highest F1
 
 
 def choose_examples(evaluation: Evaluation) -> Examples:
@@ -24,9 +22,8 @@ def choose_examples(evaluation: Evaluation) -> Examples:
     Among equals the sample with the most truth comes first. Samples without truth are left out.
     """
     rankings, num_samples = evaluation.rankings, len(evaluation.tokens)
-    score = np.concatenate([ranking.score for ranking in rankings])
-    hit = np.concatenate([ranking.hit[ERROR_ROW] for ranking in rankings])
-    sample = np.concatenate([ranking.sample for ranking in rankings])
+    of_class = [(ranking.score, ranking.hit[ERROR_ROW], ranking.sample) for ranking in rankings]
+    score, hit, sample = (np.concatenate(columns) for columns in zip(*of_class, strict=True))
     truth = np.bincount(np.concatenate([r.truth_sample for r in rankings]), minlength=num_samples)
     order = np.argsort(-score, kind="stable")
     found = np.cumsum(hit[order])
@@ -34,18 +31,15 @@ def choose_examples(evaluation: Evaluation) -> Examples:
     min_score = float(score[order[np.argmax(f1)]]) if len(f1) else 0.0
     shown = score >= min_score
     hits = np.bincount(sample[shown & hit], minlength=num_samples)
-    shown_count = np.bincount(sample[shown], minlength=num_samples)
-    quality = 2 * hits / np.maximum(shown_count + truth, 1)
+    quality = 2 * hits / np.maximum(np.bincount(sample[shown], minlength=num_samples) + truth, 1)
     candidates = np.flatnonzero(truth)
     if not len(candidates):
         return Examples({}, min_score)
-    ranked = candidates[np.lexsort((-truth[candidates], -quality[candidates]))]
-    worst = candidates[np.lexsort((-truth[candidates], quality[candidates]))[0]]
-    rows: dict[str, int] = {}
-    for name, row in (("best", ranked[0]), ("worst", worst), ("typical", ranked[len(ranked) // 2])):
-        if row not in rows.values():
-            rows[name] = int(row)
-    return Examples(dict(sorted(rows.items())), min_score)
+    most = -truth[candidates]
+    falling, rising = (candidates[np.lexsort((most, q[candidates]))].tolist() for q in (-quality, quality))
+    # One name a sample, of several the last.
+    names = {falling[len(falling) // 2]: "typical", rising[0]: "worst", falling[0]: "best"}
+    return Examples(dict(sorted((name, row) for row, name in names.items())), min_score)
 
 
 def sensor_boxes(
@@ -53,11 +47,7 @@ def sensor_boxes(
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Predictions (boxes, labels, scores) and truth (boxes, labels) of a sample in a sensor's frame, as evaluated.
 
-    Args:
-        evaluation: holds them in the global frame.
-        sample: row.
-        sensor_to_global: f64[4, 4].
-        min_score: of the predictions.
+    The sample is given by its row, the sensor by its pose f64[4, 4]; ``min_score`` is for the predictions alone.
     """
     turn, origin = sensor_to_global[:3, :3], sensor_to_global[:3, 3]
 

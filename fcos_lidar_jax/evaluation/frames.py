@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.frame import Frame
-from fcos_lidar_jax.evaluation.boxes import NO_BOXES, NO_RACKS, BoxColumns, GroundTruth, join, make_columns
-from fcos_lidar_jax.evaluation.json_io import decode_json, expect_samples, read_json
+from fcos_lidar_jax.evaluation.boxes import NO_BOXES, BoxColumns, GroundTruth, join, make_columns
+from fcos_lidar_jax.evaluation.json_io import expect, expect_samples, index_of, read_json
 from fcos_lidar_jax.evaluation.metrics import Evaluation, Metric, evaluate
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference.records import confident
@@ -48,13 +48,13 @@ def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric
 def frame_columns(found: Iterable[Detections], frames: Iterable[Frame]) -> tuple[BoxColumns, GroundTruth]:
     """Detections and truth of frames as columns, with the sensors' frames as the global one."""
     predictions, truths = [NO_BOXES], [NO_BOXES]
-    sample = 0
-    for sample, (d, frame) in enumerate(zip(found, frames, strict=True), start=1):
+    for sample, (d, frame) in enumerate(zip(found, frames, strict=True)):
         boxes, labels, scores = confident(d, 0.0)
-        predictions.append(_columns(sample - 1, boxes, label=labels, score=scores))
-        truths.append(_columns(sample - 1, frame.boxes, label=frame.labels, num_points=frame.num_points))
-    tokens = tuple(map(str, range(sample)))
-    return join(predictions), GroundTruth(tokens, np.zeros((sample, 3)), join(truths), NO_RACKS)
+        predictions.append(_columns(sample, boxes, label=labels, score=scores))
+        truths.append(_columns(sample, frame.boxes, label=frame.labels, num_points=frame.num_points))
+    tokens = tuple(map(str, range(len(truths) - 1)))
+    ego, rack_axes = np.zeros((len(tokens), 3)), np.zeros((0, 3, 3))
+    return join(predictions), GroundTruth(tokens, ego, join(truths), NO_BOXES, rack_axes)
 
 
 def _columns(sample: int, boxes: np.ndarray, **columns: np.ndarray) -> BoxColumns:
@@ -68,9 +68,7 @@ def write_detections(path: Path, frames: Iterable[tuple[str, bytes]], classes: S
     """Write detections: ``{"classes", "frames": [{"name", "boxes": [{"label", "score", "box"}]}]}``.
 
     Args:
-        path: JSON file to write.
         frames: names with their boxes as JSON, see :func:`fcos_lidar_jax.inference.records.as_records`.
-        classes: of the detector.
     """
     lines = (b'{"name": %s, "boxes": %s}' % (json.dumps(name).encode(), boxes) for name, boxes in frames)
     text = b'{"classes": %s, "frames": [\n%s\n]}\n' % (json.dumps(list(classes)).encode(), b",\n".join(lines))
@@ -96,7 +94,6 @@ def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) ->
     """Read what :func:`write_detections` wrote, in the order of the names.
 
     Args:
-        path: the file.
         names: of the frames that it must cover, no more and no less.
         classes: that the labels shall index.
 
@@ -104,26 +101,19 @@ def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) ->
         ValueError: naming the file, the frame, the box (from 0) and what is wrong.
     """
     by_name: dict[str, list[_Box]] = {}
-    for frame in decode_json(read_json(path), _DetectionsFile, str(path)).frames:
+    for frame in read_json(path, _DetectionsFile)[0].frames:
         if frame.name in by_name:
             raise ValueError(f"{path}: frame {frame.name}: occurs twice")
         by_name[frame.name] = frame.boxes
-    expect_samples(by_name, tuple(names), str(path), of="the data")
-    label_of = {name: label for label, name in enumerate(classes)}
+    expect_samples(by_name, names, str(path), of="the data")
     found = []
     for name in names:
-        boxes = by_name[name]
-        for i, box in enumerate(boxes):
-            if box.label not in label_of or box.score < 0 or min(box.box[3:6]) <= 0:
-                got = f"got {box.label!r}, score {box.score:g}, size {list(box.box[3:6])}"
-                expected = f"one of {', '.join(classes)}, a score of at least 0 and a positive size"
-                raise ValueError(f"{path}: frame {name}: box {i}: {got}, expected {expected}")
-        columns: tuple[Any, ...] = (
-            np.array([box.box for box in boxes], np.float32).reshape(-1, 9),
-            np.array([box.score for box in boxes], np.float32),
-            np.array([label_of[box.label] for box in boxes], np.int32),
-            np.ones(len(boxes), bool),
-            np.int32(0),
-        )
-        found.append(Detections(*columns))
+        boxes, where = by_name[name], f"{path}: frame {name}"
+        labels = index_of(boxes, "label", {known: label for label, known in enumerate(classes)}, where)
+        columns = np.array([box.box for box in boxes], np.float32).reshape(-1, 9)
+        expect((columns[:, 3:6] > 0).all(axis=1), boxes, "box", where, "three positive sizes")
+        scores = np.array([box.score for box in boxes], np.float32)
+        expect(scores >= 0, boxes, "score", where, "a number of at least 0")
+        arrays: Any = (columns, scores, labels.astype(np.int32), np.ones(len(boxes), bool), np.int32(0))
+        found.append(Detections(*arrays))
     return found

@@ -12,49 +12,29 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.classes import DEFAULT_RANGE_M, NUSCENES_CLASSES, RANGES_M
-from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth, Racks
-from fcos_lidar_jax.evaluation.matching import TP_ERRORS, Ranking, rank
+from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
+from fcos_lidar_jax.evaluation.matching import DISTANCES_M, ERROR_ROW, TP_ERRORS, Ranking, candidate_pairs, rank
 
-DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
-"""Hits are nearer than this; average precision is the mean over the four."""
-ERROR_DISTANCE_M = 2.0
-"""The errors are those of the hits at this distance."""
-ERROR_ROW = DISTANCES_M.index(ERROR_DISTANCE_M)
-"""Its row in what is kept by distance."""
-MIN_RECALL = MIN_PRECISION = 0.1
-"""What is below counts nothing."""
-MAX_BOXES = 500
-"""Boxes of a sample that an official results file may hold."""
-AP_WEIGHT = 5
-"""Of mAP in NDS; each of the five errors has weight 1."""
+MIN_RECALL = MIN_PRECISION = 0.1  # what is below counts nothing
+MAX_BOXES = 500  # boxes of a sample that an official results file may hold
+AP_WEIGHT = 5  # of mAP in NDS; each of the five errors has weight 1
 
 _RECALL = np.linspace(0, 1, 101)
 _FIRST = round(100 * MIN_RECALL) + 1
+_WITHOUT = {"traffic_cone": {"orient_err", "vel_err", "attr_err"}, "barrier": {"vel_err", "attr_err"}}
+"""Class -> errors that it does not have."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """Which classes count, up to which range, and which errors each of them has.
+    """Which classes count, and up to which range.
 
     Labels index ``classes``. Properties go by name: a class named as one of nuScenes behaves as it does there.
     """
 
-    classes: tuple[str, ...]
-    """Names of the classes."""
-    class_ranges_m: tuple[float, ...]
-    """Boxes of a class count when nearer than this."""
-    no_attribute: tuple[str, ...]
-    """Classes without attributes."""
-    no_velocity: tuple[str, ...] = ("traffic_cone", "barrier")
-    """Classes whose velocity is not asked for."""
-    no_heading: tuple[str, ...] = ("traffic_cone",)
-    """Classes without a heading."""
-    half_turn: tuple[str, ...] = ("barrier",)
-    """Classes that look the same after half a turn."""
-    in_racks: tuple[str, ...] = ("bicycle", "motorcycle")
-    """Classes that do not count inside a bicycle rack."""
-    benchmark: bool = False
-    """The nuScenes benchmark: it has NDS, and a class without truth has AP 0 and errors 1."""
+    classes: tuple[str, ...]  # names of the classes
+    class_ranges_m: tuple[float, ...]  # boxes of a class count when nearer than this
+    benchmark: bool = False  # nuScenes': with NDS and attributes; a class without truth has AP 0 and errors 1
 
     def __post_init__(self) -> None:
         if len(set(self.classes)) != len(self.classes) or not self.classes:
@@ -66,21 +46,27 @@ class Metric:
     @property
     def heading_period_rad(self) -> np.ndarray:
         """f64[classes]: the turn after which a box of each class looks the same, 0 without a heading."""
-        periods = [np.pi if name in self.half_turn else 2 * np.pi for name in self.classes]
-        return np.where(np.isin(self.classes, self.no_heading), 0.0, periods)
+        periods = {"traffic_cone": 0.0, "barrier": np.pi}
+        return np.array([periods.get(name, 2 * np.pi) for name in self.classes])
 
-    def has_error(self, name: str, error: str) -> bool:
-        """Whether a class has one of the errors of :data:`matching.TP_ERRORS`."""
-        without = {"orient_err": self.no_heading, "vel_err": self.no_velocity, "attr_err": self.no_attribute}
-        return name not in without.get(error, ())
+    @property
+    def settings(self) -> dict[str, Any]:
+        """As ``cfg`` of ``metrics_summary.json`` has them."""
+        matching = {
+            "class_range": dict(zip(self.classes, self.class_ranges_m, strict=True)),
+            "dist_fcn": "center_distance",
+            "dist_ths": list(DISTANCES_M),
+            "dist_th_tp": DISTANCES_M[ERROR_ROW],
+            "min_recall": MIN_RECALL,
+            "min_precision": MIN_PRECISION,
+        }
+        if self.benchmark:
+            return {**matching, "max_boxes_per_sample": MAX_BOXES, "mean_ap_weight": AP_WEIGHT}
+        note = "not the nuScenes benchmark: no attributes, no NDS, means over the classes that occur in the truth"
+        return {"metric": "center_distance", "note": note, **matching}
 
 
-NUSCENES_METRIC = Metric(
-    NUSCENES_CLASSES,
-    tuple(int(RANGES_M[name]) for name in NUSCENES_CLASSES),
-    no_attribute=("traffic_cone", "barrier"),
-    benchmark=True,
-)
+NUSCENES_METRIC = Metric(NUSCENES_CLASSES, tuple(int(RANGES_M[name]) for name in NUSCENES_CLASSES), benchmark=True)
 """The benchmark's own, ``detection_cvpr_2019``; ranges count from the ego vehicle and not from its sensor."""
 
 
@@ -97,46 +83,30 @@ def metric_of(classes: Sequence[str], class_ranges_m: Sequence[float] = ()) -> M
     >>> metric_of(["pedestrian", "forklift"]).class_ranges_m
     (40.0, 50.0)
     """
-    ranges = class_ranges_m or [RANGES_M.get(name, DEFAULT_RANGE_M) for name in classes]
-    return Metric(tuple(classes), tuple(ranges), no_attribute=tuple(classes))
+    return Metric(tuple(classes), tuple(class_ranges_m or (RANGES_M.get(n, DEFAULT_RANGE_M) for n in classes)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Curves:
     """What the numbers of one class are made of, at the recalls 0, 0.01 ... 1."""
 
-    precision: np.ndarray
-    """f64[t, 101]: for every matching distance; 0 beyond the highest recall."""
-    confidence: np.ndarray
-    """f64[t, 101]: the score at which a recall is reached; 0 beyond the highest."""
-    errors: np.ndarray
-    """f64[5, 101]: mean :data:`matching.TP_ERRORS` of the hits up to a recall."""
-    num_truth: int
-    """Boxes of the class that count."""
-    knows_velocity: bool
-    """Whether one of them has a velocity."""
+    precision: np.ndarray  # f64[t, 101]: for every matching distance; 0 beyond the highest recall
+    confidence: np.ndarray  # f64[t, 101]: the score at which a recall is reached; 0 beyond the highest
+    errors: np.ndarray  # f64[5, 101]: mean TP_ERRORS of the hits up to a recall
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
     """The numbers, and what they were made of."""
 
-    metric: Metric
-    """By which it was evaluated."""
-    tokens: tuple[str, ...]
-    """The samples."""
-    summary: dict[str, Any]
-    """See :func:`summarise`."""
-    curves: dict[str, Curves]
-    """By class."""
-    rankings: tuple[Ranking, ...]
-    """By label."""
-    predictions: BoxColumns
-    """Those that count."""
-    truth: BoxColumns
-    """The boxes that count."""
-    seconds: float
-    """How long filtering, matching and scoring took."""
+    metric: Metric  # by which it was evaluated
+    tokens: tuple[str, ...]  # the samples
+    summary: dict[str, Any]  # see score
+    curves: dict[str, Curves]  # by class
+    rankings: tuple[Ranking, ...]  # by label
+    predictions: BoxColumns  # those that count
+    truth: BoxColumns  # the boxes that count
+    seconds: float  # how long filtering, matching and scoring took
 
 
 def evaluate(predictions: BoxColumns, truth: GroundTruth, metric: Metric = NUSCENES_METRIC) -> Evaluation:
@@ -148,47 +118,30 @@ def evaluate(predictions: BoxColumns, truth: GroundTruth, metric: Metric = NUSCE
         metric: whose classes the labels of both index.
     """
     began = time.perf_counter()
-    counted = filter_boxes(predictions, truth.ego_translation, truth.racks, metric)
-    true = filter_boxes(truth.boxes, truth.ego_translation, truth.racks, metric)
-    period = metric.heading_period_rad
-    rankings = rank(counted, true, heading_period_rad=period, distances_m=DISTANCES_M, error_row=ERROR_ROW)
-    curves = {name: class_curves(ranking) for name, ranking in zip(metric.classes, rankings, strict=True)}
-    summary, seconds = summarise(curves, metric), time.perf_counter() - began
+    counted, true = (filter_boxes(boxes, truth, metric) for boxes in (predictions, truth.boxes))
+    rankings = rank(counted, true, heading_period_rad=metric.heading_period_rad)
+    curves, summary = score(rankings, metric)
+    seconds = time.perf_counter() - began
     return Evaluation(metric, truth.tokens, summary, curves, rankings, counted, true, seconds)
 
 
-def filter_boxes(boxes: BoxColumns, ego_translation: np.ndarray, racks: Racks, metric: Metric) -> BoxColumns:
-    """The boxes that are evaluated, in their order.
+def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxColumns:
+    """The boxes, truth or predictions, that are evaluated, in their order.
 
     Left out is what lies at or beyond its class's range, what holds not a single LiDAR or radar point, and
     bicycles and motorcycles whose centre is in a bicycle rack, boundary included.
-
-    Args:
-        boxes: truth or predictions.
-        ego_translation: f64[samples, 3], global frame.
-        racks: of all samples.
-        metric: whose classes the labels index.
     """
-    offset = boxes.translation[:, :2] - ego_translation[boxes.sample, :2]
+    offset = boxes.translation[:, :2] - truth.ego_translation[boxes.sample, :2]
     near = np.sqrt((offset**2).sum(axis=1)) < np.array(metric.class_ranges_m, float)[boxes.label]
-    boxes = boxes.take(near & (boxes.num_points != 0))
-    cycles = [label for label, name in enumerate(metric.classes) if name in metric.in_racks]
-    return boxes.take(~_in_rack(boxes, racks, cycles))
-
-
-def _in_rack(boxes: BoxColumns, racks: Racks, labels: list[int]) -> np.ndarray:
-    """bool[n]: of one of these classes, with its centre in a rack of its sample."""
-    inside = np.zeros(len(boxes), bool)
-    cycles = np.flatnonzero(np.isin(boxes.label, labels) & np.isin(boxes.sample, racks.sample))
-    order = cycles[np.argsort(boxes.sample[cycles], kind="stable")]
-    sample = boxes.sample[order]
-    for i in range(len(racks.sample)):
-        first, last = np.searchsorted(sample, racks.sample[i]), np.searchsorted(sample, racks.sample[i], "right")
-        rows = order[first:last]
-        local = (boxes.translation[rows] - racks.translation[i]) @ racks.axes[i]
-        half = racks.size[i][[1, 0, 2]] / 2
-        inside[rows] |= (np.abs(local) <= half).all(axis=1)
-    return inside
+    boxes, racks = boxes.take(near & (boxes.num_points != 0)), truth.racks
+    cycles = np.flatnonzero(np.isin(metric.classes, ("bicycle", "motorcycle"))[boxes.label])
+    own = boxes.take(cycles)
+    centres, rack_centres = own.translation[:, :2], racks.translation[:, :2]
+    pairs = candidate_pairs(own.sample, centres, racks.sample, rack_centres, max_distance_m=np.inf)
+    offset = own.translation[pairs.detection] - racks.translation[pairs.truth]
+    local = np.matmul(offset[:, None], truth.rack_axes[pairs.truth])[:, 0]
+    inside = (np.abs(local) <= racks.size[pairs.truth][:, [1, 0, 2]] / 2).all(axis=1)
+    return boxes.take(~np.isin(np.arange(len(boxes)), cycles[pairs.detection[inside]]))
 
 
 def class_curves(ranking: Ranking) -> Curves:
@@ -210,7 +163,7 @@ def class_curves(ranking: Ranking) -> Curves:
             hit_score = ranking.score[hit][::-1]
             for k, error in enumerate(ranking.errors):
                 errors[k] = np.interp(confidence[row, ::-1], hit_score, running_mean(error)[::-1])[::-1]
-    return Curves(precision, confidence, errors, len(ranking.truth_sample), ranking.knows_velocity)
+    return Curves(precision, confidence, errors)
 
 
 def running_mean(values: np.ndarray) -> np.ndarray:
@@ -237,76 +190,45 @@ def average_precision(precision: np.ndarray) -> float:
 
 
 def mean_error(error: np.ndarray, confidence: np.ndarray) -> float:
-    """Mean of an error curve f64[101] from the recall floor to the highest recall; 1 if that is not reached.
-
-    Args:
-        error: curve.
-        confidence: of the same hits; 0 beyond the highest recall.
+    """Mean of an error curve f64[101] from the recall floor to the highest recall, beyond which confidence is 0;
+    1 if the floor is not reached.
     """
-    reached = np.flatnonzero(confidence)
-    last = int(reached[-1]) if len(reached) else 0
+    last = int(np.max(np.flatnonzero(confidence), initial=0))
     return 1.0 if last < _FIRST else float(np.mean(error[_FIRST : last + 1]))
 
 
-def summarise(curves: dict[str, Curves], metric: Metric) -> dict[str, Any]:
-    """The scores: AP by class and distance, its means, and the errors of the hits.
+def score(rankings: Sequence[Ranking], metric: Metric) -> tuple[dict[str, Curves], dict[str, Any]]:
+    """The curves of every class, and the scores: AP by class and distance, its means, and the errors of the hits.
 
-    For the benchmark the official summary, without ``meta`` and ``eval_time``. Other metrics have neither NDS nor
-    attribute errors, velocity errors only of classes whose truth has a velocity, and take all means over the
-    classes that occur in the truth; the others are named in ``absent_classes``. No truth at all has mAP NaN.
-
-    Args:
-        curves: of all classes of the metric.
-        metric: by which they were made.
+    For the benchmark the official summary, without ``eval_time``, ``cfg`` and ``meta``. Other metrics have neither
+    NDS nor attribute errors, velocity errors only of classes whose truth has a velocity, and take all means over
+    the classes that occur in the truth; the others are named in ``absent_classes``. No truth at all has mAP NaN.
     """
-    counted = {name: curve for name, curve in curves.items() if metric.benchmark or curve.num_truth}
+    benchmark, all_errors = metric.benchmark, {}
+    of_class = dict(zip(metric.classes, rankings, strict=True))
+    curves = {name: class_curves(ranking) for name, ranking in of_class.items()}
+    counted = [name for name, ranking in of_class.items() if benchmark or len(ranking.truth_sample)]
     label_aps = {
-        name: {str(d): average_precision(p) for d, p in zip(DISTANCES_M, curve.precision, strict=True)}
-        for name, curve in counted.items()
+        name: {str(d): average_precision(p) for d, p in zip(DISTANCES_M, curves[name].precision, strict=True)}
+        for name in counted
     }
-    label_errors = {name: _class_errors(name, curve, metric) for name, curve in counted.items()}
+    for name in counted:
+        unknown, confidence = _WITHOUT.get(name, set()), curves[name].confidence[ERROR_ROW]
+        if not benchmark:
+            unknown = unknown | ({"attr_err"} if of_class[name].knows_velocity else {"attr_err", "vel_err"})
+        all_errors[name] = {
+            error: float("nan") if error in unknown else mean_error(values, confidence)
+            for error, values in zip(TP_ERRORS, curves[name].errors, strict=True)
+            if benchmark or error not in unknown
+        }
     mean_aps = {name: float(np.mean(list(aps.values()))) for name, aps in label_aps.items()}
     mean_ap = float(np.mean(list(mean_aps.values()))) if mean_aps else float("nan")
-    by_error = {e: [errors[e] for errors in label_errors.values() if e in errors] for e in TP_ERRORS}
+    by_error = {e: [errors[e] for errors in all_errors.values() if e in errors] for e in TP_ERRORS}
     tp_errors = {error: float(np.nanmean(values)) for error, values in by_error.items() if values}
-    summary = {
-        "label_aps": label_aps,
-        "mean_dist_aps": mean_aps,
-        "mean_ap": mean_ap,
-        "label_tp_errors": label_errors,
-        "tp_errors": tp_errors,
-    }
-    matching = {
-        "class_range": dict(zip(metric.classes, metric.class_ranges_m, strict=True)),
-        "dist_fcn": "center_distance",
-        "dist_ths": list(DISTANCES_M),
-        "dist_th_tp": ERROR_DISTANCE_M,
-        "min_recall": MIN_RECALL,
-        "min_precision": MIN_PRECISION,
-    }
-    if not metric.benchmark:
-        absent = [name for name in metric.classes if name not in counted]
-        return {
-            **summary,
-            "absent_classes": absent,
-            "cfg": {"metric": "center_distance", "note": _NOTE, **matching},
-        }
+    summary: dict[str, Any] = {"label_aps": label_aps, "mean_dist_aps": mean_aps, "mean_ap": mean_ap}
+    summary |= {"label_tp_errors": all_errors, "tp_errors": tp_errors}
+    if not benchmark:
+        return curves, {**summary, "absent_classes": [name for name in metric.classes if name not in counted]}
     scores = {error: max(0.0, 1.0 - value) for error, value in tp_errors.items()}
     nd_score = float(AP_WEIGHT * mean_ap + np.sum(list(scores.values()))) / (AP_WEIGHT + len(scores))
-    config = {**matching, "max_boxes_per_sample": MAX_BOXES, "mean_ap_weight": AP_WEIGHT}
-    return {**summary, "tp_scores": scores, "nd_score": nd_score, "cfg": config}
-
-
-_NOTE = "not the nuScenes benchmark: no attributes, no NDS, means over the classes that occur in the truth"
-
-
-def _class_errors(name: str, curve: Curves, metric: Metric) -> dict[str, float]:
-    """Errors of one class; what it does not have is NaN in the benchmark and left out elsewhere."""
-    errors = {}
-    for error, values in zip(TP_ERRORS, curve.errors, strict=True):
-        unknown = error == "vel_err" and not (metric.benchmark or curve.knows_velocity)
-        if metric.has_error(name, error) and not unknown:
-            errors[error] = mean_error(values, curve.confidence[ERROR_ROW])
-        elif metric.benchmark:
-            errors[error] = float("nan")
-    return errors
+    return curves, {**summary, "tp_scores": scores, "nd_score": nd_score}

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 
@@ -30,26 +29,20 @@ class ResumeLog:
         self.path, self.places = path, dict[str, tuple[int, int]]()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = path.open("a+b")
-        end = self._read(json.dumps(fingerprint).encode())
-        self._stream.truncate(end)
-        self._stream.seek(end)
-        if end == 0:
-            self._stream.write(json.dumps(fingerprint).encode() + b"\n")
-
-    def _read(self, first: bytes) -> int:
-        """Where the whole lines end; 0 if they are of something else."""
         self._stream.seek(0)
-        end = 0
-        for number, line in enumerate(self._stream):
-            token, separator, entries = line.partition(b"\t")
-            if not line.endswith(b"\n") or (number == 0 and line != first + b"\n"):
-                break
-            if number:
-                if not separator:
+        first, end = json.dumps(fingerprint).encode() + b"\n", 0
+        if self._stream.readline() == first:
+            end = len(first)
+            for line in self._stream:
+                token, separator, entries = line.partition(b"\t")
+                if not separator or not line.endswith(b"\n"):
                     break
                 self.places[json.loads(token)] = end + len(token) + 1, len(entries) - 1
-            end += len(line)
-        return end
+                end += len(line)
+        self._stream.truncate(end)
+        self._stream.seek(end)
+        if not end:
+            self._stream.write(first)
 
     def __contains__(self, token: str) -> bool:
         return token in self.places
@@ -75,7 +68,5 @@ class ResumeLog:
     def __enter__(self) -> "ResumeLog":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stream.close()

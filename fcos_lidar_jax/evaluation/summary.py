@@ -45,22 +45,14 @@ def evaluate_detections(predictions: dict[str, Any] | str | Path, ground_truth: 
 
 
 def full_summary(evaluation: Evaluation, meta: Mapping[str, Any]) -> dict[str, Any]:
-    """All that ``metrics_summary.json`` holds.
-
-    Args:
-        evaluation: the numbers.
-        meta: of the official results file; only the benchmark's summary holds it.
-    """
-    summary = {**evaluation.summary, "eval_time": evaluation.seconds}
-    summary["cfg"] = summary.pop("cfg")  # last but for meta
-    return {**summary, "meta": meta} if evaluation.metric.benchmark else summary
+    """All that ``metrics_summary.json`` holds; ``meta``, of the results file, is the benchmark's alone."""
+    metric = evaluation.metric
+    summary = {**evaluation.summary, "eval_time": evaluation.seconds, "cfg": metric.settings}
+    return {**summary, "meta": meta} if metric.benchmark else summary
 
 
-def curve_record(evaluation: Evaluation) -> dict[str, Any]:
-    """The curves as a JSON object: precision by class, distance and recall; errors by class, error and recall.
-
-    Classes and errors are those of the summary.
-    """
+def _curves(evaluation: Evaluation) -> dict[str, Any]:
+    """Precision by class, distance and recall, and errors by class, error and recall: those of the summary."""
     classes = {}
     for name, defined in evaluation.summary["label_tp_errors"].items():
         curves = evaluation.curves[name]
@@ -84,31 +76,29 @@ def write_evaluation(
 
     Args:
         out: folder; an older ``bootstrap.json`` in it is removed.
-        evaluation: the numbers.
         meta: see :func:`full_summary`.
         repeats: sets of samples to draw for the intervals of the scores; 0 for none.
-        report: told how many sets are done.
+        report: called with the number of sets that are done.
 
     Returns:
         the intervals, see :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`; None without.
     """
-    write_json(out / "metrics_summary.json", full_summary(evaluation, meta))
-    write_json(out / "curves.json", curve_record(evaluation))
+
+    def write(name: str, value: Any) -> None:
+        atomic_write(out / name, lambda file: file.write_text(json.dumps(value, indent=2), encoding="utf-8"))
+
+    write("metrics_summary.json", full_summary(evaluation, meta))
+    write("curves.json", _curves(evaluation))
     if not repeats:
         (out / "bootstrap.json").unlink(missing_ok=True)
         return None
     intervals = bootstrap(evaluation, repeats=repeats, report=report)
-    write_json(out / "bootstrap.json", intervals)
+    write("bootstrap.json", intervals)
     return intervals
 
 
 def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None) -> str:
-    """The scores as lines of text, named as what they are.
-
-    Args:
-        evaluation: the numbers.
-        intervals: of them, if there are.
-    """
+    """The scores, and their intervals where there are some, as lines of text, named as what they are."""
     summary, benchmark = evaluation.summary, evaluation.metric.benchmark
     names = {"nd_score": "NDS", "mean_ap": "mAP"} if benchmark else {"mean_ap": "mAP by centre distance"}
     scores = "  ".join(f"{name} {summary[key]:.4f}" for key, name in names.items())
@@ -123,16 +113,14 @@ def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None)
 def warnings(evaluation: Evaluation, num_found: int) -> list[str]:
     """What the scores must not be mistaken for: a line for missing truth, and one for missing detections.
 
-    Args:
-        evaluation: the numbers.
-        num_found: boxes that were to be evaluated, before the filters.
+    ``num_found`` boxes were to be evaluated, before the filters.
     """
     benchmark, lines = evaluation.metric.benchmark, []
-    absent = [name for name, curves in evaluation.curves.items() if not curves.num_truth]
+    rankings = zip(evaluation.metric.classes, evaluation.rankings, strict=True)
+    absent = [name for name, ranking in rankings if not len(ranking.truth_sample)]
     if not len(evaluation.truth):
-        lines.append(
-            f"no ground truth counts here: {'every AP is 0 and every error 1' if benchmark else 'no score'}"
-        )
+        effect = "every AP is 0 and every error 1" if benchmark else "no score"
+        lines.append(f"no ground truth counts here: {effect}")
     elif absent:
         rule = "AP 0 and errors 1, as in the benchmark" if benchmark else "left out of the means"
         lines.append(f"no ground truth counts of {', '.join(absent)}: {rule}")
@@ -141,8 +129,3 @@ def warnings(evaluation: Evaluation, num_found: int) -> list[str]:
     elif not len(evaluation.predictions):
         lines.append("no box of the results is within the range of its class: every AP is 0")
     return lines
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, whole or not at all."""
-    atomic_write(path, lambda file: file.write_text(json.dumps(value, indent=2), encoding="utf-8"))

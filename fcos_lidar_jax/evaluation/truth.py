@@ -9,43 +9,32 @@ import numpy as np
 
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.names import BICYCLE_RACK, label_of
+from fcos_lidar_jax.evaluation import json_io
 from fcos_lidar_jax.evaluation.boxes import (
     ATTRIBUTE_INDEX,
     LABELS,
     NO_BOXES,
-    NO_RACKS,
-    UNKNOWN_POINTS,
     BoxColumns,
     GroundTruth,
-    Racks,
     heading_yaw,
     join,
     make_columns,
 )
-from fcos_lidar_jax.evaluation.json_io import decode_json, decode_samples, encode_json, read_json, split_samples
-from fcos_lidar_jax.evaluation.results import Quaternion, Vector, Velocity, expect, geometry
 from fcos_lidar_jax.geometry import rotation_matrix
 
-_RACK, _OTHER = -1, -2
-"""Labels of bicycle racks, while they are among the boxes, and of what nobody knows."""
+_RACK = -1  # label of bicycle racks while they are among the boxes
 
 
-class Box(msgspec.Struct, gc=False):
+class Box(json_io.JsonBox, gc=False):
     """One annotation in the global frame."""
 
-    translation: Vector
-    size: Vector
-    rotation: Quaternion
-    velocity: Velocity
-    detection_name: str
-    attribute_name: str
     num_pts: int
 
 
 class Sample(msgspec.Struct, gc=False):
     """What is at one keyframe."""
 
-    ego_translation: Vector
+    ego_translation: json_io.Vector
     boxes: list[Box]
 
 
@@ -58,54 +47,32 @@ def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
     Raises:
         ValueError: naming the file, the sample, the box (from 0) and the field.
     """
-    given = isinstance(source, dict)
-    name = "ground truth" if given else str(source)
-    raw = decode_json(encode_json(source) if given else read_json(source), msgspec.Raw, name)
-    tokens: list[str] = []
-    ego: list[Vector] = []
-    boxes, racks = [NO_BOXES], [NO_RACKS]
-    for row, (token, sample) in enumerate(decode_samples(split_samples(raw, name), Sample, name)):
-        if not np.isfinite(sample.ego_translation).all():
-            got = f"got {list(sample.ego_translation)}, expected three finite numbers"
-            raise ValueError(f"{name}: sample {token}: ego_translation: {got}")
-        tokens.append(token)
-        ego.append(sample.ego_translation)
-        own_boxes, own_racks = _columns(row, sample.boxes, f"{name}: sample {token}")
-        boxes.append(own_boxes)
-        racks.append(own_racks)
-    if not tokens:
+    raw, name = json_io.read_json(source, msgspec.Raw, given="ground truth")
+    ego, parts, rotations = dict[str, json_io.Vector](), [NO_BOXES], [np.zeros((0, 4))]
+    for row, (token, sample) in enumerate(json_io.decode_samples(raw, Sample, name)):
+        ego[token] = sample.ego_translation
+        boxes, where = sample.boxes, f"{name}: sample {token}"
+        label = json_io.index_of(boxes, "detection_name", {**LABELS, BICYCLE_RACK: _RACK}, where)
+        attribute = json_io.index_of(boxes, "attribute_name", ATTRIBUTE_INDEX, where)
+        points = np.array([box.num_pts for box in boxes], np.int64)
+        json_io.expect(points >= -1, boxes, "num_pts", where, "a count, or -1 for unknown")
+        columns, rotation = json_io.geometry(boxes, where)
+        parts.append(make_columns(sample=row, label=label, attribute=attribute, num_points=points, **columns))
+        rotations.append(rotation)
+    if not ego:
         raise ValueError(f"{name}: got no sample, expected at least one")
-    return GroundTruth(tuple(tokens), np.array(ego), join(boxes), join(racks))
+    return _ground_truth(ego, list(ego.values()), join(parts), np.concatenate(rotations))
 
 
-def _columns(sample: int, boxes: list[Box], where: str) -> tuple[BoxColumns, Racks]:
-    names = np.array([box.detection_name for box in boxes])
-    attributes = np.array([box.attribute_name for box in boxes])
-    points = np.array([box.num_pts for box in boxes])
-    label = np.array([_RACK if name == BICYCLE_RACK else LABELS.get(str(name), _OTHER) for name in names], int)
-    attribute = np.array([ATTRIBUTE_INDEX.get(str(name), _OTHER) for name in attributes], int)
-    expect(where, "detection_name", names, label > _OTHER, f"one of {', '.join(LABELS)}, {BICYCLE_RACK}")
-    known = ", ".join(filter(None, ATTRIBUTE_INDEX))
-    expect(where, "attribute_name", attributes, attribute > _OTHER, f"one of {known} or nothing")
-    expect(where, "num_pts", points, points >= UNKNOWN_POINTS, "a count, or -1 for unknown")
-    columns, rotation = geometry(boxes, where)
-    every = make_columns(sample=sample, label=label, attribute=attribute, num_points=points, **columns)
-    return _split_racks(every, rotation)
-
-
-def _split_racks(boxes: BoxColumns, rotation: np.ndarray) -> tuple[BoxColumns, Racks]:
-    """Boxes of the ten classes, and racks."""
+def _ground_truth(tokens: Any, ego: Sequence[Any], boxes: BoxColumns, rotation: np.ndarray) -> GroundTruth:
+    """Boxes apart from racks."""
     rack = boxes.label == _RACK
-    racks = boxes.take(rack)
-    return boxes.take(~rack), Racks(racks.sample, racks.translation, racks.size, rotation_matrix(rotation[rack]))
+    axes, where = rotation_matrix(rotation[rack]), np.array(ego).reshape(-1, 3)
+    return GroundTruth(tuple(tokens), where, boxes.take(~rack), boxes.take(rack), axes)
 
 
 def split_truth(data: NuScenes, tokens: Sequence[str]) -> GroundTruth:
     """Ground truth of some keyframes, those of the ten classes and the bicycle racks.
-
-    Args:
-        data: the data set.
-        tokens: keyframes.
 
     Raises:
         ValueError: an attribute that the benchmark does not know.
@@ -115,25 +82,22 @@ def split_truth(data: NuScenes, tokens: Sequence[str]) -> GroundTruth:
     rows = np.concatenate([np.arange(part.start, part.stop) for part in own])
     sample = np.repeat(np.arange(len(tokens)), [part.stop - part.start for part in own])
     names = [str(name) for name in index.category_name]
-    wanted = np.array([_RACK if name == BICYCLE_RACK else label_of(name) for name in names], np.int64)
     counted = np.array([label_of(name) >= 0 or name == BICYCLE_RACK for name in names], bool)
     kept = counted[index.box_category[rows]]
     rows, sample = rows[kept], sample[kept]
-    for used in np.unique(index.box_attribute[rows]):
-        name = str(index.attribute_name[used]) if used >= 0 else ""
+    attributes = [*map(str, index.attribute_name), ""]  # the last for -1
+    for name in (attributes[used] for used in np.unique(index.box_attribute[rows])):
         if name not in ATTRIBUTE_INDEX:
             raise ValueError(f"{data.tables / 'attribute.json'}: name: got {name!r}, expected a known attribute")
-    attribute = np.array([ATTRIBUTE_INDEX.get(str(name), -1) for name in index.attribute_name] + [-1])
-    every = make_columns(
+    boxes = make_columns(
         sample=sample,
-        label=wanted[index.box_category[rows]],
+        label=np.array([label_of(name) for name in names])[index.box_category[rows]],  # -1 for a rack
         translation=index.box_translation[rows],
         size=index.box_size[rows],
         yaw=heading_yaw(index.box_rotation[rows]),
         velocity=index.box_velocity[rows, :2],
-        attribute=attribute[index.box_attribute[rows]],
+        attribute=np.array([ATTRIBUTE_INDEX.get(name, -1) for name in attributes])[index.box_attribute[rows]],
         num_points=index.box_lidar_points[rows] + index.box_radar_points[rows],
     )
-    boxes, racks = _split_racks(every, index.box_rotation[rows])
-    ego = np.array([data.ego_translation(token) for token in tokens]).reshape(-1, 3)
-    return GroundTruth(tuple(tokens), ego, boxes, racks)
+    ego = [data.ego_translation(token) for token in tokens]
+    return _ground_truth(tokens, ego, boxes, index.box_rotation[rows])

@@ -1,4 +1,4 @@
-"""The one policy for every cloud that meets a detector, in training too: what is removed, truncated and told."""
+"""The one policy for every cloud of a detector, in training too: what is removed, truncated and reported."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,12 +17,9 @@ leave an infinite running variance in the network."""
 MAX_TIME_LAG_S = 60.0
 """Far more than anybody fuses: what lies beyond is a time stamp or damage, as is a negative lag."""
 
-_SEED = 0
-"""Which rows of a sweep are truncated."""
-_MIN_ROWS = 500
-"""Fewer rows tell nothing about the sensor."""
-_NEAR_M = 2.0
-"""Points on the ego vehicle tell nothing either."""
+_SEED = 0  # Which rows of a sweep are truncated.
+_MIN_ROWS = 500  # Fewer rows say nothing about the sensor.
+_NEAR_M = 2.0  # Points on the ego vehicle say nothing either.
 _MAX_BEYOND = 0.9
 _MAX_OUTSIDE = 0.3
 _MAX_DENSITY = 1.7
@@ -38,20 +35,14 @@ class Cloud:
     points: np.ndarray
     """f32[max_points, c]: x, y, z (m), intensity (0-255), time lag (s), and the laser number for sensors that need
     it. Rows in their order, in their places unless there are more than fit; zero behind them."""
-    valid: np.ndarray
-    """bool[max_points]: rows that take part; False for removed rows and padding."""
-    num_points: int
-    """Rows as given, those that the reader removed included."""
-    num_close: int
-    """Rows on the ego vehicle, removed here or by the reader."""
-    num_invalid: int
-    """Rows removed because they were not finite or beyond physical limits."""
-    num_truncated: int
-    """Rows removed because there were more than ``config.max_points``."""
+    valid: np.ndarray  # bool[max_points]: rows that take part; False for removed rows and padding.
+    num_points: int  # Rows as given, those that the reader removed included.
+    num_close: int  # Rows on the ego vehicle, removed here or by the reader.
+    num_invalid: int  # Rows removed because they were not finite or beyond physical limits.
+    num_truncated: int  # Rows removed because there were more than ``config.max_points``.
 
     @property
     def num_removed(self) -> int:
-        """Rows that do not reach the detector."""
         return self.num_close + self.num_invalid + self.num_truncated
 
 
@@ -67,7 +58,7 @@ def make_cloud(
         points: f32[n, 3 to 6]: x, y, z, intensity (0-255), time lag (s), laser number. Intensity and lag are 0
             where missing; columns that the sensor has no use for are left out.
         config: ``max_points``, and which close points are removed.
-        sensor: whose points they are.
+        sensor: of the points.
         num_close: points on the ego vehicle that the reader has removed already.
         remove_close: ``"all"``, ``"sweeps"`` or ``"none"``, see :func:`fcos_lidar_jax.projection.remove_close`;
             default: as configured. Readers that fuse sweeps have removed theirs, in each sweep's own frame:
@@ -109,10 +100,7 @@ def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def usable_rows(points: np.ndarray) -> np.ndarray:
-    """Which rows are finite and within physical limits, bool[n].
-
-    Args:
-        points: f32[n, 5 or 6].
+    """Which rows of f32[n, 5 or 6] are finite and within physical limits, bool[n].
 
     >>> usable_rows(np.array([[1, 2, 0, 255, 0.45], [1, 2, 0, 1e30, 0], [1, np.nan, 0, 0, 0]])).tolist()
     [True, False, False]
@@ -123,13 +111,12 @@ def usable_rows(points: np.ndarray) -> np.ndarray:
 
 
 def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarray, valid: np.ndarray) -> int:
-    """Write a cloud's rows into arrays of a fixed size, see :func:`make_cloud`.
+    """Write a cloud's rows into zeroed arrays of a fixed size, see :func:`make_cloud`.
 
     Args:
         parts: f32[n, c] each, written one behind another.
-        kept: bool[n of all parts]: the others stay in their places, invalid, where all fits.
-        points: f32[m, c], zero, written to.
-        valid: bool[m], False, written to.
+        kept: bool[n of all parts]; where all fits, the others stay in their places, invalid.
+        points, valid: f32[m, c] and bool[m], written to.
 
     Returns:
         how many rows were truncated.
@@ -145,11 +132,8 @@ def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarr
         rows = _newest(cloud[:, 4], len(points))
         num_truncated = len(cloud) - len(rows)
         parts, kept = [cloud[rows]], np.ones(len(rows), bool)
-    end = 0
-    for part in parts:
-        points[end : end + len(part)] = part
-        end += len(part)
-    valid[:end] = kept
+    np.concatenate(parts, out=points[: len(kept)])
+    valid[: len(kept)] = kept
     return num_truncated
 
 
@@ -166,13 +150,7 @@ def _newest(lags: np.ndarray, number: int) -> np.ndarray:
 
 
 def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> None:
-    """Refuse a cloud of which nothing reaches the range image.
-
-    Args:
-        name: of the cloud, for the message.
-        cloud: from :func:`make_cloud`.
-        num_dropped: valid rows that the projection dropped.
-        sensor: whose range image.
+    """Refuse a cloud of which nothing reaches the range image: the projection dropped all of its valid rows.
 
     Raises:
         ValueError: naming the cloud and what became of its points.
@@ -194,10 +172,6 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     Judged by the current sweep: the share of points beyond the sensor's limits and outside its vertical field of
     view, points a cell of the image, and how many points have a neighbour in the next column and in the next row.
 
-    Args:
-        points: f32[n, 3 to 6] as in :func:`make_cloud`, as read.
-        sensor: of the detector.
-
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame
     >>> cloud = make_frame(0, NUSCENES_HDL32E).points
@@ -213,10 +187,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     if len(points) < _MIN_ROWS:
         return None
     finding = _mismatch(points, sensor)
-    if finding is None:
-        return None
     about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
-    return f"points hardly of {about}: {finding}; expect poor detections"
+    return finding and f"points hardly of {about}: {finding}; expect poor detections"
 
 
 def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
@@ -227,14 +199,10 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
         limits = f"|x|, |y| < {sensor.limit_xy_m:g} m, {low:g} < z < {high:g} m"
         return f"{beyond:.0%} of the points lie beyond its limits, {limits}"
     # A power of two of rows: few compilations for clouds of any length.
-    rows = 1 << (len(points) - 1).bit_length()
-    padded = np.pad(points, ((0, rows - len(points)), (0, 0)))
-    valid = np.arange(rows) < len(points)
-    valid[: len(points)] = within
-    cells = np.bincount(
-        np.asarray(image_cells(padded, valid, sensor)[0])[valid],
-        minlength=sensor.num_rows * sensor.num_columns + 1,
-    )
+    padding = (0, (1 << (len(points) - 1).bit_length()) - len(points))
+    valid = np.pad(within, padding)
+    cell = np.asarray(image_cells(np.pad(points, (padding, (0, 0))), valid, sensor)[0])
+    cells = np.bincount(cell[valid], minlength=sensor.num_rows * sensor.num_columns + 1)
     outside = cells[-1] / within.sum()
     if outside > _MAX_OUTSIDE:
         return f"{outside:.0%} of the points lie outside its vertical field of view"

@@ -25,14 +25,12 @@ def select_candidates(
 ) -> tuple[Array, Array, Array, Array]:
     """The best (location, class) pairs of every level, decoded.
 
-    A pair needs a class probability above the threshold, before the IoU factor, and a point to look at.
+    A pair needs a class probability above the threshold, before the IoU factor, and a point in its cell.
     Boxes are decoded only for the pairs that are kept.
 
     Args:
-        outputs: of one sample.
-        locations: of the same.
-        config: thresholds and counts (static).
-        layout: sizes (static).
+        outputs, locations: of one sample.
+        config, layout: thresholds, counts and sizes (static).
 
     Returns:
         boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c].
@@ -58,13 +56,7 @@ def select_candidates(
 def postprocess(
     outputs: Outputs, locations: Locations, *, config: InferenceConfig, layout: ImageLayout
 ) -> tuple[Array, Array, Array, Array]:
-    """Candidates, class-wise rotated NMS, the best boxes.
-
-    Args:
-        outputs: of one sample.
-        locations: of the same.
-        config: thresholds and counts (static).
-        layout: sizes (static).
+    """Candidates, class-wise rotated NMS, the best boxes; arguments as in :func:`select_candidates`.
 
     Returns:
         boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d]; zero where invalid.
@@ -80,19 +72,12 @@ def postprocess(
             max_outputs=config.max_detections,
             overlap=config.nms_overlap,
         )
-    return (
-        jnp.where(used[:, None], boxes[index], 0.0),
-        jnp.where(used, scores[index], 0.0),
-        jnp.where(used, labels[index], 0),
-        used,
-    )
+    best_boxes = jnp.where(used[:, None], boxes[index], 0.0)
+    return best_boxes, jnp.where(used, scores[index], 0.0), jnp.where(used, labels[index], 0), used
 
 
 def make_detect(detector: Detector) -> Detect:
     """The whole path from points to boxes: projection, network, decoding, NMS.
-
-    Args:
-        detector: from :func:`fcos_lidar_jax.models.build_detector`.
 
     Returns:
         pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` of one cloud, to be jitted by the
@@ -104,13 +89,8 @@ def make_detect(detector: Detector) -> Detect:
 
     def detect(variables: Any, points: Array | np.ndarray, valid: Array | np.ndarray) -> Detections:
         with jax.named_scope("mrv"):
-            image = project_points(
-                points,
-                valid,
-                binned,
-                num_rounds=config.projection.num_rounds,
-                prioritize_current=config.projection.prioritize_current,
-            )
+            rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
+            image = project_points(points, valid, binned, num_rounds=rounds, prioritize_current=current_first)
         outputs, _ = detector.apply(variables, image.features[None], train=False)
         outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
         boxes, scores, labels, used = postprocess(

@@ -24,7 +24,7 @@ from fcos_lidar_jax.types import Detections
 
 @dataclasses.dataclass(frozen=True)
 class TrainedDetector:
-    """A network with its weights.
+    """A network with its weights, its configuration, and the sensor whose clouds it was trained on.
 
     >>> from fcos_lidar_jax.inference import load_detector
     >>> detector = load_detector("quickstart")
@@ -33,23 +33,18 @@ class TrainedDetector:
     """
 
     model: Detector
-    """The network's pure functions, with configuration and sensor."""
-    variables: Variables
-    """``params`` and ``batch_stats``."""
+    variables: Variables  # ``params`` and ``batch_stats``.
 
     @property
     def config(self) -> Config:
-        """All choices."""
         return self.model.config
 
     @property
     def sensor(self) -> Sensor:
-        """The LiDAR whose clouds it was trained on."""
         return self.model.sensor
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the labels."""
         return self.config.classes
 
     def __call__(self, points: np.ndarray) -> Detections:
@@ -68,11 +63,7 @@ class TrainedDetector:
         return self.detect(make_cloud(points_from_array(points, self.sensor), self.config, sensor=self.sensor))
 
     def detect(self, cloud: Cloud) -> Detections:
-        """Boxes in one cloud that :func:`~fcos_lidar_jax.inference.cloud.make_cloud` has prepared.
-
-        Returns:
-            NumPy arrays.
-        """
+        """Boxes in one cloud of :func:`~fcos_lidar_jax.inference.cloud.make_cloud`, as NumPy arrays."""
         mesh = make_mesh(jax.local_devices()[:1])
         found = sharded_detect(self.model, mesh)(
             replicate(self.variables, mesh), *shard_batch((cloud.points[None], cloud.valid[None]), mesh)
@@ -81,11 +72,7 @@ class TrainedDetector:
 
 
 def load_detector(checkpoint: str | Path) -> TrainedDetector:
-    """A detector from a checkpoint.
-
-    Args:
-        checkpoint: folder of a checkpoint; folder of a run, which stands for its last checkpoint; or the name of
-            weights that come with the package.
+    """A detector from a checkpoint, a run, or weights that come with the package, see :func:`find_checkpoint`.
 
     Raises:
         CheckpointError: naming the folder, what was found and what was expected.
@@ -101,11 +88,6 @@ def sharded_detect(detector: Detector, mesh: Mesh, batch_size: int = 1) -> Calla
     With one cloud a device every device runs the program of a single cloud, so the boxes do not depend on the
     number of devices.
 
-    Args:
-        detector: from :func:`fcos_lidar_jax.models.build_detector`.
-        mesh: the devices.
-        batch_size: clouds that a device takes at once.
-
     Returns:
         compiled ``(variables, points f32[b, n, c], valid bool[b, n]) -> Detections`` with a leading axis b,
         ``batch_size`` times the number of devices, split over the devices.
@@ -120,8 +102,5 @@ def sharded_detect(detector: Detector, mesh: Mesh, batch_size: int = 1) -> Calla
         return jax.tree.map(lambda leaf: leaf[None], detect(variables, points[0], valid[0]))
 
     rows = PartitionSpec(mesh.axis_names[0])
-    return jax.jit(
-        jax.shard_map(
-            on_one_device, mesh=mesh, in_specs=(PartitionSpec(), rows, rows), out_specs=rows, check_vma=False
-        )
-    )
+    specs = {"in_specs": (PartitionSpec(), rows, rows), "out_specs": rows}
+    return jax.jit(jax.shard_map(on_one_device, mesh=mesh, **specs, check_vma=False))

@@ -9,12 +9,7 @@ from fcos_lidar_jax.types import Detections
 
 
 def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 0.0) -> list[dict[str, Any]]:
-    """Detections of one cloud as JSON objects, best first.
-
-    Args:
-        found: NumPy arrays.
-        classes: names that the labels index.
-        min_score: leave out what is below.
+    """Detections of one cloud, of NumPy arrays, that reach a score, as JSON objects, best first.
 
     >>> one = np.ones(1, np.float32)
     >>> as_records(Detections(np.ones((1, 9)), one, one.astype(int), one > 0, one), ("car", "tram"))[0]["label"]
@@ -27,11 +22,6 @@ def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 
 
 
 def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Boxes, labels and scores of the detections of one cloud that reach a score.
-
-    Args:
-        found: of one cloud.
-        min_score: leave out what is below.
-    """
+    """Boxes, labels and scores of the detections of one cloud that reach a score."""
     kept = np.asarray(found.valid) & (np.asarray(found.scores) >= min_score)
     return np.asarray(found.boxes)[kept], np.asarray(found.labels)[kept], np.asarray(found.scores)[kept]

@@ -16,7 +16,6 @@ def empty_batch(size: int, *, max_points: int, max_boxes: int, columns: int) -> 
     >>> empty_batch(2, max_points=8, max_boxes=4, columns=5).points.shape
     (2, 8, 5)
     """
-    # NumPy arrays, which travel to the device later.
     arrays: Any = (
         np.zeros((size, max_points, columns), np.float32),
         np.zeros((size, max_points), bool),
@@ -36,8 +35,7 @@ def fill_row(
     with the fewest points go, among equals the last; the others keep their order.
 
     Args:
-        batch: from :func:`empty_batch`.
-        row: which sample.
+        batch, row: from :func:`empty_batch`, and which sample.
         parts: the frame, and what is pasted into it.
         removed: i64[k], rows of points to leave out, counted through the parts.
 
@@ -64,51 +62,31 @@ def fill_row(
     boxes[: len(most)] = np.concatenate([part.boxes for part in parts])[most]
     labels[: len(most)] = np.concatenate([part.labels for part in parts])[most]
     box_valid[: len(most)] = True
-    return {
-        "truncated_points": truncated,
-        "truncated_boxes": len(num_points) - len(most),
-        "invalid_points": num_invalid,
-    }
+    num_lost = len(num_points) - len(most)
+    return {"truncated_points": truncated, "truncated_boxes": num_lost, "invalid_points": num_invalid}
 
 
 def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> Batch:
-    """Pad frames to one shape and stack them.
-
-    Args:
-        frames: at least one, with the same number of point columns.
-        max_points: rows of points a frame.
-        max_boxes: rows of boxes a frame.
+    """Pad frames, at least one, of the same point columns, to one shape and stack them.
 
     Raises:
         ValueError: when a frame is larger; nothing is truncated.
-
-    >>> from fcos_lidar_jax.simulation.frames import make_frame
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> make_batch([make_frame(0, TINY)], max_points=4096, max_boxes=32).points.shape
-    (1, 4096, 5)
     """
     columns = frames[0].points.shape[1]
     batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
     for row, frame in enumerate(frames):
-        for name, rows, limit in (
-            ("points", len(frame.points), max_points),
-            ("boxes", len(frame.boxes), max_boxes),
-        ):
-            if rows > limit:
-                raise ValueError(f"frame {row}: {name}: got {rows}, expected at most {limit}")
+        for name, rows, limit in (("points", frame.points, max_points), ("boxes", frame.boxes, max_boxes)):
+            if len(rows) > limit:
+                raise ValueError(f"frame {row}: {name}: got {len(rows)}, expected at most {limit}")
         fill_row(batch, row, [frame])
     return batch
 
 
 def check_boxes(boxes: np.ndarray, name: str) -> None:
-    """Refuse boxes that no loss can be computed from: one would make all weights NaN.
-
-    Args:
-        boxes: f32[m, 9] of one frame; NaN velocities are unknown ones.
-        name: of the frame, for the message.
+    """Refuse boxes, f32[m, 9] of one frame, that no loss can be computed from: one would make all weights NaN.
 
     Raises:
-        ValueError: naming the frame and the first such box.
+        ValueError: naming the frame and the first such box; NaN velocities are fine, they are unknown ones.
     """
     shapes = boxes[:, :7]
     bad = np.flatnonzero(~np.isfinite(shapes).all(axis=1) | (shapes[:, 3:6] <= 0).any(axis=1))

@@ -31,8 +31,7 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
         ``config.classes``. The same frame and generator give the same objects.
 
     Raises:
-        ValueError: the database was cut with a higher ``min_points`` than the configuration asks for, or shares no
-            class with it.
+        ValueError: the database has a higher ``min_points`` than the configuration, or shares no class with it.
     """
     assert config.copy_paste is not None
     targets, min_points, manifest = config.paste_targets, config.copy_paste.min_points, objects.manifest

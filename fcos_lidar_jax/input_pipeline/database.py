@@ -16,10 +16,11 @@ import signal
 import threading
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -30,8 +31,7 @@ from fcos_lidar_jax.files import atomic_write, checksum
 from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
 
-MAX_SWEEPS = 20
-"""Sweeps by which an object's points are told apart."""
+MAX_SWEEPS = 20  # Sweeps by which an object's points are distinguished.
 
 _FORMAT, _VERSION = "fcos_lidar_jax objects", 2
 _MANIFEST = "manifest.json"
@@ -47,8 +47,7 @@ _ROW = np.dtype(
     ]
 )
 """One object in a shard's table."""
-_BLOCK = 100
-"""Frames of a shard where the data know no scenes."""
+_BLOCK = 100  # Frames of a shard where the data know no scenes.
 
 
 class DatabaseError(ValueError):
@@ -64,11 +63,14 @@ class Shard(msgspec.Struct, forbid_unknown_fields=True):
     table_blake2b: str
 
 
-class Manifest(msgspec.Struct, forbid_unknown_fields=True):
-    """The last file to be written: without it a database is not finished."""
-
+class _Header(msgspec.Struct):
     format: str
     version: int
+
+
+class Manifest(_Header, forbid_unknown_fields=True):
+    """The last file to be written: without it a database is not finished."""
+
     source: str
     classes: list[str]
     min_points: int
@@ -76,28 +78,11 @@ class Manifest(msgspec.Struct, forbid_unknown_fields=True):
     shards: list[Shard]
 
 
-class _Header(msgspec.Struct):
-    format: str
-    version: int
-
-
-@dataclasses.dataclass(frozen=True)
-class _Table:
-    """What a shard's table file holds."""
-
-    rows: np.ndarray
-    """:data:`_ROW`, one an object."""
-    columns: int
-    """Of a point; 0 where there was no frame."""
-    recipe: str
-    """Checksum of all that the shard's bytes follow from."""
-    blake2b: str
-    """Checksum of the file."""
-
-    @property
-    def num_points(self) -> int:
-        """Points of all its objects."""
-        return int(self.rows["count"].sum(dtype=np.int64))
+class _Table(NamedTuple):
+    rows: np.ndarray  # _ROW, one an object
+    recipe: str  # checksum of all that the shard's bytes follow from
+    blake2b: str  # checksum of the file
+    num_points: int  # of all objects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,25 +90,17 @@ class GroundTruthDatabase:
     """An opened database: the tables in memory, the points on disk."""
 
     folder: Path
-    """Where the shards are."""
     manifest: Manifest
-    """What was built."""
     table: np.ndarray
     """One row an object, all shards one behind another: ``box``, ``label`` (index into the manifest's classes),
     ``frame``, and what says where its points are."""
-    shard: np.ndarray
-    """i32: which shard of the manifest holds each object."""
+    shard: np.ndarray  # i32: which shard of the manifest holds each object.
 
     def __len__(self) -> int:
-        """Number of objects."""
         return len(self.table)
 
     def num_points(self, num_sweeps: int) -> np.ndarray:
-        """Points of every object in the newest sweeps of its frame, i32[n].
-
-        Raises:
-            ValueError: more sweeps than the table tells apart.
-        """
+        """Points of every object in the newest sweeps, at most :data:`MAX_SWEEPS`, of its frame, i32[n]."""
         if not 1 <= num_sweeps <= MAX_SWEEPS:
             raise ValueError(f"num_sweeps: got {num_sweeps}, expected 1 to {MAX_SWEEPS} for copy-paste")
         return self.table["newest"][:, num_sweeps - 1]
@@ -137,7 +114,7 @@ class GroundTruthDatabase:
             DatabaseError: when the bytes are not those that were written.
         """
         row, columns = self.table[index], self.manifest.columns
-        file = _points_file(self.folder, self.manifest.shards[self.shard[index]].name)
+        file, _ = _files(self.folder, self.manifest.shards[self.shard[index]].name)
         start, count = int(row["start"]) * columns, int(row["count"]) * columns
         values = np.fromfile(file, "<f4", count=count, offset=4 * start)
         if zlib.crc32(values.data) != row["crc32"]:
@@ -151,7 +128,7 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
     """Open and check a finished ground-truth database.
 
     Args:
-        folder: of the database.
+        folder: where :func:`prepare_database` wrote.
         fingerprint: of the frames that it must have been built from; None to take any.
 
     Raises:
@@ -161,18 +138,15 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
     manifest = read_manifest(folder)
     file = folder / _MANIFEST
     if fingerprint is not None and manifest.source != fingerprint:
-        raise DatabaseError(
-            f"{file}: source: got {manifest.source!r}, expected {fingerprint!r}: built from other data, "
-            f"build it anew"
-        )
+        found = f"got {manifest.source!r}, expected {fingerprint!r}"
+        raise DatabaseError(f"{file}: source: {found}: built from other data, build it anew")
     tables = []
     for entry in manifest.shards:
-        table = _read_shard(folder, entry.name, expected=entry.table_blake2b)
-        found = len(table.rows), table.num_points
-        if found != (entry.objects, entry.points):
+        table = _read_shard(folder, entry.name, manifest.columns, expected=entry.table_blake2b)
+        if (len(table.rows), table.num_points) != (entry.objects, entry.points):
             raise DatabaseError(
                 f"{file}: {entry.name}: got {entry.objects} objects of {entry.points} points, "
-                f"expected {found[0]} of {found[1]} as in its table; build it anew"
+                f"expected {len(table.rows)} of {table.num_points} as in its table; build it anew"
             )
         tables.append(table.rows)
     rows = np.concatenate([np.zeros(0, _ROW), *tables])
@@ -185,16 +159,12 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
 
 
 def objects_folder(index: Path, split: str | None) -> Path:
-    """Where the objects of a split are, below the index: those of another split never get into a training."""
+    """Where the objects of a split are, apart from those of others, which must not get into its training."""
     return index / "objects" / (split or "all_frames")
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a finished database.
-
-    Raises:
-        DatabaseError: as :func:`open_database`.
-    """
+    """The manifest of a finished database; errors as of :func:`open_database`."""
     file = folder / _MANIFEST
     if not file.is_file():
         raise DatabaseError(f"{file}: no such file, expected a finished ground-truth database")
@@ -222,12 +192,12 @@ def prepare_database(
     """Cut the points of every box of at least ``min_points`` points out of the frames, a shard a scene.
 
     Each shard is written beside its place and renamed, its table last, so a kill at any moment loses the shards in
-    work at most; the next call goes on with the rest. The files are the same bytes whatever the number of workers
+    work at most; the next call does the rest. The files are the same bytes whatever the number of workers
     and however often it was stopped. Shards of frames with another fingerprint are replaced.
 
     Args:
         frames: of any classes; picklable where there are several workers.
-        folder: of the database; made if missing. Nothing else may live there.
+        folder: of the database alone; made if missing.
         min_points: points, of all sweeps, an object needs.
         workers: processes; 1 works in this one.
         report: called with (frames done, frames in all) at the beginning, frames of an earlier run counted as
@@ -237,19 +207,23 @@ def prepare_database(
         the finished database, checked and opened.
 
     Raises:
-        ValueError: frames with different columns, or a box without a size.
+        ValueError: a frame with other columns than its sensor's, or a box without a size.
         OSError: what the file system raises, or a worker that died.
     """
     folder = Path(folder)
     if workers < 1:
         raise ValueError(f"workers: got {workers}, expected at least 1")
-    shards, source = shards_by_scene(frames), frames.fingerprint()
+    shards, source, columns = shards_by_scene(frames), frames.fingerprint(), frames.sensor.point_columns
     folder.mkdir(parents=True, exist_ok=True)
-    _remove_left_overs(folder, set(shards))
+    for file in folder.iterdir():  # left half-written by a killed run, or of scenes that the frames no longer have
+        shard = re.sub(r"\.(points\.f32|objects\.npz)$", "", file.name)
+        left_over = re.fullmatch(r"\.[0-9a-f]{12}\.(f32|npz|json)", file.name)
+        if left_over or (shard != file.name and shard not in shards):
+            file.unlink()
     jobs, done = [], 0
     for name, indices in shards.items():
         follows_from = _FORMAT, _VERSION, tuple(frames.classes), source, min_points, name, indices
-        job = _Job(folder, name, indices, min_points, checksum(repr(follows_from).encode()))
+        job = _Job(folder, name, indices, min_points, columns, checksum(repr(follows_from).encode()))
         if _finished(job):
             done += len(indices)
         else:
@@ -261,7 +235,11 @@ def prepare_database(
     for count in (_cut_shard(frames, job) for job in jobs) if workers == 1 else _pooled(frames, jobs, workers):
         done += count
         report(done, len(frames))
-    _write_manifest(folder, shards, source, frames.classes, min_points)
+    tables = {name: _read_shard(folder, name, columns) for name in shards}
+    entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
+    manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, columns, entries)
+    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
+    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
     return open_database(folder, fingerprint=source)
 
 
@@ -280,43 +258,31 @@ def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
     return shards
 
 
-@dataclasses.dataclass(frozen=True)
-class _Job:
+class _Job(NamedTuple):
     """A shard to be written."""
 
     folder: Path
     name: str
     indices: list[int]
     min_points: int
+    columns: int
     recipe: str
 
 
-def _points_file(folder: Path, shard: str) -> Path:
-    return folder / f"{shard}.points.f32"
-
-
-def _table_file(folder: Path, shard: str) -> Path:
-    return folder / f"{shard}.objects.npz"
-
-
-def _remove_left_overs(folder: Path, names: set[str]) -> None:
-    """Remove what a killed run left half-written, and shards of scenes that the frames no longer have."""
-    for file in folder.iterdir():
-        shard = re.sub(r"\.(points\.f32|objects\.npz)$", "", file.name)
-        left_over = re.fullmatch(r"\.[0-9a-f]{12}\.(f32|npz|json)", file.name)
-        if left_over or (shard != file.name and shard not in names):
-            file.unlink()
+def _files(folder: Path, shard: str) -> tuple[Path, Path]:
+    """A shard's points and its table."""
+    return folder / f"{shard}.points.f32", folder / f"{shard}.objects.npz"
 
 
 def _finished(job: _Job) -> bool:
     """Whether an earlier run left the whole shard, every point of it."""
     try:
-        table = _read_shard(job.folder, job.name)
+        table = _read_shard(job.folder, job.name, job.columns)
     except DatabaseError:
         return False
     if table.recipe != job.recipe:
         return False
-    data, size = memoryview(_points_file(job.folder, job.name).read_bytes()), 4 * table.columns
+    data, size = memoryview(_files(job.folder, job.name)[0].read_bytes()), 4 * job.columns
     starts, counts = (table.rows[field].tolist() for field in ("start", "count"))
     found = [zlib.crc32(data[size * i : size * (i + n)]) for i, n in zip(starts, counts, strict=True)]
     return found == table.rows["crc32"].tolist()
@@ -326,12 +292,11 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     """Write one shard; returns how many frames it has."""
     rows: list[tuple] = []
     parts: list[np.ndarray] = []
-    start = columns = 0
+    start = 0
     for index in job.indices:
         frame = frames.frame(index)
-        if columns not in (0, frame.points.shape[1]):
-            raise ValueError(f"frame {index}: points: got {frame.points.shape[1]} columns, expected {columns}")
-        columns = frame.points.shape[1]
+        if (found := frame.points.shape[1]) != job.columns:
+            raise ValueError(f"frame {index}: points: got {found} columns, expected {job.columns} of the sensor")
         check_boxes(frame.boxes, frames.name(index))
         cloud = frame.points[usable_rows(frame.points)]
         lags = np.unique(np.append(cloud[:, 4], np.float32(0)))[:MAX_SWEEPS]
@@ -345,20 +310,17 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
             rows.append((box, label, index, start, len(points), newest, zlib.crc32(points.data)))
             parts.append(points)
             start += len(points)
-    table = {"rows": np.array(rows, _ROW), "columns": np.int32(columns), "recipe": np.array(job.recipe)}
-    points = np.concatenate(parts) if parts else np.zeros((0, columns), "<f4")
-    atomic_write(_points_file(job.folder, job.name), lambda path: points.tofile(path))
-    atomic_write(_table_file(job.folder, job.name), lambda path: np.savez(path, allow_pickle=False, **table))
+    table = {"rows": np.array(rows, _ROW), "recipe": np.array(job.recipe)}
+    points = np.concatenate([np.zeros((0, job.columns), "<f4"), *parts])
+    points_file, table_file = _files(job.folder, job.name)
+    atomic_write(points_file, points.tofile)
+    atomic_write(table_file, lambda path: np.savez(path, allow_pickle=False, **table))
     return len(job.indices)
 
 
 def _pooled(frames: FrameSet, jobs: Sequence[_Job], workers: int) -> Iterator[int]:
-    pool = ProcessPoolExecutor(
-        min(workers, max(len(jobs), 1)),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin_worker,
-        initargs=(frames,),
-    )
+    number, context = min(workers, max(len(jobs), 1)), multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(number, mp_context=context, initializer=_begin_worker, initargs=(frames,))
     try:
         # The workers inherit the mask: an interruption is this process's to answer.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -395,40 +357,25 @@ def _work(job: _Job) -> int:
     return _cut_shard(_worker_frames, job)
 
 
-def _write_manifest(
-    folder: Path, names: Iterable[str], source: str, classes: Iterable[str], min_points: int
-) -> None:
-    entries, columns = [], 0
-    for name in names:
-        table = _read_shard(folder, name)
-        if columns and table.columns not in (0, columns):
-            raise ValueError(f"shard {name!r}: points: got {table.columns} columns, expected {columns}")
-        columns = columns or table.columns
-        entries.append(Shard(name, len(table.rows), table.num_points, table.blake2b))
-    manifest = Manifest(_FORMAT, _VERSION, source, list(classes), min_points, columns, entries)
-    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
-    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
-
-
-def _read_shard(folder: Path, name: str, *, expected: str | None = None) -> _Table:
+def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None = None) -> _Table:
     """A shard's table, its points being as many as it says; ``expected`` is the table's checksum."""
-    file = _table_file(folder, name)
+    points_file, file = _files(folder, name)
     data = _read(file)
     found = checksum(data)
     if expected is not None and found != expected:
         raise DatabaseError(f"{file}: checksum differs from the manifest's; build it anew")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            table = _Table(arrays["rows"], int(arrays["columns"]), str(arrays["recipe"]), found)
+            rows, recipe = arrays["rows"], str(arrays["recipe"])
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise DatabaseError(f"{file}: not a table of objects: {error}") from None
-    if table.rows.dtype != _ROW or table.rows.ndim != 1:
-        raise DatabaseError(f"{file}: got columns {table.rows.dtype.names}, expected {_ROW.names}; build it anew")
-    file = _points_file(folder, name)
-    size = 4 * table.columns * table.num_points
-    found = f"{file.stat().st_size} bytes" if file.is_file() else "no file"
+    if rows.dtype != _ROW or rows.ndim != 1:
+        raise DatabaseError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; build it anew")
+    table = _Table(rows, recipe, found, int(rows["count"].sum(dtype=np.int64)))
+    size = 4 * columns * table.num_points
+    found = f"{points_file.stat().st_size} bytes" if points_file.is_file() else "no file"
     if found != f"{size} bytes":
-        raise DatabaseError(f"{file}: got {found}, expected {size} bytes of points; build it anew")
+        raise DatabaseError(f"{points_file}: got {found}, expected {size} bytes of points; build it anew")
     return table
 
 

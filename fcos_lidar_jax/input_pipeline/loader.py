@@ -22,11 +22,10 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.types import Batch, HostBatch
+from fcos_lidar_jax.types import HostBatch
 
 _MAX_COLUMNS = 6
-_CLASS_BALANCE = 0xCB65
-"""Keeps these draws apart from others of the same seed."""
+_CLASS_BALANCE = 0xCB65  # Keeps these draws apart from others of the same seed.
 
 
 class SampleOrder:
@@ -37,11 +36,6 @@ class SampleOrder:
     classes that occur at all, floor(N / C) frames are drawn for every class, with replacement and equal chances,
     from the n_c. Frames without any box are then never drawn. A position's frame follows from the seed and the
     position alone.
-
-    Args:
-        frames: training set, of which the labels are read.
-        config: ``class_balanced``.
-        seed: of draws and shuffles.
 
     Raises:
         ValueError: no frames, or none that shows an object.
@@ -76,7 +70,6 @@ class SampleOrder:
         self._shuffled: Any = grain.MapDataset.range(self.epoch_size).shuffle(seed=shuffle_seed).repeat()
 
     def __getitem__(self, position: int) -> int:
-        """Index of the frame at a position, which counts through all epochs."""
         index = int(self._shuffled[position])
         if not self._showing:
             return index
@@ -85,14 +78,7 @@ class SampleOrder:
 
 
 def steps_per_epoch(frames: FrameSet, config: Config) -> int:
-    """Steps until every sample of an epoch was seen; the last batch reaches into the next epoch.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> steps_per_epoch(SimulatedFrames(TINY, 5), dataclasses.replace(QUICKSTART, class_balanced=False))
-    3
-    """
+    """Steps until every sample of an epoch was seen; the last batch reaches into the next epoch."""
     return -(-SampleOrder(frames, config, seed=0).epoch_size // config.optimizer.batch_size)
 
 
@@ -120,8 +106,7 @@ def make_batches(
         frames: training set, whose labels index ``config.classes``; picklable where there are workers.
         config: batch size, padded sizes, class balance, copy-paste and its end.
         seed: of class balance, order and pasted objects.
-        num_steps: of the whole run.
-        first_step: where a resumed run goes on.
+        num_steps, first_step: of the whole run, and where a resumed one starts.
         objects: to paste; needed unless ``config.copy_paste`` is None.
         process_index: of this process among those that share each global batch.
         num_processes: process i gets rows i * B / n to (i + 1) * B / n, so the parts in order are the whole.
@@ -135,19 +120,51 @@ def make_batches(
         ValueError: sizes that do not divide, no frames, or no objects where some are to be pasted.
     """
     import grain
+    from absl import flags
 
     if not 0 <= first_step <= num_steps:
         raise ValueError(f"first_step: got {first_step}, expected 0 to {num_steps}")
     for name, value in (("threads", threads), ("workers", workers)):
         if value < 0:
             raise ValueError(f"{name}: got {value}, expected at least 0")
-    batch_of = _BatchOf(frames, config, seed, num_steps, objects, process_index, num_processes)
+    size = config.optimizer.batch_size
+    if not 0 <= process_index < num_processes or size % num_processes:
+        raise ValueError(
+            f"process {process_index} of {num_processes}: expected a number that divides the batch of {size}"
+        )
+    order = SampleOrder(frames, config, seed=seed)
+    if config.copy_paste is not None and objects is None:
+        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
+    rows = range(process_index * size // num_processes, (process_index + 1) * size // num_processes)
+    fade_step = num_steps - config.fade_epochs * -(-order.epoch_size // size)
+    paste = make_paste(objects, config) if objects is not None and config.copy_paste is not None else None
+
+    def batch_of(step: int) -> HostBatch:
+        positions = [step * size + row for row in rows]
+        shown = [order[position] for position in positions]
+        names = tuple(frames.name(index) for index in shown)
+        counts, columns = Counter(pasted_objects=0), frames.sensor.point_columns
+        batch = empty_batch(len(shown), max_points=config.max_points, max_boxes=config.max_boxes, columns=columns)
+        for row, (position, index) in enumerate(zip(positions, shown, strict=True)):
+            frame = frames.frame(index)
+            check_boxes(frame.boxes, names[row])
+            seen = frame.num_points >= 1
+            boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
+            parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)
+            if paste is not None and step < fade_step:
+                pasted, removed = paste(frame, np.random.default_rng([seed, position]))
+                parts.append(pasted)
+                counts["pasted_objects"] += len(pasted.boxes)
+            counts.update(fill_row(batch, row, parts, removed))
+        return HostBatch(batch, dict(counts), names)
+
     steps = grain.MapDataset.range(first_step, num_steps).map(batch_of)
     # Batches are large: one waits ready beside those in work, no more.
     stream = steps.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads + 1))
     if workers:
         _check_shared_memory(config, workers, num_processes)
-        _mark_flags_parsed()
+        if not flags.FLAGS.is_parsed():  # which grain's worker processes read
+            flags.FLAGS.mark_as_parsed()
         stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1))
     prepared: Any = _from_workers(stream) if workers else iter(stream)
     with contextlib.closing(prepared) as batches:
@@ -168,14 +185,6 @@ def _check_shared_memory(config: Config, workers: int, num_processes: int) -> No
         )
 
 
-def _mark_flags_parsed() -> None:
-    """Worker processes of grain read absl's flags, which nobody parses here."""
-    from absl import flags
-
-    if not flags.FLAGS.is_parsed():
-        flags.FLAGS.mark_as_parsed()
-
-
 def _from_workers(stream: Iterable[HostBatch]) -> Iterator[HostBatch]:
     """Batches out of the shared memory in which the workers pass them."""
     iterator: Any = iter(stream)
@@ -185,69 +194,3 @@ def _from_workers(stream: Iterable[HostBatch]) -> Iterator[HostBatch]:
             # Before it is handed on: grain frees the memory in a thread of its own, in which it needs some time.
             del item
             yield batch
-
-
-class _BatchOf:
-    """Step -> batch, as an object that travels to the workers."""
-
-    def __init__(
-        self,
-        frames: FrameSet,
-        config: Config,
-        seed: int,
-        num_steps: int,
-        objects: GroundTruthDatabase | None,
-        process_index: int,
-        num_processes: int,
-    ) -> None:
-        size = config.optimizer.batch_size
-        if not 0 <= process_index < num_processes or size % num_processes:
-            raise ValueError(
-                f"process {process_index} of {num_processes}: expected a number that divides the batch of {size}"
-            )
-        self.frames, self.config, self.seed = frames, config, seed
-        share = size // num_processes
-        self.rows = range(process_index * share, (process_index + 1) * share)
-        self.order = SampleOrder(frames, config, seed=seed)
-        self.fade_step = num_steps - config.fade_epochs * -(-self.order.epoch_size // size)
-        self.paste = None
-        if config.copy_paste is not None:
-            if objects is None:
-                raise ValueError(
-                    "copy_paste: got no ground-truth database, expected one, or None in the configuration"
-                )
-            self.paste = make_paste(objects, config)
-
-    def __call__(self, step: int) -> HostBatch:
-        batch: Batch | None = None
-        counts = Counter(pasted_objects=0)
-        positions = [step * self.config.optimizer.batch_size + row for row in self.rows]
-        shown = [self.order[position] for position in positions]
-        names = tuple(self.frames.name(index) for index in shown)
-        for row, index in enumerate(shown):
-            frame = self.frames.frame(index)
-            check_boxes(frame.boxes, names[row])
-            truth = frame.num_points >= 1
-            parts: list[Any] = [
-                dataclasses.replace(
-                    frame,
-                    boxes=frame.boxes[truth],
-                    labels=frame.labels[truth],
-                    num_points=frame.num_points[truth],
-                )
-            ]
-            removed = np.zeros(0, np.int64)
-            if self.paste is not None and step < self.fade_step:
-                pasted, removed = self.paste(frame, np.random.default_rng([self.seed, positions[row]]))
-                parts.append(pasted)
-                counts["pasted_objects"] += len(pasted.boxes)
-            if batch is None:
-                batch = empty_batch(
-                    len(shown),
-                    max_points=self.config.max_points,
-                    max_boxes=self.config.max_boxes,
-                    columns=frame.points.shape[1],
-                )
-            counts.update(fill_row(batch, row, parts, removed))
-        assert batch is not None
-        return HostBatch(batch, dict(counts), names)

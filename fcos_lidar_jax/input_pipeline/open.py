@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
 from fcos_lidar_jax.data.classes import ClassMap, MappedFrames, mapped_classes, unknown_name
@@ -16,22 +16,15 @@ from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 
 Format = Literal["nuscenes", "kitti", "argoverse2", "folder", "simulated"]
 
-_MARKS: dict[Format, tuple[str, ...]] = {
+_MARKS: dict[Format, tuple[str, ...]] = {  # by what a layout is recognised: one of these is there
     "nuscenes": ("*/sample.json",),
     "kitti": ("training/velodyne",),
     "argoverse2": ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar"),
     "folder": ("clouds",),
 }
-"""By what a layout is recognised: one of these is there."""
-
 
 _FULL_REACH_M = 45.0
-_SIMULATED = {"train": (100_000, 0), "val": (400, UNSEEN_SEED)}
-"""Split of simulated frames -> how many there are, and the first one's seed."""
-
-
-class LayoutError(ValueError):
-    """A folder that is no data set that can be read; one line that says what was looked for."""
+_SIMULATED = {"train": (100_000, 0), "val": (400, UNSEEN_SEED)}  # number of frames, the first one's seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,15 +32,12 @@ class Layout:
     """What kind of data set a folder holds."""
 
     root: Path
-    """The folder."""
     format: Format
-    """Who reads it."""
-    version: str | None
-    """Folder of the tables, for nuScenes alone."""
+    version: str | None  # Folder of the tables, for nuScenes alone.
 
     @property
     def index(self) -> Path:
-        """Where ``prepare`` writes, and its product is looked for, unless another place is given."""
+        """Where ``prepare`` writes by default, and where its index is looked for."""
         return self.root / ".fcos_lidar" / (self.version or "")
 
 
@@ -60,24 +50,27 @@ def find_layout(root: str | Path | None, format: Format | None = None, version: 
         version: of nuScenes, which other formats have not; may be left out where there is one.
 
     Raises:
-        LayoutError: not one format's or version's, naming the folder and what was looked for.
+        ValueError: not one format's or version's, naming the folder and what was looked for.
     """
     if format == "simulated":
         if root is not None:
-            raise LayoutError(f"data root: got {root}, expected none for simulated frames")
+            raise ValueError(f"data root: got {root}, expected none for simulated frames")
         return Layout(Path("simulated"), format, None)
     if root is None:
-        raise LayoutError("data root: missing, expected the folder of a data set")
+        raise ValueError("data root: missing, expected the folder of a data set")
     root = Path(root)
     if not root.is_dir():
-        raise LayoutError(f"{root}: no such folder, expected a data set")
+        raise ValueError(f"{root}: no such folder, expected a data set")
     known = _recognise(root) if format is None else format
     if known not in _MARKS:
-        raise LayoutError(f"format: {unknown_name(known, _MARKS)}")
+        raise ValueError(f"format: {unknown_name(known, _MARKS)}")
     if known == "nuscenes":
-        version = _find_version(root) if version is None else version
+        there = sorted(file.parent.name for file in root.glob("*/sample.json")) if version is None else [version]
+        if len(there) != 1:
+            raise ValueError(f"{root}: got versions {', '.join(there) or '(none)'}, expected one: name it")
+        version = there[0]
     elif version is not None:
-        raise LayoutError(f"version: got {version!r}, expected none: {root} is of format {known}")
+        raise ValueError(f"version: got {version!r}, expected none: {root} is of format {known}")
     return Layout(root, known, version)
 
 
@@ -86,18 +79,11 @@ def _recognise(root: Path) -> Format:
         name for name, marks in _MARKS.items() if any(next(root.glob(mark), None) for mark in marks)
     ]
     if len(found) > 1:
-        raise LayoutError(f"{root}: looks like {' and '.join(found)}, expected one format: name it")
+        raise ValueError(f"{root}: looks like {' and '.join(found)}, expected one format: name it")
     if not found:
         marks = ", ".join(f"{' or '.join(marks)} ({name})" for name, marks in _MARKS.items())
-        raise LayoutError(f"{root}: no known data set, expected one of {marks}")
+        raise ValueError(f"{root}: no known data set, expected one of {marks}")
     return found[0]
-
-
-def _find_version(root: Path) -> str:
-    there = sorted(file.parent.name for file in root.glob("*/sample.json"))
-    if len(there) != 1:
-        raise LayoutError(f"{root}: got versions {', '.join(there) or '(none)'}, expected one: name it")
-    return there[0]
 
 
 def default_split(
@@ -117,7 +103,7 @@ def default_split(
         a name, or None where the data have no splits, and, if it is not required, where they have no such split.
 
     Raises:
-        LayoutError: several splits, none of that name, and one is required.
+        ValueError: several splits, none of that name, and one is required.
     """
     name = f"mini_{purpose}" if (layout.version or "").endswith("mini") else purpose
     names = _split_names(layout, splits)
@@ -126,7 +112,7 @@ def default_split(
     if not required or not names:
         return None
     if len(names) > 1:
-        raise LayoutError(f"{layout.root}: split: got splits {', '.join(names)}, none is {name}: name one")
+        raise ValueError(f"{layout.root}: split: got splits {', '.join(names)}, none is {name}: name one")
     return names[0]
 
 
@@ -175,7 +161,7 @@ def open_frames(
         class_map: the data's name -> another, None for objects to leave out; other names stay.
         index: of nuScenes, where ``prepare`` has put it.
         splits: JSON file of own splits, ``{"name": [scene, ...]}`` for nuScenes, of frames for a folder.
-        allow_missing_sweeps: of nuScenes: go on without older sweeps whose file is missing.
+        allow_missing_sweeps: of nuScenes: continue without older sweeps whose file is missing.
 
     Returns:
         frames whose labels count their own classes; :class:`~fcos_lidar_jax.data.classes.MappedFrames` brings them
@@ -187,49 +173,33 @@ def open_frames(
     >>> import tempfile
     >>> open_frames(tempfile.mkdtemp())  # doctest: +ELLIPSIS
     Traceback (most recent call last):
-    fcos_lidar_jax.input_pipeline.open.LayoutError: ...: no known data set, expected one of ...
+    ValueError: ...: no known data set, expected one of ...
     """
     layout = find_layout(root, format, version)
-    _refuse(layout, index=index, allow_missing_sweeps=allow_missing_sweeps or None)
+    refused = {"index": index, "allow_missing_sweeps": allow_missing_sweeps or None}
+    if layout.format != "folder":
+        refused["splits"] = splits
+    for name, value in refused.items():
+        if value is not None and layout.format != "nuscenes":
+            raise ValueError(f"{name}: got {value}, expected none: {layout.root} is of format {layout.format}")
     if num_sweeps < 1:
         raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
+    close: Any = {"remove_close": remove_close, "close_m": close_m}
     if layout.format == "simulated":
-        _refuse(layout, splits=splits)
         frames = _simulated_frames(split, sensor or NUSCENES_HDL32E, num_sweeps, remove_close, close_m)
     elif layout.format == "nuscenes":
-        assert layout.version is not None
-        data = NuScenes(layout.root, layout.version, index=index, allow_missing_sweeps=allow_missing_sweeps)
+        data = NuScenes(layout.root, str(layout.version), index=index, allow_missing_sweeps=allow_missing_sweeps)
         tokens = data.sample_tokens if split is None else data.split(split, file=splits)
-        sensor = sensor or NUSCENES_HDL32E
-        frames = NuScenesFrames(data, tuple(tokens), num_sweeps, remove_close, close_m, sensor)
+        frames = NuScenesFrames(data, tuple(tokens), num_sweeps, sensor=sensor or NUSCENES_HDL32E, **close)
     elif layout.format == "kitti":
-        _refuse(layout, splits=splits)
-        frames = KittiFrames(
-            layout.root, split, sensor=sensor or KITTI_HDL64E, remove_close=remove_close, close_m=close_m
-        )
+        frames = KittiFrames(layout.root, split, sensor=sensor or KITTI_HDL64E, **close)
     elif layout.format == "argoverse2":
-        _refuse(layout, splits=splits)
-        frames = Argoverse2Frames(
-            layout.root,
-            split,
-            sensor=sensor or ARGOVERSE2,
-            num_sweeps=num_sweeps,
-            remove_close=remove_close,
-            close_m=close_m,
-        )
+        frames = Argoverse2Frames(layout.root, split, sensor=sensor or ARGOVERSE2, num_sweeps=num_sweeps, **close)
     else:
-        frames = FolderFrames(
-            layout.root,
-            sensor,
-            split=split,
-            splits=splits,
-            num_sweeps=num_sweeps,
-            remove_close=remove_close,
-            close_m=close_m,
-        )
-    return (
-        frames if class_map is None else MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
-    )
+        frames = FolderFrames(layout.root, sensor, split=split, splits=splits, num_sweeps=num_sweeps, **close)
+    if class_map is None:
+        return frames
+    return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
 
 
 def _simulated_frames(
@@ -238,18 +208,11 @@ def _simulated_frames(
     """Streets that fit the sensor: what is near for one of a short reach, else up to 45 m."""
     split = split or "train"
     if split not in _SIMULATED:
-        raise LayoutError(f"split: {unknown_name(split, _SIMULATED)}")
+        raise ValueError(f"split: {unknown_name(split, _SIMULATED)}")
     number, first = _SIMULATED[split]
     # The simulated ego vehicle has no body that the sensor could see: what is close is the road.
-    frames = SimulatedFrames(
-        sensor, number, first, num_sweeps=num_sweeps, close_m=0.0 if remove_close == "none" else close_m
-    )
+    close_m = 0.0 if remove_close == "none" else close_m
+    frames = SimulatedFrames(sensor, number, first, num_sweeps=num_sweeps, close_m=close_m)
     if sensor.limit_xy_m < _FULL_REACH_M:
         return frames
     return dataclasses.replace(frames, num_objects=40, reach_m=_FULL_REACH_M)
-
-
-def _refuse(layout: Layout, **options: object) -> None:
-    for name, value in options.items():
-        if value is not None and layout.format != "nuscenes":
-            raise ValueError(f"{name}: got {value}, expected none: {layout.root} is of format {layout.format}")

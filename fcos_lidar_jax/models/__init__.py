@@ -1,4 +1,4 @@
-"""The network: the only room that knows Flax."""
+"""The network: the only package that knows Flax."""
 
 from fcos_lidar_jax.models.detector import Detector, Variables, build_detector, count_parameters
 

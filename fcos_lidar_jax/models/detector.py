@@ -13,14 +13,13 @@ from fcos_lidar_jax.config import Config, ModelConfig
 from fcos_lidar_jax.locations import ImageLayout, image_layout, pad_image
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
-from fcos_lidar_jax.models.layers import Image
+from fcos_lidar_jax.models.layers import Image, recomputed
 from fcos_lidar_jax.models.lidar_net import Backbone
 from fcos_lidar_jax.models.modality import Stem
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Outputs
 
-Variables = dict[str, Any]
-"""``params`` and ``batch_stats``, plain dicts of arrays."""
+Variables = dict[str, Any]  # ``params`` and ``batch_stats``, plain dicts of arrays.
 
 
 class Detector(NamedTuple):
@@ -29,8 +28,7 @@ class Detector(NamedTuple):
     Attributes:
         init: ``key -> variables``.
         apply: ``(variables, features f32[b, h, w, 9, r], train=False) -> (Outputs, batch_stats)``. The
-            features are a range image's, in raw units; the batch statistics are the given ones unless
-            training.
+            features are a range image's, in raw units; the batch statistics are the given ones unless training.
         config: all choices.
         sensor: the image's geometry.
     """
@@ -48,19 +46,16 @@ class Network(nn.Module):
     num_classes: int
 
     def setup(self) -> None:
-        """The four parts; their names are the top level of the parameters."""
-        c = self.config
+        c = self.config  # the four names are the top level of the parameters
         self.stem = Stem(c.stem, c.circular_width, c.precision)
-        self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width)
+        self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width, c.remat)
         self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
-        self.heads = Heads(
-            self.num_classes, c.head_channels, c.head_convs, c.background_prior, c.tied_heads, c.circular_width
-        )
+        sizes = self.num_classes, c.head_channels, c.head_convs
+        self.heads = Heads(*sizes, c.background_prior, c.tied_heads, c.circular_width)
 
     def __call__(self, image: Image, *, train: bool) -> Outputs:
-        """Predictions from a normalised and padded image."""
         with jax.named_scope("stem"):
-            x = self.stem(image, train=train)
+            x = (recomputed(self.stem) if self.config.remat else self.stem)(image, train=train)
         with jax.named_scope("backbone"):
             levels = self.backbone(x, train=train)
         with jax.named_scope("fpn"):
@@ -70,17 +65,10 @@ class Network(nn.Module):
 
 
 def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, layout: ImageLayout) -> Image:
-    """The network's door: normalise, repeat rows, pad, join the channel types and the rounds.
+    """Preprocessing of a range image: normalise, repeat rows, pad, join channel types and rounds.
 
-    Empty slots stay zero in all nine channels.
-
-    Args:
-        features: a range image's, in raw units.
-        config: gives the channels' means and scales.
-        layout: sizes.
-
-    Returns:
-        ``9 r`` channels, those of one type adjacent (paper, figure 2).
+    Empty slots stay zero in all nine channels. Of the ``9 r`` channels of the result those of one type are
+    adjacent (paper, figure 2).
 
     >>> network_input(jnp.zeros((1, 16, 256, 9, 2)), ModelConfig(), ImageLayout(16, 256, 2)).shape
     (1, 32, 256, 18)
@@ -94,14 +82,7 @@ def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, la
 
 @functools.cache
 def build_detector(config: Config, sensor: Sensor) -> Detector:
-    """The network of a configuration as pure functions; the same for the same arguments, as are their programs.
-
-    Args:
-        config: which network.
-        sensor: whose images.
-
-    Returns:
-        the functions ``init`` and ``apply``, and what was given.
+    """The network of a configuration for a sensor's images; equal arguments share one object and its programs.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import TINY

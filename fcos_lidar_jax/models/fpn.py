@@ -25,7 +25,6 @@ class FeaturePyramid(nn.Module):
 
     @nn.compact
     def __call__(self, levels: list[Image]) -> list[Image]:
-        """P2 ... P7 from C2 ... C5."""
         laterals = [Conv(self.channels, 1, use_bias=True, name=f"lateral{i + 2}")(c) for i, c in enumerate(levels)]
         for i in range(len(laterals) - 2, -1, -1):
             laterals[i] = laterals[i] + double(laterals[i + 1])

@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from fcos_lidar_jax.models.layers import Conv, GroupNorm, Image, at_least_float32, convolve, pieces
+from fcos_lidar_jax.models.layers import Conv, GroupNorm, Image, at_least_float32, convolve, normal, pieces
 from fcos_lidar_jax.types import Outputs
 
-_REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}
-"""Numbers a class of the four sibling layers."""
+_REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}  # Numbers a class of the four sibling layers.
 _LANES = 32
 """Fused predictions are padded to a multiple of this: 110 channels run at half the speed of 128 on CPU."""
 
@@ -25,7 +24,6 @@ class Tower(nn.Module):
 
     @nn.compact
     def __call__(self, x: Image) -> Image:
-        """Apply them."""
         for i in range(self.depth):
             x = Conv(self.channels, circular=self.circular, name=f"conv{i}")(x)
             x = jax.nn.relu(GroupNorm(name=f"norm{i}")(x))
@@ -41,12 +39,11 @@ class Predictions(nn.Module):
 
     @nn.compact
     def __call__(self, x: Image) -> dict[str, Image]:
-        """The named outputs."""
         x = at_least_float32(x)
         kernels, biases = [], []
         for name, size in self.sizes.items():
             shape = (3, 3, x.shape[-1], size)
-            kernels.append(self.param(f"{name}_kernel", nn.initializers.normal(0.01), shape))
+            kernels.append(self.param(f"{name}_kernel", normal, shape, 0.01))
             start = jnp.asarray(self.biases.get(name, (0.0,) * size), jnp.float32)
             biases.append(self.param(f"{name}_bias", lambda _, start=start: start))
         total = sum(self.sizes.values())
@@ -74,9 +71,8 @@ class Head(nn.Module):
         prior = math.log(k * self.background_prior / (1 - self.background_prior))
         classes = Tower(self.channels, self.depth, self.circular, name="classification_tower")(x)
         boxes = Tower(self.channels, self.depth, self.circular, name="regression_tower")(x)
-        logits = Predictions(
-            {"logits": k + 1}, {"logits": (0.0,) * k + (prior,)}, self.circular, name="classification"
-        )(classes)["logits"]
+        biases = {"logits": (0.0,) * k + (prior,)}
+        logits = Predictions({"logits": k + 1}, biases, self.circular, name="classification")(classes)["logits"]
         sizes = {**{name: count * k for name, count in _REGRESSION.items()}, "iou": k}
         numbers = Predictions(sizes, {}, self.circular, name="regression")(boxes)
 
@@ -84,11 +80,7 @@ class Head(nn.Module):
             return y.reshape(y.shape[0], -1, *shape)
 
         regression = [flat(numbers[name], count, k) for name, count in _REGRESSION.items()]
-        return Outputs(
-            logits=flat(logits, k + 1),
-            regression=jnp.concatenate(regression, axis=2),
-            iou_logits=flat(numbers["iou"], k),
-        )
+        return Outputs(flat(logits, k + 1), jnp.concatenate(regression, axis=2), flat(numbers["iou"], k))
 
 
 class Heads(nn.Module):
@@ -104,12 +96,7 @@ class Heads(nn.Module):
     @nn.compact
     def __call__(self, levels: list[Image]) -> Outputs:
         """Predictions at the locations of all levels, joined from P2 to P7."""
-
-        def head(name: str) -> Head:
-            return Head(
-                self.num_classes, self.channels, self.depth, self.background_prior, self.circular, name=name
-            )
-
-        shared = head("shared") if self.tied else None
-        outputs = [(shared or head(f"level{i + 2}"))(x) for i, x in enumerate(levels)]
+        options = self.num_classes, self.channels, self.depth, self.background_prior, self.circular
+        shared = Head(*options, name="shared") if self.tied else None
+        outputs = [(shared or Head(*options, name=f"level{i + 2}"))(x) for i, x in enumerate(levels)]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *outputs)

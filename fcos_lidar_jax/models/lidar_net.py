@@ -3,7 +3,7 @@
 import flax.linen as nn
 import jax
 
-from fcos_lidar_jax.models.layers import ConvNorm, Image
+from fcos_lidar_jax.models.layers import ConvNorm, Image, recomputed
 
 _STRIDES = (1, 2, 2, 2)
 _EXPANSION = 4
@@ -19,7 +19,6 @@ class Bottleneck(nn.Module):
 
     @nn.compact
     def __call__(self, x: Image, *, train: bool) -> Image:
-        """Apply the block."""
         wide = self.width * _EXPANSION
         y = ConvNorm(self.width, 1, name="reduce")(x, train=train)
         y = ConvNorm(self.width, 3, self.stride, circular=self.circular, name="spatial")(y, train=train)
@@ -35,21 +34,18 @@ class Backbone(nn.Module):
     blocks: tuple[int, ...]
     widths: tuple[int, ...]
     circular: bool = False
+    remat: bool = False  # Of the first convolution and stage, whose activations are the largest.
 
     @nn.compact
     def __call__(self, x: Image, *, train: bool) -> list[Image]:
         """C2, C3, C4, C5 at 1/1, 1/2, 1/4, 1/8 of the image."""
-        x = ConvNorm(x.shape[-1], 7, circular=self.circular, name="first")(x, train=train)
+        module = ConvNorm(x.shape[-1], 7, circular=self.circular, name="first")
+        x = (recomputed(module) if self.remat else module)(x, train=train)
         levels = []
         for stage, (count, width, stride) in enumerate(zip(self.blocks, self.widths, _STRIDES, strict=True)):
             for block in range(count):
-                first = block == 0
-                x = Bottleneck(
-                    width,
-                    stride if first else 1,
-                    project=first,
-                    circular=self.circular,
-                    name=f"stage{stage}_block{block}",
-                )(x, train=train)
+                first, name = block == 0, f"stage{stage}_block{block}"
+                module = Bottleneck(width, stride if first else 1, first, self.circular, name=name)
+                x = (recomputed(module) if self.remat and stage == 0 else module)(x, train=train)
             levels.append(x)
         return levels

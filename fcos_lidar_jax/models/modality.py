@@ -12,8 +12,7 @@ from jax import lax
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.models.layers import BatchNorm, Image, Kernel, convolve, kernel_init, pieces
 
-Form = Literal["split", "dense", "grouped"]
-"""Of the stem, see there."""
+Form = Literal["split", "dense", "grouped"]  # How the stem's convolutions are computed, see :class:`Stem`.
 _MODALITIES = (3, 3, 1, 1, 1)
 """Channel types a modality: (x, y, z), (range, azimuth, inclination), intensity, existence, time lag."""
 _WIDE = 24
@@ -66,42 +65,6 @@ def block_diagonal(kernels: Sequence[Kernel]) -> Kernel:
     return jnp.concatenate(rows, axis=2)
 
 
-def modality_convolve(
-    parts: Sequence[Image],
-    kernels: Sequence[Sequence[Kernel]],
-    *,
-    dilation: int,
-    circular: bool,
-    grouped: bool = False,
-) -> list[Image]:
-    """One 3x3 convolution for each group of channels.
-
-    Args:
-        parts: the channels, in as many images as there are to be convolutions; each holds whole groups.
-        kernels: those of each part's groups.
-        dilation: of both axes (static).
-        circular: wrap the width (static).
-        grouped: groups of one size are convolved by ``feature_group_count`` instead of a block-diagonal kernel
-            (static).
-
-    Returns:
-        the groups' features, in as many parts.
-
-    >>> kernels = [[jnp.ones((3, 3, 2, 5))] * 2] * 2
-    >>> parts = modality_convolve([jnp.ones((1, 4, 4, 4))] * 2, kernels, dilation=1, circular=False)
-    >>> [part.shape for part in parts]
-    [(1, 4, 4, 10), (1, 4, 4, 10)]
-    """
-
-    def one(x: Image, own: Sequence[Kernel]) -> Image:
-        if grouped and len({kernel.shape for kernel in own}) == 1:
-            kernel = jnp.concatenate(own, axis=-1)
-            return convolve(x, kernel, dilation=dilation, groups=len(own), circular=circular)
-        return convolve(x, block_diagonal(own), dilation=dilation, circular=circular)
-
-    return [one(x, own) for x, own in zip(parts, kernels, strict=True)]
-
-
 class ModalityBranch(nn.Module):
     """The grouped convolutions of one dilation rate, each with batch norm and ReLU."""
 
@@ -114,32 +77,32 @@ class ModalityBranch(nn.Module):
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
-        """Features of the groups, in as many parts as are given."""
         together = bundles(self.groups, self.form)
-        sizes = [size for size, _ in self.groups]
-        widths = [width for _, width in self.groups]
+        sizes, widths = zip(*self.groups, strict=True)
         for layer in range(self.config.num_convs):
             kernels = [
                 self.param(f"conv{layer}_group{g}", kernel_init, (3, 3, size, width))
                 for g, (size, width) in enumerate(zip(sizes, widths, strict=True))
             ]
-            grouped = self.form == "grouped"
-            parts = modality_convolve(
-                parts,
-                [kernels[cut] for cut in together],
-                dilation=self.dilation,
-                circular=self.circular,
-                grouped=grouped,
-            )
+            parts = [self._convolve(x, kernels[cut]) for x, cut in zip(parts, together, strict=True)]
             parts = [jax.nn.relu(x) for x in BatchNorm(name=f"norm{layer}")(parts, train=train)]
             if self.precision == "bfloat16":  # only behind the first layer: metres need more bits
                 parts = [x.astype(jnp.bfloat16) for x in parts]
             sizes = widths
         return list(parts)
 
+    def _convolve(self, x: Image, kernels: Sequence[Kernel]) -> Image:
+        """One convolution of the groups of channels in ``x``."""
+        grouped = self.form == "grouped" and len({kernel.shape for kernel in kernels}) == 1
+        kernel = jnp.concatenate(kernels, axis=-1) if grouped else block_diagonal(kernels)
+        groups = len(kernels) if grouped else 1
+        return convolve(x, kernel, dilation=self.dilation, groups=groups, circular=self.circular)
+
 
 class Stem(nn.Module):
     """Parallel modality-wise branches, merged by 1x1 convolutions and summed.
+
+    Takes a normalised image of ``9 r`` channels, those of one type adjacent.
 
     The same function in three forms, with the same parameters: ``"split"``, independent chains, of which narrow
     ones are joined to what a CPU does well; ``"dense"``, one block-diagonal kernel; ``"grouped"``,
@@ -153,12 +116,6 @@ class Stem(nn.Module):
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
-        """Features of the merged modalities.
-
-        Args:
-            image: normalised, ``9 r`` channels, those of one type adjacent.
-            train: normalise by the batch's statistics.
-        """
         if self.form is not None or self.is_initializing():
             return self._merged(image, self.form or "split", train)
 
@@ -166,9 +123,8 @@ class Stem(nn.Module):
             stem = self.clone(form=form, parent=None)
             return lambda variables, x: stem.apply(variables, x, train=train, mutable=["batch_stats"])
 
-        merged, updates = lax.platform_dependent(
-            self.variables, image, cpu=compute("split"), default=compute("dense")
-        )
+        forms = {"cpu": compute("split"), "default": compute("dense")}
+        merged, updates = lax.platform_dependent(self.variables, image, **forms)
         if train:
             for name, value in updates["batch_stats"].items():
                 self.put_variable("batch_stats", name, value)
@@ -186,9 +142,8 @@ class Stem(nn.Module):
         num_kernels = len(config.dilations) if config.merge == "per_branch" else 1
         kernels = [self.param(f"merge{i}", nn.initializers.he_normal(), shape) for i in range(num_kernels)]
         for index, dilation in enumerate(config.dilations):
-            branch = ModalityBranch(
-                config, tuple(groups), dilation, form, self.circular, self.precision, name=f"branch{index}"
-            )
+            options = dilation, form, self.circular, self.precision
+            branch = ModalityBranch(config, tuple(groups), *options, name=f"branch{index}")
             features = branch(parts, train=train)
             computed = features[0].dtype
             # Accumulated group by group: no concatenation of all features is ever written.

@@ -1,18 +1,10 @@
 """Where rays meet solids, and at what angle: one vectorised test for each kind of solid."""
 
-from collections.abc import Callable, Iterator
-
 import numpy as np
 
 from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, WHEEL, unit_map
 
-_POROUS_COSINE = 0.5
-"""Incidence on leaves and wires, which have no surface to speak of."""
-
-
-Crossing = Callable[[np.ndarray, tuple[np.ndarray, ...], np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Where rays (origins and directions in a unit shape's axes, tapers) enter and leave it; leave < enter or NaN
-where they miss."""
+_POROUS_COSINE = 0.5  # incidence on leaves and wires, which have no surface to speak of
 
 
 def crossings(
@@ -33,9 +25,13 @@ def crossings(
     taper = solids["taper"].astype(np.float32)
     density = solids["density"].astype(np.float32)
     reach = np.full(len(which), np.inf, np.float32)
-    for crossing, pairs in _by_shape(solids, which):
+    # Straight cuboids, the most frequent, have a test of their own.
+    straight = (solids["kind"] == BOX) & (solids["taper"] == 1).all(axis=1)
+    shape = np.where(straight, -1, solids["kind"])[which]
+    for name, crossing in _CROSSINGS.items():
+        pairs = np.flatnonzero(shape == name)
         of = which[pairs]
-        v = _turned(maps, of, d.take(rays[pairs], axis=1))
+        v = _to_unit(maps, of, d.take(rays[pairs], axis=1))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             enter, leave = crossing(start.take(of, axis=1), v, taper[of])
             crossed = np.flatnonzero((enter < leave) & (enter > 0))
@@ -59,12 +55,21 @@ def incidence(solids: np.ndarray, which: np.ndarray, points: np.ndarray, d: np.n
     maps = np.ascontiguousarray(unit_map(solids).transpose(1, 2, 0), np.float32)
     center = np.ascontiguousarray(solids["center"].T, np.float32)
     taper = np.ascontiguousarray(solids["taper"].T, np.float32)
-    u = _turned(maps, which, points - center.take(which, axis=1))
+    u = _to_unit(maps, which, points - center.take(which, axis=1))
     normal = np.array(u)  # that of a ball
     slope = (taper.take(which, axis=1) - 1) / 2
     bound = np.maximum((1 + slope) + slope * u[2], np.float32(1e-9))
     kind = solids["kind"][which]
-    _box_normals(normal, np.flatnonzero(kind == BOX), bound, slope)
+    share = np.abs(normal)
+    share[:2] /= bound
+    face = np.where(kind == BOX, np.argmax(share, axis=0), -1)  # of a box, on which the point lies
+    for axis in range(3):
+        on = np.flatnonzero(face == axis)
+        sign = np.sign(normal[axis, on])
+        normal[:, on] = 0
+        normal[axis, on] = sign
+        if axis < 2:
+            normal[2, on] = -slope[axis, on]
     drum = np.flatnonzero(kind == DRUM)
     normal[2, drum] = -slope[0, drum] * bound[0, drum]
     cap = drum[np.abs(u[2][drum]) > np.hypot(u[0][drum], u[1][drum]) / bound[0, drum]]
@@ -73,7 +78,7 @@ def incidence(solids: np.ndarray, which: np.ndarray, points: np.ndarray, d: np.n
     normal[1, wheel] = 0
     side = wheel[np.abs(u[1][wheel]) > np.hypot(u[0][wheel], u[2][wheel])]
     normal[:, side] = np.array([[0], [1], [0]])
-    along = _turned(maps, which, d)
+    along = _to_unit(maps, which, d)
     m = {(i, j): maps[i, j].take(which) for i, j in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 2))}
     x = m[0, 0] * normal[0] + m[1, 0] * normal[1]
     y = m[0, 1] * normal[0] + m[1, 1] * normal[1]
@@ -84,38 +89,13 @@ def incidence(solids: np.ndarray, which: np.ndarray, points: np.ndarray, d: np.n
     return np.where(porous, np.float32(_POROUS_COSINE), np.minimum(cosine, np.float32(1)))
 
 
-def _by_shape(solids: np.ndarray, which: np.ndarray) -> Iterator[tuple[Crossing, np.ndarray]]:
-    """The pairs of every shape; straight cuboids, the most frequent, have a test of their own."""
-    straight = (solids["kind"] == BOX) & (solids["taper"] == 1).all(axis=1)
-    shape = np.where(straight, -1, solids["kind"])[which]
-    for name, crossing in _CROSSINGS.items():
-        pairs = np.flatnonzero(shape == name)
-        if len(pairs):
-            yield crossing, pairs
-
-
-def _turned(maps: np.ndarray, which: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _to_unit(maps: np.ndarray, which: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vectors in the unit shapes' axes; the maps' other entries are 0."""
     return (
         maps[0, 0].take(which) * d[0] + maps[0, 1].take(which) * d[1] + maps[0, 2].take(which) * d[2],
         maps[1, 0].take(which) * d[0] + maps[1, 1].take(which) * d[1],
         maps[2, 2].take(which) * d[2],
     )
-
-
-def _box_normals(normal: np.ndarray, box: np.ndarray, bound: np.ndarray, slope: np.ndarray) -> None:
-    """Turn positions on boxes into normals of the faces that they lie on."""
-    u = normal[:, box]
-    share = np.abs(u)
-    share[:2] /= bound[:, box]
-    face = np.argmax(share, axis=0)
-    for axis in range(3):
-        at = np.flatnonzero(face == axis)
-        on = box[at]
-        normal[:, on] = 0
-        normal[axis, on] = np.sign(u[axis, at])
-        if axis < 2:
-            normal[2, on] = -slope[axis, on]
 
 
 def _slab(o: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -156,21 +136,13 @@ def _cross_ball(o: np.ndarray, v: tuple[np.ndarray, ...], _: np.ndarray) -> tupl
     return nearest - span, nearest + span
 
 
-def _round_span(
-    o: tuple[np.ndarray, np.ndarray], v: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays are inside an endless unit cylinder."""
-    a = np.maximum(v[0] * v[0] + v[1] * v[1], np.float32(1e-20))
-    nearest = -(o[0] * v[0] + o[1] * v[1]) / a
-    p, q = o[0] + nearest * v[0], o[1] + nearest * v[1]
-    span = np.sqrt((1 - (p * p + q * q)) / a)
-    return nearest - span, nearest + span
-
-
 def _cross_wheel(o: np.ndarray, v: tuple[np.ndarray, ...], _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    enter, leave = _round_span((o[0], o[2]), (v[0], v[2]))
+    a = np.maximum(v[0] * v[0] + v[2] * v[2], np.float32(1e-20))
+    nearest = -(o[0] * v[0] + o[2] * v[2]) / a
+    p, q = o[0] + nearest * v[0], o[2] + nearest * v[2]
+    span = np.sqrt((1 - (p * p + q * q)) / a)
     near, far = _slab(o[1], v[1])
-    return np.maximum(enter, near), np.minimum(leave, far)
+    return np.maximum(nearest - span, near), np.minimum(nearest + span, far)
 
 
 def _cross_drum(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -193,11 +165,6 @@ def _cross_drum(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> 
     return np.maximum(near, at + begin), np.minimum(far, at + end)
 
 
-_CROSSINGS: dict[int, Crossing] = {
-    -1: _cross_cuboid,
-    BOX: _cross_box,
-    DRUM: _cross_drum,
-    BALL: _cross_ball,
-    WHEEL: _cross_wheel,
-}
-"""By kind, -1 for straight cuboids."""
+# By kind, -1 for straight cuboids: where rays (origins and directions in a unit shape's axes, tapers) enter and
+# leave the shape; leave < enter or NaN where they miss.
+_CROSSINGS = {-1: _cross_cuboid, BOX: _cross_box, DRUM: _cross_drum, BALL: _cross_ball, WHEEL: _cross_wheel}

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import numpy as np
-
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config
@@ -15,7 +13,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedFrames(FrameSet):
-    """So many frames of :func:`make_frame`, each of another street, without the points on the ego vehicle.
+    """Frames of :func:`make_frame`, each of another street, without the points on the ego vehicle.
 
     The objects are near, and only those that enough points show are annotated: what a small detector can learn.
     Ten sweeps of fast traffic are a stress set for the fusion of sweeps: ego vehicle and objects move fast, and
@@ -28,52 +26,33 @@ class SimulatedFrames(FrameSet):
     """
 
     sensor: Sensor
-    """Who looks."""
     number: int
-    """Of frames."""
-    first_seed: int = 0
-    """Of the first frame; the others follow."""
-    num_objects: int = 14
-    """Of a street; fewer where there is no room."""
+    first_seed: int = 0  # of the first frame; the others follow
+    num_objects: int = 14  # this and the others as of make_frame
     reach_m: float = 10.0
-    """They are placed along the street within this distance."""
     min_points: int = 5
-    """Objects that fewer points of the current sweep show are not annotated."""
     close_m: float = 1.0
-    """Half the side of the square around the sensor that is emptied, in each sweep's own frame."""
     num_sweeps: int = 1
-    """Sweeps fused, the current one included."""
     fast_traffic: bool = False
-    """The ego vehicle and most of the objects move fast."""
     classes = NUSCENES_CLASSES
 
     def __len__(self) -> int:
-        """Number of frames."""
         return self.number
 
     def frame(self, index: int) -> Frame:
         """One frame, simulated anew."""
-        seed = self.first_seed + index
-        frame = make_frame(
-            seed,
+        return make_frame(
+            self.first_seed + index,
             self.sensor,
             num_objects=self.num_objects,
             reach_m=self.reach_m,
+            min_points=self.min_points,
+            close_m=self.close_m,
             num_sweeps=self.num_sweeps,
             fast_traffic=self.fast_traffic,
-            close_m=self.close_m,
         )
-        shown = frame.num_points >= self.min_points
-        return dataclasses.replace(
-            frame, boxes=frame.boxes[shown], labels=frame.labels[shown], num_points=frame.num_points[shown]
-        )
-
-    def labels(self, index: int) -> np.ndarray:
-        """Labels of a frame's boxes; the frame is simulated for it."""
-        return self.frame(index).labels
 
     def name(self, index: int) -> str:
-        """What messages call a frame."""
         return f"seed {self.first_seed + index}"
 
     def fingerprint(self) -> str:
@@ -81,8 +60,7 @@ class SimulatedFrames(FrameSet):
         return checksum(repr((__version__, self)).encode())
 
 
-UNSEEN_SEED = 1_000_000
-"""Seeds of test frames start here; training frames never get that far."""
+UNSEEN_SEED = 1_000_000  # seeds of test frames start here; training frames never get that far
 
 
 def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config, SimulatedFrames]:
@@ -90,8 +68,7 @@ def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config,
 
     Args:
         config: what makes more of few frames is taken out: class balance, copy-paste, augmentation.
-        steps: of the run.
-        seed: other seeds give other streets.
+        seed: another seed gives other streets.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> config, frames = fresh_streets(QUICKSTART, steps=10)

@@ -7,7 +7,7 @@ from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.simulation.lidar import SWEEP_S, Mount, Scan, sample_mount, scan, sensor_pose
+from fcos_lidar_jax.simulation.lidar import SWEEP_S, sample_mount, scan, sensor_pose
 from fcos_lidar_jax.simulation.motion import velocity_at
 from fcos_lidar_jax.simulation.world import World, sample_world
 
@@ -18,23 +18,23 @@ def make_frame(
     *,
     num_objects: int = 12,
     reach_m: float | None = None,
+    min_points: int = 1,
     num_sweeps: int = 1,
     fast_traffic: bool = False,
     close_m: float = 0.0,
 ) -> Frame:
     """A simulated frame of a level street; the same seed gives the same bytes, in whatever order frames are made.
 
-    All ten classes occur equally often. Only objects that a point of the current sweep shows are annotated, and
-    rays without a return are left out.
+    All ten classes occur equally often; rays without a return are left out.
 
     Args:
         seed: any non-negative integer.
-        sensor: who looks.
         num_objects: to place; fewer where there is no room.
         reach_m: greatest distance along the street at which they are placed; default: four fifths of the sensor's.
+        min_points: objects that fewer points of the current sweep show are not annotated.
         num_sweeps: fused, the current one included; with more than one the world moves.
-        fast_traffic: the car and most of the objects move fast, as in :func:`~.world.sample_world`.
-        close_m: as in :func:`scan_sweeps`.
+        fast_traffic: as of :func:`~.world.sample_world`.
+        close_m: as of :func:`scan_sweeps`.
 
     Raises:
         ValueError: fewer than one sweep.
@@ -50,28 +50,20 @@ def make_frame(
     labels = rng.permutation(np.resize(rng.permutation(len(NUSCENES_CLASSES)), num_objects))
     reach = 0.8 * sensor.limit_xy_m if reach_m is None else reach_m
     now_s = (num_sweeps - 1) * SWEEP_S
-    world = sample_world(
-        rng,
-        reach_m=reach,
-        beyond_m=2 * reach,
-        duration_s=now_s,
-        labels=labels,
-        level=True,
-        fused=True,
-        fast_traffic=fast_traffic,
-    )
+    options = {"level": True, "fused": True, "fast_traffic": fast_traffic}
+    world = sample_world(rng, reach_m=reach, beyond_m=2 * reach, duration_s=now_s, labels=labels, **options)
     mount = sample_mount(rng, sensor, level=True)
     points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, num_sweeps=num_sweeps, close_m=close_m)
     boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, now_s), now_s).astype(np.float32)
     counts = count_inside(points[points[:, 4] == 0], boxes)
-    shown = counts > 0
+    shown = counts >= max(min_points, 1)
     return Frame(points, boxes[shown], world.traffic.labels[shown], counts[shown], num_close)
 
 
 def scan_sweeps(
     world: World,
     sensor: Sensor,
-    mount: Mount,
+    mount: np.ndarray,
     time_s: float,
     rng: np.random.Generator,
     *,
@@ -81,9 +73,7 @@ def scan_sweeps(
     """The sweeps up to a moment in the sensor's frame of that moment, the current one first, then by age.
 
     Args:
-        world: what there is.
-        sensor: whose beams.
-        mount: where it sits.
+        mount: f64[4, 4], as of :func:`~.lidar.sample_mount`.
         time_s: of the current sweep; the others are ``SWEEP_S`` apart.
         rng: noise and dropout.
         num_sweeps: how many, the current one included.
@@ -92,45 +82,28 @@ def scan_sweeps(
     Returns:
         f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, the lag exactly 0 for the current sweep; and how
         many points were left out.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> rng = np.random.default_rng(0)
-    >>> world = sample_world(rng, reach_m=20, beyond_m=30, duration_s=0.1, labels=np.arange(10), level=True)
-    >>> points, _ = scan_sweeps(world, TINY, sample_mount(rng, TINY, level=True), 0.1, rng, num_sweeps=3)
-    >>> (np.unique(points[:, 4]) / SWEEP_S).round().tolist()
-    [0.0, 1.0, 2.0]
     """
-    moments = (time_s - age * SWEEP_S for age in range(num_sweeps))
-    sweeps = (
-        Sweep(
-            _as_cloud(scan(world, sensor, mount, then_s, rng), sensor),
-            sensor_pose(world, mount, then_s),
-            -age * round(SWEEP_S * 1e6),
-        )
-        for age, then_s in enumerate(moments)
-    )
-    return fuse_sweeps(sweeps, sensor, remove_close="all", close_m=close_m)
 
+    def take_sweep(age: int) -> Sweep:
+        then_s = time_s - age * SWEEP_S
+        sweep = scan(world, sensor, mount, then_s, rng)
+        points = sweep.points[sweep.returned]
+        columns = [points[:, :4], np.zeros((len(points), 1), np.float32)]
+        if sensor.row_source == "laser":
+            columns.append(sensor.num_rows - 1 - points[:, 4:])
+        pose = sensor_pose(world, mount, then_s)
+        return Sweep(np.concatenate(columns, axis=1), pose, -age * round(SWEEP_S * 1e6))
 
-def _as_cloud(sweep: Scan, sensor: Sensor) -> np.ndarray:
-    """What came back, in the columns of :class:`fcos_lidar_jax.data.frame.Frame`."""
-    points = sweep.points[sweep.returned]
-    columns = [points[:, :4], np.zeros((len(points), 1), np.float32)]
-    if sensor.row_source == "laser":
-        columns.append(sensor.num_rows - 1 - points[:, 4:])
-    return np.concatenate(columns, axis=1)
+    return fuse_sweeps(map(take_sweep, range(num_sweeps)), sensor, remove_close="all", close_m=close_m)
 
 
 def boxes_in_sensor_frame(world: World, pose: np.ndarray, time_s: float) -> np.ndarray:
     """``x, y, z, l, w, h, yaw, vx, vy`` of all objects in the points' frame, f64[m, 9].
 
-    Args:
-        world: in the street's frame.
-        pose: f64[4, 4], the points' frame in the street's.
-        time_s: when.
+    ``pose``, f64[4, 4], is the points' frame in the street's.
     """
     placed, sizes = world.object_poses(time_s), world.traffic.sizes
-    center = placed[:, :3] + np.stack([0 * sizes[:, 0], 0 * sizes[:, 0], sizes[:, 2] / 2], axis=1)
+    center = placed[:, :3] + sizes * (0, 0, 0.5)
     heading = np.stack([np.cos(placed[:, 3]), np.sin(placed[:, 3]), 0 * placed[:, 3]], axis=1) @ pose[:3, :3]
     velocity = np.pad(velocity_at(world.traffic.motions, time_s), ((0, 0), (0, 1))) @ pose[:3, :3]
     yaw = np.arctan2(heading[:, 1], heading[:, 0])

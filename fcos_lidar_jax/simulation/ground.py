@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+LANE_M = 3.5
 _MARK_HALF_M = 0.08
 
 
@@ -14,20 +15,13 @@ class Ground:
     The frame is the street's: x along the main street, y to the left of it, z up, metres.
     """
 
-    planes: np.ndarray
-    """f64[p, 3]: ``z = a x + b y + c``; the highest counts, so the ground is convex."""
-    half_width: float
-    """Of the main street's carriageway."""
-    crossing_x: float
-    """Where the other street crosses, along its own y."""
-    crossing_half_width: float
-    """Of its carriageway."""
-    kerb: float
-    """Height of everything beside the carriageways above them."""
-    pavement: float
-    """Width of the pavements."""
-    brightness: tuple[float, float, float]
-    """Albedo of carriageway, pavement and what lies beyond."""
+    planes: np.ndarray  # f64[p, 3]: z = a x + b y + c; the highest counts, so the ground is convex
+    half_width: float  # of the main street's carriageway
+    crossing_x: float  # where the other street crosses, along its own y
+    crossing_half_width: float  # of its carriageway
+    kerb: float  # height of everything beside the carriageways above them
+    pavement: float  # width of the pavements
+    brightness: tuple[float, float, float]  # albedo of carriageway, pavement and what lies beyond
 
     def on_road(self, x: np.ndarray, y: np.ndarray, margin: np.ndarray | float = 0.0) -> np.ndarray:
         """Whether places lie on a carriageway, or within ``margin`` of one."""
@@ -92,7 +86,7 @@ class Ground:
         shade = np.where(self.on_road(x, y), road, np.where(self.on_road(x, y, self.pavement), walk, beyond))
         off = np.abs(x - self.crossing_x)
         main = (np.abs(y) < self.half_width) & (off > self.crossing_half_width + 2)
-        lanes = np.minimum(np.abs(y), np.abs(np.abs(y) - 3.5))
+        lanes = np.minimum(np.abs(y), np.abs(np.abs(y) - LANE_M))
         dashed = (np.abs(y) < 0.5) | (x % 9 < 3)
         marked = main & dashed & (lanes < _MARK_HALF_M)
         # A zebra crossing on either side of the junction.

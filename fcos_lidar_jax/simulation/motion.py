@@ -16,12 +16,18 @@ MOTION = np.dtype(
 )
 
 
+def make_motion(**fields: float) -> np.ndarray:
+    """One motion, [1] of :data:`MOTION`; fields that are not given are 0."""
+    motion = np.zeros(1, MOTION)
+    for name, value in fields.items():
+        motion[name] = value
+    return motion
+
+
 def travelled(motion: np.ndarray, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Metres gone and speed at a time not before 0.
 
-    >>> braking = np.zeros(1, MOTION)
-    >>> braking["speed"], braking["acceleration"] = 4.0, -2.0
-    >>> [v.tolist() for v in travelled(braking, 10.0)]
+    >>> [v.tolist() for v in travelled(make_motion(speed=4, acceleration=-2), 10.0)]
     [[4.0], [0.0]]
     """
     speed, change = motion["speed"], motion["acceleration"]
@@ -31,15 +37,9 @@ def travelled(motion: np.ndarray, time_s: np.ndarray | float) -> tuple[np.ndarra
 
 
 def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
-    """Positions and headings, f64[..., 3]: x, y, yaw.
+    """Positions and headings, f64[..., 3]: x, y, yaw; motions [...] and times broadcast.
 
-    Args:
-        motion: structured array of :data:`MOTION`.
-        time_s: broadcasts with it.
-
-    >>> bend = np.zeros(1, MOTION)
-    >>> bend["speed"], bend["curvature"], bend["turn"] = 1.0, 1.0, np.pi / 2
-    >>> pose_at(bend, np.pi / 2 + 3).round(6).tolist()
+    >>> pose_at(make_motion(speed=1, curvature=1, turn=np.pi / 2), np.pi / 2 + 3).round(6).tolist()
     [[1.0, 4.0, 1.570796]]
     """
     way, _ = travelled(motion, time_s)
@@ -53,10 +53,8 @@ def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
     along = before + np.sin(angle) / safe + after * np.cos(angle)
     across = (1 - np.cos(angle)) / safe + after * np.sin(angle)
     c, s = np.cos(motion["yaw"]), np.sin(motion["yaw"])
-    return np.stack(
-        [motion["x"] + c * along - s * across, motion["y"] + s * along + c * across, motion["yaw"] + angle],
-        axis=-1,
-    )
+    x, y = motion["x"] + c * along - s * across, motion["y"] + s * along + c * across
+    return np.stack([x, y, motion["yaw"] + angle], axis=-1)
 
 
 def velocity_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:

@@ -1,65 +1,39 @@
-"""Rows of the official nuScenes tables: tokens, the tables that never change, and those of one scene."""
+"""Rows of the official nuScenes tables: those that are the same in every data set, and those of one scene."""
 
 import hashlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fcos_lidar_jax.data.nuscenes.names import BICYCLE_RACK, CATEGORY_TO_CLASS
+from fcos_lidar_jax.simulation.lidar import SWEEP_S
+
 Row = dict[str, Any]
 
-SCENE_TABLES = (
-    "log",
-    "scene",
-    "calibrated_sensor",
-    "sample",
-    "sample_data",
-    "ego_pose",
-    "instance",
-    "sample_annotation",
-)
-"""Tables of which every scene has rows of its own."""
-
-CATEGORIES = (
-    "animal",
-    "human.pedestrian.adult",
-    "human.pedestrian.child",
-    "human.pedestrian.construction_worker",
-    "human.pedestrian.personal_mobility",
-    "human.pedestrian.police_officer",
-    "human.pedestrian.stroller",
-    "human.pedestrian.wheelchair",
-    "movable_object.barrier",
-    "movable_object.debris",
-    "movable_object.pushable_pullable",
-    "movable_object.trafficcone",
-    "static_object.bicycle_rack",
-    "vehicle.bicycle",
-    "vehicle.bus.bendy",
-    "vehicle.bus.rigid",
-    "vehicle.car",
-    "vehicle.construction",
-    "vehicle.emergency.ambulance",
-    "vehicle.emergency.police",
-    "vehicle.motorcycle",
-    "vehicle.trailer",
-    "vehicle.truck",
+CATEGORIES = sorted(
+    {
+        *CATEGORY_TO_CLASS,
+        BICYCLE_RACK,
+        "animal",
+        *(f"human.pedestrian.{kind}" for kind in ("personal_mobility", "stroller", "wheelchair")),
+        *(f"movable_object.{kind}" for kind in ("debris", "pushable_pullable")),
+        *(f"vehicle.emergency.{kind}" for kind in ("ambulance", "police")),
+    }
 )
 """The official categories; their index counts from 1."""
-
 ATTRIBUTES = (
-    "vehicle.moving",
-    "vehicle.stopped",
-    "vehicle.parked",
-    "cycle.with_rider",
-    "cycle.without_rider",
-    "pedestrian.sitting_lying_down",
-    "pedestrian.standing",
-    "pedestrian.moving",
+    *("vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider"),
+    *("pedestrian.sitting_lying_down", "pedestrian.standing", "pedestrian.moving"),
 )
 VISIBILITIES = ("v0-40", "v40-60", "v60-80", "v80-100")
 MAP_FILE = "maps/synthetic.png"
 CHANNEL = "LIDAR_TOP"
+SWEEPS_PER_KEYFRAME = 10
+_LOG = {"vehicle": "sim", "date_captured": "2023-11-14", "location": "synthetic-street"}
+_EPOCH_US = 1_700_000_000_000_000
+_SCENE_APART_US = 600_000_000
 _MOVING_MPS = 0.2
 
 
@@ -72,26 +46,144 @@ def token(*name: object) -> str:
     return hashlib.blake2b("/".join(map(str, name)).encode(), digest_size=16).hexdigest()
 
 
-def fixed_tables() -> dict[str, list[Row]]:
-    """The tables that are the same in every synthetic data set."""
+def fixed_tables(logs: list[str]) -> dict[str, list[Row]]:
+    """The tables without scenes: one map for all logs, as the official reader wants it, with nothing on it."""
     return {
         "category": [
-            {"token": token("category", name), "name": name, "description": "", "index": i + 1}
-            for i, name in enumerate(CATEGORIES)
+            {"token": token("category", name), "name": name, "description": "", "index": i}
+            for i, name in enumerate(CATEGORIES, 1)
         ],
         "attribute": [{"token": token("attribute", n), "name": n, "description": ""} for n in ATTRIBUTES],
-        "visibility": [
-            {"token": str(i + 1), "level": level, "description": ""} for i, level in enumerate(VISIBILITIES)
-        ],
+        "visibility": [{"token": str(i), "level": v, "description": ""} for i, v in enumerate(VISIBILITIES, 1)],
         "sensor": [{"token": token("sensor", CHANNEL), "channel": CHANNEL, "modality": "lidar"}],
+        "map": [{"token": token("map"), "log_tokens": logs, "category": "semantic_prior", "filename": MAP_FILE}],
     }
 
 
-def map_table(logs: list[str]) -> list[Row]:
-    """One map for all logs, as the official reader wants it; there is nothing on it."""
-    return [
-        {"token": token("map"), "log_tokens": logs, "category": "semantic_prior", "filename": MAP_FILE},
-    ]
+def scene_name(index: int) -> str:
+    """Name of a scene, counted from 0.
+
+    >>> scene_name(0)
+    'scene-0001'
+    """
+    return f"scene-{index + 1:04d}"
+
+
+def sweep_file(seed: int, index: int, number: int) -> str:
+    """Name of a sweep's point file in its data set.
+
+    >>> sweep_file(0, 0, 10)
+    'samples/LIDAR_TOP/sim-0-0001__LIDAR_TOP__1700000600500000.pcd.bin'
+    """
+    folder = "sweeps" if number % SWEEPS_PER_KEYFRAME else "samples"
+    return f"{folder}/{CHANNEL}/{_logfile(seed, index)}__{CHANNEL}__{_timestamp_us(index, number)}.pcd.bin"
+
+
+def scene_rows(seed: int, index: int, mount: Row, ego_poses: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows of a scene (its index, and the seed of the data set) but for its objects.
+
+    Args:
+        mount: of the sensor, as of :func:`pose_fields`.
+        ego_poses: likewise, one a sweep, the first and the last of a keyframe.
+    """
+    key = (seed, scene_name(index))
+    log, scene, calibration = (token(table, *key) for table in ("log", "scene", "calibrated_sensor"))
+    numbers = range(len(ego_poses))
+    times = [_timestamp_us(index, number) for number in numbers]
+    data = [token("sample_data", *key, number) for number in numbers]
+    samples = [token("sample", *key, i) for i in range(len(numbers[::SWEEPS_PER_KEYFRAME]))]
+    return {
+        "log": [{"token": log, "logfile": _logfile(seed, index), **_LOG}],
+        "scene": [
+            {
+                "token": scene,
+                "log_token": log,
+                "nbr_samples": len(samples),
+                "first_sample_token": samples[0],
+                "last_sample_token": samples[-1],
+                "name": scene_name(index),
+                "description": "Simulated street",
+            }
+        ],
+        "calibrated_sensor": [
+            {"token": calibration, "sensor_token": token("sensor", CHANNEL), **mount, "camera_intrinsic": []}
+        ],
+        "sample": [
+            {"token": sample, "timestamp": time_us, **_neighbours(samples, i), "scene_token": scene}
+            for i, (sample, time_us) in enumerate(zip(samples, times[::SWEEPS_PER_KEYFRAME], strict=True))
+        ],
+        "sample_data": [
+            {
+                "token": data[number],
+                "sample_token": samples[(number + SWEEPS_PER_KEYFRAME // 2) // SWEEPS_PER_KEYFRAME],
+                "ego_pose_token": data[number],
+                "calibrated_sensor_token": calibration,
+                "timestamp": times[number],
+                "fileformat": "pcd",
+                "is_key_frame": number % SWEEPS_PER_KEYFRAME == 0,
+                "height": 0,
+                "width": 0,
+                "filename": sweep_file(seed, index, number),
+                **_neighbours(data, number),
+            }
+            for number in numbers
+        ],
+        "ego_pose": [{"token": data[i], "timestamp": times[i], **ego_poses[i]} for i in numbers],
+    }
+
+
+def object_rows(
+    seed: int,
+    index: int,
+    categories: Sequence[str],
+    boxes: np.ndarray,
+    attributes: Sequence[Sequence[str | None]],
+    seen_shares: np.ndarray,
+    counts: np.ndarray,
+) -> dict[str, list[Row]]:
+    """Rows of a scene's objects, each annotated from the first keyframe to the last in which a point shows it.
+
+    Args:
+        categories: [m] of the objects.
+        boxes: f64[k, m, 7] in every keyframe, in the global frame, ``x, y, z, l, w, h, yaw``.
+        attributes: [k][m] names, None for objects that have none.
+        seen_shares: f64[k, m], of the rays towards each.
+        counts: i32[k, m], points inside.
+    """
+    key = (seed, scene_name(index))
+    rows: dict[str, list[Row]] = {"instance": [], "sample_annotation": []}
+    for number, category in enumerate(categories):
+        if not len(shown := np.flatnonzero(counts[:, number])):
+            continue
+        instance = token("instance", *key, number)
+        tokens = [token("sample_annotation", *key, number, i) for i in range(shown[0], shown[-1] + 1)]
+        rows["instance"].append(
+            {
+                "token": instance,
+                "category_token": token("category", category),
+                "nbr_annotations": len(tokens),
+                "first_annotation_token": tokens[0],
+                "last_annotation_token": tokens[-1],
+            }
+        )
+        for i, annotation in enumerate(tokens, shown[0]):
+            box, attribute = boxes[i, number], attributes[i][number]
+            rows["sample_annotation"].append(
+                {
+                    "token": annotation,
+                    "sample_token": token("sample", *key, i),
+                    "instance_token": instance,
+                    "visibility_token": visibility_of(seen_shares[i, number]),
+                    "attribute_tokens": [token("attribute", attribute)] if attribute else [],
+                    "translation": box[:3].tolist(),
+                    "size": box[[4, 3, 5]].tolist(),
+                    "rotation": [float(np.cos(box[6] / 2)), 0.0, 0.0, float(np.sin(box[6] / 2))],
+                    **_neighbours(tokens, i - shown[0]),
+                    "num_lidar_pts": int(counts[i, number]),
+                    "num_radar_pts": 0,
+                }
+            )
+    return rows
 
 
 def attribute_of(name: str, speed_mps: float, *, rider: bool, parked: bool) -> str | None:
@@ -125,8 +217,13 @@ def pose_fields(pose: np.ndarray) -> Row:
     return {"translation": pose[:3, 3].tolist(), "rotation": quaternion.tolist()}
 
 
-def link(rows: list[Row]) -> None:
-    """Set ``prev`` and ``next`` of rows in the order of time."""
-    for i, row in enumerate(rows):
-        row["prev"] = rows[i - 1]["token"] if i else ""
-        row["next"] = rows[i + 1]["token"] if i + 1 < len(rows) else ""
+def _logfile(seed: int, index: int) -> str:
+    return f"sim-{seed}-{index + 1:04d}"
+
+
+def _timestamp_us(index: int, number: int) -> int:
+    return _EPOCH_US + (index + 1) * _SCENE_APART_US + round(number * SWEEP_S * 1e6)
+
+
+def _neighbours(tokens: Sequence[str], i: int) -> Row:
+    return {"prev": tokens[i - 1] if i else "", "next": tokens[i + 1] if i + 1 < len(tokens) else ""}

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 
 import numpy as np
+from numpy.random import Generator
 
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.simulation.crossings import crossings, incidence
@@ -22,16 +23,11 @@ class Fan:
     Ray (column, row) has azimuth ``start - step * (column + delay[row])`` and the inclination of its row.
     """
 
-    inclinations: np.ndarray
-    """f64[h], radians, falling: row 0 is the highest."""
-    num_columns: int
-    """Columns of the turn; their width times their number may be more than a full turn."""
-    start: float
-    """Azimuth of column 0, radians."""
-    step: float
-    """Width of a column, radians."""
-    delay: np.ndarray
-    """f64[h]: when each laser of a column fires, as part of the column's width."""
+    inclinations: np.ndarray  # f64[h], radians, falling: row 0 is the highest
+    num_columns: int  # columns of the turn; their width times their number may be more than a full turn
+    start: float  # azimuth of column 0, radians
+    step: float  # width of a column, radians
+    delay: np.ndarray  # f64[h]: when each laser of a column fires, as part of the column's width
 
     @functools.cached_property
     def directions(self) -> np.ndarray:
@@ -46,39 +42,28 @@ class Fan:
 class Hits:
     """What every ray meets first."""
 
-    range_m: np.ndarray
-    """f32[w, h], inf where nothing is met."""
-    solid: np.ndarray
-    """i32[w, h]: row of the solids, -1 for ground or nothing."""
-    cosine: np.ndarray
-    """f32[w, h]: of the angle of incidence."""
-    reachable: np.ndarray
-    """i64[k]: ``owner * w * h + ray`` of every ray that would meet an owned object if it were alone."""
+    range_m: np.ndarray  # f32[w * h], column by column, inf where nothing is met
+    solid: np.ndarray  # i32[w * h]: row of the solids, -1 for ground or nothing
+    cosine: np.ndarray  # f32[w * h]: of the angle of incidence
+    reachable: np.ndarray  # i64[k]: owner * w * h + ray of every ray that would meet an owned object alone
 
 
 def cast(
-    fan: Fan,
-    rotation: np.ndarray,
-    origin: np.ndarray,
-    solids: np.ndarray,
-    ground: Ground,
-    rng: np.random.Generator,
+    fan: Fan, rotation: np.ndarray, origin: np.ndarray, solids: np.ndarray, ground: Ground, rng: Generator
 ) -> Hits:
     """First hits of all rays.
 
     Args:
-        fan: the rays.
         rotation: f64[3, 3], sensor axes to world axes.
         origin: f64[3], the sensor in the world, above the ground.
         solids: [s] in the world.
-        ground: below all.
         rng: how deep each ray gets into porous solids.
 
     >>> fan = Fan(np.radians([0.0]), 4, np.pi, np.pi / 2, np.zeros(1))
     >>> from fcos_lidar_jax.simulation.solids import BALL, make_solids
     >>> ball = make_solids(BALL, [5, 0, 0], 1.0)
     >>> flat = Ground(np.array([[0, 0, -2.0]]), 7, 0, 7, 0.1, 3, (0.1, 0.2, 0.2))
-    >>> cast(fan, np.eye(3), np.zeros(3), ball, flat, np.random.default_rng(0)).range_m[:, 0].tolist()
+    >>> cast(fan, np.eye(3), np.zeros(3), ball, flat, np.random.default_rng(0)).range_m.tolist()
     [inf, inf, 4.0, inf]
     """
     d = rotation.astype(np.float32) @ fan.directions
@@ -99,8 +84,7 @@ def cast(
     struck = np.flatnonzero(winner >= 0)
     towards = d.take(struck, axis=1)
     cosine[struck] = incidence(solids, winner[struck], best[struck] * towards, towards)
-    shape = (fan.num_columns, len(fan.inclinations))
-    return Hits(best.reshape(shape), winner.reshape(shape), cosine.reshape(shape), reachable)
+    return Hits(best, winner, cosine, reachable)
 
 
 def _candidate_pairs(fan: Fan, rotation: np.ndarray, solids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,7 @@ from numpy.random import Generator
 from fcos_lidar_jax.simulation.ground import Ground
 from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, SOLID, make_solids
 
-_LEAVES = 0.55
-"""Rays stopped by a metre of foliage."""
+_LEAVES = 0.55  # rays stopped by a metre of foliage
 _FENCES = ((0.08, 5.0), (0.24, np.inf), (0.24, np.inf), (0.8, 2.5))
 """Thickness in metres, and rays stopped by a metre of it: a fence, walls, a hedge."""
 
@@ -18,8 +17,6 @@ def sample_scenery(
     """Scenery on both sides of both streets.
 
     Args:
-        rng: draws all of it.
-        ground: the streets.
         low: f64[2], least x and y that the sensor comes to.
         high: f64[2], greatest.
         beyond_m: how far around that there is anything.

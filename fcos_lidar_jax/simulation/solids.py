@@ -20,24 +20,17 @@ SOLID = np.dtype(
         ("taper", np.float64, 2),  # top over base, along and across; drums use the first
         ("albedo", np.float64),  # 0-1
         ("density", np.float64),  # stopped rays a metre of the way through, inf where opaque
-        ("owner", np.int32),  # object it belongs to, -1 for scenery, -2 for the car that carries the sensor
+        ("owner", np.int32),  # object it belongs to, -1 for scenery, -2 for the ego vehicle
     ]
 )
 
-SCENERY, OWN_CAR = -1, -2
+SCENERY, EGO = -1, -2
 
 
 def make_solids(kind: int, center: object, half: object, **fields: object) -> np.ndarray:
-    """Solids of one kind; all fields broadcast.
+    """Solids [s] of one kind; all fields broadcast, ``center`` and ``half`` are [..., 3].
 
-    Args:
-        kind: one of the kinds above.
-        center: [..., 3].
-        half: [..., 3].
-        **fields: the other fields of :data:`SOLID`; by default upright, untapered, opaque scenery of albedo 0.3.
-
-    Returns:
-        structured array [s].
+    The other fields of :data:`SOLID` are by default those of upright, untapered, opaque scenery of albedo 0.3.
 
     >>> make_solids(BALL, [[0, 0, 1], [4, 0, 1]], 0.5, albedo=0.1)["half"].tolist()
     [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
@@ -79,12 +72,9 @@ def corners(solids: np.ndarray) -> np.ndarray:
     half = solids["half"].copy()
     half[:, 0] += np.abs(solids["lean"]) * half[:, 2]
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    local = half[:, None] * signs
     c, s = np.cos(solids["yaw"])[:, None], np.sin(solids["yaw"])[:, None]
-    turned = np.stack(
-        [c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], axis=-1
-    )
-    return solids["center"][:, None] + turned
+    x, y, z = np.moveaxis(half[:, None] * signs, -1, 0)
+    return solids["center"][:, None] + np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
 
 
 def unit_map(solids: np.ndarray) -> np.ndarray:

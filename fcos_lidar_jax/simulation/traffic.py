@@ -1,47 +1,52 @@
-"""The objects of a world: of which kind, how large, where, and how they move."""
+"""The objects of a world: which, how large, where they stand (lanes, kerbs, yards, pavements), how they move."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.random import Generator
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import footprints_overlap
-from fcos_lidar_jax.simulation.ground import Ground
-from fcos_lidar_jax.simulation.motion import MOTION, pose_at
-from fcos_lidar_jax.simulation.object_models import LOOKS, sample_object_model
-from fcos_lidar_jax.simulation.places import PARKED, Places
-from fcos_lidar_jax.simulation.shapes import ObjectModel, sample_size
+from fcos_lidar_jax.simulation.ground import LANE_M, Ground
+from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, travelled
+from fcos_lidar_jax.simulation.objects import ObjectModel, sample_object_model, sample_size
 
-_CLEARANCE_M = 0.35
-"""Objects keep this from each other, at all times ..."""
-_ROW_CLEARANCE_M = 0.08
-"""... but in a row only this."""
-_STEP_S = 0.5
-"""They are compared at moments so far apart ..."""
-_FUSED_STEP_S = 0.025
-"""... but in worlds of a few sweeps so often that nothing slips through anything between two sweeps."""
+# Where objects of a class are, and how often; first where they move, if they do.
+_PLACES: dict[str, tuple[tuple[str, float], ...]] = {
+    "car": (("lane", 0.5), ("row", 0.42), ("yard", 0.08)),
+    "truck": (("lane", 0.4), ("kerb", 0.3), ("yard", 0.3)),
+    "bus": (("lane", 0.75), ("yard", 0.25)),
+    "trailer": (("lane", 0.15), ("kerb", 0.05), ("row", 0.8)),
+    "construction_vehicle": (("lane", 0.15), ("kerb", 0.45), ("yard", 0.4)),
+    "pedestrian": (("pavement", 0.8), ("crossing", 0.2)),
+    "motorcycle": (("lane", 0.5), ("kerb", 0.5)),
+    "bicycle": (("cycle", 0.5), ("pavement", 0.5)),
+    "traffic_cone": (("row", 1.0),),
+    "barrier": (("row", 1.0),),
+}
+_PARKED = ("row", "kerb", "yard")
+_ROW_LENGTH = {"car": 8, "trailer": 5, "traffic_cone": 8, "barrier": 14}  # objects in a row, at most
+_FAST = 0.7  # share of the objects in fast traffic that get the first of their class's places
+_FLOWING = {0: 0.8, 1: 0.4}  # how often traffic moves in a lane of the main street and of the other
+_CLEARANCE_M = 0.35  # objects keep this from each other, at all times
+_ROW_CLEARANCE_M = 0.08  # but in a row only this
+_STEP_S = 0.5  # they are compared at moments so far apart
+_FUSED_STEP_S = 0.025  # but in worlds of a few sweeps so often that nothing slips through between two of them
 _TRIES = 25
-CAR_SIZE_M = (4.6, 2.0)
-"""Length and width of the car that carries the sensor."""
-CAR_MIDDLE_M = 1.35
-"""Its middle is this far before its rear axle."""
+EGO_SIZE_M = (4.6, 2.0)  # length and width of the ego vehicle
+EGO_MIDDLE_M = 1.35  # its middle is this far before its rear axle
 
 
 @dataclasses.dataclass(frozen=True)
 class Traffic:
     """The objects of a world, in the street's frame."""
 
-    labels: np.ndarray
-    """i32[m]: index into ``NUSCENES_CLASSES``."""
-    looks: tuple[ObjectModel, ...]
-    """Variety of each."""
-    sizes: np.ndarray
-    """f64[m, 3]: length, width, height of the annotated boxes."""
-    motions: np.ndarray
-    """[m] of ``motion.MOTION``."""
-    parked: np.ndarray
-    """bool[m]: stands where vehicles are left, rather than in traffic."""
+    labels: np.ndarray  # i32[m]: index into NUSCENES_CLASSES
+    models: tuple[ObjectModel, ...]  # model of each
+    sizes: np.ndarray  # f64[m, 3]: length, width, height of the annotated boxes
+    motions: np.ndarray  # [m] of motion.MOTION
+    parked: np.ndarray  # bool[m]: stands where vehicles are left, rather than in traffic
 
 
 def sample_traffic(
@@ -49,53 +54,48 @@ def sample_traffic(
     ground: Ground,
     ego: np.ndarray,
     *,
-    labels: np.ndarray,
+    labels: Sequence[int],
+    occupied: np.ndarray,
     reach_m: float,
     duration_s: float,
-    occupied: np.ndarray,
-    fused: bool = False,
-    fast_traffic: bool = False,
+    fused: bool,
+    fast_traffic: bool,
 ) -> Traffic:
-    """Objects that never touch each other, the car or what stands already.
+    """Objects that never touch each other, the ego vehicle or what stands already.
 
-    Every object is within reach of the sensor at some moment, at a distance drawn evenly.
+    Every object is within reach of the sensor at some moment, at a distance drawn evenly. Options are those of
+    :func:`~.world.sample_world`.
 
     Args:
-        rng: draws all of it.
-        ground: the streets.
         ego: [1] of ``motion.MOTION``.
-        labels: i32[m], wanted; those without room are left out.
-        reach_m: greatest distance at that moment.
-        duration_s: how long the world lasts.
+        labels: wanted, in this order; those without room are left out.
         occupied: f64[k, 5], ``x, y, l, w, yaw`` of what stands already.
-        fused: seen at the end alone: that is the moment at which every object is within reach.
-        fast_traffic: nearly all that can move does.
     """
     times = np.arange(0, duration_s + 1e-6, _FUSED_STEP_S if fused else _STEP_S)
-    room = _Room(times, occupied)
-    car = pose_at(ego, times)
-    car[:, :2] += CAR_MIDDLE_M * np.stack([np.cos(car[:, 2]), np.sin(car[:, 2])], axis=1)
-    room.take(car, CAR_SIZE_M)
-    places = Places(rng, ground, ego, reach_m, fast_traffic)
+    taken = _Taken(times, occupied)
+    vehicle = pose_at(ego, times)
+    vehicle[:, :2] += EGO_MIDDLE_M * np.stack([np.cos(vehicle[:, 2]), np.sin(vehicle[:, 2])], axis=1)
+    taken.add(vehicle, EGO_SIZE_M)
+    places = _Places(rng, ground, ego, reach_m, fast_traffic)
     found: list[tuple[int, ObjectModel, np.ndarray, np.ndarray, bool]] = []
     for label in labels:
         name = NUSCENES_CLASSES[label]
         for _ in range(_TRIES):
-            look = _draw_mover(rng, name) if fast_traffic else sample_object_model(rng, name)
-            size = sample_size(rng, look)
-            place, clearance = places.sample_place(name, look), _CLEARANCE_M
+            model = sample_object_model(rng, name, moving=fast_traffic)
+            size = sample_size(rng, model)
+            place, clearance = places.sample_place(name, model), _CLEARANCE_M
             moment = rng.uniform(duration_s if fused else 0.0, duration_s)
             if place == "row":
-                row, clearance = places.row_for(name, moment, look, size), _ROW_CLEARANCE_M
-                if row.look is not look and name in ("traffic_cone", "barrier"):  # in a row all are alike
-                    look = row.look
-                    size = sample_size(rng, look)
-                motion = places.in_row(row, size)
+                row, clearance = places.row_for(name, moment, model, size), _ROW_CLEARANCE_M
+                if row.model is not model and name in ("traffic_cone", "barrier"):  # in a row all are alike
+                    model = row.model
+                    size = sample_size(rng, model)
+                motion = places.next_in_row(row, size)
             else:
-                motion = places.draw(place, moment, look, size)
-            if motion is not None and room.free(pose_at(motion, times), size, clearance):
-                room.take(pose_at(motion, times), size)
-                found.append((int(label), look, size, motion, place in PARKED))
+                motion = places.sample_motion(place, moment, model, size)
+            if motion is not None and taken.has_room(pose_at(motion, times), size, clearance):
+                taken.add(pose_at(motion, times), size)
+                found.append((label, model, size, motion, place in _PARKED))
                 break
     return Traffic(
         np.array([f[0] for f in found], np.int32),
@@ -106,34 +106,23 @@ def sample_traffic(
     )
 
 
-def _draw_mover(rng: Generator, name: str) -> ObjectModel:
-    """A variety that moves, of a class that has one."""
-    look = sample_object_model(rng, name)
-    while look.speed_mps[1] == 0 and any(other.speed_mps[1] > 0 for other in LOOKS[name]):
-        look = sample_object_model(rng, name)
-    return look
-
-
-class _Room:
-    """Rectangles that are taken, at a few moments."""
+class _Taken:
+    """Rectangles on the ground that are taken, at a few moments."""
 
     def __init__(self, times: np.ndarray, occupied: np.ndarray) -> None:
-        still = np.repeat(occupied[:, None], len(times), axis=1)
-        self._poses = list(still[..., [0, 1, 4]])
-        self._sizes = [tuple(v) for v in occupied[:, 2:4]]
+        self._poses = list(np.repeat(occupied[:, None, [0, 1, 4]], len(times), axis=1))
+        self._sizes = [tuple(size) for size in occupied[:, 2:4]]
 
-    def take(self, poses: np.ndarray, size: np.ndarray | tuple[float, float]) -> None:
+    def add(self, poses: np.ndarray, size: np.ndarray | tuple[float, float]) -> None:
         self._poses.append(poses)
         self._sizes.append((size[0], size[1]))
 
-    def free(self, poses: np.ndarray, size: np.ndarray, clearance: float) -> bool:
+    def has_room(self, poses: np.ndarray, size: np.ndarray, clearance: float) -> bool:
         others, sizes = np.array(self._poses), np.array(self._sizes)
         reach = np.hypot(sizes[:, 0], sizes[:, 1])[:, None] / 2 + np.hypot(size[0], size[1]) / 2 + clearance
         which, when = np.nonzero(np.hypot(*(others[..., :2] - poses[:, :2]).transpose(2, 0, 1)) < reach)
-        if not len(which):
-            return True
-        mine = _footprints(poses[when], np.array([size[0], size[1]]) + 2 * clearance)
-        return not footprints_overlap(mine, _footprints(others[which, when], sizes[which])).any()
+        own = _footprints(poses[when], size[:2] + 2 * clearance)
+        return not footprints_overlap(own, _footprints(others[which, when], sizes[which])).any()
 
 
 def _footprints(poses: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -141,3 +130,146 @@ def _footprints(poses: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     boxes = np.zeros((len(poses), 7))
     boxes[:, [0, 1, 6]], boxes[:, 3:5] = poses, sizes
     return boxes
+
+
+@dataclasses.dataclass
+class _Row:
+    """Cones or barriers of a work zone, or parked cars or trailers, in line along one side of a street."""
+
+    along: int  # 0 main street, 1 the other
+    end: float  # where the last one ends, along the street
+    beside: float  # left of the street's middle, metres
+    gap: float  # between one and the next
+    left: int  # how many more it takes
+    across: bool  # they face the street, as barriers do; otherwise along it
+    model: ObjectModel  # of its cones or barriers
+
+
+@dataclasses.dataclass
+class _Places:
+    """Samples places and motions of objects in the streets."""
+
+    rng: Generator
+    ground: Ground
+    ego: np.ndarray
+    reach_m: float  # greatest distance from the ego vehicle
+    fast_traffic: bool  # every lane flows, fast and steadily, and few stand
+    # Class -> the row that is being filled.
+    rows: dict[str, _Row] = dataclasses.field(default_factory=dict)
+    # Street, side and lane -> speed and acceleration, the same for all in the lane: they keep their distances.
+    flows: dict[tuple[int, int, int], tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+    def sample_place(self, name: str, model: ObjectModel) -> str:
+        """A place that suits the model: what is ridden is on the road, a cycle without a rider stands."""
+        names, shares = zip(*_PLACES[name], strict=True)
+        if name in ("motorcycle", "bicycle"):
+            return names[0] if model.rider else names[1]
+        if self.fast_traffic and self.rng.random() < _FAST:
+            return names[0]
+        drawn = np.searchsorted(np.cumsum(shares), self.rng.random(), side="right")
+        return names[min(int(drawn), len(names) - 1)]
+
+    def row_for(self, name: str, moment: float, model: ObjectModel, size: np.ndarray) -> _Row:
+        """The row of a class with room for one more; a new one for this model and size where there is none."""
+        if name not in self.rows or self.rows[name].left == 0:
+            self.rows[name] = self._sample_row(name, moment, model, size)
+        return self.rows[name]
+
+    def next_in_row(self, row: _Row, size: np.ndarray) -> np.ndarray:
+        """The next place of a row, [1] of ``motion.MOTION``."""
+        extent = size[1] if row.across else size[0]
+        s = row.end + row.gap + extent / 2
+        row.end, row.left = s + extent / 2, row.left - 1
+        turn = np.pi / 2 * np.sign(row.beside) if row.across else np.pi * (row.beside > 0)
+        noise = self.rng.normal(0, (0.06, 0.03))
+        return self._motion(row.along, s, row.beside + noise[0], turn + noise[1])
+
+    def sample_motion(self, place: str, moment: float, model: ObjectModel, size: np.ndarray) -> np.ndarray | None:
+        """A motion that is at such a place at a moment, [1] of ``motion.MOTION``; None where that fails."""
+        rng, ground = self.rng, self.ground
+        along, s = self._sample_station(moment)
+        half = self._half(along)
+        side = int(rng.choice([-1, 1]))
+        turn = 0.0 if side < 0 else np.pi  # traffic keeps to the right
+        speed, change = 0.0, 0.0
+        if place == "lane":
+            lane = int(rng.integers(max(int((half - 2.4) // LANE_M), 1)))
+            beside, turn = side * LANE_M * (lane + 0.5), turn + rng.normal(0, 0.01)
+            speed, change = self._flow(along, side, lane)
+        elif place == "kerb":
+            beside, turn = side * (half - size[1] / 2 - rng.uniform(0.1, 0.4)), turn + rng.normal(0, 0.03)
+        elif place == "cycle":
+            beside, turn = side * (half - 2.7 + rng.normal(0, 0.15)), turn + rng.normal(0, 0.03)
+            speed = rng.uniform(*model.speed_mps)
+        elif place == "yard":
+            beside = side * (half + ground.pavement + size[0] / 2 + rng.uniform(0.5, 15))
+            turn = rng.integers(4) * np.pi / 2 + rng.normal(0, 0.12)
+        elif place == "crossing":
+            if along == 0 and rng.random() < 0.7:  # on the zebra
+                s = ground.crossing_x + rng.choice([-1, 1]) * (ground.crossing_half_width + rng.uniform(2, 4))
+            beside, turn = rng.uniform(-half, half), side * np.pi / 2 + rng.normal(0, 0.1)
+            speed = rng.uniform(*model.speed_mps)
+        else:  # pavement
+            beside = side * (half + rng.uniform(1.6, max(ground.pavement - 0.4, 1.7)))
+            moves = model.speed_mps[1] > 0 and (self.fast_traffic or rng.random() < 0.75)
+            speed = rng.uniform(*model.speed_mps) if moves else 0.0
+            turn = rng.choice([0.0, np.pi]) + rng.normal(0, 0.15) if moves else rng.uniform(-np.pi, np.pi)
+        motion = self._motion(along, s, beside, turn, speed, change)
+        way, _ = travelled(motion, moment)
+        motion["x"] -= way * np.cos(motion["yaw"])
+        motion["y"] -= way * np.sin(motion["yaw"])
+        if place in ("pavement", "yard") and ground.on_road(motion["x"], motion["y"]).any():
+            return None
+        return motion
+
+    def _half(self, along: int) -> float:
+        return self.ground.crossing_half_width if along else self.ground.half_width
+
+    def _flow(self, along: int, side: int, lane: int) -> tuple[float, float]:
+        """Speed and acceleration in a lane; in the ego vehicle's lane they are its own."""
+        if (along, side, lane) not in self.flows:
+            rng = self.rng
+            if self.fast_traffic:
+                flow = (rng.uniform(8, 18), 0.0)
+            else:
+                flow = (rng.uniform(3, 12), rng.choice([0.0, 0.0, 0.0, -0.5, -1.5, 0.5]))
+            if along == 0 and np.isclose(side * LANE_M * (lane + 0.5), self.ego["y"][0]):
+                flow = (self.ego["speed"][0], self.ego["acceleration"][0])
+            elif not self.fast_traffic and rng.random() > _FLOWING[along]:
+                flow = (0.0, 0.0)
+            self.flows[along, side, lane] = float(flow[0]), float(flow[1])
+        return self.flows[along, side, lane]
+
+    def _sample_row(self, name: str, moment: float, model: ObjectModel, size: np.ndarray) -> _Row:
+        rng, pavement = self.rng, self.ground.pavement
+        along, s = self._sample_station(moment)
+        half, side = self._half(along), rng.choice([-1, 1])
+        left, across, gap = int(rng.integers(2, _ROW_LENGTH[name] + 1)), True, 0.25
+        if name in ("traffic_cone", "barrier"):
+            beside = half - rng.uniform(0.6, 2.6)
+            gap = rng.uniform(1.0, 3.5) if name == "traffic_cone" or rng.random() < 0.3 else gap
+        elif name == "trailer" or rng.random() < 0.6:  # side by side off the street
+            beside, gap = half + pavement + size[0] / 2 + rng.uniform(1.5, 14), rng.uniform(0.5, 1.2)
+        else:  # one after the other at the kerb
+            beside, gap, across = half - size[1] / 2 - rng.uniform(0.1, 0.4), rng.uniform(0.5, 2.5), False
+        return _Row(along, s, side * beside, gap, left, across, model)
+
+    def _sample_station(self, moment: float) -> tuple[int, float]:
+        """A street (0 main, 1 the other) and a place along it, by its distance from the sensor at a moment."""
+        x, y, _ = pose_at(self.ego, moment)[0]
+        distance = self.reach_m * self.rng.uniform(0.05, 1)
+        stations = []
+        for along, (here, off) in enumerate(((x, y), (y, x - self.ground.crossing_x))):
+            if distance > abs(off):
+                way = np.sqrt(distance**2 - off**2)
+                stations += [(along, here - way), (along, here + way)]
+        if not stations:
+            return 0, x + self.rng.choice([-1, 1]) * distance
+        return stations[int(self.rng.integers(len(stations)))]
+
+    def _motion(
+        self, along: int, s: float, beside: float, turn: float, speed: float = 0.0, change: float = 0.0
+    ) -> np.ndarray:
+        """A straight motion from a place along a street and beside its middle (left of its direction)."""
+        x, y = (s, beside) if along == 0 else (self.ground.crossing_x - beside, s)
+        return make_motion(x=x, y=y, yaw=turn + along * np.pi / 2, speed=speed, acceleration=change)

@@ -1,4 +1,4 @@
-"""A simulated world: streets, scenery, traffic, and the car that carries the sensor."""
+"""A simulated world: streets, scenery, traffic, and the ego vehicle."""
 
 import dataclasses
 
@@ -6,12 +6,10 @@ import numpy as np
 from numpy.random import Generator
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.simulation.ground import Ground
-from fcos_lidar_jax.simulation.motion import MOTION, pose_at
-from fcos_lidar_jax.simulation.object_models import LOOKS
-from fcos_lidar_jax.simulation.places import LANE_M
+from fcos_lidar_jax.simulation.ground import LANE_M, Ground
+from fcos_lidar_jax.simulation.motion import make_motion, pose_at
+from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_paint
 from fcos_lidar_jax.simulation.scenery import sample_scenery
-from fcos_lidar_jax.simulation.shapes import object_solids, sample_paint
 from fcos_lidar_jax.simulation.solids import SOLID, place_solids
 from fcos_lidar_jax.simulation.traffic import Traffic, sample_traffic
 
@@ -25,30 +23,23 @@ class World:
     """All that there is, in the street's frame: x along the main street, y left of it, z up."""
 
     ground: Ground
-    """Streets and slopes."""
-    scenery: np.ndarray
-    """[s] solids that never move."""
+    scenery: np.ndarray  # [s] solids that never move
     traffic: Traffic
-    """The objects of the ten classes."""
-    parts: np.ndarray
-    """[s] solids of the objects, each in the frame of the object that it names as its owner."""
-    ego: np.ndarray
-    """[1] of ``motion.MOTION``: the rear axle of the car that carries the sensor."""
+    parts: np.ndarray  # [s] solids of the objects, each in the frame of the object that it names as its owner
+    ego: np.ndarray  # [1] of motion.MOTION: the rear axle of the ego vehicle
 
     def object_poses(self, time_s: float) -> np.ndarray:
         """``x, y, z, yaw`` of the middles of all objects' undersides, f64[m, 4]."""
-        pose = pose_at(self.traffic.motions, time_s)
-        height = self.ground.height(pose[:, 0], pose[:, 1])
-        return np.stack([pose[:, 0], pose[:, 1], height, pose[:, 2]], axis=1)
+        x, y, yaw = pose_at(self.traffic.motions, time_s).T
+        return np.stack([x, y, self.ground.height(x, y), yaw], axis=1)
 
     def solids(self, time_s: float) -> np.ndarray:
-        """Everything but the ground and the car that carries the sensor, at a moment."""
-        return np.concatenate(
-            [self.scenery, place_solids(self.parts, self.object_poses(time_s)[self.parts["owner"]])]
-        )
+        """Everything but the ground and the ego vehicle, at a moment."""
+        objects = place_solids(self.parts, self.object_poses(time_s)[self.parts["owner"]])
+        return np.concatenate([self.scenery, objects])
 
     def ego_pose(self, time_s: float) -> np.ndarray:
-        """The car at a moment, f64[4, 4]: its axes (x forward, z off the ground) in the street's frame."""
+        """The ego vehicle at a moment, f64[4, 4]: its axes (x forward, z off the ground) in the street's frame."""
         x, y, yaw = pose_at(self.ego, time_s)[0]
         a, b, _ = max(self.ground.planes, key=lambda p: p[0] * x + p[1] * y + p[2])
         up = np.array([-a, -b, 1]) / np.sqrt(1 + a * a + b * b)
@@ -74,9 +65,8 @@ def sample_world(
     """A random world.
 
     Args:
-        rng: draws all of it.
-        reach_m: every object is within this distance of the car at some moment.
-        beyond_m: scenery reaches this far beyond where the car goes.
+        reach_m: every object is within this distance of the ego vehicle at some moment.
+        beyond_m: scenery reaches this far beyond where the ego vehicle goes.
         duration_s: how long it lasts.
         labels: i32[m], objects wanted; those without room are left out.
         level: without slopes.
@@ -89,32 +79,27 @@ def sample_world(
     >>> len(world.traffic.labels) <= 10, world.object_poses(0.0).shape[1]
     (True, 4)
     """
-    ground = _draw_ground(rng, level)
-    ego = _draw_ego(rng, ground, duration_s, fast_traffic)
+    ground = _sample_ground(rng, level)
+    ego = _sample_ego(rng, ground, duration_s, fast_traffic)
     path = pose_at(ego, np.arange(0, duration_s + 0.1, 0.5))[:, :2]
     scenery = sample_scenery(rng, ground, path.min(axis=0), path.max(axis=0), beyond_m=beyond_m)
-    standing = scenery["center"][:, 2] - scenery["half"][:, 2] < 2 + ground.height(*scenery["center"][:, :2].T)
-    columns = [scenery["center"][:, :2], 2 * scenery["half"][:, :2], scenery["yaw"][:, None]]
-    occupied = np.concatenate(columns, axis=1)[standing]
-    largest_first = np.array(
-        sorted(labels, key=lambda k: -np.prod(LOOKS[NUSCENES_CLASSES[k]][0].size_m)), np.int32
-    )
+    center, half, yaw = scenery["center"], scenery["half"], scenery["yaw"]
+    standing = center[:, 2] - half[:, 2] < 2 + ground.height(*center[:, :2].T)
     traffic = sample_traffic(
         rng,
         ground,
         ego,
-        labels=largest_first,
+        labels=sorted(labels, key=lambda k: -np.prod(OBJECT_MODELS[NUSCENES_CLASSES[k]][0].size_m)),
+        occupied=np.concatenate([center[:, :2], 2 * half[:, :2], yaw[:, None]], axis=1)[standing],
         reach_m=reach_m,
         duration_s=duration_s,
-        occupied=occupied,
         fused=fused,
         fast_traffic=fast_traffic,
     )
     parts = [np.zeros(0, SOLID)]
-    for index, (look, size) in enumerate(zip(traffic.looks, traffic.sizes, strict=True)):
-        solids = object_solids(look, size, sample_paint(rng, look))
-        solids["owner"] = index
-        parts.append(solids)
+    for index, (model, size) in enumerate(zip(traffic.models, traffic.sizes, strict=True)):
+        parts.append(object_solids(model, size, sample_paint(rng, model)))
+        parts[-1]["owner"] = index
     return World(ground, scenery, traffic, np.concatenate(parts), ego)
 
 
@@ -128,7 +113,7 @@ def sample_labels(rng: Generator, number: int) -> np.ndarray:
     return np.concatenate([np.arange(len(NUSCENES_CLASSES)), more]).astype(np.int32)[:number]
 
 
-def _draw_ground(rng: Generator, level: bool) -> Ground:
+def _sample_ground(rng: Generator, level: bool) -> Ground:
     lanes, across = rng.integers(1, 3, 2)
     slope = 0.0 if level else 1.0
     a, b = slope * rng.normal(0, 0.012, 2)
@@ -153,25 +138,20 @@ def _draw_ground(rng: Generator, level: bool) -> Ground:
     )
 
 
-def _draw_ego(rng: Generator, ground: Ground, duration_s: float, fast_traffic: bool) -> np.ndarray:
-    ego = np.zeros(1, MOTION)
-    ego["y"] = -LANE_M / 2 if rng.random() < 0.6 else -(ground.half_width - 2.5 - LANE_M / 2)
+def _sample_ego(rng: Generator, ground: Ground, duration_s: float, fast_traffic: bool) -> np.ndarray:
+    y = -LANE_M / 2 if rng.random() < 0.6 else -(ground.half_width - 2.5 - LANE_M / 2)
     if fast_traffic:
-        ego["speed"] = rng.uniform(10, 20)
-        return ego
-    manoeuvre = rng.choice(_MANOEUVRES)
-    ego["speed"] = rng.uniform(4, 11)
+        return make_motion(y=y, speed=rng.uniform(10, 20))
+    manoeuvre, speed = rng.choice(_MANOEUVRES), rng.uniform(4, 11)
     if manoeuvre == "stopped":
-        ego["speed"] = 0
-    elif manoeuvre == "braking":
-        ego["acceleration"] = -ego["speed"] / max(0.6 * duration_s, 2.0)
-    elif manoeuvre == "starting":
-        ego["speed"], ego["acceleration"] = 0, rng.uniform(0.4, 0.9)
-    elif manoeuvre in ("left", "right"):
-        left = manoeuvre == "left"
-        lane = ground.crossing_x + (LANE_M / 2 if left else -LANE_M / 2)
-        radius = rng.uniform(10, 14) if left else rng.uniform(6, 9)
-        ego["speed"] = rng.uniform(4, 6.5)
-        ego["straight"] = lane - radius
-        ego["curvature"], ego["turn"] = (1 / radius, np.pi / 2) if left else (-1 / radius, -np.pi / 2)
-    return ego
+        return make_motion(y=y)
+    if manoeuvre == "braking":
+        return make_motion(y=y, speed=speed, acceleration=-speed / max(0.6 * duration_s, 2.0))
+    if manoeuvre == "starting":
+        return make_motion(y=y, acceleration=rng.uniform(0.4, 0.9))
+    if manoeuvre == "straight":
+        return make_motion(y=y, speed=speed)
+    side = 1 if manoeuvre == "left" else -1
+    radius = rng.uniform(10, 14) if manoeuvre == "left" else rng.uniform(6, 9)
+    bend = {"straight": ground.crossing_x + side * LANE_M / 2 - radius, "curvature": side / radius}
+    return make_motion(y=y, speed=rng.uniform(4, 6.5), turn=side * np.pi / 2, **bend)

@@ -1,22 +1,19 @@
 """Pictures of a run: curves of its metrics, and what it finds in a few test frames."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.inference.records import confident
 from fcos_lidar_jax.trainer.prediction import Prediction
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.types import Detections
 
-_SHOWN_SCORE = 0.2
+SHOWN_SCORE = 0.2  # Of the detections in pictures, at least: early in training the scores are still low.
 
 
 def draw_metrics(folder: Path) -> None:
-    """The losses and, where there is one, the mean average precision over the steps.
-
-    Args:
-        folder: of the run; gets ``loss.png`` and ``scores.png``.
-    """
+    """Draw a run's losses over the steps, ``loss.png``, and, where there is one, the mAP, ``scores.png``."""
     from fcos_lidar_jax.visualization.curves import draw_curves
 
     lines = read_metrics(folder)
@@ -29,25 +26,21 @@ def draw_metrics(folder: Path) -> None:
 
 
 def draw_predictions(folder: Path, predictions: Iterable[Prediction], frames: FrameSet, step: int) -> None:
-    """Test frames from above, with detections and truth.
-
-    Args:
-        folder: made if missing.
-        predictions: in some of the frames.
-        frames: with boxes of the detector's classes.
-        step: updates done.
-    """
-    from fcos_lidar_jax.visualization.bev import draw_bev
-
+    """Draw test frames from above, with detections and truth, a picture each, named for step and frame."""
     folder.mkdir(exist_ok=True)
     for prediction in predictions:
         frame = prediction.frame or frames.frame(prediction.index)
-        draw_bev(
-            frame.points,
-            folder / f"step_{step:06d}_frame_{prediction.index}.png",
-            limit_m=frames.sensor.limit_xy_m,
-            classes=frames.classes,
-            detections=confident(prediction.detections, _SHOWN_SCORE),
-            truth=(frame.boxes, frame.labels),
-            title=f"step {step}, test frame {prediction.index}: score {_SHOWN_SCORE} and more, truth dashed",
-        )
+        path = folder / f"step_{step:06d}_frame_{prediction.index}.png"
+        title, limit_m = f"step {step}, test frame {prediction.index}", frames.sensor.limit_xy_m
+        draw_frame(path, frame, prediction.detections, title, limit_m=limit_m, classes=frames.classes)
+
+
+def draw_frame(
+    path: Path, frame: Frame, detections: Detections, title: str, *, limit_m: float, classes: Sequence[str]
+) -> None:
+    """Draw a frame from above, with its truth and the detections of a score of :data:`SHOWN_SCORE` and more."""
+    from fcos_lidar_jax.visualization.bev import draw_bev
+
+    found, truth = confident(detections, SHOWN_SCORE), (frame.boxes, frame.labels)
+    title = f"{title}: score {SHOWN_SCORE} and more, truth dashed"
+    draw_bev(frame.points, path, limit_m=limit_m, classes=classes, detections=found, truth=truth, title=title)

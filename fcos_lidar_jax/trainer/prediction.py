@@ -1,4 +1,4 @@
-"""A detector on many frames: read ahead, spread over the devices."""
+"""A detector on many frames, read ahead, spread over the devices: its boxes, and how good they are."""
 
 import dataclasses
 import sys
@@ -11,28 +11,27 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from fcos_lidar_jax.data.classes import MappedFrames
 from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.evaluation.frames import evaluate_frames
+from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.inference.detector import TrainedDetector, sharded_detect
+from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.types import Detections
 
-_AHEAD = 2
-"""Groups of frames that are read while the devices work on others."""
+_AHEAD = 2  # Groups of frames that are read while the devices work on others.
 
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
     """What was found in a frame."""
 
-    index: int
-    """Of the frame."""
-    detections: Detections
-    """NumPy arrays."""
-    frame: Frame | None
-    """As it was read; None where another process has read it."""
-    cloud: Cloud | None
-    """What the network was given of it, and how many points were dropped; likewise."""
+    index: int  # Of the frame.
+    detections: Detections  # NumPy arrays.
+    frame: Frame | None  # As it was read; None where another process has read it.
+    cloud: Cloud | None  # What the network was given of it, and how many points were dropped; likewise.
 
 
 def predict(
@@ -49,23 +48,19 @@ def predict(
     of devices and processes. Frames are read in threads while the devices work.
 
     Args:
-        detector: network and weights.
-        frames: to detect in.
-        indices: which of them; default: all.
+        detector, frames: network with its weights, and what to detect in.
+        indices: which of the frames; default: all.
         batch_size: clouds that a device takes at once; more than one changes scores and boxes by rounding, at most
             1e-4.
         devices: to work on; default: all, those of other processes too. Every process then makes the same call,
             reads its share of the frames, and is given all predictions.
-
-    Yields:
-        a prediction for every frame.
 
     Raises:
         ValueError: a batch size below 1, or a frame that cannot be read.
     """
     if batch_size < 1:
         raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
-    mesh = make_mesh(devices)
+    mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
     program = sharded_detect(detector.model, mesh, batch_size)
     variables = replicate(detector.variables, mesh)
     todo = list(range(len(frames)) if indices is None else indices)
@@ -75,20 +70,16 @@ def predict(
     own = [r for r in range(size) if mesh.devices[r // batch_size].process_index == jax.process_index()]
 
     def read(group: list[int]) -> tuple[dict[int, tuple[Frame, Cloud]], tuple[np.ndarray, np.ndarray]]:
-        shape = (len(own), detector.config.max_points, detector.sensor.point_columns)
+        shape = (len(own), config.max_points, sensor.point_columns)
         points, valid = np.zeros(shape, np.float32), np.zeros(shape[:2], bool)
         loaded = {}
         for slot, row in enumerate(own):
             if row < len(group):
                 frame = frames.frame(group[row])
-                if group is groups[0] and slot == 0:
-                    _warn_of_another_sensor(detector, frame)
+                if group is groups[0] and slot == 0 and (line := sensor_mismatch(frame.points, sensor)):
+                    print(f"warning: {line}", file=sys.stderr, flush=True)
                 cloud = make_cloud(
-                    frame.points,
-                    detector.config,
-                    sensor=detector.sensor,
-                    num_close=frame.num_close,
-                    remove_close="none",
+                    frame.points, config, sensor=sensor, num_close=frame.num_close, remove_close="none"
                 )
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud
@@ -116,7 +107,23 @@ def predict(
             yield from finished(*running)
 
 
-def _warn_of_another_sensor(detector: TrainedDetector, frame: Frame) -> None:
-    told = sensor_mismatch(frame.points, detector.sensor)
-    if told is not None:
-        print(f"warning: {told}", file=sys.stderr, flush=True)
+def evaluate(
+    detector: TrainedDetector, frames: FrameSet, *, batch_size: int = 1, devices: Sequence[Any] | None = None
+) -> Evaluation:
+    """Detect in every frame and compare with its boxes, by centre distance; arguments as in :func:`predict`.
+
+    Classes are matched by name; boxes of other classes are left out.
+
+    Returns:
+        precision and errors over the detector's classes, see
+        :func:`fcos_lidar_jax.evaluation.frames.evaluate_frames`.
+    """
+    mapped = MappedFrames(frames, detector.classes)
+    progress = Progress("test frames", len(mapped))
+    found, truths = [], []
+    for prediction in predict(detector, mapped, batch_size=batch_size, devices=devices):
+        frame = prediction.frame or mapped.frame(prediction.index)
+        found.append(prediction.detections)
+        truths.append(Frame(frame.points[:0], frame.boxes, frame.labels, frame.num_points))
+        progress.show(len(found))
+    return evaluate_frames(found, truths, metric_of(detector.classes, tuple(detector.config.ranges_m.values())))

@@ -33,8 +33,7 @@ def write_predictions(
     What is done is kept in a resume log beside the file, which is removed when the file is written.
 
     Args:
-        detector: network and weights.
-        frames: to detect in; their names differ.
+        detector, frames: network with its weights, and what to detect in; the frames' names differ.
         path: of the results file.
         entries: index of a frame and its detections -> what the file shall hold of them.
         write: writes the file from the frames' names with their entries as JSON.

@@ -28,46 +28,32 @@ from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.trainer.evaluation import evaluate
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
-from fcos_lidar_jax.trainer.prediction import predict
-from fcos_lidar_jax.training import (
-    Checkpoint,
-    NonFiniteLossError,
-    detection_variables,
-    fit,
-    load_checkpoint,
-    make_optimizer,
-    make_state,
-    make_train_step,
-)
-from fcos_lidar_jax.training.checkpoint import NonFiniteStateError, check_arrays
+from fcos_lidar_jax.trainer.prediction import evaluate, predict
+from fcos_lidar_jax.training.checkpoint import Checkpoint, NonFiniteStateError, check_arrays, load_checkpoint
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, find_checkpoint
-from fcos_lidar_jax.training.loop import Record
+from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
 from fcos_lidar_jax.training.metrics_log import MetricsLog
+from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.preemption import stop_requests
 from fcos_lidar_jax.training.sharding import check_batch_size, jit_step, make_mesh, replicate, shard_batch
+from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 from fcos_lidar_jax.types import TrainState
 
-_NUM_PICTURES = 2
-"""Test frames that are drawn at an evaluation."""
-RUN_SPEC = "run.json"
-"""Name of the file in a run's folder that says what the run is."""
+_NUM_PICTURES = 2  # Test frames that are drawn at an evaluation.
+RUN_SPEC = "run.json"  # Name of the file in a run's folder that says what the run is.
 
-Hook = Callable[[int, Record], None]
-"""Called with (steps done, metrics of the last of them) after every step."""
+Hook = Callable[[int, Record], None]  # Called with (steps done, metrics of the last of them) after every step.
 
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
     """When a run saves and evaluates."""
 
-    save_every: int
-    """Steps between two checkpoints."""
-    evaluate_every: int
-    """Steps between two evaluations; each saves a checkpoint, too."""
-    keep: int = 2
-    """Newest checkpoints that are kept, beside the best."""
+    save_every: int | None = None  # Steps between two checkpoints; default: a fiftieth of the run.
+    evaluate_every: int | None = None
+    """Steps between two evaluations; each saves a checkpoint, too; default: a tenth of the run."""
+    keep: int = 2  # Newest checkpoints that are kept, beside the best.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,18 +67,17 @@ class _Run:
     tests: FrameSet | None
     devices: Sequence[Any] | None
     spec: dict[str, Any]
-    is_main_process: bool
 
     @property
     def checkpoints(self) -> Checkpoints:
         return Checkpoints(self.folder / CHECKPOINTS, keep=self.schedule.keep)
 
     def evaluates_at(self, step: int) -> bool:
-        due = step % self.schedule.evaluate_every == 0 or step == self.num_steps
-        return self.tests is not None and due
+        every = self.schedule.evaluate_every or -(-self.num_steps // 10)
+        return self.tests is not None and (step % every == 0 or step == self.num_steps)
 
     def saves_at(self, step: int) -> bool:
-        return step % self.schedule.save_every == 0 or self.evaluates_at(step)
+        return step % (self.schedule.save_every or -(-self.num_steps // 50)) == 0 or self.evaluates_at(step)
 
 
 def train(
@@ -108,7 +93,7 @@ def train(
     weights: str | Path | Variables | None = None,
     devices: Sequence[Any] | None = None,
     hooks: Sequence[Hook] = (),
-    schedule: Schedule | None = None,
+    schedule: Schedule = Schedule(),
     threads: int = 2,
     workers: int = 0,
 ) -> TrainState:
@@ -123,13 +108,12 @@ def train(
         seed: of weights, order, pasted objects and augmentation.
         tests: frames to evaluate on along the way.
         objects: ground-truth database for copy-paste; needed unless ``config.copy_paste`` is None.
-        resume: go on from the newest whole checkpoint in the folder; the run must be the same.
+        resume: from the newest whole checkpoint in the folder; the run must be the same.
         weights: to begin with, instead of random ones: a checkpoint, or arrays.
         devices: to share each batch; default: all.
         hooks: called after every step.
-        schedule: default: 50 checkpoints and 10 evaluations a run.
-        threads: that prepare batches.
-        workers: processes that prepare batches, beside the threads.
+        schedule: when to save and to evaluate.
+        threads, workers: threads that prepare batches, and processes beside them.
 
     Returns:
         the last state.
@@ -145,16 +129,20 @@ def train(
     tests = None if tests is None else MappedFrames(tests, config.classes)
     mesh = make_mesh(devices)
     check_batch_size(config.optimizer.batch_size, mesh)
-    run = _Run(
-        folder=Path(out),
-        detector=build_detector(config, frames.sensor),
-        schedule=schedule or Schedule(-(-steps // 50), -(-steps // 10)),
-        num_steps=steps,
-        tests=tests,
-        devices=devices,
-        spec=run_spec(config, frames, steps=steps, seed=seed, objects=objects, weights=weights),
-        is_main_process=jax.process_index() == 0,
-    )
+    # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
+    spec = {
+        "config": config_to_json(config),
+        "sensor": sensor_to_json(frames.sensor),
+        "steps": steps,
+        "seed": seed,
+        "frames": len(frames),
+        "data": frames.fingerprint(),
+        "objects": None if objects is None else objects.manifest.source,
+        "weights": str(weights) if isinstance(weights, str | Path) else None,
+    }
+    spec, detector = json.loads(json.dumps(spec)), build_detector(config, frames.sensor)
+    run = _Run(Path(out), detector, schedule, steps, tests, devices, spec)
+    is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
     check_run(run.folder, run.spec, resume=resume)
     given = None if resume else _given_weights(run.detector, weights)
     with _claimed(run, resume=resume):
@@ -165,8 +153,7 @@ def train(
             print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
             return start
         step = jit_step(make_train_step(run.detector, optimizer), mesh)
-        metrics = MetricsLog(run.folder, first_step=first) if run.is_main_process else None
-        saved = first if resume else -1
+        metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
 
         def report(number: int, record: Record) -> None:
             if metrics is not None:
@@ -176,25 +163,15 @@ def train(
                 hook(number, record)
 
         def pause(number: int, state: TrainState) -> None:
-            nonlocal saved
             score = _evaluate(run, number, state, metrics) if run.evaluates_at(number) else None
             if metrics is not None:
                 metrics.flush()
                 _save(run, state, score)
-            saved = number
 
-        several = jax.process_count() > 1
+        processes = {"process_index": jax.process_index(), "num_processes": jax.process_count()}
+        helpers = {"threads": threads, "workers": workers, **processes}
         batches = make_batches(
-            frames,
-            config,
-            seed=seed,
-            num_steps=steps,
-            first_step=first,
-            objects=objects,
-            process_index=jax.process_index(),
-            num_processes=jax.process_count(),
-            threads=threads,
-            workers=workers,
+            frames, config, seed=seed, num_steps=steps, first_step=first, objects=objects, **helpers
         )
         with stop_requests(active=not several) as request, batches as stream:
 
@@ -213,10 +190,10 @@ def train(
                     pause_at=run.saves_at,
                     pause=pause,
                     stopping=stopping,
-                    log_every_s=10.0 if run.is_main_process else float("inf"),
+                    log_every_s=10.0 if is_main_process else math.inf,
                 )
                 done = int(state.step)
-                if run.is_main_process and saved != done:
+                if is_main_process and not run.saves_at(done):
                     _save(run, state, None)
             except (NonFiniteLossError, NonFiniteStateError) as error:
                 kept = run.checkpoints.paths()
@@ -225,7 +202,7 @@ def train(
             finally:
                 if metrics is not None:
                     metrics.close()
-        if run.is_main_process:
+        if is_main_process:
             draw_metrics(run.folder)
     if done < steps:
         print(f"stopped after step {done}, which is saved", file=sys.stderr)
@@ -235,40 +212,13 @@ def train(
     return state
 
 
-def run_spec(
-    config: Config,
-    frames: FrameSet,
-    *,
-    steps: int,
-    seed: int,
-    objects: GroundTruthDatabase | None = None,
-    weights: str | Path | Variables | None = None,
-) -> dict[str, Any]:
-    """What a run follows from, as JSON; it is resumed with the same alone.
-
-    Args:
-        config: as in :func:`train`, as are the others; weights that are given as arrays are not told.
-    """
-    record = {
-        "config": config_to_json(config),
-        "sensor": sensor_to_json(frames.sensor),
-        "steps": steps,
-        "seed": seed,
-        "frames": len(frames),
-        "data": frames.fingerprint(),
-        "objects": None if objects is None else objects.manifest.source,
-        "weights": str(weights) if isinstance(weights, str | Path) else None,
-    }
-    return json.loads(json.dumps(record))
-
-
 def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> None:
     """Refuse a folder that cannot take a run.
 
     Args:
         folder: of the run.
-        spec: from :func:`run_spec`; None to look no closer than whether there is a run.
-        resume: the run is to go on.
+        spec: what ``run.json`` must hold; None to check only whether there is a run.
+        resume: the run is to be resumed.
 
     Raises:
         ValueError: there is a run and it is not to be resumed, or none to resume, or another one, with the first
@@ -294,11 +244,10 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
 
 @contextlib.contextmanager
 def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
-    """Hold the run's folder in the main process; the others go on only when it does."""
-    several = jax.process_count() > 1
+    """Hold the run's folder in the main process; the others continue only when it does."""
     with contextlib.ExitStack() as held:
         error: Exception | None = None
-        if run.is_main_process:
+        if jax.process_index() == 0:
             try:
                 held.enter_context(folder_lock(run.folder, "training"))
                 check_run(run.folder, run.spec, resume=resume)  # another process may have been faster
@@ -307,7 +256,7 @@ def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
                     atomic_write(run.folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
             except (OSError, ValueError) as failure:
                 error = failure
-        if several and not multihost_utils.broadcast_one_to_all(np.array(error is None)):
+        if jax.process_count() > 1 and not multihost_utils.broadcast_one_to_all(np.array(error is None)):
             error = error or OSError(f"{run.folder}: the main process cannot work there")
         if error is not None:
             raise error
@@ -315,7 +264,6 @@ def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
 
 
 def _given_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
-    """Arrays to begin with, of the same network."""
     if not isinstance(weights, str | Path):
         return weights
     folder = find_checkpoint(Path(weights))
@@ -337,10 +285,9 @@ def _start(run: _Run, optimizer: Any, seed: int, resume: bool, weights: Variable
 
 
 def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | None) -> float | None:
-    """Score on the test frames, which all processes share."""
+    """Score on the test frames, which all processes share; None where it is not a number."""
     assert run.tests is not None
-    variables = jax.tree.map(lambda leaf: leaf.addressable_data(0), detection_variables(state))
-    trained = TrainedDetector(run.detector, variables)
+    trained = TrainedDetector(run.detector, _local_variables(state))
     summary = evaluate(trained, run.tests, devices=run.devices).summary
     score = summary["mean_ap"]
     first = range(min(_NUM_PICTURES, len(run.tests)))
@@ -354,10 +301,14 @@ def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | N
 
 
 def _save(run: _Run, state: TrainState, score: float | None) -> None:
-    local = jax.tree.map(lambda leaf: leaf.addressable_data(0), detection_variables(state))
-    told = json.dumps({name: run.spec[name] for name in ("data", "frames", "weights")}, sort_keys=True)
+    data = json.dumps({name: run.spec[name] for name in ("data", "frames", "weights")}, sort_keys=True)
     config, sensor = run.detector.config, run.detector.sensor
-    run.checkpoints.save(Checkpoint(config, sensor, local, int(state.step), told, score), state)
+    checkpoint = Checkpoint(config, sensor, _local_variables(state), int(state.step), data, score)
+    run.checkpoints.save(checkpoint, state)
+
+
+def _local_variables(state: TrainState) -> Variables:
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), detection_variables(state))
 
 
 def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:

@@ -2,7 +2,6 @@
 
 from fcos_lidar_jax.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.loop import NonFiniteLossError, fit
-from fcos_lidar_jax.training.objective import make_loss
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 
@@ -13,7 +12,6 @@ __all__ = [
     "detection_variables",
     "fit",
     "load_checkpoint",
-    "make_loss",
     "make_optimizer",
     "make_state",
     "make_train_step",

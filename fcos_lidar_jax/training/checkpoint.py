@@ -1,11 +1,10 @@
 """Checkpoints that explain themselves: orbax arrays beside the configuration and the sensor as JSON.
 
 A checkpoint is a folder: ``checkpoint.json`` says what it is and lists every file with its hash, ``variables`` is
-what detection needs, ``state`` is there where training can go on from it.
+what detection needs, ``state`` is there where training can resume from it.
 """
 
 import dataclasses
-import hashlib
 import json
 import os
 import shutil
@@ -20,17 +19,17 @@ import numpy as np
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
+from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
 from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
 _OLD_FORMAT = 2
-_DESCRIPTION = "checkpoint.json"
-_VARIABLES = "variables"
-_STATE = "state"
-_ROOM_FOR_NAMES = 2**20
-"""Bytes on disk for what describes the arrays."""
+_LATER_FIELDS = {"model": {"remat": False}}
+"""Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
+_DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
+_ROOM_FOR_NAMES = 2**20  # Bytes on disk for what describes the arrays.
 
 
 class NonFiniteStateError(ArithmeticError):
@@ -46,29 +45,18 @@ class Checkpoint:
     """A trained detector."""
 
     config: Config
-    """What was trained."""
     sensor: Sensor
-    """For which sensor."""
-    variables: Variables
-    """``params`` and ``batch_stats``."""
-    step: int
-    """Updates done."""
-    data: str = ""
-    """What it was trained on, as text; a run goes on with the same alone."""
-    score: float | None = None
-    """Mean average precision when it was evaluated; None where it was not."""
+    variables: Variables  # ``params`` and ``batch_stats``.
+    step: int  # Updates done.
+    data: str = ""  # What it was trained on, as text; a run resumes with the same alone.
+    score: float | None = None  # Mean average precision when it was evaluated; None where it was not.
 
 
 def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainState | None = None) -> None:
-    """Write a checkpoint, whole or not at all.
+    """Write a checkpoint, whole or not at all, with the state to resume from where one is given.
 
-    It is written beside the folder and renamed; a checkpoint that was there before is kept until then. Where there
-    are several processes, one of them calls.
-
-    Args:
-        folder: where; its parent must exist.
-        checkpoint: what.
-        state: to go on from; None for detection alone.
+    It is written beside the folder, whose parent must exist, and renamed; a checkpoint that was there before is
+    kept until then. Of several processes, one calls.
 
     Raises:
         NonFiniteStateError: nothing is written.
@@ -76,7 +64,11 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     """
     folder = Path(folder).absolute()
     parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
-    _check_finite(folder, parts)
+    # Replicated arrays are whole on every device.
+    parts = jax.tree.map(lambda x: np.asarray(x.addressable_data(0) if isinstance(x, jax.Array) else x), parts)
+    for name, leaf in _by_name(parts).items():
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
+            raise NonFiniteStateError(f"{folder}: not saved: {name}: not finite")
     _check_room(folder, parts)
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -92,7 +84,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
             "sensor": sensor_to_json(checkpoint.sensor),
             "files": _hashes(beside),
         }
-        description["hash"] = _hash(_canonical(description))
+        description["hash"] = checksum(_canonical(description))
         (beside / _DESCRIPTION).write_text(json.dumps(description, indent=1), encoding="utf-8")
         os.chmod(beside, 0o755)
         old = beside.with_name(beside.name + ".old")
@@ -106,9 +98,6 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
     """Read a checkpoint, and check that its files are as written and its arrays those of its configuration.
-
-    Args:
-        folder: of a checkpoint.
 
     Raises:
         CheckpointError: naming the folder, what was found and what was expected.
@@ -125,11 +114,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
 
 
 def load_state(folder: str | Path, like: TrainState) -> TrainState:
-    """Read what a run needs to go on: the same arrays, bit for bit.
-
-    Args:
-        folder: of a checkpoint that was saved with its state.
-        like: any state of the same run.
+    """Read the state to resume from, bit for bit; ``like`` is any state of the same run.
 
     Raises:
         CheckpointError: as :func:`load_checkpoint`, or there is no state.
@@ -140,24 +125,23 @@ def load_state(folder: str | Path, like: TrainState) -> TrainState:
         raise CheckpointError(f"{folder}: found a detector, expected a training state beside it")
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     loaded = _load_arrays(folder / _STATE, jax.eval_shape(_as_arrays, like), config)
-    state = jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _names(like)])
+    state = jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _by_name(like, ".")])
     return dataclasses.replace(state, key=jax.random.wrap_key_data(state.key))
-
-
-def _names(state: TrainState) -> list[str]:
-    """Of the state's leaves, in their order."""
-    paths = jax.tree_util.tree_flatten_with_path(state)[0]
-    return [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths]
 
 
 def _as_arrays(state: TrainState) -> dict[str, Any]:
     """The state's leaves by name; the random key as numbers."""
-    leaves = jax.tree.leaves(dataclasses.replace(state, key=jax.random.key_data(state.key)))
-    return dict(zip(_names(state), leaves, strict=True))
+    return _by_name(dataclasses.replace(state, key=jax.random.key_data(state.key)), ".")
 
 
-def _alone() -> Any:
-    """Orbax in one process, whatever others there are."""
+def _by_name(tree: Any, separator: str = "/") -> dict[str, Any]:
+    """All leaves, in their order."""
+    leaves = jax.tree.leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator=separator): leaf for path, leaf in leaves}
+
+
+def _checkpointer() -> Any:
+    """Orbax in this process alone, whatever others there are."""
     import orbax.checkpoint as ocp
 
     own = jax.process_index()
@@ -165,13 +149,6 @@ def _alone() -> Any:
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
     )
     return ocp.StandardCheckpointer(multiprocessing_options=options)
-
-
-def _check_finite(folder: Path, tree: Any) -> None:
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if jnp.issubdtype(leaf.dtype, jnp.floating) and not jnp.isfinite(leaf).all():
-            name = jax.tree_util.keystr(path, simple=True, separator="/")
-            raise NonFiniteStateError(f"{folder}: not saved: {name}: not finite")
 
 
 def _check_room(folder: Path, tree: Any) -> None:
@@ -186,25 +163,20 @@ def _check_room(folder: Path, tree: Any) -> None:
 
 
 def _save_arrays(folder: Path, tree: Any) -> None:
-    # Replicated arrays are whole on every device.
-    tree = jax.tree.map(
-        lambda leaf: np.asarray(leaf.addressable_data(0)) if isinstance(leaf, jax.Array) else leaf, tree
-    )
     try:
-        with _alone() as checkpointer:
+        with _checkpointer() as checkpointer:
             checkpointer.save(folder, tree)
-        # It tells a path of this machine; that the checkpoint is whole is told by its hashes.
+        # It holds a path of this machine; that the checkpoint is whole follows from its hashes.
         (folder / "commit_success.txt").unlink(missing_ok=True)
     except Exception as error:  # orbax and its storage raise what they like on a full disk
-        reason = " ".join(str(error).split())[:200]
-        raise OSError(f"{folder}: cannot be written: {reason}") from error
+        raise OSError(f"{folder}: cannot be written: {_one_line(error)}") from error
 
 
 def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
     where = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     target = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where), expected)
     try:
-        with _alone() as checkpointer:
+        with _checkpointer() as checkpointer:
             metadata: Any = checkpointer.metadata(folder).item_metadata
             whose = f"the configuration {config.name!r} beside them"
             check_arrays(folder.parent, expected, metadata.tree, whose=whose)
@@ -212,12 +184,11 @@ def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
     except CheckpointError:
         raise
     except Exception as error:  # likewise on damaged files
-        reason = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"{folder}: cannot be read: {reason}") from error
+        raise CheckpointError(f"{folder}: cannot be read: {_one_line(error)}") from error
 
 
-def _hash(content: bytes) -> str:
-    return hashlib.blake2b(content, digest_size=16).hexdigest()
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 def _canonical(description: dict[str, Any]) -> bytes:
@@ -226,9 +197,9 @@ def _canonical(description: dict[str, Any]) -> bytes:
 
 
 def _hashes(folder: Path) -> dict[str, str]:
-    """blake2b of every file below a folder but the description."""
+    """Checksum of every file below a folder but the description."""
     return {
-        file.relative_to(folder).as_posix(): _hash(file.read_bytes())
+        file.relative_to(folder).as_posix(): checksum(file.read_bytes())
         for file in sorted(folder.rglob("*"))
         if file.is_file() and file.name != _DESCRIPTION
     }
@@ -267,46 +238,26 @@ def read_description(folder: Path) -> dict[str, Any]:
     if not isinstance(description, dict) or description.get("format") not in (_OLD_FORMAT, _FORMAT):
         found = description.get("format") if isinstance(description, dict) else type(description).__name__
         raise CheckpointError(f"{file}: format: got {found!r}, expected {_FORMAT}")
-    if description.get("hash") != _hash(_canonical(description)):
+    if description.get("hash") != checksum(_canonical(description)):
         raise CheckpointError(f"{file}: not as it was written: its hash does not match its content")
     for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
         if not isinstance(description.get(name), kind):
             raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
-    return _converted(description) if description["format"] == _OLD_FORMAT else description
-
-
-def _converted(description: dict[str, Any]) -> dict[str, Any]:
-    """A description of format 2 in the fields of format 3."""
-    config = dict(description["config"])
-    model, inference = dict(config["model"]), dict(config["inference"])
-    model["stem"] = {name: value for name, value in model["stem"].items() if name != "form"}
-    del model["num_classes"], inference["nms_form"]
-    classes = {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}
-    return {
-        **description,
-        "format": _FORMAT,
-        "config": {**config, "model": model, "inference": inference, **classes},
-    }
+    config = description["config"]
+    if description["format"] == _OLD_FORMAT:
+        del config["model"]["stem"]["form"], config["model"]["num_classes"], config["inference"]["nms_form"]
+        config |= {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}
+    later = {section: {**fields, **config.get(section, {})} for section, fields in _LATER_FIELDS.items()}
+    return {**description, "format": _FORMAT, "config": {**config, **later}}
 
 
 def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:
-    """Same names and shapes.
-
-    Args:
-        where: the arrays were found.
-        expected: arrays, or their shapes.
-        found: likewise.
-        whose: shapes are expected.
+    """Compare the names and shapes of arrays found at ``where`` with those expected of ``whose``.
 
     Raises:
         CheckpointError: naming the first array that differs.
     """
-
-    def shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-        leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-        return {jax.tree_util.keystr(path, simple=True, separator="/"): tuple(leaf.shape) for path, leaf in leaves}
-
-    wanted, there = shapes(expected), shapes(found)
+    wanted, there = ({name: tuple(leaf.shape) for name, leaf in _by_name(t).items()} for t in (expected, found))
     for name in sorted(wanted.keys() | there.keys()):
         if wanted.get(name) != there.get(name):
             raise CheckpointError(

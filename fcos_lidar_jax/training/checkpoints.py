@@ -1,4 +1,4 @@
-"""The checkpoints of a run: the newest ones to go on from, and the best."""
+"""The checkpoints of a run: the newest ones, to resume from, and the best."""
 
 import shutil
 import sys
@@ -15,24 +15,21 @@ from fcos_lidar_jax.training.checkpoint import (
 )
 from fcos_lidar_jax.types import TrainState
 
+CHECKPOINTS = "checkpoints"  # Folder of the checkpoints in a run's folder.
+BEST = "best"  # Below a run's folder: name for its best checkpoint.
+
 
 class Checkpoints:
-    """Checkpoints below a folder, one a step.
-
-    Args:
-        folder: made where there is none.
-        keep: so many of the newest are kept, and the one of the best score.
-    """
+    """Checkpoints below a folder, one a step; the ``keep`` newest are kept, and the one of the best score."""
 
     def __init__(self, folder: Path, *, keep: int = 2) -> None:
-        """Nothing is written yet."""
         self.folder, self.keep = folder, keep
 
     def save(self, checkpoint: Checkpoint, state: TrainState) -> Path:
         """Write a checkpoint, then remove what is no longer kept.
 
         Raises:
-            OSError: it cannot be written; the others are as they were.
+            OSError: it cannot be written; the others stay.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{checkpoint.step:08d}"
@@ -51,10 +48,7 @@ class Checkpoints:
     def newest(self, like: TrainState) -> tuple[Checkpoint, TrainState] | None:
         """The newest checkpoint that is whole, with its state; None where there are none.
 
-        A damaged one is passed over with a warning on standard error.
-
-        Args:
-            like: any state of the same run.
+        A damaged one is passed over with a warning on standard error. ``like`` is any state of the same run.
 
         Raises:
             CheckpointError: there are some, and all are damaged.
@@ -86,9 +80,8 @@ def best_of(paths: list[Path]) -> Path | None:
 def find_checkpoint(folder: Path) -> Path:
     """The checkpoint that a path or a name stands for.
 
-    Args:
-        folder: of a checkpoint; of a run, which stands for its last checkpoint, as ``RUN/best`` does for the one
-            that scored best while it was trained; or the name of weights that come with the package.
+    A checkpoint's folder stands for itself, a run's for its last checkpoint, ``RUN/best`` for the one that scored
+    best while it was trained; or it is the name of weights that come with the package.
 
     >>> find_checkpoint(Path("nowhere"))
     PosixPath('nowhere')
@@ -109,9 +102,3 @@ def shipped_checkpoints() -> dict[str, Path]:
     """
     folder = Path(str(files("fcos_lidar_jax") / "weights"))
     return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()} if folder.is_dir() else {}
-
-
-CHECKPOINTS = "checkpoints"
-"""Folder of the checkpoints in a run's folder."""
-BEST = "best"
-"""Below a run's folder: name for its best checkpoint."""

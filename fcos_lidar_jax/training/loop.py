@@ -94,9 +94,8 @@ def fit(
 
 
 def _check_finite(number: int, record: Record, names: Sequence[str]) -> None:
-    """Loss and gradient are numbers, or there is a line about it."""
-    told = {k: v for k, v in record.items() if k.startswith("loss/") or k == "gradient_norm"}
-    broken = {k: v for k, v in told.items() if not isinstance(v, float) or not math.isfinite(v)}
+    checked = {k: v for k, v in record.items() if k.startswith("loss/") or k == "gradient_norm"}
+    broken = {k: v for k, v in checked.items() if not isinstance(v, float) or not math.isfinite(v)}
     if broken:
         parts = ", ".join(f"{name.removeprefix('loss/')} {value}" for name, value in broken.items())
         raise NonFiniteLossError(f"step {number}: not finite: {parts}; samples: {', '.join(names)}")

@@ -1,7 +1,7 @@
-"""What is remembered of a run: one line of JSON a step, and the same for TensorBoard."""
+"""The metrics of a run: one line of JSON a step, and the same for TensorBoard."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,10 @@ _FILE = "metrics.jsonl"
 class MetricsLog:
     """Appends to ``metrics.jsonl`` and to TensorBoard's events below a run's folder.
 
-    Args:
-        folder: of the run.
-        first_step: steps done before; what is told of later ones, by a run that was killed, is forgotten.
+    What a killed run recorded of steps after ``first_step``, those done before, is dropped.
     """
 
     def __init__(self, folder: Path, *, first_step: int) -> None:
-        """Open both."""
         from tensorboardX import SummaryWriter
 
         file = folder / _FILE
@@ -32,29 +29,26 @@ class MetricsLog:
         self._events = SummaryWriter(str(folder / "tensorboard"), purge_step=first_step + 1)
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
-        """Remember numbers and lists of numbers by name."""
+        """Record numbers and lists of numbers by name."""
         self._lines.write(json.dumps({"step": step, **values}) + "\n")
         self._lines.flush()
         for name, value in values.items():
-            for suffix, number in _numbers(value):
-                self._events.add_scalar(name + suffix, number, step)
+            numbers = {f"{name}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
+            for tag, number in numbers.items():
+                if np.isscalar(number):
+                    self._events.add_scalar(tag, float(number), step)  # type: ignore[arg-type]
 
     def flush(self) -> None:
         """Write what is waiting, so that a checkpoint never knows of more steps than the records."""
         self._events.flush()
 
     def close(self) -> None:
-        """Write what is waiting."""
         self._lines.close()
         self._events.close()
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """All lines of a run, in order; half a line, of a run that was killed as it wrote, is left out.
-
-    Args:
-        folder: of the run.
-    """
+    """All lines of a run, in order; half a line, of a run that was killed as it wrote, is left out."""
     lines = []
     for text in (folder / _FILE).read_text(encoding="utf-8").splitlines():
         try:
@@ -62,10 +56,3 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break
     return lines
-
-
-def _numbers(value: Any) -> Iterator[tuple[str, float]]:
-    if isinstance(value, list):
-        yield from ((f"/{i}", float(v)) for i, v in enumerate(value))
-    elif np.isscalar(value):
-        yield "", float(value)  # type: ignore[arg-type]

@@ -40,11 +40,7 @@ def momentum_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule
 
 
 def make_optimizer(config: OptimizerConfig, num_steps: int) -> optax.GradientTransformation:
-    """Global-norm clipping, then AdamW with weight decay on all parameters.
-
-    Args:
-        config: rates and bounds.
-        num_steps: updates of the whole run.
+    """Global-norm clipping, then AdamW with weight decay on all parameters, for a run of ``num_steps`` updates.
 
     >>> state = make_optimizer(OptimizerConfig(), 10).init({"w": jnp.ones(2)})
     >>> sorted(current_hyperparameters(state))

@@ -11,21 +11,14 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class StopRequest:
     """Whether a run has been asked to stop, and by what."""
 
-    signal: int | None = None
-    """SIGINT (Ctrl-C) or SIGTERM; None as long as the run is to go on."""
+    signal: int | None = None  # SIGINT (Ctrl-C) or SIGTERM; None as long as nothing has been asked.
 
 
 @contextlib.contextmanager
 def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
     """Turn the first Ctrl-C or SIGTERM into a request that the run sees between two steps; the second one ends it.
 
-    To be entered in the main thread.
-
-    Args:
-        active: False leaves the signals alone.
-
-    Yields:
-        the request.
+    To be entered in the main thread; ``active=False`` leaves the signals alone.
     """
     request = StopRequest()
     before = {number: signal.getsignal(number) for number in _SIGNALS if active}

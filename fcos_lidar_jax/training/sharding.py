@@ -20,7 +20,7 @@ _AXIS = "data"
 
 
 def make_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """A mesh of one axis, over all devices of all processes unless told otherwise.
+    """A mesh of one axis, over all devices of all processes by default.
 
     >>> make_mesh().axis_names
     ('data',)
@@ -49,10 +49,6 @@ def replicate(tree: Tree, mesh: Mesh) -> Tree:
 def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
     """A batch split along its first axis; every process gives its own rows of the global batch, in its order.
 
-    Args:
-        batch: NumPy arrays.
-        mesh: whose number of devices divides the global batch.
-
     >>> shard_batch(np.zeros((4, 3)), make_mesh(jax.devices()[:1])).shape
     (4, 3)
     """
@@ -61,11 +57,7 @@ def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
 
 
 def check_batch_size(batch_size: int, mesh: Mesh) -> None:
-    """Refuse a global batch that the devices cannot share evenly.
-
-    Raises:
-        ValueError: with both numbers.
-    """
+    """Raise a ValueError, with both numbers, for a global batch that the devices cannot share evenly."""
     if batch_size % mesh.size:
         raise ValueError(f"batch_size: got {batch_size}, expected a multiple of the {mesh.size} devices")
 
@@ -81,10 +73,6 @@ def pmap_step(step: TrainStep, mesh: Mesh) -> Callable[[Any, Any], Any]:
 
     A thin wrapper: it drops the state's axis, joins the batch's axes and runs :func:`jit_step`; a real ``pmap``
     would need the collectives written into the network.
-
-    Args:
-        step: pure ``(state, batch) -> (state, metrics)``.
-        mesh: its devices are the leading axis.
     """
     compiled = jit_step(step, mesh)
 
@@ -92,6 +80,6 @@ def pmap_step(step: TrainStep, mesh: Mesh) -> Callable[[Any, Any], Any]:
         joined = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), batch)
         first = jax.tree.map(lambda leaf: leaf[0], state)
         results = compiled(replicate(first, mesh), shard_batch(joined, mesh))
-        return jax.tree.map(lambda leaf: jax.numpy.broadcast_to(leaf, (mesh.size, *leaf.shape)), results)
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (mesh.size, *leaf.shape)), results)
 
     return stacked

@@ -1,5 +1,6 @@
 """One training step as a pure function: raw points in, new state and metrics out."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -8,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
-from jaxtyping import Array
 
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.models import Detector, Variables
@@ -28,14 +28,10 @@ def make_state(
 ) -> TrainState:
     """The state before the first step, with a running mean of the weights if ``ema_decay`` asks for one.
 
-    Args:
-        detector: from :func:`fcos_lidar_jax.models.build_detector`.
-        optimizer: from :func:`fcos_lidar_jax.training.make_optimizer`.
-        key: the run's random key.
-        variables: ``params`` and ``batch_stats`` to start from; None for random ones.
+    ``key`` is the run's random key; ``variables`` are ``params`` and ``batch_stats`` to start from, by default
+    random ones.
     """
-    if variables is None:
-        variables = detector.init(key)
+    variables = detector.init(key) if variables is None else variables
     state = TrainState(
         step=jnp.zeros((), jnp.int32),
         params=variables["params"],
@@ -46,24 +42,16 @@ def make_state(
         key=key,
     )
     # Strong types throughout: a weakly typed leaf would compile the step a second time.
-    return jax.tree.map(lambda leaf: lax.convert_element_type(leaf, leaf.dtype) if _numeric(leaf) else leaf, state)
+    state = jax.tree.map(lambda x: lax.convert_element_type(x, x.dtype), dataclasses.replace(state, key=None))
+    return dataclasses.replace(state, key=key)
 
 
-def _numeric(leaf: Any) -> bool:
-    return not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def make_gradient(
-    detector: Detector,
-) -> Callable[[Any, Any, Batch], tuple[Any, Any, Metrics]]:
+def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, Any, Metrics]]:
     """The gradient of the loss of a batch, in ``config.optimizer.accumulate`` micro-batches.
 
     The gradients of the sums are summed and divided once by the positives of all micro-batches, so their number
     does not change what is weighed how; only batch norm sees smaller batches. Where the box losses are divided by
     the candidates instead, their gradient is a second one.
-
-    Args:
-        detector: from :func:`fcos_lidar_jax.models.build_detector`.
 
     Returns:
         pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``.
@@ -107,11 +95,7 @@ def make_gradient(
 
 
 def make_train_step(detector: Detector, optimizer: optax.GradientTransformation) -> TrainStep:
-    """A training step: augment, project, predict, assign, differentiate, update.
-
-    Args:
-        detector: from :func:`fcos_lidar_jax.models.build_detector`; ``config.augment`` None for no augmentation.
-        optimizer: from :func:`fcos_lidar_jax.training.make_optimizer`.
+    """A training step: augment unless ``config.augment`` is None, project, predict, assign, differentiate, update.
 
     Returns:
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. The metrics are scalars but
@@ -124,15 +108,11 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
     def augmented(state: TrainState, batch: Batch) -> Batch:
         if config.augment is None:
             return batch
-        recipe = config.augment
-
-        def one(index: Array, points: Array, boxes: Array) -> tuple[Array, Array]:
-            key = sample_key(state.key, state.step, index)
-            return augment(key, points, boxes, recipe, origin_m=sensor.origin_m)
-
+        augment_one = functools.partial(augment, config=config.augment, origin_m=sensor.origin_m)
         index = jnp.arange(batch.points.shape[0], dtype=jnp.int32)
-        points, boxes = jax.vmap(one)(index, batch.points, batch.boxes)
-        return Batch(points, batch.valid, boxes, batch.labels, batch.box_valid)
+        keys = jax.vmap(lambda i: sample_key(state.key, state.step, i))(index)
+        points, boxes = jax.vmap(augment_one)(keys, batch.points, batch.boxes)
+        return dataclasses.replace(batch, points=points, boxes=boxes)
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         grads, batch_stats, metrics = gradient(state.params, state.batch_stats, augmented(state, batch))
@@ -142,18 +122,10 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         metrics.update(current_hyperparameters(opt_state))
         ema = state.ema
         if ema is not None:
-            # Young means follow faster, or they would remember the random start.
+            # EMA warm-up: a slow mean would remember the random start.
             kept = jnp.minimum(decay, (1 + state.step) / (10 + state.step)).astype(jnp.float32)
             ema = jax.tree.map(lambda old, new: old + (1 - kept.astype(old.dtype)) * (new - old), ema, params)
-        new_state = TrainState(
-            step=state.step + 1,
-            params=params,
-            batch_stats=batch_stats,
-            opt_state=opt_state,
-            ema=ema,
-            key=state.key,
-        )
-        return new_state, metrics
+        return TrainState(state.step + 1, params, batch_stats, opt_state, ema, state.key), metrics
 
     return step
 

@@ -33,37 +33,30 @@ def draw_bev(
 
     Args:
         points: f32[n, >= 3], metres; non-finite rows do not show.
-        path: PNG to write.
         limit_m: half the side of the square that is shown.
         classes: names that the labels index.
         detections: boxes f32[d, 9], labels i32[d], scores f32[d].
         truth: boxes f32[m, 9], labels i32[m].
-        title: above the picture.
         global_axes: x and y are the directions of the global frame and not the ego vehicle's.
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
     axis = figure.add_subplot()
     _draw_points(axis, points, limit_m)
     present: set[int] = set()
-    if truth is not None:
-        for box, label in zip(*truth, strict=True):
-            if _in_view(box, limit_m):
-                axis.fill(*_corners(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
-                _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
-                present.add(int(label))
-    if detections is not None:
-        shown = [d for d in zip(*detections, strict=True) if _in_view(d[0], limit_m)]
-        for box, label, _ in shown:
-            _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
+    for box, label in zip(*(truth or ()), strict=True):
+        if _in_view(box, limit_m):
+            axis.fill(*_corners(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
+            _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
             present.add(int(label))
-        _write_scores(axis, shown, limit_m)
-    extra = [name for name, there in (("detection", detections), ("truth", truth)) if there is not None]
-    _legend(figure, sorted(present), classes, extra)
-    axis.set_xlim(-limit_m, limit_m)
-    axis.set_ylim(-limit_m, limit_m)
-    axis.set_aspect("equal")
-    axis.set_xlabel("x [m], global" if global_axes else "x [m], right")
-    axis.set_ylabel("y [m], global" if global_axes else "y [m], forward")
+    shown = [d for d in zip(*(detections or ()), strict=True) if _in_view(d[0], limit_m)]
+    for box, label, _ in shown:
+        _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
+        present.add(int(label))
+    _write_scores(axis, shown, limit_m)
+    _legend(figure, sorted(present), classes, detections is not None, truth is not None)
+    right, forward = ("global", "global") if global_axes else ("right", "forward")
+    axis.set(xlim=(-limit_m, limit_m), ylim=(-limit_m, limit_m), aspect="equal")
+    axis.set(xlabel=f"x [m], {right}", ylabel=f"y [m], {forward}")
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
     if title:
@@ -76,11 +69,9 @@ def _draw_points(axis: Any, points: np.ndarray, limit_m: float) -> None:
     if len(cloud):
         # The ground stays light, what stands on it is dark, whatever the height of the frame's origin.
         low, high = np.quantile(cloud[:, 2], (0.1, 0.9))
-        shade = np.clip((cloud[:, 2] - low) / max(high - low, 1.0), 0, 1)
+        shade = 0.35 + 0.4 * np.clip((cloud[:, 2] - low) / max(high - low, 1.0), 0, 1)
         dot = float(np.clip(3e4 / len(cloud), 0.8, 7))  # sparse clouds get larger dots
-        axis.scatter(
-            *cloud[:, :2].T, c=0.35 + 0.4 * shade, s=dot, cmap="Greys", vmin=0, vmax=1, linewidths=0, zorder=2
-        )
+        axis.scatter(*cloud[:, :2].T, c=shade, s=dot, cmap="Greys", vmin=0, vmax=1, linewidths=0, zorder=2)
     axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
 
 
@@ -91,10 +82,9 @@ def _in_view(box: np.ndarray, limit_m: float) -> bool:
 
 def _corners(box: np.ndarray) -> np.ndarray:
     """The closed outline seen from above, f64[2, 5]: x and y, metres."""
-    x, y, l, w, yaw = (float(box[i]) for i in (0, 1, 3, 4, 6))
+    x, y, _, l, w, _, yaw = map(float, box[:7])
     cos, sin = np.cos(yaw), np.sin(yaw)
-    along = np.array([1, 1, -1, -1, 1]) * l / 2
-    across = np.array([1, -1, -1, 1, 1]) * w / 2
+    along, across = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * [[l / 2], [w / 2]]
     return np.stack([x + cos * along - sin * across, y + sin * along + cos * across])
 
 
@@ -116,25 +106,23 @@ def _write_scores(axis: Any, shown: list[tuple[np.ndarray, int, float]], limit_m
         beside = (box[:2] + reach * side for side in ((1, 0), (-1, 0), (0, 1), (0, -1)))
         inside = (p for p in beside if (np.abs(p) + half < limit_m).all())
         place = next((p for p in inside if all((np.abs(p - t) > 2 * half).any() for t in taken)), None)
-        if place is None:
-            continue
-        taken.append(place)
-        text = axis.text(*place, f"{score:.2f}", fontsize=_TEXT_POINTS, ha="center", va="center", zorder=6)
-        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+        if place is not None:
+            taken.append(place)
+            text = axis.text(*place, f"{score:.2f}", fontsize=_TEXT_POINTS, ha="center", va="center", zorder=6)
+            text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
-def _legend(figure: Any, present: list[int], classes: Sequence[str], extra: Sequence[str]) -> None:
+def _legend(figure: Any, present: list[int], classes: Sequence[str], detections: bool, truth: bool) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    lines = {
-        "detection": Line2D([], [], color="#444444", linewidth=1.7, label="detection"),
-        "truth": Line2D([], [], color="black", linewidth=0.9, linestyle=_DASHES, label="truth"),
-    }
     shown, rest = present[:_LEGEND_CLASSES], len(present[_LEGEND_CLASSES:])
     entries: list[Any] = [Patch(color=class_color(k), label=classes[k].replace("_", " ")) for k in shown]
     entries += [Patch(color="white", label=f"and {rest} more")] if rest else []
-    entries += [lines[name] for name in extra]
+    if detections:
+        entries.append(Line2D([], [], color="#444444", linewidth=1.7, label="detection"))
+    if truth:
+        entries.append(Line2D([], [], color="black", linewidth=0.9, linestyle=_DASHES, label="truth"))
     if entries:
         legend = figure.legend(handles=entries, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
         for text in legend.get_texts():

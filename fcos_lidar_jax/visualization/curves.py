@@ -5,8 +5,7 @@ from pathlib import Path
 
 from fcos_lidar_jax.visualization.figure import LINE_COLORS, new_axis, save_png
 
-_FEW = 40
-"""Up to so many points are marked one by one; a single one would not show otherwise."""
+_FEW = 40  # up to so many points are marked one by one; a single one would not show otherwise
 
 
 def draw_curves(
@@ -20,21 +19,14 @@ def draw_curves(
 ) -> None:
     """Draw named series of (x, y) into one PNG.
 
-    Args:
-        path: PNG to write.
-        series: name -> points; non-finite ones leave a gap.
-        x_label: below the abscissa.
-        y_label: beside the ordinate.
-        title: above the picture.
-        log_y: logarithmic ordinate; values that are not positive leave a gap.
+    Points that are not finite leave a gap, and with a logarithmic ordinate those that are not positive.
     """
     figure, axis = new_axis(8, 4.5)
     for i, (name, points) in enumerate(series.items()):
-        xs, ys = [x for x, _ in points], [y for _, y in points]
         # A second turn through the colours is dashed.
         axis.plot(
-            xs,
-            ys,
+            [x for x, _ in points],
+            [y for _, y in points],
             label=name.replace("_", " "),
             color=LINE_COLORS[i % len(LINE_COLORS)],
             linestyle="-" if i < len(LINE_COLORS) else "--",
@@ -44,8 +36,7 @@ def draw_curves(
         )
     if log_y:
         axis.set_yscale("log", nonpositive="mask")
-    axis.set_xlabel(x_label)
-    axis.set_ylabel(y_label)
+    axis.set(xlabel=x_label, ylabel=y_label)
     axis.set_title(title, fontsize=11)
     if series:
         axis.legend(fontsize=9, frameon=False)

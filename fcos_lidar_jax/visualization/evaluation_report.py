@@ -24,24 +24,18 @@ ERROR_NAMES = {
     "attr_err": ("AAE", "attribute [1 - accuracy]"),
 }
 """Errors of the hits: abbreviation, name and unit."""
-_MARGIN_M = 2.0
-"""Shown beyond the largest class range."""
+_MARGIN_M = 2.0  # shown beyond the largest class range
 
 
 @dataclasses.dataclass(frozen=True)
 class Example:
     """One sample of an evaluation to draw, in its sensor's frame."""
 
-    kind: str
-    """``best``, ``typical`` or ``worst``."""
-    name: str
-    """Of the sample."""
-    points: np.ndarray
-    """f32[n, >= 5]: the cloud; without points there is no range image."""
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """Boxes f64[d, 9], labels and scores."""
-    truth: tuple[np.ndarray, np.ndarray]
-    """Boxes f64[m, 9] and labels."""
+    kind: str  # best, typical or worst
+    name: str  # of the sample
+    points: np.ndarray  # f32[n, >= 5]: the cloud; without points there is no range image
+    detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f64[d, 9], labels and scores
+    truth: tuple[np.ndarray, np.ndarray]  # boxes f64[m, 9] and labels
 
 
 def write_evaluation_report(
@@ -60,9 +54,6 @@ def write_evaluation_report(
 
     Args:
         out: folder that holds these files.
-        title: heading.
-        num_samples: that were evaluated.
-        examples: samples to draw.
         sensor: of their range images.
         global_axes: x and y of the examples are the directions of the global frame.
     """
@@ -112,8 +103,8 @@ def _lead(summary: Mapping[str, Any], num_samples: int, defined: Sequence[str]) 
 def _scores(
     summary: Mapping[str, Any], intervals: Mapping[str, Any] | None, defined: Sequence[str]
 ) -> dict[str, Cell]:
-    names = {"NDS": "nd_score", "mAP": "mean_ap"}
-    names = names if "nd_score" in summary else {"mAP by centre distance": "mean_ap"}
+    official = "nd_score" in summary
+    names = {"NDS": "nd_score", "mAP": "mean_ap"} if official else {"mAP by centre distance": "mean_ap"}
     scores: dict[str, Cell] = {name: summary[key] for name, key in names.items()}
     if intervals is not None:
         for name, key in names.items():
@@ -128,17 +119,16 @@ def _draw_class_curves(
     """Precision and error curves of every class, as pictures with captions."""
     recall, distance = curves["recall"], str(summary["cfg"]["dist_th_tp"])
     first = round(100 * summary["cfg"]["min_recall"]) + 1
-    precisions: list[Picture] = []
-    errors: list[Picture] = []
+    precisions, errors = list[Picture](), list[Picture]()
     for row, (name, curve) in enumerate(curves["classes"].items()):
         plain = re.sub(r"[^\w-]", "_", name)  # class names may hold what file names may not
-        files = [folder / f"{kind}_{row:02d}_{plain}.png" for kind in ("precision", "errors")]
-        _draw_precision(files[0], recall, curve["precision"])
-        precisions.append((f"{_words(name)}: AP {summary['mean_dist_aps'][name]:.3f}", files[0]))
+        above, below = (folder / f"{kind}_{row:02d}_{plain}.png" for kind in ("precision", "errors"))
+        _draw_precision(above, recall, curve["precision"])
+        precisions.append((f"{_words(name)}: AP {summary['mean_dist_aps'][name]:.3f}", above))
         own = {e: v for e, v in curve["errors"].items() if not np.isnan(summary["label_tp_errors"][name][e])}
         last = int(np.max(np.flatnonzero(curve["confidence"][distance]), initial=0))
-        _draw_errors(files[1], recall, own, last=last, first=first)
-        errors.append((_words(name), files[1]))
+        _draw_errors(below, recall, own, last=last, first=first)
+        errors.append((_words(name), below))
     return precisions, errors
 
 
@@ -152,8 +142,7 @@ def _draw_precision(path: str | Path, recall: Sequence[float], precision: Mappin
         style = {"color": LINE_COLORS[rank], "linewidth": 1.2 + rank, "zorder": 9 - rank}
         axis.plot(recall[:end], values[:end], label=f"{float(distance):g} m", **style)
     axis.set_ylim(0, 1.02)
-    axis.set_ylabel("precision")
-    _save(figure, path, columns=4, title="match within")
+    _save(figure, path, "precision", ncols=4, title="match within")
 
 
 def _draw_errors(
@@ -169,19 +158,16 @@ def _draw_errors(
     else:
         axis.text(0.5, 0.5, "recall never above 0.1", ha="center", transform=axis.transAxes, color="#555555")
     axis.set_ylim(bottom=0)
-    axis.set_ylabel("mean error of the hits")
-    _save(figure, path, columns=2)
+    _save(figure, path, "mean error of the hits", ncols=2)
 
 
-def _save(figure: Any, path: str | Path, *, columns: int, title: str | None = None) -> None:
+def _save(figure: Any, path: str | Path, y_label: str, **legend: Any) -> None:
     """Recall below, and the legend below that, where no curve runs."""
     axis = figure.axes[0]
-    axis.set_xlim(0, 1)
-    axis.set_xlabel("recall")
-    handles = axis.get_lines()
-    if handles:
+    axis.set(xlim=(0, 1), xlabel="recall", ylabel=y_label)
+    if handles := axis.get_lines():
         style = {"loc": "outside lower center", "title_fontsize": 9, "fontsize": 9, "frameon": False}
-        figure.legend(handles=handles, ncols=columns, title=title, **style)
+        figure.legend(handles=handles, **style, **legend)
     save_png(figure, path)
 
 
@@ -189,27 +175,25 @@ def _draw_examples(
     folder: Path, examples: Iterable[Example], ranges_m: Mapping[str, float], sensor: Sensor, global_axes: bool
 ) -> tuple[list[Picture], list[Picture]]:
     """Samples from above, and their range images where there are points."""
-    views: list[Picture] = []
-    images: list[Picture] = []
-    for one in examples:
-        view, image = folder / f"{one.kind}_bev.png", folder / f"{one.kind}_range.png"
+    views, images = list[Picture](), list[Picture]()
+    for example in examples:
+        points, kind = example.points, example.kind
+        view, image = folder / f"{kind}_bev.png", folder / f"{kind}_range.png"
         draw_bev(
-            one.points,
+            points,
             view,
             limit_m=max(ranges_m.values()) + _MARGIN_M,
             classes=list(ranges_m),
-            detections=one.detections,
-            truth=one.truth,
+            detections=example.detections,
+            truth=example.truth,
             global_axes=global_axes,
         )
-        views.append(
-            (f"The {one.kind} sample by hits and misses at 2 m ({one.name}): detections, truth dashed.", view)
-        )
-        if len(one.points):
-            valid = np.ones(len(one.points), bool)
-            projected = project_points(one.points, valid, sensor, num_rounds=1)
-            draw_range_image(projected, image, boxes=one.truth[0], detections=one.detections[0])
-            images.append((f"The {one.kind} sample's range image: truth above, detections below.", image))
+        caption = f"The {kind} sample by hits and misses at 2 m ({example.name}): detections, truth dashed."
+        views.append((caption, view))
+        if len(points):
+            projected = project_points(points, np.ones(len(points), bool), sensor, num_rounds=1)
+            draw_range_image(projected, image, boxes=example.truth[0], detections=example.detections[0])
+            images.append((f"The {kind} sample's range image: truth above, detections below.", image))
     return views, images
 
 

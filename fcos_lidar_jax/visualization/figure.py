@@ -8,14 +8,12 @@ from fcos_lidar_jax.files import atomic_write
 
 LINE_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Okabe and Ito's, which colour-blind readers tell apart."""
-EMPTY = "#d9d9d9"
-"""Cells without a point."""
+EMPTY = "#d9d9d9"  # cells without a point
 _CLASS_COLORS = (
     *("#1f77b4", "#d62728", "#9467bd", "#8c564b", "#e6a000"),
     *("#e377c2", "#17becf", "#2ca02c", "#ff6f00", "#5b5b5b"),
 )
-_GOLDEN = 0.6180339887
-"""Hues that are this far apart never meet."""
+_GOLDEN = 0.6180339887  # hues that are this far apart never meet
 
 
 def class_color(label: int) -> str:

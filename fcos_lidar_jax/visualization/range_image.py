@@ -13,8 +13,7 @@ from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
 _RANGE, _INCLINATION, _INTENSITY, _EXISTENCE, _LAG = (
     CHANNELS.index(c) for c in ("range", "inclination", "intensity", "existence", "time_lag")
 )
-_BOX = "#ff1f1f"
-"""Outlines of boxes: a colour that neither the map of the range nor the empty cells have."""
+_BOX = "#ff1f1f"  # outlines of boxes: a colour that neither the map of the range nor the empty cells have
 
 
 def draw_range_image(
@@ -32,24 +31,16 @@ def draw_range_image(
     current.
 
     Args:
-        image: of one sample.
-        path: PNG to write.
-        title: above the picture.
         boxes: f32[m, >= 7], metres, in the frame of the points; each is outlined in round 1 around the cells
             whose point lies in it, so a box without such a cell does not show.
         detections: likewise, on a panel of their own below.
     """
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
-    panels: list[tuple[int, int, tuple[str, np.ndarray] | None]] = [
-        (_RANGE, 0, (kind, those))
-        for kind, those in (("boxes", boxes), ("detections", detections))
-        if those is not None
-    ]
-    panels = panels or [(_RANGE, 0, None)]
-    panels.append((_INTENSITY, 0, None))
-    if features[:, :, _LAG].any():
-        panels.append((_LAG, 0, None))
+    lags = features[:, :, _LAG].any()
+    outlined = [(k, those) for k, those in (("boxes", boxes), ("detections", detections)) if those is not None]
+    panels = [(_RANGE, 0, pair) for pair in outlined or [None]]
+    panels += [(channel, 0, None) for channel in (_INTENSITY, _LAG) if channel == _INTENSITY or lags]
     panels += [(_RANGE, r, None) for r in range(1, rounds)]
     figure = new_figure(13, 1.5 * len(panels) + 0.6)
     if title:
@@ -57,15 +48,14 @@ def draw_range_image(
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     ticks = np.unique(np.linspace(0, rows - 1, 5).round().astype(int))
     degrees = np.degrees(_row_inclinations(features))[ticks]
-    for axis, (channel, r, outlined) in zip(axes, panels, strict=True):
+    for axis, (channel, r, pair) in zip(axes, panels, strict=True):
         name = _draw_channel(figure, axis, features, channel, r)
-        if outlined is not None:
-            kind, those = outlined
+        if pair is not None:
+            kind, those = pair
             name += f"; {_outline(axis, features, those)} of {len(those)} {kind} have a cell"
         axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
         axis.set_ylabel("inclination", fontsize=9)
-        axis.set_xlim(180, -180)
-        axis.set_ylim(rows, 0)
+        axis.set(xlim=(180, -180), ylim=(rows, 0))
         axis.set_xticks(range(180, -181, -45), [f"{v}°" for v in range(180, -181, -45)])
         axis.set_yticks(ticks + 0.5, [f"{round(v)}°" for v in degrees])
         axis.tick_params(labelsize=9)
@@ -105,20 +95,15 @@ def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r:
 
 def _row_inclinations(features: np.ndarray) -> np.ndarray:
     """Inclination of every row, radians: the median of its points, between them for rows without."""
-    rows = features.shape[0]
+    rows = np.arange(features.shape[0])
     filled = features[:, :, _EXISTENCE] > 0
-    known = [i for i in range(rows) if filled[i].any()]
+    known = [i for i in rows if filled[i].any()]
     if not known:
-        return np.zeros(rows)
+        return np.zeros(len(rows))
     medians = [float(np.median(features[i, :, _INCLINATION][filled[i]])) for i in known]
-    if len(known) == 1:
-        return np.full(rows, medians[0])
-    table = np.interp(np.arange(rows), known, medians)
-    step = (medians[-1] - medians[0]) / (known[-1] - known[0])
-    for i in (*range(known[0]), *range(known[-1] + 1, rows)):  # beyond the outermost known rows
-        near = 0 if i < known[0] else -1
-        table[i] = medians[near] + (i - known[near]) * step
-    return table
+    step = (medians[-1] - medians[0]) / max(known[-1] - known[0], 1)
+    beyond = np.minimum(rows - known[0], 0) + np.maximum(rows - known[-1], 0)  # the outermost known rows
+    return np.interp(rows, known, medians) + beyond * step
 
 
 def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray) -> int:

@@ -8,10 +8,8 @@ from pathlib import Path
 from fcos_lidar_jax.files import atomic_write
 
 Cell = str | float | int
-Table = tuple[str, Sequence[str], Sequence[Sequence[Cell]]]
-"""Caption, header, rows."""
-Picture = tuple[str, str | Path]
-"""Caption and PNG file."""
+Table = tuple[str, Sequence[str], Sequence[Sequence[Cell]]]  # caption, header, rows
+Picture = tuple[str, str | Path]  # caption and PNG file
 
 _STYLE = """
 :root { color-scheme: light dark; }
@@ -49,8 +47,6 @@ def write_report(
     """Write a self-contained report: one file, no outside address, light or dark as the reader's system is.
 
     Args:
-        path: HTML file to write.
-        title: heading.
         summary: named values; of all numbers, those with a point are shown with three decimals, NaN as a dash.
         lead: one paragraph below the heading.
         tables: caption, header and rows each; the first column names the row.

@@ -7,7 +7,9 @@ import re
 import jax
 import numpy as np
 import pytest
+from commands import assert_one_line_error
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
+from tiny_run import TINY_CONFIG, untrained
 
 from fcos_lidar_jax.cli import evaluate
 from fcos_lidar_jax.cli.data import DataOptions
@@ -16,8 +18,6 @@ from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation import evaluate_detections
 from fcos_lidar_jax.inference import load_detector
-from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.trainer.results import _fingerprint
@@ -37,21 +37,8 @@ def home(tmp_path_factory):
         file.parent.mkdir(parents=True, exist_ok=True)
         make_frame(i, TINY).points.tofile(file)
     (folder / "truth.json").write_text(json.dumps(truth_of(tables)))
-    config = dataclasses.replace(
-        QUICKSTART, inference=dataclasses.replace(QUICKSTART.inference, candidates_per_level=20, max_detections=30)
-    )
-    shapes = jax.eval_shape(build_detector(config, TINY).init, jax.random.key(0))
-    variables = jax.tree_util.tree_map_with_path(fill, shapes)
-    save_checkpoint(folder / "checkpoint", Checkpoint(config, TINY, variables, 0))
+    save_checkpoint(folder / "checkpoint", Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 0))
     return folder
-
-
-def fill(path, leaf):
-    """Random weights without the compilation of their initialiser, and no bias towards the background."""
-    name = path[-1].key
-    if name == "kernel":
-        return np.random.default_rng(leaf.size).normal(0, 0.05, leaf.shape).astype(leaf.dtype)
-    return np.full(leaf.shape, float(name in ("scale", "var")), leaf.dtype)
 
 
 def place(home):
@@ -62,49 +49,52 @@ def read(file):
     return json.loads(file.read_text())
 
 
-def test_results_against_a_file_of_truth_and_against_the_tables(home, tmp_path, capsys):
-    results = home / "results.json"
-    run(Evaluate(DataOptions(), tmp_path / "a", results=results, ground_truth=home / "truth.json", report=False))
+def by_files(folder, results, truth, **options):
+    """Evaluate results against truth, both given as what their files hold, into the folder ``out``."""
+    for name, content in (("r.json", results), ("t.json", truth)):
+        (folder / name).write_text(json.dumps(content))
+    files = {"results": folder / "r.json", "ground_truth": folder / "t.json"}
+    run(Evaluate(DataOptions(), folder / "out", **files, **options))
+
+
+@pytest.fixture(scope="module")
+def by_tables(home, tmp_path_factory):
+    """The folder of an evaluation of the results file against the tables, with intervals and report."""
+    out = tmp_path_factory.mktemp("by_tables")
+    run(Evaluate(out=out, results=home / "results.json", **place(home), bootstrap=20, sensor="tiny"))
+    return out
+
+
+def test_results_against_a_file_of_truth_and_against_the_tables(home, by_tables, tmp_path, capsys):
+    results, truth = home / "results.json", home / "truth.json"
+    run(Evaluate(DataOptions(), tmp_path, results=results, ground_truth=truth, report=False))
     shown = capsys.readouterr()
-    run(Evaluate(out=tmp_path / "b", results=results, **place(home), report=False))
-    by_file, by_tables = (read(tmp_path / name / "metrics_summary.json") for name in "ab")
-    expected = evaluate_detections(read(results), read(home / "truth.json"))
-    assert list(by_file) == list(expected)
-    for summary in (by_file, by_tables, expected):
+    summaries = [read(folder / "metrics_summary.json") for folder in (tmp_path, by_tables)]
+    expected = evaluate_detections(read(results), read(truth))
+    assert list(summaries[0]) == list(expected)
+    for summary in (*summaries, expected):
         assert summary.pop("eval_time") > 0
-    assert json.dumps(by_file) == json.dumps(by_tables) == json.dumps(expected)
-    assert {path.name for path in (tmp_path / "a").iterdir()} == FILES
-    assert read(tmp_path / "a" / "results_nusc.json") == read(results) or "NaN" in results.read_text()
-    assert f"NDS {by_file['nd_score']:.4f}  mAP {by_file['mean_ap']:.4f}  on 6 samples" in shown.out
+    assert json.dumps(summaries[0]) == json.dumps(summaries[1]) == json.dumps(expected)
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+    assert read(tmp_path / "results_nusc.json") == read(results) or "NaN" in results.read_text()
+    assert f"NDS {expected['nd_score']:.4f}  mAP {expected['mean_ap']:.4f}  on 6 samples" in shown.out
     assert re.search(r"warning: .*rotation: normalised", shown.err)
 
 
-def test_the_official_keys_in_the_official_order(home, tmp_path):
-    run(Evaluate(out=tmp_path, results=home / "results.json", **place(home), report=False))
-    summary = read(tmp_path / "metrics_summary.json")
-    assert list(summary) == [
-        "label_aps",
-        "mean_dist_aps",
-        "mean_ap",
-        "label_tp_errors",
-        "tp_errors",
-        "tp_scores",
-        "nd_score",
-        "eval_time",
-        "cfg",
-        "meta",
-    ]
+def test_the_official_keys_in_the_official_order(by_tables):
+    summary = read(by_tables / "metrics_summary.json")
+    keys = "label_aps mean_dist_aps mean_ap label_tp_errors tp_errors tp_scores nd_score eval_time cfg meta"
+    assert list(summary) == keys.split()
     assert list(summary["label_aps"]["car"]) == ["0.5", "1.0", "2.0", "4.0"]
-    curves = read(tmp_path / "curves.json")
+    curves = read(by_tables / "curves.json")
     precision = np.array(curves["classes"]["car"]["precision"]["2.0"])
     ap = np.maximum(precision[11:] - 0.1, 0).mean() / 0.9
     assert summary["label_aps"]["car"]["2.0"] == pytest.approx(ap)
 
 
-def test_the_report_shows_the_numbers_of_the_summary(home, tmp_path):
-    run(Evaluate(out=tmp_path, results=home / "results.json", **place(home), bootstrap=20, sensor="tiny"))
-    page = (tmp_path / "report.html").read_text()
-    summary, drawn = read(tmp_path / "metrics_summary.json"), read(tmp_path / "bootstrap.json")
+def test_the_report_shows_the_numbers_of_the_summary(by_tables):
+    page = (by_tables / "report.html").read_text()
+    summary, drawn = read(by_tables / "metrics_summary.json"), read(by_tables / "bootstrap.json")
     text = re.sub(r'src="data:[^"]*"', "", page)
     assert "http" not in text
     # 10 precision and 10 error curves; the three samples from above and as range images.
@@ -183,17 +173,7 @@ def test_empty_sides_are_told_in_words(home, tmp_path, capsys, empty):
         truth = {token: {**sample, "boxes": []} for token, sample in truth.items()}
     if empty in ("results", "both"):
         results["results"] = {token: [] for token in truth}
-    (tmp_path / "r.json").write_text(json.dumps(results))
-    (tmp_path / "t.json").write_text(json.dumps(truth))
-    run(
-        Evaluate(
-            DataOptions(),
-            tmp_path / "out",
-            results=tmp_path / "r.json",
-            ground_truth=tmp_path / "t.json",
-            bootstrap=3,
-        )
-    )
+    by_files(tmp_path, results, truth, bootstrap=3)
     shown = capsys.readouterr().err
     assert ("no ground truth counts here" in shown) == (empty != "results")
     assert ("the results hold not a single box" in shown) == (empty != "truth")
@@ -205,64 +185,34 @@ def test_classes_without_truth_are_named(home, tmp_path, capsys):
     truth = read(home / "truth.json")
     for sample in truth.values():
         sample["boxes"] = [box for box in sample["boxes"] if box["detection_name"] not in ("bus", "barrier")]
-    (tmp_path / "t.json").write_text(json.dumps(truth))
-    run(
-        Evaluate(
-            DataOptions(), tmp_path, results=home / "results.json", ground_truth=tmp_path / "t.json", report=False
-        )
-    )
+    by_files(tmp_path, read(home / "results.json"), truth, report=False)
     assert re.search("no ground truth counts of .*bus.*barrier", capsys.readouterr().err)
 
 
+TRUTH = "--ground-truth HOME/truth.json"
 MISTAKES = {
-    "neither": ({}, "expected --checkpoint or --results"),
-    "no place": ({"results": "{home}/results.json"}, "expected --data-root, or --results with --ground-truth"),
-    "no such version": (
-        {"results": "{home}/results.json", "data_root": "{home}", "version": "v2"},
-        "v2: no such folder",
-    ),
-    "checkpoint and truth": (
-        {"checkpoint": "x", "ground_truth": "{home}/truth.json"},
-        "a checkpoint needs --data-root",
-    ),
-    "truth and tables": (
-        {"results": "x", "ground_truth": "{home}/truth.json", "split": "val"},
-        "--ground-truth: expected no data set with it",
-    ),
-    "no such truth": ({"results": "x", "ground_truth": "{home}/none.json"}, "none.json: no such file"),
-    "no such results": (
-        {"results": "{home}/none.json", "ground_truth": "{home}/truth.json"},
-        "none.json: no such file",
-    ),
+    "neither": ("", "expected --checkpoint or --results"),
+    "no place": ("--results HOME/results.json", "expected --data-root, or --results with --ground-truth"),
+    "no such version": ("--results HOME/results.json --data-root HOME --version v2", "v2: no such folder"),
+    "checkpoint and truth": (f"--checkpoint x {TRUTH}", "a checkpoint needs --data-root"),
+    "truth and tables": (f"--results x --split val {TRUTH}", "--ground-truth: expected no data set with it"),
+    "no such truth": ("--results x --ground-truth HOME/none.json", "none.json: no such file"),
+    "no such results": (f"--results HOME/none.json {TRUTH}", "none.json: no such file"),
     "other samples": (
-        {"results": "{home}/results.json", "data_root": "{home}", "version": VERSION, "split": "other"},
+        f"--results HOME/results.json --data-root HOME --version {VERSION} --split other",
         "split 'other': not found",
     ),
-    "batch": ({"results": "x", "ground_truth": "y", "batch_size": 0}, "--batch-size: got 0, expected at least 1"),
-    "bootstrap": (
-        {"results": "x", "ground_truth": "y", "bootstrap": -1},
-        "--bootstrap: got -1, expected at least 0",
-    ),
-    "no such sensor": ({"results": "x", "ground_truth": "y", "sensor": "sonar"}, "sonar: no such sensor"),
+    "batch": (f"--results x {TRUTH} --batch-size 0", "--batch-size: got 0, expected at least 1"),
+    "bootstrap": (f"--results x {TRUTH} --bootstrap -1", "--bootstrap: got -1, expected at least 0"),
+    "no such sensor": (f"--results x {TRUTH} --sensor sonar", "sonar: no such sensor"),
+    "file for a folder": (f"--results x {TRUTH} --out HOME/truth.json", "--out: .*found a file"),
 }
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_named_before_anything_is_written(home, tmp_path, name):
-    given, message = MISTAKES[name]
-    paths = ("checkpoint", "results", "data_root", "ground_truth")
-    options = {key: type(home)(value.format(home=home)) if key in paths else value for key, value in given.items()}
-    data = DataOptions(**{key: options.pop(key) for key in ("data_root", "version") if key in options})
-    with pytest.raises((ValueError, OSError), match=message):
-        run(Evaluate(data, tmp_path / "out", **options))
+def test_mistakes_are_named_before_anything_is_written(home, tmp_path, capsys, name):
+    line, message = MISTAKES[name]
+    line += "" if "--out" in line else " --out OUT"
+    args = line.replace("HOME", str(home)).replace("OUT", str(tmp_path / "out")).split()
+    assert_one_line_error(capsys, ["evaluate", *args], message)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_out_may_not_be_a_file(home, tmp_path):
-    (tmp_path / "out").touch()
-    with pytest.raises(ValueError, match=r"--out: .*found a file"):
-        run(
-            Evaluate(
-                DataOptions(), tmp_path / "out", results=home / "results.json", ground_truth=home / "truth.json"
-            )
-        )

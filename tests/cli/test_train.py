@@ -1,8 +1,6 @@
 """``fcos-lidar train`` on a small simulated data set: from tables to a run, and one line for what goes wrong."""
 
 import json
-import os
-import re
 import shutil
 import signal
 import socket
@@ -14,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from commands import assert_one_line_error, child_environment, command
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax import cli
@@ -22,8 +21,6 @@ from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 VERSION = "v1.0-synthetic"
-KEYFRAMES = 2
-CACHE = Path(__file__).parents[2] / ".cache" / "jax"
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +28,8 @@ def root(tmp_path_factory) -> Path:
     """Two scenes, one to train on and one to test on, with an index and objects."""
     home = tmp_path_factory.mktemp("home")
     (home / "sensor.json").write_text(json.dumps(sensor_to_json(SENSOR)))
-    args = ["--scenes", "2", "--keyframes", str(KEYFRAMES), "--sensor", str(home / "sensor.json")]
-    assert cli.main(["synthesize", "--out", str(home / "data"), *args]) == 0
-    assert cli.main(["prepare", "--data-root", str(home / "data"), "--version", VERSION, "--num-sweeps", "1"]) == 0
+    command("synthesize --scenes 2 --keyframes 2 --out", home / "data", "--sensor", home / "sensor.json")
+    command("prepare --num-sweeps 1 --data-root", home / "data", "--version", VERSION)
     save_checkpoint(home / "start", Checkpoint(CONFIG, SENSOR, weights(), 1))
     return home / "data"
 
@@ -46,9 +42,8 @@ def train(root: Path, out: Path, *more: str) -> list[str]:
 
 
 def test_trains_evaluates_and_says_where_the_best_checkpoint_is(root, tmp_path, capsys):
-    start = root.parent / "start"
-    out = tmp_path / "run"
-    assert cli.main(train(root, out, "--weights", str(start), "--samples", "1:2")) == 0
+    start, out = root.parent / "start", tmp_path / "run"
+    command(*train(root, out, "--weights", str(start), "--samples", "1:2"))
     said = json.loads(capsys.readouterr().out)
     last = str(out / "checkpoints" / "00000004")
     assert said == {"run": str(out), "steps": STEPS, "checkpoint": last, "best": last}
@@ -60,32 +55,23 @@ def test_trains_evaluates_and_says_where_the_best_checkpoint_is(root, tmp_path, 
     shards = json.loads((out / "objects" / "manifest.json").read_text())["shards"]
     assert [shard["name"] for shard in shards] == ["scene-0001"]
     # Four steps from the given weights, not from random ones: AdamW moves a weight by a rate a step at most.
-    moved = jax.tree.map(
-        lambda a, b: float(np.abs(a - b).max()),
-        load_checkpoint(said["checkpoint"]).variables["params"],
-        weights()["params"],
-    )
+    trained = load_checkpoint(said["checkpoint"]).variables["params"]
+    moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), trained, weights()["params"])
     reach = 1.1 * sum(line["learning_rate"] for line in lines if "learning_rate" in line)
     assert 0 < max(jax.tree.leaves(moved)) < reach
     # Detection and evaluation take the run for its best checkpoint.
     cloud = next((root / "samples" / "LIDAR_TOP").iterdir())
-    args = ["detect", str(cloud), "--checkpoint", str(out), "--out", str(tmp_path / "boxes.json")]
-    assert cli.main(args) == 0
+    command("detect", cloud, "--checkpoint", out, "--out", tmp_path / "boxes.json")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def child():
-    """Starts the command as a process, with the tests' compilation cache."""
+    """Starts the command as a process."""
     started = []
 
     def start(args: list[str]) -> subprocess.Popen[str]:
-        environment = {
-            **os.environ,
-            "JAX_COMPILATION_CACHE_DIR": str(CACHE),
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-        }
-        command = [sys.executable, "-m", "fcos_lidar_jax", *args]
-        started.append(subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True))
+        words = [sys.executable, "-m", "fcos_lidar_jax", *args]
+        started.append(subprocess.Popen(words, env=child_environment(), stderr=subprocess.PIPE, text=True))
         return started[-1]
 
     yield start
@@ -113,34 +99,44 @@ def long(root: Path) -> list[str]:
     return [*more, "--save-every", "2000", "--evaluate-every", "2000"]
 
 
-def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, tmp_path, child):
-    """A run is asked to stop as soon as it has done a step, twice; where it then ends, test_runs tells."""
-    out = tmp_path / "run"
-    stops = []
-    for number, code, resume in ((signal.SIGINT, 130, []), (signal.SIGTERM, 143, ["--resume"])):
-        process = child(train(root, out, *long(root), *resume))
-        wait_for_a_step(process, out, len(read_metrics(out)) if resume else 0)
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=200)
-        assert process.returncode == code, errors
-        assert "Traceback" not in errors
-        assert "which is saved\nthe same command with --resume goes on\n" in errors
-        stops.append(len(read_metrics(out)))
-        assert checkpoints(out)[-1] == f"{stops[-1]:08d}"
-    assert 0 < stops[0] < stops[1] < 2000
+def stop(process: subprocess.Popen[str], number: int, out: Path, beyond: int = 0) -> tuple[int, str, int]:
+    """Ask a run to stop as soon as it has done a step more: its exit code, messages, and steps done in all."""
+    wait_for_a_step(process, out, beyond)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=200)
+    return process.returncode, errors, len(read_metrics(out))
+
+
+@pytest.fixture(scope="module")
+def interrupted(root, tmp_path_factory, child):
+    """A run of one process that got Ctrl-C: its folder, and what :func:`stop` tells."""
+    out = tmp_path_factory.mktemp("interrupted") / "run"
+    return out, *stop(child(train(root, out, *long(root))), signal.SIGINT, out)
+
+
+def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, interrupted, tmp_path, child):
+    """Where a stopped and resumed run ends, tests/trainer/test_run.py tells."""
+    first, code, errors, stopped_at = interrupted
+    out = shutil.copytree(first, tmp_path / "run")
+    resumed = child(train(root, out, *long(root), "--resume"))
+    again_code, again_errors, again_at = stop(resumed, signal.SIGTERM, out, stopped_at)
+    assert (code, again_code) == (130, 143), errors + again_errors
+    for told in (errors, again_errors):
+        assert "Traceback" not in told
+        assert "which is saved\nthe same command with --resume goes on\n" in told
+    assert 0 < stopped_at < again_at < 2000
+    assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, again_at)]
     # Nothing was done twice or left out.
-    assert [line["step"] for line in read_metrics(out)] == list(range(1, stops[1] + 1))
+    assert [line["step"] for line in read_metrics(out)] == list(range(1, again_at + 1))
 
 
-@pytest.mark.slow
-def test_two_processes_are_one_run_and_stop_together(root, tmp_path, child):
+def test_two_processes_are_one_run_and_stop_together(root, interrupted, tmp_path, child):
     """Each reads its half of the batch; the first step is that of one process, and asking the second to stop stops
     both after the same step, saved once."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    alone, together = tmp_path / "alone", tmp_path / "together"
-    assert cli.main(train(root, alone, *long(root), "--steps", "1")) == 0
+    together = tmp_path / "together"
     cluster = ["--coordinator", f"localhost:{port}", "--num-processes", "2"]
     both = [child(train(root, together, *long(root), *cluster, "--process-index", str(i))) for i in range(2)]
     wait_for_a_step(both[0], together)
@@ -152,49 +148,50 @@ def test_two_processes_are_one_run_and_stop_together(root, tmp_path, child):
     records = read_metrics(together)
     assert 0 < len(records) < 2000
     assert checkpoints(together) == [f"{len(records):08d}"]
-    expected, found = read_metrics(alone)[0], records[0]
+    expected, found = read_metrics(interrupted[0])[0], records[0]
     for name in ("positives", "unique_positives", "positives_per_level", "candidates"):
         assert found[name] == expected[name], name
     for name in ("loss/total", "loss/classification", "loss/l1", "loss/iou", "loss/iou_prediction"):
         assert found[name] == pytest.approx(expected[name], rel=1e-5), name
+    assert found["gradient_norm"] == pytest.approx(expected["gradient_norm"], rel=1e-4)
 
 
 BAD = {
-    "no steps": (["--steps", "0"], "--steps: got 0, expected at least 1"),
-    "no saves": (["--save-every", "0"], "--save-every: got 0"),
-    "no evaluations": (["--evaluate-every", "-1"], "--evaluate-every: got -1"),
-    "none kept": (["--keep", "0"], "--keep: got 0"),
-    "threads": (["--threads", "-1"], "--threads: got -1, expected at least 0"),
-    "workers": (["--workers", "-1"], "--workers: got -1"),
-    "seed": (["--seed", "-1"], "--seed: got -1"),
-    "half a cluster": (["--num-processes", "2"], "expected all or none"),
+    "no steps": ("--steps 0", "--steps: got 0, expected at least 1"),
+    "no saves": ("--save-every 0", "--save-every: got 0"),
+    "no evaluations": ("--evaluate-every -1", "--evaluate-every: got -1"),
+    "none kept": ("--keep 0", "--keep: got 0"),
+    "threads": ("--threads -1", "--threads: got -1, expected at least 0"),
+    "workers": ("--workers -1", "--workers: got -1"),
+    "seed": ("--seed -1", "--seed: got -1"),
+    "half a cluster": ("--num-processes 2", "expected all or none"),
     "all faded": (
-        ["--fade-epochs", "4", "--steps", "4"],
+        "--fade-epochs 4 --steps 4",
         "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: nothing would ever be pasted",
     ),
     "process": (
-        ["--coordinator", "localhost:1", "--num-processes", "2", "--process-index", "2"],
+        "--coordinator localhost:1 --num-processes 2 --process-index 2",
         "--process-index: got 2, expected 0 to 2 excluded",
     ),
-    "no data": (["--data-root", "gone"], "gone: no such folder, expected a data set"),
-    "version": (["--version", "v9"], "v9: no such folder"),
-    "split": (["--train-split", "other"], "split 'other': not found"),
-    "test split": (["--val-split", "other"], "split 'other': not found"),
-    "splits": (["--splits", "gone.json"], "gone.json: no such file"),
-    "samples": (["--samples", "1"], "samples: got '1', expected FIRST:LAST"),
-    "too many samples": (["--samples", "0:9"], "expected FIRST < LAST within the 2 frames"),
-    "samples twice": (["--samples", "0:2,1:2"], "'1:2' overlaps"),
-    "test samples": (["--val-samples", "2:2"], "expected FIRST < LAST within the 2 frames"),
-    "nothing to resume": (["--resume"], "run.json: found nothing, expected the run to resume"),
-    "weights": (["--weights", "gone"], "gone: found nothing, expected a checkpoint folder"),
+    "no data": ("--data-root gone", "gone: no such folder, expected a data set"),
+    "version": ("--version v9", "v9: no such folder"),
+    "split": ("--train-split other", "split 'other': not found"),
+    "test split": ("--val-split other", "split 'other': not found"),
+    "splits": ("--splits gone.json", "gone.json: no such file"),
+    "samples": ("--samples 1", "samples: got '1', expected FIRST:LAST"),
+    "too many samples": ("--samples 0:9", "expected FIRST < LAST within the 2 frames"),
+    "samples twice": ("--samples 0:2,1:2", "'1:2' overlaps"),
+    "test samples": ("--val-samples 2:2", "expected FIRST < LAST within the 2 frames"),
+    "nothing to resume": ("--resume", "run.json: found nothing, expected the run to resume"),
+    "weights": ("--weights gone", "gone: found nothing, expected a checkpoint folder"),
     "weights of another network": (
-        ["--weights", "{start}", "--model.fpn-channels", "16"],
+        "--weights HOME/start --model.fpn-channels 16",
         r"start: params/.*: got \(.*8.*\), expected \(.*16.*\): the arrays are not of the network",
     ),
-    "sensor": (["--sensor", "sonar"], "sonar: no such sensor"),
-    "more sweeps than prepared": (["--num-sweeps", "2"], "cut from other frames than those of split 'train'"),
+    "sensor": ("--sensor sonar", "sonar: no such sensor"),
+    "more sweeps than prepared": ("--num-sweeps 2", "cut from other frames than those of split 'train'"),
     "objects of another split": (
-        ["--train-split", "val"],
+        "--train-split val",
         "objects/val: no objects here, .* prepare --train-split val",
     ),
 }
@@ -202,42 +199,34 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_mistakes_get_one_line_and_leave_nothing(root, tmp_path, capsys, name):
-    args, message = BAD[name]
-    args = [arg.format(start=root.parent / "start") for arg in args]
-    assert cli.main(train(root, tmp_path / "out", *args)) == 1
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("fcos-lidar: error: ")]
-    assert len(errors) == 1
-    assert re.search(message, errors[0]), errors[0]
+    line, message = BAD[name]
+    args = line.replace("HOME", str(root.parent)).split()
+    assert_one_line_error(capsys, train(root, tmp_path / "out", *args), message)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    "more",
+    ("option", "value"),
     [
-        ["--optimizer.batch-size", "0"],
-        ["--optimizer.accumulate", "3"],
-        ["--model.precision", "float16"],
-        ["--loss.l1-weight", "many"],
-        ["--optimizer.ema-decay", "1"],
+        ("--optimizer.batch-size", "0"),
+        ("--optimizer.accumulate", "3"),
+        ("--model.precision", "float16"),
+        ("--loss.l1-weight", "many"),
+        ("--optimizer.ema-decay", "1"),
     ],
 )
-def test_what_a_configuration_refuses_is_a_usage_error(root, tmp_path, capsys, more):
-    try:
-        code = cli.main(train(root, tmp_path / "out", *more))
-    except SystemExit as stopped:
-        code = stopped.code
+def test_what_a_configuration_refuses_is_a_usage_error(root, tmp_path, capsys, option, value):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(train(root, tmp_path / "out", option, value))
     shown = capsys.readouterr()
-    assert code in (1, 2)
-    assert "Traceback" not in shown.err
-    assert more[0].split(".")[1].replace("-", "_") in (shown.err + shown.out).replace("-", "_")
+    assert stopped.value.code == 2
+    assert option.split(".")[1].replace("-", "_") in (shown.err + shown.out).replace("-", "_")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_prepare_there_is_a_line_that_names_it(root, tmp_path, capsys):
     copy = shutil.copytree(root, tmp_path / "data", ignore=shutil.ignore_patterns(".fcos_lidar"))
     shutil.copy(root.parent / "sensor.json", tmp_path)
-    assert cli.main(train(copy, tmp_path / "out")) == 1
-    error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("fcos-lidar: error: ")
-    assert error.endswith("v1.0-synthetic: no index here, expected one: run fcos-lidar prepare")
+    message = "v1.0-synthetic: no index here, expected one: run fcos-lidar prepare$"
+    assert_one_line_error(capsys, train(copy, tmp_path / "out"), message)
     assert not (tmp_path / "out").exists()

@@ -2,16 +2,19 @@
 
 import dataclasses
 import io
+import itertools
 import json
 import tracemalloc
 import zipfile
 
 import numpy as np
 import pytest
+from refusal import refused
+from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.keyframe import read_keyframe
-from fcos_lidar_jax.data.point_files import PointFileError, read_points
+from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -38,48 +41,51 @@ def pcd_header(form, number, fields="x y z intensity", kinds="F F F F", sizes="4
 def lzf(data: bytes) -> bytes:
     """A greedy packer: copies of what came before, near or far, and literals between them."""
     out, literals, position = bytearray(), bytearray(), 0
-    last: dict[bytes, int] = {}
-
-    def flush():
-        for i in range(0, len(literals), 32):
-            out.extend([len(literals[i : i + 32]) - 1, *literals[i : i + 32]])
-        literals.clear()
-
     while position < len(data):
-        start = last.get(data[position : position + 3], -1)
-        distance, length = position - start, 0
-        if start >= 0 and distance <= 8192:
-            while (
-                length < 264 and position + length < len(data) and data[start + length] == data[position + length]
-            ):
-                length += 1
-        last[data[position : position + 3]] = position
+        start, length = data.rfind(data[position : position + 3], max(position - 8192, 0), position + 2), 0
+        if start >= 0:
+            pairs = zip(data[start : start + 264], data[position : position + 264], strict=False)
+            length = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
         if length < 3:
             literals.append(data[position])
             position += 1
-            continue
-        flush()
-        high, low = divmod(distance - 1, 256)
-        out.extend([(7 << 5) + high, length - 9, low] if length >= 9 else [((length - 2) << 5) + high, low])
-        position += length
-    flush()
+        if literals and (length >= 3 or len(literals) == 32 or position == len(data)):
+            out += bytes([len(literals) - 1]) + literals
+            literals.clear()
+        if length >= 3:
+            high, low = divmod(position - start - 1, 256)
+            out += bytes([(7 << 5) + high, length - 9, low] if length >= 9 else [((length - 2) << 5) + high, low])
+            position += length
     return bytes(out)
 
 
-def test_nuscenes_file_drops_the_ring_and_lag_is_zero(tmp_path, points):
-    path = tmp_path / "a.pcd.bin"
-    nuscenes_rows(points).tofile(path)
+def save(path, content):
+    """Bytes as they are, arrays and dictionaries of arrays by NumPy, raw where the name is of a raw file."""
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif isinstance(content, dict):
+        np.savez_compressed(path, **content)
+    elif path.suffix == ".bin":
+        content.tofile(path)
+    else:
+        np.savez(path, content) if path.suffix == ".npz" else np.save(path, content, allow_pickle=True)
+    return path
+
+
+def test_the_laser_number_is_the_ring_or_the_sixth_column_where_the_sensor_has_one(tmp_path, points):
+    path = save(tmp_path / "a.pcd.bin", nuscenes_rows(points))
     read = read_points(path, NUSCENES_HDL32E)
     np.testing.assert_array_equal(read[:, :4], points[:, :4])
     assert not read[:, 4].any()
+    np.testing.assert_array_equal(read_points(path, ARGOVERSE2)[:, 5], np.arange(2000) % 32)
+    rows = np.concatenate([points, (np.arange(2000) % 64)[:, None]], 1).astype(np.float32)
+    np.testing.assert_array_equal(read_points(save(tmp_path / "a.npy", rows), ARGOVERSE2)[:, 5], rows[:, 5])
 
 
-def test_kitti_file_scales_the_intensity(tmp_path, points):
-    rows = points[:, :4].copy()
-    rows[:, 3] /= 255
-    path = tmp_path / "000.bin"
-    rows.tofile(path)
-    read = read_points(path, KITTI_HDL64E)
+@pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.npz"])
+def test_every_intensity_is_scaled(tmp_path, points, name):
+    rows = points[:, :4] / np.array([1, 1, 1, 255], np.float32)
+    read = read_points(save(tmp_path / name, rows), KITTI_HDL64E)
     np.testing.assert_allclose(read[:, 3], points[:, 3], rtol=1e-5)
     np.testing.assert_array_equal(read[:, :3], points[:, :3])
 
@@ -90,30 +96,19 @@ def test_other_raw_layouts_by_columns_and_dtype(tmp_path, points, columns, dtype
     rows = points[:, :columns].astype(dtype)
     if columns == 5:
         rows[:, 4] = 0.05
-    path = tmp_path / "a.bin"
-    rows.tofile(path)
-    read = read_points(path, NUSCENES_HDL32E, columns=columns, dtype=dtype)
+    read = read_points(save(tmp_path / "a.bin", rows), NUSCENES_HDL32E, columns=columns, dtype=dtype)
     np.testing.assert_array_equal(read[:, :columns], rows.astype(np.float32))
     assert not read[:, columns:].any()
 
 
-@pytest.mark.parametrize("ending", [".npy", ".npz"])
 @pytest.mark.parametrize("columns", [3, 4, 5])
-def test_numpy_files(tmp_path, points, ending, columns):
-    path = tmp_path / f"a{ending}"
+def test_numpy_files(tmp_path, points, columns):
+    """Of several arrays that called points, of one any."""
     rows = points[:, :columns]
-    np.save(path, rows) if ending == ".npy" else np.savez(path, points=rows, other=np.zeros(3))
-    read = read_points(path, NUSCENES_HDL32E)
-    np.testing.assert_array_equal(read[:, :columns], rows)
-
-
-def test_laser_number_is_the_sixth_column_or_the_ring(tmp_path, points):
-    rows = np.concatenate([points, (np.arange(len(points)) % 64)[:, None]], 1).astype(np.float32)
-    np.save(tmp_path / "a.npy", rows)
-    read = read_points(tmp_path / "a.npy", ARGOVERSE2)
-    np.testing.assert_array_equal(read[:, 5], rows[:, 5])
-    nuscenes_rows(points).tofile(tmp_path / "a.pcd.bin")
-    np.testing.assert_array_equal(read_points(tmp_path / "a.pcd.bin", ARGOVERSE2)[:, 5], np.arange(2000) % 32)
+    several, one = {"points": rows, "other": np.zeros(3)}, {"cloud": rows.astype(np.float64)}
+    for name, content in (("a.npy", rows), ("several.npz", several), ("one.npz", one)):
+        read = read_points(save(tmp_path / name, content), NUSCENES_HDL32E)
+        np.testing.assert_array_equal(read[:, :columns], rows)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
@@ -127,31 +122,23 @@ def test_pcd_files_by_their_header(tmp_path, points, form):
     rows["intensity"], rows["time_lag"] = points[:, 3], 0.25
     rows["normal"], rows["t"] = np.nan, -(2**40)
     base = [record[name].base for name in record.names]
-    head = pcd_header(
-        form,
-        len(rows),
-        " ".join(record.names),
-        " ".join(b.kind.upper() for b in base),
-        " ".join(str(b.itemsize) for b in base),
-        " ".join(str(record[name].itemsize // b.itemsize) for name, b in zip(record.names, base, strict=True)),
-    )
+    kinds, sizes = " ".join(b.kind.upper() for b in base), " ".join(str(b.itemsize) for b in base)
+    counts = " ".join(str(record[i].itemsize // b.itemsize) for i, b in enumerate(base))
+    head = pcd_header(form, len(rows), " ".join(record.names), kinds, sizes, counts)
     if form == "ascii":
         lines = (" ".join(str(v) for field in row.item() for v in np.ravel(field)) for row in rows)
         body = "\r\n".join(lines).encode()
     elif form == "binary":
         body = rows.tobytes()
     else:
-        plain = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in record.names)
+        plain = b"".join(rows[name].tobytes() for name in record.names)
         packed = lzf(plain)
         assert len(packed) < len(plain)
         body = np.array([len(packed), len(plain)], "<u4").tobytes() + packed
-    (tmp_path / "a.PCD").write_bytes(head + body)
-    read = read_points(tmp_path / "a.PCD", ARGOVERSE2)
-    np.testing.assert_array_equal(read[:, :2], points[:, :2])
-    np.testing.assert_array_equal(read[:, 2], rows["z"])
-    np.testing.assert_array_equal(read[:, 3], rows["intensity"])
-    np.testing.assert_array_equal(read[:, 4:], np.stack([rows["time_lag"], rows["ring"]], 1))
-    np.testing.assert_array_equal(read_points(tmp_path / "a.PCD", NUSCENES_HDL32E), read[:, :5])
+    path = save(tmp_path / "a.PCD", head + body)
+    expected = np.column_stack([points[:, :2], *(rows[name] for name in ("z", "intensity", "time_lag", "ring"))])
+    np.testing.assert_array_equal(read_points(path, ARGOVERSE2), expected)
+    np.testing.assert_array_equal(read_points(path, NUSCENES_HDL32E), expected[:, :5])
 
 
 def test_pcd_packed_by_the_reference_library(tmp_path):
@@ -159,44 +146,23 @@ def test_pcd_packed_by_the_reference_library(tmp_path):
     packed = bytes.fromhex("070000803f000000402002200300804003e0360fe0470001c0bfe0410301c0bf")
     sizes = np.array([len(packed), 240], "<u4").tobytes()
     head = pcd_header("binary_compressed", 20, "x y z", "F F F", "4 4 4", "1 1 1")
-    (tmp_path / "a.pcd").write_bytes(head + sizes + packed)
-    read = read_points(tmp_path / "a.pcd", NUSCENES_HDL32E)
+    read = read_points(save(tmp_path / "a.pcd", head + sizes + packed), NUSCENES_HDL32E)
     np.testing.assert_array_equal(read, [[1 + i % 4, 0, -1.5, 0, 0] for i in range(20)])
 
 
-def test_a_single_array_of_any_name_is_read_from_npz(tmp_path, points):
-    np.savez_compressed(tmp_path / "a.npz", cloud=points.astype(np.float64))
-    np.testing.assert_array_equal(read_points(tmp_path / "a.npz", NUSCENES_HDL32E), points)
-
-
-@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
-def test_every_intensity_is_scaled(tmp_path, points, name):
-    rows = points[:, :4] / np.array([1, 1, 1, 255], np.float32)
-    np.save(tmp_path / name, rows) if name == "a.npy" else np.savez(tmp_path / name, rows)
-    np.testing.assert_allclose(read_points(tmp_path / name, KITTI_HDL64E)[:, 3], points[:, 3], rtol=1e-5)
-
-
-def test_too_large_values_become_infinite_without_a_warning(tmp_path, points):
-    rows = points[:, :4].astype(np.float64)
-    rows[3, 0], rows[5, 3] = 1e300, 3e38
-    rows.tofile(tmp_path / "a.bin")
-    read = read_points(tmp_path / "a.bin", KITTI_HDL64E, dtype="float64")
-    assert np.flatnonzero(np.isinf(read).any(1)).tolist() == [3, 5]
-
-
-@pytest.mark.parametrize("name", ["a.bin", "a.pcd.bin", "a.npy"])
-def test_nothing_finite_is_left_to_the_projection(tmp_path, name):
-    rows = np.full((20, 5), np.nan, np.float32)
-    np.save(tmp_path / name, rows) if name == "a.npy" else rows.tofile(tmp_path / name)
-    assert not np.isfinite(read_points(tmp_path / name, NUSCENES_HDL32E)[:, :4]).any()
-
-
 def test_non_finite_points_are_kept_for_the_projection_to_count(tmp_path, points):
+    """All of a cloud or some; too large values become infinite without a warning."""
     rows = nuscenes_rows(points)
     rows[7, 0], rows[9, 2] = np.nan, np.inf
-    rows.tofile(tmp_path / "a.pcd.bin")
-    read = read_points(tmp_path / "a.pcd.bin", NUSCENES_HDL32E)
+    read = read_points(save(tmp_path / "a.pcd.bin", rows), NUSCENES_HDL32E)
     assert np.flatnonzero(~np.isfinite(read).all(1)).tolist() == [7, 9]
+    rows = points[:, :4].astype(np.float64)
+    rows[3, 0], rows[5, 3] = 1e300, 3e38
+    read = read_points(save(tmp_path / "a.bin", rows), KITTI_HDL64E, dtype="float64")
+    assert np.flatnonzero(np.isinf(read).any(1)).tolist() == [3, 5]
+    for name in ("a.bin", "a.pcd.bin", "a.npy"):
+        path = save(tmp_path / name, np.full((20, 5), np.nan, np.float32))
+        assert not np.isfinite(read_points(path, NUSCENES_HDL32E)[:, :4]).any()
 
 
 @pytest.mark.parametrize("intensity_scale", [1, 1 / 255, 0], ids=["0-255", "0-1", "none"])
@@ -207,59 +173,50 @@ def test_four_and_five_columns_are_told_apart(tmp_path, points, intensity_scale,
     rows[:, 3] *= intensity_scale
     if fifth == "lag":
         rows[:, 4] = 0
-    rows.tofile(tmp_path / "five.bin")
+    five, four = save(tmp_path / "five.bin", rows), save(tmp_path / "four.pcd.bin", rows[:, :4])
     if fifth == "lag":
-        assert read_points(tmp_path / "five.bin", NUSCENES_HDL32E, columns=5).shape == (number, 5)
+        assert read_points(five, NUSCENES_HDL32E, columns=5).shape == (number, 5)
     else:
-        with pytest.raises(
-            PointFileError, match=r"five\.bin: fifth column: got whole numbers up to 31, which look"
-        ):
-            read_points(tmp_path / "five.bin", NUSCENES_HDL32E, columns=5)
-    with pytest.raises(PointFileError, match=r"five\.bin: .*not plausible metres, 5 columns would fit"):
-        read_points(tmp_path / "five.bin", KITTI_HDL64E)
-    np.ascontiguousarray(rows[:, :4]).tofile(tmp_path / "four.pcd.bin")
-    assert read_points(tmp_path / "four.pcd.bin", NUSCENES_HDL32E, columns=4).shape == (number, 5)
-    with pytest.raises(PointFileError, match=r"four\.pcd\.bin: .*not plausible metres, 4 columns would fit"):
-        read_points(tmp_path / "four.pcd.bin", NUSCENES_HDL32E)
-
-
-@pytest.mark.parametrize("columns", [3, 4, 6])
-def test_a_wrong_number_of_columns_is_refused_by_name(tmp_path, points, columns):
-    nuscenes_rows(points)[:1800].tofile(tmp_path / "a.bin")
-    with pytest.raises(PointFileError, match="not plausible metres, 5 columns would fit"):
-        read_points(tmp_path / "a.bin", NUSCENES_HDL32E, columns=columns)
+        with refused("five.bin: fifth column: got whole numbers up to 31, which look"):
+            read_points(five, NUSCENES_HDL32E, columns=5)
+    with refused("not plausible metres, 5 columns would fit", five):
+        read_points(five, KITTI_HDL64E)
+    assert read_points(four, NUSCENES_HDL32E, columns=4).shape == (number, 5)
+    with refused("not plausible metres, 4 columns would fit", four):
+        read_points(four, NUSCENES_HDL32E)
 
 
 @pytest.mark.parametrize("stored", ["float16", "float32", "float64"])
 @pytest.mark.parametrize("named", ["float16", "float32", "float64"])
 def test_a_wrong_number_type_is_refused_by_name(tmp_path, points, stored, named):
-    points[:, :4].astype(stored).tofile(tmp_path / "a.bin")
+    path = save(tmp_path / "a.bin", points[:, :4].astype(stored))
     if stored == named:
-        assert len(read_points(tmp_path / "a.bin", NUSCENES_HDL32E, dtype=named)) == len(points)
+        assert len(read_points(path, NUSCENES_HDL32E, dtype=named)) == len(points)
         return
-    with pytest.raises(PointFileError, match=f"not plausible metres, 4 columns would fit as {stored}"):
-        read_points(tmp_path / "a.bin", NUSCENES_HDL32E, dtype=named)
-
-
-def test_a_size_that_does_not_fit_names_the_columns_that_do(tmp_path, points):
-    nuscenes_rows(points)[:999].tofile(tmp_path / "a.bin")
-    with pytest.raises(PointFileError, match=r"not a multiple of 16 .* another layout, 5 columns would fit"):
-        read_points(tmp_path / "a.bin", KITTI_HDL64E)
+    with refused(f"not plausible metres, 4 columns would fit as {stored}"):
+        read_points(path, NUSCENES_HDL32E, dtype=named)
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "message"),
+    ("name", "number", "options", "message"),
     [
-        ("a.bin", {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
-        ("a.bin", {"dtype": "int16"}, "dtype: got int16, expected float16"),
-        ("a.npy", {"columns": 4}, "columns and dtype are for raw .bin files"),
-        ("a.pcd", {"dtype": "float32"}, "columns and dtype are for raw .bin files"),
+        *(("a.bin", 1800, {"columns": n}, "not plausible metres, 5 columns would fit") for n in (3, 4, 6)),
+        (
+            "a.bin",
+            999,
+            {},
+            "not a multiple of 16 (4 float32 values a point): truncated, or another layout, 5 columns",
+        ),
+        ("a.bin", 8, {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
+        ("a.bin", 8, {"dtype": "int16"}, "dtype: got int16, expected float16"),
+        ("a.npy", 8, {"columns": 4}, "columns and dtype are for raw .bin files"),
+        ("a.pcd", 8, {"dtype": "float32"}, "columns and dtype are for raw .bin files"),
     ],
 )
-def test_bad_layouts_are_refused(tmp_path, name, options, message):
-    (tmp_path / name).write_bytes(good_bytes())
-    with pytest.raises(PointFileError, match=f"{name}: {message}"):
-        read_points(tmp_path / name, NUSCENES_HDL32E, **options)
+def test_bad_layouts_are_refused(tmp_path, points, name, number, options, message):
+    path = save(tmp_path / name, nuscenes_rows(points)[:number].tobytes())
+    with refused(message, path):
+        read_points(path, NUSCENES_HDL32E, **options)
 
 
 @pytest.mark.real_data
@@ -267,30 +224,23 @@ def test_real_keyframe_reads_whole_and_refuses_other_layouts(real_data, tmp_path
     (path,) = (real_data / "nuscenes_scene0061").glob("*.pcd.bin")
     read = read_points(path, NUSCENES_HDL32E)
     assert read.shape == (34_688, 5)
-    with pytest.raises(PointFileError, match="not plausible metres, 5 columns would fit"):
+    with refused("not plausible metres, 5 columns would fit"):
         read_points(path, NUSCENES_HDL32E, columns=4)
-    with pytest.raises(PointFileError, match="not plausible metres, 5 columns would fit as float32"):
+    with refused("not plausible metres, 5 columns would fit as float32"):
         read_points(path, NUSCENES_HDL32E, dtype="float16")
     for scale in (1, 1 / 255):
-        four = read[:34_680, :4] * np.array([1, 1, 1, scale], np.float32)
-        four.tofile(tmp_path / "four.pcd.bin")
-        with pytest.raises(PointFileError, match="not plausible metres, 4 columns would fit"):
-            read_points(tmp_path / "four.pcd.bin", NUSCENES_HDL32E)
+        four = save(tmp_path / "four.pcd.bin", read[:34_680, :4] * np.array([1, 1, 1, scale], np.float32))
+        with refused("not plausible metres, 4 columns would fit"):
+            read_points(four, NUSCENES_HDL32E)
 
 
-def good_bytes():
-    return np.tile(np.array([[5, 6, -1, 30, 2]], np.float32), (8, 1)).tobytes()
-
-
-def npy_header(text):
-    text = text.ljust(53) + "\n"
+def npy_header(shape):
+    text = f"{{'descr':'<f4','fortran_order':False,'shape':{shape}}}".ljust(53) + "\n"
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
 
 
-def npy_bytes():
-    stream = io.BytesIO()
-    np.save(stream, np.ones((40, 4), np.float32))
-    return stream.getvalue()
+GOOD = np.tile(np.array([[5, 6, -1, 30, 2]], np.float32), (8, 1)).tobytes()
+NPY = npy_header((40, 4)) + np.ones((40, 4), np.float32).tobytes()
 
 
 def damaged_npz():
@@ -309,15 +259,12 @@ def wrapping_pcd(number, count):
     """A point of so many bytes that a 32-bit size is another; a few bytes of it."""
     names = " ".join(f"f{i}" for i in range(number))
     sizes, kinds, counts = "8 " * number, "F " * number, f"{count} " * number
-    header = (
-        f"FIELDS x y z {names}\nSIZE 4 4 4 {sizes}\nTYPE F F F {kinds}\nCOUNT 1 1 1 {counts}\n"
-        "WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA binary\n"
-    )
-    return header.encode() + bytes(4096)
+    header = pcd_header("binary", 1, f"x y z {names}", f"F F F {kinds}", f"4 4 4 {sizes}", f"1 1 1 {counts}")
+    return header + bytes(4096)
 
 
 def zipped(method, size=1000):
-    stream, header = io.BytesIO(), npy_header("{'descr':'<f4','fortran_order':False,'shape':(9,4)}")
+    stream, header = io.BytesIO(), npy_header((9, 4))
     with zipfile.ZipFile(stream, "w", method) as archive:
         archive.writestr("points.npy", header + bytes(size))
     return stream.getvalue()
@@ -334,40 +281,29 @@ BAD = {
     "empty.bin": (b"", "empty file"),
     "empty.npy": (b"", "empty file"),
     "empty.pcd": (b"", "empty file"),
-    "truncated.pcd.bin": (good_bytes()[:-3], "got 157 bytes, not a multiple of 20"),
-    "odd.bin": (good_bytes()[:-4], "got 156 bytes, not a multiple of 16"),
+    ".": (None, "found a folder"),
+    "truncated.pcd.bin": (GOOD[:-3], "got 157 bytes, not a multiple of 20"),
+    "odd.bin": (GOOD[:-4], "got 156 bytes, not a multiple of 16"),
     "text.bin": (b"12.5 3.75 -1.25 0.5\n" * 80, "not plausible metres"),
     "noise.bin": (np.random.default_rng(0).bytes(16_000), "not plausible metres"),
     "cloud.ply": (b"ply", "unknown extension '.ply', expected .pcd.bin"),
     "noextension": (b"1 2 3", "unknown extension"),
     "text.npy": (b"1 2 3\n4 5 6\n", "not a readable .npy file: got b'1 2 3"),
     "text.npz": (b"1 2 3\n4 5 6\n", "not a readable .npz file: got b'1 2 3"),
-    "really_npy.npz": (npy_bytes(), "not a readable .npz file: got b'.x93NUMPY'"),
+    "really_npy.npz": (NPY, "not a readable .npz file: got b'\\x93NUMPY'"),
     "pickled.npy": (np.array([{"a": 1}], object), "without pickled objects"),
     "pickled.npz": ({"points": np.array([{"a": 1}], object)}, "without pickled objects"),
-    "truncated.npy": (npy_bytes()[:-7], "not a readable .npy file"),
-    "header.npy": (npy_header("{'descr': '<f4',"), "not a readable .npy file"),
-    "huge.npy": (
-        npy_header("{'descr':'<f4','fortran_order':False,'shape':(20000000000000,4)}"),
-        "got 0 bytes of values, expected 320000000000000 for",
-    ),
-    "wrapping.npy": (
-        npy_header("{'descr':'<f4','fortran_order':False,'shape':(4611686018427387904,4)}"),
-        "got 0 bytes of values, expected 73786976294838206464",
-    ),
-    "negative.npy": (
-        npy_header("{'descr':'<f4','fortran_order':False,'shape':(-4,-4)}") + bytes(64),
-        r"for \(-4, -4\) of float32",
-    ),
-    "bomb.npz": (
-        with_size(zipped(zipfile.ZIP_DEFLATED), 3 * 2**30),
-        "got 3221225472 bytes unpacked",
-    ),
+    "truncated.npy": (NPY[:-7], "not a readable .npy file"),
+    "header.npy": (npy_header((9, 4)).replace(b"}", b","), "not a readable .npy file"),
+    "huge.npy": (npy_header((2 * 10**13, 4)), "got 0 bytes of values, expected 320000000000000 fo"),
+    "wrapping.npy": (npy_header((2**62, 4)), "got 0 bytes of values, expected 73786976294838206464"),
+    "negative.npy": (npy_header((-4, -4)) + bytes(64), "for (-4, -4) of float32"),
+    "bomb.npz": (with_size(zipped(zipfile.ZIP_DEFLATED), 3 * 2**30), "got 3221225472 bytes unpacked"),
     "bzip2.npz": (zipped(zipfile.ZIP_BZIP2), "got another compression, expected none or deflate"),
     "damaged.npz": (damaged_npz(), "not a readable .npz file"),
-    "one_axis.npy": (np.zeros(5, np.float32), r"shape: got \(5,\)"),
-    "two_columns.npy": (np.zeros((5, 2), np.float32), r"shape: got \(5, 2\)"),
-    "nine_columns.npy": (np.zeros((5, 9), np.float32), r"shape: got \(5, 9\)"),
+    "one_axis.npy": (np.zeros(5, np.float32), "shape: got (5,)"),
+    "two_columns.npy": (np.zeros((5, 2), np.float32), "shape: got (5, 2)"),
+    "nine_columns.npy": (np.zeros((5, 9), np.float32), "shape: got (5, 9)"),
     "text_values.npy": (np.array([["a", "b", "c"]]), "dtype: got <U1"),
     "complex.npy": (np.zeros((5, 4), complex), "dtype: got complex128"),
     "truth.npy": (np.zeros((5, 4), bool), "dtype: got bool"),
@@ -380,7 +316,10 @@ BAD = {
     "short.pcd": (pcd_header("binary", 9) + b"1234", "DATA: truncated: got 4 bytes, expected 144"),
     "short_ascii.pcd": (pcd_header("ascii", 2) + b"1 2 3 4\n", "DATA: truncated: got 4 values"),
     "long_ascii.pcd": (pcd_header("ascii", 1) + b"1 2 3 4 5\n", "DATA: too long: got 5 values"),
-    "words.pcd": (pcd_header("ascii", 1) + b"1 2 3 four\n", "DATA: got 'four' among the values"),
+    "words.pcd": (
+        pcd_header("ascii", 1) + b"1 2 3 four\n",
+        "DATA: could not convert string to float: b'four', expected a number",
+    ),
     "no_z.pcd": (pcd_header("ascii", 1, "x y q intensity") + b"1 2 3 4\n", "FIELDS: got 0 named z"),
     "two_x.pcd": (pcd_header("ascii", 1, "x y z x") + b"1 2 3 4\n", "FIELDS: got 2 named x"),
     "kind.pcd": (pcd_header("ascii", 1, kinds="F F F Q") + b"1 2 3 4\n", "got Q 4 for field intensity"),
@@ -395,7 +334,7 @@ BAD = {
         pcd_header("binary_compressed", 2**27) + np.array([3, 2**31], "<u4").tobytes() + b"\x00aa",
         "got 3 compressed bytes, expected more: they cannot unpack to 2147483648",
     ),
-    "huge_count.pcd": (pcd_header("binary", 1, counts="1 1 1 " + "9" * 15), "COUNT: got 9+ for field intensity"),
+    "huge.pcd": (pcd_header("binary", 1, counts=f"1 1 1 {10**15}"), "COUNT: got 1000000000000000 for field int"),
     "double_z.pcd": (pcd_header("ascii", 1, counts="1 1 2 1") + b"1 2 3 3 4\n", "COUNT: got 2 for field z"),
     "negative.pcd": (pcd_header("binary", -1) + bytes(64), "POINTS: got '-1'"),
     "disagrees.pcd": (
@@ -414,30 +353,20 @@ BAD = {
 }
 
 
-def write(path, content):
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    elif isinstance(content, dict):
-        np.savez(path, **content)
-    elif content is not None:
-        np.save(path, content, allow_pickle=True)
-
-
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_get_one_line(tmp_path, name):
     content, message = BAD[name]
-    write(tmp_path / name, content)
-    with pytest.raises(PointFileError, match=message) as caught:
+    if content is not None:
+        save(tmp_path / name, content)
+    with refused(message, tmp_path / name):
         read_points(tmp_path / name, NUSCENES_HDL32E)
-    assert str(tmp_path / name) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_an_archive_that_unpacks_to_more_than_it_says_is_read_no_further(tmp_path):
-    (tmp_path / "a.npz").write_bytes(with_size(zipped(zipfile.ZIP_DEFLATED, 2**27), 1000))
+    path = save(tmp_path / "a.npz", with_size(zipped(zipfile.ZIP_DEFLATED, 2**27), 1000))
     tracemalloc.start()
-    with pytest.raises(PointFileError, match=r"not a readable .npz file"):
-        read_points(tmp_path / "a.npz", NUSCENES_HDL32E)
+    with refused("not a readable .npz file"):
+        read_points(path, NUSCENES_HDL32E)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**24
@@ -447,65 +376,57 @@ def test_an_archive_that_unpacks_to_more_than_it_says_is_read_no_further(tmp_pat
 def test_a_file_larger_than_any_cloud_is_refused_before_it_is_read(tmp_path, name):
     with (tmp_path / name).open("wb") as file:
         file.truncate(2**40)  # takes no room on the disk
-    with pytest.raises(PointFileError, match="got 1099511627776 bytes, expected at most 2147483648"):
+    with refused("got 1099511627776 bytes, expected at most 2147483648"):
         read_points(tmp_path / name, NUSCENES_HDL32E)
-
-
-def test_a_folder_is_refused(tmp_path):
-    with pytest.raises(PointFileError, match="found a folder"):
-        read_points(tmp_path, NUSCENES_HDL32E)
 
 
 @pytest.mark.parametrize("value", [-1, 64, 1.5])
 def test_bad_or_missing_laser_numbers_are_refused(tmp_path, value):
-    np.save(tmp_path / "a.npy", np.array([[1, 2, 0, 3, 0, value]], np.float32))
-    with pytest.raises(PointFileError, match=f"laser number: got {value:g} in row 0, expected whole"):
-        read_points(tmp_path / "a.npy", ARGOVERSE2)
-    np.save(tmp_path / "b.npy", np.zeros((1, 5), np.float32))
-    with pytest.raises(PointFileError, match=r"b\.npy: no laser number"):
-        read_points(tmp_path / "b.npy", ARGOVERSE2)
+    path = save(tmp_path / "a.npy", np.array([[1, 2, 0, 3, 0, value]], np.float32))
+    with refused(f"laser number: got {value:g} in row 0, expected whole"):
+        read_points(path, ARGOVERSE2)
+    path = save(tmp_path / "b.npy", np.zeros((1, 5), np.float32))
+    with refused("b.npy: no laser number"):
+        read_points(path, ARGOVERSE2)
 
 
-def pose(rng):
-    yaw = rng.uniform(-3, 3)
-    matrix = np.eye(4)
-    matrix[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    matrix[:3, 3] = rng.uniform(-1000, 1000, 3)
-    return matrix
+EYE = np.eye(4).tolist()
+
+
+def entry(file="a.npy", timestamp_us=1, sensor_to_world=EYE):
+    return {"file": file, "timestamp_us": timestamp_us, "sensor_to_world": sensor_to_world}
+
+
+def fuse(folder, entries, sensor=TINY, remove_close="all"):
+    path = folder / "sweeps.json"
+    path.write_text(entries if isinstance(entries, str) else json.dumps(entries))
+    return read_sweeps(path, sensor, remove_close=remove_close, close_m=1.0)
 
 
 def test_sweeps_see_a_fixed_world(tmp_path):
     """Points fixed in the world land on the same place from every pose; lags are exact microseconds."""
     rng = np.random.default_rng(0)
-    poses = [pose(rng) for _ in range(4)]
-    world = np.concatenate([poses[0][:3, 3] + rng.uniform(-20, 20, (50, 3)), np.ones((50, 4 - 3))], 1)
-    entries = []
-    for i, matrix in enumerate(poses):
-        local = (np.linalg.inv(matrix) @ world.T).T[:, :3]
-        np.save(tmp_path / f"{i}.npy", local)
-        stamp = 1_532_402_927_647_951 - 49_999 * i
-        entries.append({"file": f"{i}.npy", "timestamp_us": stamp, "sensor_to_world": matrix.tolist()})
-    (tmp_path / "sweeps.json").write_text(json.dumps(entries))
-    fused, num_close = read_sweeps(tmp_path / "sweeps.json", NUSCENES_HDL32E, remove_close="none", close_m=1.0)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", rng.uniform(-3, 3, (4, 1))).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-1000, 1000, (4, 3))
+    world = poses[0, :3, 3] + rng.uniform(-20, 20, (50, 3))
+    local = [(world - pose[:3, 3]) @ pose[:3, :3] for pose in poses]
+    for i, points in enumerate(local):
+        np.save(tmp_path / f"{i}.npy", points)
+    entries = [entry(f"{i}.npy", 1_532_402_927_647_951 - 49_999 * i, p.tolist()) for i, p in enumerate(poses)]
+    fused, num_close = fuse(tmp_path, entries, NUSCENES_HDL32E, "none")
     assert num_close == 0
-    expected = (np.linalg.inv(poses[0]) @ world.T).T[:, :3]
     for i in range(4):
         part = fused[50 * i : 50 * (i + 1)]
-        np.testing.assert_allclose(part[:, :3], expected, atol=2e-4)
+        np.testing.assert_allclose(part[:, :3], local[0], atol=2e-4)
         np.testing.assert_array_equal(part[:, 4], np.float32(0.049999 * i))
 
 
 @pytest.mark.parametrize(("mode", "counts"), [("all", [1, 1]), ("sweeps", [2, 1]), ("none", [2, 2])])
 def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
-    moved = np.eye(4)
-    moved[0, 3] = 10
     np.save(tmp_path / "a.npy", np.array([[0.5, 0, 0], [10, 0, 0]]))
-    entries = [
-        {"file": "a.npy", "timestamp_us": 100, "sensor_to_world": moved.tolist()},
-        {"file": "a.npy", "timestamp_us": 50, "sensor_to_world": np.eye(4).tolist()},
-    ]
-    (tmp_path / "s.json").write_text(json.dumps(entries))
-    fused, num_close = read_sweeps(tmp_path / "s.json", TINY, remove_close=mode, close_m=1.0)
+    entries = [entry(timestamp_us=100, sensor_to_world=[[1, 0, 0, 10], *EYE[1:]]), entry(timestamp_us=50)]
+    fused, num_close = fuse(tmp_path, entries, remove_close=mode)
     assert [int((fused[:, 4] == 0).sum()), int((fused[:, 4] > 0).sum())] == counts
     assert num_close == 4 - sum(counts)
     if mode == "all":  # the old sweep's far point now lies at the sensor and stays
@@ -513,48 +434,34 @@ def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
 
 
 def test_close_points_lie_around_the_sensors_origin(tmp_path):
-    origin = (1.4, 0.0, 1.6)
     np.save(tmp_path / "a.npy", np.array([[0.3, 0, 0], [2.3, 0.5, 0], [1.4, 0, 0]]))
-    entries = [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": np.eye(4).tolist()}]
-    (tmp_path / "s.json").write_text(json.dumps(entries))
-    sensor = dataclasses.replace(TINY, origin_m=origin)
-    fused, num_close = read_sweeps(tmp_path / "s.json", sensor, remove_close="all", close_m=1.0)
+    fused, num_close = fuse(tmp_path, [entry()], dataclasses.replace(TINY, origin_m=(1.4, 0.0, 1.6)))
     np.testing.assert_array_equal(fused[:, :3], np.array([[0.3, 0, 0]], np.float32))
     assert num_close == 2
 
 
-EYE = np.eye(4).tolist()
 BAD_SWEEPS = {
     "not json": ("{", "not JSON"),
-    "not a list": ({"a": 1}, "got dict, expected a list"),
-    "empty": ([], "expected a list of at least one sweep"),
-    "not an object": ([3], r"\[0\]: got int"),
-    "no pose": ([{"file": "a.npy", "timestamp_us": 1}], r"\[0\].sensor_to_world: missing"),
-    "time": ([{"file": "a.npy", "timestamp_us": 1.5, "sensor_to_world": EYE}], "timestamp_us: got 1.5"),
-    "file": ([{"file": 3, "timestamp_us": 1, "sensor_to_world": EYE}], r"\[0\].file: got 3"),
-    "far time": ([{"file": "a.npy", "timestamp_us": 10**400, "sensor_to_world": EYE}], "timestamp_us: got 10000"),
-    "far place": (
-        [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": [[10**400, 0, 0, 0], *EYE[1:]]}],
-        r"finite numbers of at most 1e\+08",
+    "not a list": ({"a": 1}, "$: got {'a': 1}, expected array"),
+    "empty": ([], "$: got [], expected array of length >= 1"),
+    "not an object": ([3], "$[0]: got 3, expected object"),
+    "no pose": ([{"file": "a.npy", "timestamp_us": 1}], "$[0]: Object missing required field `sensor_to_w"),
+    "time": ([entry(timestamp_us=1.5)], "$[0].timestamp_us: got 1.5, expected int"),
+    "true time": ([entry(timestamp_us=True)], "$[0].timestamp_us: got True, expected int"),
+    "file": ([entry(3)], "$[0].file: got 3, expected str"),
+    "far time": ([entry(timestamp_us=10**400)], f"$[0].timestamp_us: got 1{56 * '0'}..., expected int <= 9223"),
+    "far place": ([entry(sensor_to_world=[[10**400, 0, 0, 0], *EYE[1:]])], ".sensor_to_world[0][0]: Number out"),
+    "too far": (
+        [entry(sensor_to_world=[[1, 0, 0, -2e8], *EYE[1:]])],
+        "$[0].sensor_to_world[0][3]: got -200000000.0, expected float >= -100000000.0",
     ),
-    "shape": ([{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": EYE[:3]}], "expected 4 rows"),
-    "text": ([{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": [["a"] * 4] * 4}], "expected 4 rows"),
-    "last row": ([{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": [*EYE[:3], [1, 1, 1, 1]]}], "last row"),
-    "scaled": (
-        [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": (np.diag([2, 2, 2, 1.0])).tolist()}],
-        "not a rotation",
-    ),
-    "mirrored": (
-        [{"file": "a.npy", "timestamp_us": 1, "sensor_to_world": (np.diag([-1, 1, 1, 1.0])).tolist()}],
-        "not a rotation",
-    ),
-    "future": (
-        [
-            {"file": "a.npy", "timestamp_us": 1, "sensor_to_world": EYE},
-            {"file": "a.npy", "timestamp_us": 2, "sensor_to_world": EYE},
-        ],
-        r"\[1\].timestamp_us: got 2",
-    ),
+    "NaN": ([entry(sensor_to_world=[[np.nan, 0, 0, 0], *EYE[1:]])], "[0].sensor_to_world[0][0]: got nan, exp"),
+    "shape": ([entry(sensor_to_world=EYE[:3])], f"_world: got {str(EYE)[:57]}..., expected array of length 4"),
+    "text": ([entry(sensor_to_world=[["a"] * 4] * 4)], "$[0].sensor_to_world[0][0]: got 'a', expected float"),
+    "last row": ([entry(sensor_to_world=[*EYE[:3], [1, 1, 1, 1]])], "$[0].sensor_to_world: last row: got (1.0, 1"),
+    "scaled": ([entry(sensor_to_world=np.diag([2, 2, 2, 1.0]).tolist())], "not a rotation"),
+    "mirrored": ([entry(sensor_to_world=np.diag([-1, 1, 1, 1.0]).tolist())], "not a rotation"),
+    "future": ([entry(), entry(timestamp_us=2)], "$[1].timestamp_us: got 2, expected less than the current"),
 }
 
 
@@ -562,45 +469,43 @@ BAD_SWEEPS = {
 def test_bad_sweep_lists_get_one_line(tmp_path, name):
     content, message = BAD_SWEEPS[name]
     np.save(tmp_path / "a.npy", np.ones((3, 3)))
-    path = tmp_path / "sweeps.json"
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    with pytest.raises(PointFileError, match=message) as caught:
-        read_sweeps(path, NUSCENES_HDL32E, remove_close="all", close_m=1.0)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    with refused(message, tmp_path / "sweeps.json"):
+        fuse(tmp_path, content)
 
 
 def test_keyframe_folder_gives_points_boxes_and_unknown_velocities(tmp_path, points):
-    nuscenes_rows(points).tofile(tmp_path / "a.pcd.bin")
+    save(tmp_path / "a.pcd.bin", nuscenes_rows(points))
     box = dict(zip("xyzlwh", range(1, 7), strict=True)) | {"yaw": 0.5, "vx": None, "vy": None, "num_lidar_pts": 9}
-    boxes = [{**box, "class": "truck"}, {**box, "class": None}]
-    (tmp_path / "boxes.json").write_text(json.dumps({"lidar_file": "a.pcd.bin", "boxes": boxes}))
-    frame = read_keyframe(tmp_path, NUSCENES_HDL32E)
-    np.testing.assert_array_equal(frame.boxes, np.array([[1, 2, 3, 4, 5, 6, 0.5, np.nan, np.nan]], np.float32))
-    assert frame.labels.tolist() == [1]
-    assert frame.num_points.tolist() == [9]
-    assert len(frame.points) == len(points)
     counted = {("num_lidar_pts_at_key_frame" if k == "num_lidar_pts" else k): v for k, v in box.items()}
-    other = {"lidar_file": "a.pcd.bin", "boxes": [{**counted, "class": "bus"}]}
-    (tmp_path / "boxes.json").write_text(json.dumps([{"lidar_file": "a.pcd.bin", "boxes": boxes}, other]))
-    assert [read_keyframe(tmp_path, NUSCENES_HDL32E, i).labels.tolist() for i in (0, 1)] == [[1], [2]]
-    with pytest.raises(PointFileError, match="list index out of range"):
-        read_keyframe(tmp_path, NUSCENES_HDL32E, 2)
+
+    def read(content, number=0):
+        (tmp_path / "boxes.json").write_text(content if isinstance(content, str) else json.dumps(content))
+        return read_keyframe(tmp_path, NUSCENES_HDL32E, number)
+
+    def record(*boxes):
+        return {"lidar_file": "a.pcd.bin", "boxes": boxes}
+
+    truck = record({**box, "class": "truck"}, {**box, "class": None})
+    frame = read(truck)
+    np.testing.assert_array_equal(frame.boxes, np.array([[1, 2, 3, 4, 5, 6, 0.5, np.nan, np.nan]], np.float32))
+    assert (frame.labels.tolist(), frame.num_points.tolist(), len(frame.points)) == ([1], [9], len(points))
+    several = [truck, record({**counted, "class": "bus"})]
+    assert [read(several, i).labels.tolist() for i in (0, 1)] == [[1], [2]]
+    with refused("list index out of range"):
+        read(several, 2)
     for text, message in [("{", "not JSON"), ('{"boxes": []}', "'lidar_file'"), ('{"boxes": 3}', "missing or of")]:
-        (tmp_path / "boxes.json").write_text(text)
-        with pytest.raises(PointFileError, match=message):
-            read_keyframe(tmp_path, NUSCENES_HDL32E)
+        with refused(message):
+            read(text)
     for name, value, message in [
-        ("x", 1e30, r"box 1 .*: x: got 1e\+30, expected at most 10000"),
-        ("h", -2, "box 1 .*: h: got -2, expected a size above 0 m"),
-        ("yaw", float("nan"), "box 1 .*: yaw: got nan, expected at most 1000"),
-        ("vx", float("inf"), "box 1 .*: vx: got inf, expected at most 500"),
-        ("z", None, "box 1 .*: z: got nan, expected at most 10000"),
+        ("x", 1e30, "x: got 1e+30, expected at most 10000"),
+        ("h", -2, "h: got -2, expected a size above 0 m"),
+        ("yaw", float("nan"), "yaw: got nan, expected a finite number"),
+        ("vx", float("inf"), "vx: got inf, expected a finite number"),
+        ("vx", 3, "vy: got nan, expected a finite number"),
+        ("z", None, "z: got nan, expected a finite number"),
     ]:
-        rows = [{**box, "class": "truck"}, {**box, "class": "car", name: value}]
-        (tmp_path / "boxes.json").write_text(json.dumps({"lidar_file": "a.pcd.bin", "boxes": rows}))
-        with pytest.raises(PointFileError, match=message):
-            read_keyframe(tmp_path, NUSCENES_HDL32E)
+        with refused(f"box 1 of the ten classes: {message}"):
+            read(record({**box, "class": "truck"}, {**box, "class": "car", name: value}))
 
 
 @pytest.mark.real_data

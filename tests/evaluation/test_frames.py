@@ -4,10 +4,10 @@ import dataclasses
 import json
 import re
 
-import metrics_oracle
 import numpy as np
 import pytest
-from made_evaluation import make_task, truth_of
+from made_evaluation import make_task, random_boxes, truth_of
+from metrics_oracle import assert_numbers, score_frames
 
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
@@ -15,7 +15,7 @@ from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
 from fcos_lidar_jax.evaluation.frames import evaluate_frames, frame_columns, read_detections, write_detections
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, evaluate, metric_of
 from fcos_lidar_jax.evaluation.results import read_results
-from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
+from fcos_lidar_jax.evaluation.summary import describe, full_summary, warnings, write_evaluation
 from fcos_lidar_jax.evaluation.truth import read_truth
 from fcos_lidar_jax.inference.records import as_records
 from fcos_lidar_jax.sensors import TINY
@@ -27,21 +27,12 @@ MANY = tuple(f"kind_{k}" for k in range(150))
 """More than an int8 counts."""
 
 
-def made(classes, used, seed=0, frames=8, objects=25):
+def made(classes, used, frames=8, objects=25):
     """Frames with objects of some classes, the first of which has no velocity, and detections near them."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     truths, found = [], []
     for _ in range(frames):
-        boxes = np.concatenate(
-            [
-                rng.uniform(-60, 60, (objects, 2)),
-                rng.normal(0, 1, (objects, 1)),
-                rng.uniform(0.5, 5, (objects, 3)),
-                rng.uniform(-np.pi, np.pi, (objects, 1)),
-                rng.normal(0, 3, (objects, 2)),
-            ],
-            axis=1,
-        ).astype(np.float32)
+        boxes = random_boxes(rng, objects)
         labels = rng.choice(used, objects).astype(np.int32)
         boxes[labels == used[0], 7:] = np.nan
         boxes[rng.random(objects) < 0.2, 8] = np.nan
@@ -55,7 +46,7 @@ def made(classes, used, seed=0, frames=8, objects=25):
     return found, truths
 
 
-def as_dicts(boxes, labels, classes, scores, counts):
+def as_dicts(classes, boxes, labels, values, of="detection_score"):
     """Boxes as the oracle takes them."""
     return [
         {
@@ -64,21 +55,11 @@ def as_dicts(boxes, labels, classes, scores, counts):
             "rotation": [np.cos(box[6] / 2), 0.0, 0.0, np.sin(box[6] / 2)],
             "velocity": box[7:].tolist(),
             "detection_name": classes[label],
-            "detection_score": score,
             "attribute_name": "",
-            "num_pts": count,
+            of: value.item(),
         }
-        for box, label, score, count in zip(boxes.astype(float), labels, scores, counts, strict=True)
+        for box, label, value in zip(boxes.astype(float), labels, values, strict=True)
     ]
-
-
-def by_loops(found, truths, classes, ranges):
-    boxes, true = {}, {}
-    for i, (d, frame) in enumerate(zip(found, truths, strict=True)):
-        columns = [np.asarray(column)[d.valid] for column in (d.boxes, d.labels, d.scores)]
-        boxes[i] = as_dicts(columns[0], columns[1], classes, columns[2].tolist(), [-1] * len(columns[0]))
-        true[i] = as_dicts(frame.boxes, frame.labels, classes, [-1] * len(frame.boxes), frame.num_points)
-    return metrics_oracle.score_frames(boxes, true, dict(zip(classes, ranges, strict=True)))
 
 
 @pytest.mark.parametrize(
@@ -89,27 +70,27 @@ def by_loops(found, truths, classes, ranges):
 def test_every_number_is_that_of_plain_loops(classes, used, ranges):
     found, truths = made(classes, used)
     summary = evaluate_frames(found, truths, metric_of(classes, ranges)).summary
-    expected = by_loops(found, truths, classes, ranges)
-    assert list(summary) == [*expected, "cfg"]
+    expected = score_frames(
+        {i: as_dicts(classes, *(a[d.valid] for a in (d.boxes, d.labels, d.scores))) for i, d in enumerate(found)},
+        {i: as_dicts(classes, f.boxes, f.labels, f.num_points, "num_pts") for i, f in enumerate(truths)},
+        dict(zip(classes, ranges, strict=True)),
+    )
+    assert list(summary) == list(expected)
     assert summary["absent_classes"] == [name for k, name in enumerate(classes) if k not in used]
-    assert summary["absent_classes"] == expected["absent_classes"]
     for key in ("label_aps", "label_tp_errors"):
         assert summary[key].keys() == expected[key].keys()
-        for name, row in expected[key].items():
-            assert summary[key][name] == pytest.approx(row, abs=1e-6), (key, name)
-    for key in ("mean_dist_aps", "tp_errors", "mean_ap"):
-        assert summary[key] == pytest.approx(expected[key], abs=1e-6), key
+    assert_numbers(summary, expected, 1e-6)
     assert "vel_err" not in summary["label_tp_errors"][classes[used[0]]]
     assert summary["mean_ap"] > 0.1
 
 
 def test_other_metrics_say_what_they_are():
     found, truths = made(OWN, [0, 1])
-    summary = evaluate_frames(found, truths, metric_of(OWN)).summary
-    assert summary["cfg"]["metric"] == summary["cfg"]["dist_fcn"] == "center_distance"
-    assert "not the nuScenes benchmark" in summary["cfg"]["note"]
-    assert summary["cfg"]["class_range"] == dict(zip(OWN, (50, 30, 50, 30, 50), strict=True))
-    assert "nd_score" not in summary
+    settings = metric_of(OWN).settings
+    assert settings["metric"] == settings["dist_fcn"] == "center_distance"
+    assert "not the nuScenes benchmark" in settings["note"]
+    assert settings["class_range"] == dict(zip(OWN, (50, 30, 50, 30, 50), strict=True))
+    assert "nd_score" not in full_summary(evaluate_frames(found, truths, metric_of(OWN)), {})
     with pytest.raises(ValueError, match="metric: got the nuScenes benchmark's"):
         evaluate_frames(found, truths, NUSCENES_METRIC)
 
@@ -121,18 +102,14 @@ def test_properties_go_by_name_and_not_by_order():
     boxes = read_results(results, truth.tokens).boxes
     straight = evaluate(boxes, truth).summary
     order = np.random.default_rng(3).permutation(10)
-    label_of = np.argsort(order).astype(np.int16)  # old label -> new label
-    other = dataclasses.replace(
-        NUSCENES_METRIC,
-        classes=tuple(NUSCENES_METRIC.classes[k] for k in order),
-        class_ranges_m=tuple(NUSCENES_METRIC.class_ranges_m[k] for k in order),
-    )
-    turned = dataclasses.replace(truth, boxes=dataclasses.replace(truth.boxes, label=label_of[truth.boxes.label]))
-    shuffled = evaluate(dataclasses.replace(boxes, label=label_of[boxes.label]), turned, other).summary
+    names, ranges = (tuple(np.array(v)[order].tolist()) for v in dataclasses.astuple(NUSCENES_METRIC)[:2])
+    other = dataclasses.replace(NUSCENES_METRIC, classes=names, class_ranges_m=ranges)
+    new_label = np.argsort(order).astype(np.int16)
+    boxes, true = (dataclasses.replace(b, label=new_label[b.label]) for b in (boxes, truth.boxes))
+    shuffled = evaluate(boxes, dataclasses.replace(truth, boxes=true), other).summary
     assert list(shuffled["label_aps"]) == list(other.classes)
     for key in ("label_aps", "label_tp_errors"):
-        for name, row in straight[key].items():
-            np.testing.assert_array_equal(list(shuffled[key][name].values()), list(row.values()))
+        assert_numbers(shuffled[key], straight[key], tolerance=0)
     assert shuffled["nd_score"] == pytest.approx(straight["nd_score"], abs=1e-12)
 
 
@@ -148,18 +125,15 @@ def test_the_benchmarks_sums_over_frames_count_absent_classes_and_attributes():
         assert official["label_aps"][name] == own["label_aps"][name]
 
 
-@pytest.mark.parametrize(
-    ("classes", "ranges", "message"),
-    [
+def test_classes_that_make_no_metric_are_refused():
+    for classes, ranges, message in (
         ((), (), "classes: got .*expected at least one name"),
         (("a", "b", "a"), (), "classes: got .*each once"),
         (("a", "b"), (1.0,), "class_ranges_m: got .*expected 2 positive lengths"),
         (("a",), (0.0,), "class_ranges_m: got .*expected 1 positive"),
-    ],
-)
-def test_classes_that_make_no_metric_are_refused(classes, ranges, message):
-    with pytest.raises(ValueError, match=message):
-        metric_of(classes, ranges)
+    ):
+        with pytest.raises(ValueError, match=message):
+            metric_of(classes, ranges)
 
 
 def test_without_truth_there_is_no_score_and_no_interval_breaks(tmp_path):
@@ -209,38 +183,34 @@ def test_written_detections_are_read_back(tmp_path):
     assert [frame["name"] for frame in written["frames"]] == NAMES
     again = read_detections(file, NAMES[::-1], OWN[::-1])[::-1]
     for one, back in zip(found, again, strict=True):
-        np.testing.assert_array_equal(back.boxes, one.boxes[one.valid])
-        np.testing.assert_array_equal(back.scores, one.scores[one.valid])
-        np.testing.assert_array_equal(4 - back.labels, one.labels[one.valid])
+        for read, wrote in ((back.boxes, one.boxes), (back.scores, one.scores), (4 - back.labels, one.labels)):
+            np.testing.assert_array_equal(read, wrote[one.valid])
         assert back.valid.all()
     box = {"label": "barrier", "score": 0.5, "box": [0, 0, 0, 1, 1, 1, 0, None, None]}
     file.write_text(json.dumps({"frames": [{"name": "a", "boxes": [box]}]}))
     assert np.isnan(read_detections(file, ["a"], OWN)[0].boxes[0, 7:]).all()
 
 
+def one_box(label="barrier", score=1, size=1):
+    return {"label": label, "score": score, "box": [size] * 9}
+
+
 @pytest.mark.parametrize(
-    ("frames", "message"),
+    ("names", "boxes", "message"),
     [
-        ([{"name": "a", "boxes": []}], "sample b: missing"),
-        ([{"name": n, "boxes": []} for n in "abc"], "sample c: not expected: expected the 2 samples"),
-        ([{"name": n, "boxes": []} for n in "aba"], "frame a: occurs twice"),
-        ([{"name": "a", "boxes": []}, {"name": "b", "boxes": [{}]}], "label"),
-        (
-            [{"name": "a", "boxes": []}, {"name": "b", "boxes": [{"label": "x", "score": 1, "box": [1] * 9}]}],
-            "frame b: box 0: got 'x'.*expected one of crate/box, traffic_cone",
-        ),
-        (
-            [
-                {"name": "a", "boxes": []},
-                {"name": "b", "boxes": [{"label": "barrier", "score": 1, "box": [0] * 9}]},
-            ],
-            r"frame b: box 0: got 'barrier', score 1, size \[0\.0, 0\.0, 0\.0\].*positive size",
-        ),
+        ("a", [], "sample b: missing"),
+        ("abc", [], "sample c: not expected: expected the 2 samples"),
+        ("aba", [], "frame a: occurs twice"),
+        ("ab", [{}], "label"),
+        ("ab", [one_box("x")], "frame b: box 0: label: got 'x', expected one of crate/box, traffic_cone"),
+        ("ab", [one_box(size=0)], r"frame b: box 0: box: got \[0\.0, .*expected three positive sizes"),
+        ("ab", [one_box(score=-1)], "frame b: box 0: score: got -1.0, expected a number of at least 0"),
     ],
 )
-def test_bad_detections_are_named(frames, message, tmp_path):
+def test_bad_detections_are_named(names, boxes, message, tmp_path):
     file = tmp_path / "detections.json"
-    file.write_text(json.dumps({"frames": frames}))
+    entries = [{"name": name, "boxes": boxes if name == "b" else []} for name in names]
+    file.write_text(json.dumps({"frames": entries}))
     with pytest.raises(ValueError, match=f"^{re.escape(str(file))}: .*{message}"):
         read_detections(file, ["a", "b"], OWN)
 
@@ -252,14 +222,11 @@ def test_files_and_report_of_own_classes(tmp_path):
     write_evaluation(tmp_path, evaluation, {}, repeats=5)
     chosen = choose_examples(evaluation)
     cloud = np.random.default_rng(0).normal(0, 5, (50, 5)).astype(np.float32)
-    examples = [
-        Example(kind, NAMES[row], cloud, *sensor_boxes(evaluation, row, np.eye(4), min_score=chosen.min_score))
-        for kind, row in chosen.rows.items()
-    ]
-    kept = found[chosen.rows["best"]]
+    boxes = [sensor_boxes(evaluation, row, np.eye(4), min_score=chosen.min_score) for row in chosen.rows.values()]
+    examples = [Example(k, NAMES[row], cloud, *b) for (k, row), b in zip(chosen.rows.items(), boxes, strict=True)]
+    kept, seen = found[chosen.rows["best"]], examples[0].detections[0]
     shown = kept.valid & (kept.scores >= chosen.min_score) & (np.hypot(*kept.boxes[:, :2].T) < 30)
-    in_range = np.hypot(*examples[0].detections[0][:, :2].T) < 30
-    off = examples[0].detections[0][in_range] - kept.boxes[shown]
+    off = seen[np.hypot(*seen[:, :2].T) < 30] - kept.boxes[shown]
     off[:, 6] = (off[:, 6] + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(off, 0, atol=1e-5)
     write_evaluation_report(tmp_path, title="t", num_samples=8, examples=examples, sensor=TINY)

@@ -1,15 +1,8 @@
 """Matching: values worked out by hand."""
 
 import numpy as np
-import pytest
 
-from fcos_lidar_jax.evaluation.matching import (
-    Pairs,
-    candidate_pairs,
-    greedy,
-    heading_error,
-    match_frame,
-)
+from fcos_lidar_jax.evaluation.matching import Pairs, candidate_pairs, greedy, heading_error, match_frame
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
 
 CAR, CONE, BARRIER = (NUSCENES_METRIC.classes.index(c) for c in ("car", "traffic_cone", "barrier"))
@@ -22,11 +15,9 @@ def box(x, y, yaw=0.0):
 def test_matching_is_one_to_one_by_score_and_nearest_first():
     truth = np.array([box(0, 0), box(1, 0)])
     found = np.array([box(0.6, 0), box(0.1, 0), box(0.2, 0)])
-    match = match_frame(
-        found, np.zeros(3, int), np.array([0.5, 0.9, 0.8]), truth, np.zeros(2, int), max_distance_m=1.0
-    )
-    pairs = dict(zip(match.detection.tolist(), match.truth.tolist(), strict=True))
-    assert pairs == {1: 0, 2: 1}
+    scores, labels = np.array([0.5, 0.9, 0.8]), np.zeros(3, int)
+    match = match_frame(found, labels, scores, truth, labels[:2], max_distance_m=1.0)
+    assert dict(zip(match.detection.tolist(), match.truth.tolist(), strict=True)) == {1: 0, 2: 1}
     np.testing.assert_allclose(match.centre_error_m, [0.1, 0.8])
 
 
@@ -35,30 +26,18 @@ def test_matching_is_strict_and_knows_classes_and_headings():
     args = np.array([0.9]), truth, labels
     assert len(match_frame(np.array([box(0.5, 0)]), labels, *args, max_distance_m=0.5).truth) == 0
     assert len(match_frame(np.array([box(0.4, 0)]), np.array([CONE]), *args, max_distance_m=0.5).truth) == 0
-    turned = np.array([box(0, 0, 0.2)])
     limits = {"max_distance_m": 0.5, "max_heading_error_rad": 0.1}
-    assert len(match_frame(turned, labels, *args, **limits).truth) == 0
-    about = np.array([box(0, 0, np.pi)])
-    for periods, hits in ((None, 0), ([np.pi], 1), ([0.0], 1), ([2 * np.pi], 0)):
-        period = None if periods is None else np.array(periods)
-        match = match_frame(about, labels, *args, **limits, heading_period_rad=period)
-        assert len(match.truth) == hits
+    cases = ((np.pi, None, 0), (np.pi, np.pi, 1), (np.pi, 0.0, 1), (np.pi, 2 * np.pi, 0))
+    for yaw, period, hits in ((0.2, None, 0), *cases):
+        limits["heading_period_rad"] = None if period is None else np.array([period])
+        assert len(match_frame(np.array([box(0, 0, yaw)]), labels, *args, **limits).truth) == hits
 
 
-@pytest.mark.parametrize(
-    ("label", "difference", "expected"),
-    [
-        (CAR, np.pi, np.pi),
-        (BARRIER, np.pi, 0),
-        (BARRIER, 2.0, np.pi - 2.0),
-        (CONE, 1.0, 0),
-        (CAR, 2 * np.pi + 0.1, 0.1),
-    ],
-)
-def test_heading_error(label, difference, expected):
-    period = NUSCENES_METRIC.heading_period_rad[[label, label]]
-    error = heading_error(np.full(2, difference), np.zeros(2), period)
-    np.testing.assert_allclose(error, [expected] * 2, atol=1e-9)
+def test_heading_error():
+    labels = [CAR, BARRIER, BARRIER, CONE, CAR]
+    differences = np.array([np.pi, np.pi, 2.0, 1.0, 2 * np.pi + 0.1])
+    error = heading_error(differences, np.zeros(5), NUSCENES_METRIC.heading_period_rad[labels])
+    np.testing.assert_allclose(error, [np.pi, 0, np.pi - 2.0, 0, 0.1], atol=1e-9)
 
 
 def test_pairs_are_those_of_a_double_loop(monkeypatch):

@@ -1,31 +1,35 @@
-"""The runner beneath the tables: cells, intervals, changes; and the ten lines of the README of experiments/."""
+"""The runner beneath the tables: cells, intervals, changes; and the example of the README of experiments/."""
 
+import contextlib
 import dataclasses
 import doctest
 import importlib
 import json
 import math
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny_run
 
+from experiments.changes import change
 from experiments.paper import PAPER
 from experiments.paper_tables import grid, scales, table1_mrv_rounds, table2_priority, table6_untied_heads, tables
 from experiments.paper_tables import table8_test_submission as table8
 from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cell_names import cell_name
-from experiments.paper_tables.grid import change, run_cell, run_cells
+from experiments.paper_tables.grid import run_cell, run_cells
 from experiments.paper_tables.scales import Layout, NuScenesLayout, smoke
-from experiments.paper_tables.tables import Args, Row, command, run_table
+from experiments.paper_tables.tables import Args, Row, run_table
+from experiments.script import run_script
 from experiments.statistics import interval
 from experiments.studies import more_rounds
 from fcos_lidar_jax.cli import prepare
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.evaluation.results import write_results
+from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
@@ -47,9 +51,6 @@ class Pretended:
     def describe(self):
         return {"scale": self.name}
 
-    def check(self, config):
-        pass
-
     def score(self, config, seed, folder):
         self.asked += 1
         if (config.projection.num_rounds, seed) in self.diverges:
@@ -58,16 +59,27 @@ class Pretended:
         return {"mAP": score, "NDS": score / 2, "AP": {}}
 
 
+@pytest.fixture
+def train_table(tmp_path, monkeypatch):
+    """Runs a table on a scale that trains nothing; its files are below ``smoke/``."""
+
+    def run(table, *, scale=None, figures=None, **options):
+        monkeypatch.setattr(tables, "make_scale", lambda _: scale or Pretended())
+        args = Args(**{"seeds": (0,), "out": tmp_path, "runs": tmp_path, **options})
+        return run_table(dataclasses.replace(table, figures=figures), args)
+
+    return run
+
+
 def test_a_finished_cell_is_never_run_again(tmp_path):
-    scale = Pretended()
+    scale, folders = Pretended(), {"results": tmp_path, "runs": tmp_path}
     three = change(projection__num_rounds=3)(QUICKSTART)
-    first = run_cell(three, scale, 1, results=tmp_path, runs=tmp_path)
-    again = run_cell(dataclasses.replace(three, name="other"), scale, 1, results=tmp_path, runs=tmp_path)
-    assert first == again
+    first = run_cell(three, scale, 1, **folders)
+    assert run_cell(dataclasses.replace(three, name="other"), scale, 1, **folders) == first
     assert scale.asked == 1
-    run_cell(three, scale, 2, results=tmp_path, runs=tmp_path)
+    run_cell(three, scale, 2, **folders)
     assert scale.asked == 2
-    record = json.loads(next(iter(sorted(tmp_path.glob("*.json")))).read_text())
+    record = json.loads((tmp_path / f"{first['name']}.json").read_text())
     assert record["config"]["projection"]["num_rounds"] == 3
     assert {"jax", "git", "device", "seed"} <= set(record)
 
@@ -80,41 +92,26 @@ def test_a_cell_names_the_revisions_of_all_who_trained_it(tmp_path, monkeypatch)
                 raise KeyboardInterrupt
             return super().score(config, seed, folder)
 
-    scale = Interrupted()
+    scale, folders = Interrupted(), {"results": tmp_path / "cells", "runs": tmp_path}
     for revision in ("a1", "a1", "b2"):
         monkeypatch.setattr(grid, "hardware", lambda revision=revision: {"git": revision})
         with pytest.raises(KeyboardInterrupt):
-            run_cell(QUICKSTART, scale, 0, results=tmp_path / "cells", runs=tmp_path)
-    record = run_cell(QUICKSTART, scale, 0, results=tmp_path / "cells", runs=tmp_path)
+            run_cell(QUICKSTART, scale, 0, **folders)
+    record = run_cell(QUICKSTART, scale, 0, **folders)
     assert record["git"] == "a1, then b2"
-    assert record == run_cell(QUICKSTART, scale, 0, results=tmp_path / "cells", runs=tmp_path)
+    assert record == run_cell(QUICKSTART, scale, 0, **folders)
     assert record["name"] == cell_name(QUICKSTART, scale.describe(), 0)
-
-
-_HOLDER = """
-import sys
-from pathlib import Path
-from fcos_lidar_jax.files import file_lock
-with file_lock(Path(sys.argv[1])) as mine:
-    print(mine, flush=True)
-    sys.stdin.read()
-"""
 
 
 def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch):
     held, free = (change(projection__num_rounds=n)(QUICKSTART) for n in (3, 5))
     scale, folders = Pretended(), {"results": tmp_path / "cells", "runs": tmp_path}
-    lock = tmp_path / f"{cell_name(held, scale.describe(), 0)}.lock"
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", _HOLDER, str(lock)], **pipes) as other:
-        try:
-            assert other.stdout.readline() == "True\n"
-            assert run_cell(held, scale, 0, **folders) is None
-            # The other is killed while this one waits: its cell is free again.
-            monkeypatch.setattr(grid.time, "sleep", lambda _: (other.kill(), other.wait()))
-            records = run_cells([(held, 0), (free, 0)], scale, **folders)
-        finally:
-            other.kill()
+    with contextlib.ExitStack() as other:
+        assert other.enter_context(file_lock(tmp_path / f"{cell_name(held, scale.describe(), 0)}.lock"))
+        assert run_cell(held, scale, 0, **folders) is None
+        # The other ends while this one waits: its cell is free again.
+        monkeypatch.setattr(grid.time, "sleep", lambda _: other.close())
+        records = run_cells([(held, 0), (free, 0)], scale, **folders)
     assert [record["scores"]["mAP"] for record in records] == pytest.approx([0.3, 0.5])
     assert scale.asked == 2
 
@@ -151,27 +148,20 @@ def test_intervals_are_students():
 def test_change_replaces_fields_at_any_depth():
     changed = change(num_sweeps=1, model__stem__dilations=(1, 1, 1), projection__num_rounds=7)(NUSCENES)
     assert (changed.num_sweeps, changed.model.stem.dilations, changed.projection.num_rounds) == (1, (1, 1, 1), 7)
-    assert (
-        dataclasses.replace(changed, num_sweeps=10, model=NUSCENES.model, projection=NUSCENES.projection)
-        == NUSCENES
-    )
+    back = dataclasses.replace(changed, num_sweeps=10, model=NUSCENES.model, projection=NUSCENES.projection)
+    assert back == NUSCENES
     with pytest.raises(TypeError, match="roundz"):
         change(projection__roundz=3)(NUSCENES)
 
 
-def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tables, "make_scale", lambda _: Pretended())
-    table = dataclasses.replace(table1_mrv_rounds.TABLE, figures=None)
-    args = Args(seeds=(0, 1), out=tmp_path, runs=tmp_path)
-    record = run_table(table, args)
-    row = next(row for row in record["rows"] if row["label"] == "multi, 5 rounds")
-    assert row["mAP_difference"]["mean"] == pytest.approx(40.0)
-    np.testing.assert_allclose(row["mAP_difference"]["interval"], [40.0] * 3)
-    assert row["paper_difference"] == {"mAP": 2.06, "NDS": 1.88}
-    single = next(row for row in record["rows"] if row["label"] == "single, 5 rounds")
+def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_table, capsys):
+    rows = {row["label"]: row for row in train_table(table1_mrv_rounds.TABLE, seeds=(0, 1))["rows"]}
+    multi, single = rows["multi, 5 rounds"], rows["single, 5 rounds"]
+    np.testing.assert_allclose(multi["mAP_difference"]["interval"], [40.0] * 3)
+    assert multi["paper_difference"] == {"mAP": 2.06, "NDS": 1.88}
     assert single["reference"] == "single, 1 round"
-    assert single["mAP_difference"]["mean"] == pytest.approx(40.0)
     assert single["paper_difference"] == {"mAP": 0.28, "NDS": 1.88}
+    assert multi["mAP_difference"]["mean"] == single["mAP_difference"]["mean"] == pytest.approx(40.0)
     text = (tmp_path / "smoke" / "table1.md").read_text()
     assert text in capsys.readouterr().out
     assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+40.00, +40.00] | 57.08 | +2.06 |" in text
@@ -182,93 +172,74 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, monkey
 def test_more_rounds_changes_the_traffic_or_the_epochs_alone(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(more_rounds, "run_table", lambda table, args: asked.append((table.name, args.scale)))
-    more_rounds.main(Args(scale="simulated"))
-    more_rounds.main(Args(scale="smoke"))
-    assert asked == [
-        ("rounds_and_traffic", "calm"),
-        ("rounds_and_length", "simulated"),
-        ("rounds_and_traffic", "smoke"),
-        ("rounds_and_length", "smoke"),
-    ]
+    for scale in ("simulated", "smoke"):
+        more_rounds.main(Args(scale=scale))
+    names = ("rounds_and_traffic", "rounds_and_length")
+    assert asked == list(zip(names * 2, ("calm", "simulated", "smoke", "smoke"), strict=True))
     fast, light = (make(tmp_path) for make in (scales.simulated, scales.calm))
     assert light == dataclasses.replace(fast, name="calm", fast_traffic=False)
     cached, quiet = (scale.frames("train", 10).frames for scale in (fast, light))
     assert quiet.frames == dataclasses.replace(cached.frames, fast_traffic=False)
     assert quiet.folder != cached.folder
-    base = fast.base
-    by_label = {row.label: row.change(base) for row in more_rounds.LENGTH.rows}
-    longer = dataclasses.replace(base, optimizer=dataclasses.replace(base.optimizer, epochs=6))
-    assert base.optimizer.epochs == 2
-    assert by_label["5 rounds, 3 x epochs"] == longer
+    by_label = {row.label: row.change(fast.base) for row in more_rounds.LENGTH.rows}
+    assert fast.base.optimizer.epochs == 2
+    assert by_label["5 rounds, 3 x epochs"] == change(optimizer__epochs=6)(fast.base)
     assert by_label["1 round, 3 x epochs"].projection.num_rounds == 1
     with pytest.raises(ValueError, match="--scale: got nuscenes, expected smoke or simulated"):
         more_rounds.main(Args(scale="nuscenes"))
 
 
-def test_a_diverged_cell_is_told_and_the_others_are_shown(tmp_path, monkeypatch):
+def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_table):
     scale = Pretended(diverges=((1, 0), (3, 0), (3, 1)))
-    monkeypatch.setattr(tables, "make_scale", lambda _: scale)
-    table = dataclasses.replace(table1_mrv_rounds.TABLE, figures=None)
-    args = Args(seeds=(0, 1, 2), out=tmp_path, runs=tmp_path)
-    rows = {row["label"]: row for row in run_table(table, args)["rows"]}
+    options = {"scale": scale, "seeds": (0, 1, 2)}
+    rows = {row["label"]: row for row in train_table(table1_mrv_rounds.TABLE, **options)["rows"]}
     # Seeds 1 and 2 are left of one round, seed 2 of three, all of five.
     assert rows["multi, 1 round"]["mAP"]["mean"] == pytest.approx(11.5)
     assert rows["multi, 3 rounds"]["mAP"] == {"mean": pytest.approx(32.0), "interval": None}
     assert rows["multi, 5 rounds"]["mAP"]["mean"] == pytest.approx(51.0)
     assert rows["multi, 5 rounds"]["mAP_difference"]["mean"] == pytest.approx(40.0)
-    told = [f"seed {seed}: step 7: loss/l1 is not finite" for seed in (0, 1)]
-    assert rows["multi, 3 rounds"]["diverged"] == told
-    assert (
-        "multi, 3 rounds: seed 1: step 7: loss/l1 is not finite" in (tmp_path / "smoke" / "table1.md").read_text()
-    )
+    said = [f"seed {seed}: step 7: loss/l1 is not finite" for seed in (0, 1)]
+    assert rows["multi, 3 rounds"]["diverged"] == said
+    assert f"multi, 3 rounds: {said[1]}" in (tmp_path / "smoke" / "table1.md").read_text()
     asked = scale.asked
-    run_table(table, args)
+    train_table(table1_mrv_rounds.TABLE, **options)
     assert scale.asked == asked
     gone = dataclasses.replace(scale, diverges=tuple((n, 0) for n in (1, 3, 5, 7)))
-    monkeypatch.setattr(tables, "make_scale", lambda _: gone)
-    args = Args(seeds=(0,), out=tmp_path / "gone", runs=tmp_path / "gone")
-    assert all(row["mAP"] is None for row in run_table(table, args)["rows"])
+    record = train_table(table1_mrv_rounds.TABLE, scale=gone, out=tmp_path / "gone", runs=tmp_path / "gone")
+    assert all(row["mAP"] is None for row in record["rows"])
 
 
-def test_only_figures_leaves_the_finished_table_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "make_scale", lambda _: Pretended())
-    table = dataclasses.replace(
-        table2_priority.TABLE, figures=lambda _: {"columns": {"with priority": {"kept": 3.0}}}
-    )
-    args = Args(seeds=(0,), out=tmp_path, runs=tmp_path)
-    run_table(table, args)
+def test_only_figures_leaves_the_finished_table_alone(tmp_path, train_table):
+    options = {"table": table2_priority.TABLE, "figures": lambda _: {"columns": {"with priority": {"kept": 3.0}}}}
+    train_table(**options)
     before = (tmp_path / "smoke" / "table2.md").read_text()
     assert "seeds [0]; epochs 40; batch size 2; accumulate 1; precision float32.\n" in before
     assert "interval" not in before, "one seed has none"
-    run_table(table, dataclasses.replace(args, only_figures=True))
+    train_table(**options, only_figures=True)
     assert (tmp_path / "smoke" / "table2.md").read_text() == before
     assert "3.00" in (tmp_path / "smoke" / "table2_figures.md").read_text()
 
 
-def test_a_picture_of_other_seeds_does_not_stay(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "make_scale", lambda _: Pretended())
-    picture = tmp_path / "smoke" / "table6.png"
-    run_table(table6_untied_heads.TABLE, Args(seeds=(0, 1), out=tmp_path, runs=tmp_path))
-    assert picture.exists()
-    run_table(table6_untied_heads.TABLE, Args(seeds=(0,), out=tmp_path, runs=tmp_path))
-    assert not picture.exists()
+def test_a_picture_of_other_seeds_does_not_stay(tmp_path, train_table):
+    for seeds in ((0, 1), (0,)):
+        train_table(table6_untied_heads.TABLE, seeds=seeds)
+        assert (tmp_path / "smoke" / "table6.png").exists() == (len(seeds) > 1)
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"),
+    ("labels", "fields", "message"),
     [
-        ({"reference": "Tied"}, "got 'Tied', expected one of"),
-        ({"rows": ("tied", "tied")}, "got two rows 'tied'"),
-        ({"rows": ("tied", "untied"), "paper": "Untied"}, "paper: got 'Untied', expected one of"),
-        ({"rows": ("tied", "untied"), "gain": "of_it"}, "gain: got 'of_it', expected one of"),
+        (("untied",), {}, "got 'tied', expected one of ['untied']"),
+        (("tied", "tied"), {}, "got two rows 'tied'"),
+        (("tied", "untied"), {"reference": "Tied"}, "reference: got 'Tied', expected one of"),
+        (("tied", "untied"), {"paper": "Untied"}, "paper: got 'Untied', expected one of"),
+        (("tied", "untied"), {"gain": "of_it"}, "gain: got 'of_it', expected one of"),
     ],
 )
-def test_a_table_that_cannot_be_printed_is_refused_before_training(fields, message):
-    kinds = {key: fields.pop(key) for key in ("paper", "gain") if key in fields}
-    if "rows" in fields:
-        fields["rows"] = tuple(Row(label, change(), **kinds) for label in fields["rows"])
+def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, fields, message):
+    rows = tuple(Row(label, change(), **fields) for label in labels)
     with pytest.raises(ValueError, match=re.escape(message)):
-        dataclasses.replace(table6_untied_heads.TABLE, **fields)
+        dataclasses.replace(table6_untied_heads.TABLE, rows=rows)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +272,7 @@ def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["table6_untied_heads.py", *options])
     with pytest.raises(SystemExit, match="1"):
-        command(lambda args: run_table(table6_untied_heads.TABLE, args), None)
+        run_script(lambda args: run_table(table6_untied_heads.TABLE, args), Args, None)
     assert capsys.readouterr().err == f"table6_untied_heads.py: error: {message}\n"
     assert list(tmp_path.iterdir()) == []
 
@@ -309,9 +280,9 @@ def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_pa
 def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path, monkeypatch):
     splits = tmp_path / "splits.json"
     splits.write_text('{"mini_train": ["scene-0001"], "mini_val": ["scene-0002"]}')
-    order = DatasetSpec(2, 1, 3, dataclasses.replace(TINY, name="toy", num_columns=64), False, "v1.0-mini")
+    spec = DatasetSpec(2, 1, 3, dataclasses.replace(TINY, name="toy", num_columns=64), False, "v1.0-mini")
     for root, seed in (("one", 1), ("two", 2)):
-        write_dataset(dataclasses.replace(order, seed=seed), tmp_path / root, workers=1, report=lambda _: None)
+        write_dataset(dataclasses.replace(spec, seed=seed), tmp_path / root, workers=1, report=lambda _: None)
         prepare.run(prepare.Prepare(DataOptions(tmp_path / root, version="v1.0-mini", splits=splits)))
     asked, submitted = [], []
 
@@ -326,8 +297,8 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
 
     monkeypatch.setattr(scales, "trained", trained)
     monkeypatch.setattr(scales, "write_submission", write_submission)
-    layout = Layout(tmp_path / "one", "v1.0-mini", splits=splits, steps=5, accumulate=4, workers=2)
-    layout = dataclasses.replace(layout, precision="bfloat16")
+    options = {"steps": 5, "accumulate": 4, "workers": 2, "precision": "bfloat16"}
+    layout = Layout(tmp_path / "one", "v1.0-mini", splits=splits, **options)
     scale = NuScenesLayout(layout)
     assert (scale.base.optimizer.accumulate, scale.base.model.precision) == (4, "bfloat16")
     config = change(num_sweeps=3)(scale.base)
@@ -359,29 +330,23 @@ def test_every_row_of_the_tables_has_its_paper_figures():
         assert NUSCENES in configs  # the paper's detector is a row of every table
 
 
-def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(tmp_path, monkeypatch):
+def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(train_table):
     base, fade, c128, both = (row.change(NUSCENES) for row in table8.TABLE.rows)
     assert base == NUSCENES
     assert (fade.fade_epochs, c128.fade_epochs, both.fade_epochs) == (5, 0, 5)
     assert [c.model.head_channels for c in (fade, c128, both)] == [64, 128, 128]
-    monkeypatch.setattr(tables, "make_scale", lambda _: Pretended())
-    table = dataclasses.replace(table8.TABLE, figures=None)
-    record = run_table(table, Args(seeds=(0,), out=tmp_path, runs=tmp_path))
-    gains = [row["paper_difference"] for row in record["rows"]]
+    gains = [row["paper_difference"] for row in train_table(table8.TABLE)["rows"]]
     assert gains == [{}, {"mAP": 2}, {"mAP": 0.6}, {}]
 
 
 def test_table_8_submits_nothing_of_a_run_that_did_not_end(tmp_path, monkeypatch):
-    config = table8.wide(table8.faded(QUICKSTART))
-    args = table8.Args(seeds=(0,), out=tmp_path, runs=tmp_path / "runs")
+    config, scale = table8.wide(table8.faded(QUICKSTART)), Pretended()
+    args = Args(seeds=(0,), out=tmp_path, runs=tmp_path / "runs")
     folders = {"results": tmp_path / "smoke" / "cells", "runs": args.runs / "smoke"}
-    scale = Pretended()
     monkeypatch.setattr(table8, "make_scale", lambda _: scale)
-    run_cell(config, scale, 0, **folders)
-    run = folders["runs"] / cell_name(config, scale.describe(), 0)
-    assert table8.submission(args) == [
-        f"No results file: no finished run in {run}, the cell was trained elsewhere."
-    ]
+    run = folders["runs"] / run_cell(config, scale, 0, **folders)["name"]
+    said = f"No results file: no finished run in {run}, the cell was trained elsewhere."
+    assert table8.submission(args) == [said]
     (run / "run.json").write_text('{"steps": 20}')
     for step, ended in (("00000010", False), ("00000020", True)):
         (run / "checkpoints" / step).mkdir(parents=True)
@@ -390,14 +355,22 @@ def test_table_8_submits_nothing_of_a_run_that_did_not_end(tmp_path, monkeypatch
     assert table8.submission(args) == ["No results file: the training of seed 0 diverged."]
 
 
-@pytest.mark.slow
+def tiny_smoke(cache):
+    """The smoke scale with the network, the sensor and the four steps that the tests of training share."""
+    base, frames = (
+        change(optimizer__epochs=1)(tiny_run.CONFIG),
+        tiny_run.STEPS * tiny_run.CONFIG.optimizer.batch_size,
+    )
+    return dataclasses.replace(smoke(cache), base=base, sensor=tiny_run.SENSOR, train_frames=frames, test_frames=1)
+
+
 def test_the_variant_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     text = (EXPERIMENTS / "README.md").read_text()
-    code = re.search(r"## Your own variant\n\n```python\n(.*?)```", text, re.DOTALL)
-    assert code is not None
-    assert len([line for line in code[1].splitlines() if line]) <= 12
+    (code,) = re.findall(r"## Your own variant\n\n```python\n(.*?)```", text, re.DOTALL)
+    assert len([line for line in code.splitlines() if line]) <= 12
     monkeypatch.chdir(tmp_path)
-    exec(compile(code[1], "README.md", "exec"), {})
+    monkeypatch.setattr(tables, "smoke", tiny_smoke)
+    exec(compile(code, "README.md", "exec"), {})
     record = json.loads((tmp_path / "outputs" / "tables" / "smoke" / "mine.json").read_text())
     assert [row["label"] for row in record["rows"]] == ["base", "mine"]
     assert all(0 <= row["mAP"]["mean"] <= 100 for row in record["rows"])

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from tiny_run import TINY_CONFIG, untrained
 
 from fcos_lidar_jax.coding import decode
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.inference import make_detect, postprocess, select_candidates
 from fcos_lidar_jax.locations import ImageLayout, locate
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -54,27 +54,20 @@ def candidates_by_loops(outputs, locations, config):
 
 def test_candidates_are_the_best_pairs_of_each_level(scene):
     outputs, locations = scene
-    locations = jax.tree.map(np.asarray, locations)
     config = InferenceConfig(min_probability=0.2, candidates_per_level=150)
     boxes, scores, labels, valid = map(
-        np.asarray, select_candidates(outputs, look_again(locations), config=config, layout=LAYOUT)
+        np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT)
     )
-    expected = candidates_by_loops(outputs, locations, config)
+    expected = candidates_by_loops(outputs, jax.device_get(locations), config)
     assert valid.sum() == len(expected) > 300
     np.testing.assert_allclose(np.sort(scores[valid]), np.sort([-s for s, _, _ in expected]), atol=1e-6)
     order = {(round(float(s), 5), int(k)) for s, k in zip(scores[valid], labels[valid], strict=True)}
     assert len(order ^ {(round(-s, 5), k) for s, _, k in expected}) <= 0.02 * len(expected)  # last-digit rounding
     best = int(np.argmax(np.where(valid, scores, -1)))
     _, l, k = min(expected)
-    one = decode(
-        outputs.regression[l, :, k], jnp.asarray(locations.points[l]), jnp.asarray(locations.azimuth_rad[l])
-    )
+    one = decode(outputs.regression[l, :, k], locations.points[l], locations.azimuth_rad[l])
     np.testing.assert_allclose(boxes[best], one, atol=1e-5)
     assert not scores[~valid].any()
-
-
-def look_again(locations):
-    return jax.tree.map(jnp.asarray, locations)
 
 
 def test_postprocessing_is_class_wise_greedy_nms_of_the_candidates(scene):
@@ -95,25 +88,18 @@ def test_postprocessing_is_class_wise_greedy_nms_of_the_candidates(scene):
 
 
 def test_detection_ignores_padding_and_is_the_same_under_vmap():
-    detector = build_detector(QUICKSTART, TINY)
-    variables = detector.init(jax.random.key(0))
-    for head in variables["params"]["heads"].values():
-        head["classification"]["logits_bias"] = jnp.zeros(11)
-    detect = make_detect(detector)
-    clouds = []
-    for seed in range(2):
-        points = np.full((4096, 5), np.nan, np.float32)
-        scan = make_frame(seed, TINY).points
-        points[: len(scan)] = scan
-        clouds.append((points, np.arange(4096) < len(scan)))
-    single = [jax.jit(detect)(variables, *cloud) for cloud in clouds]
-    assert all(bool(d.valid.any()) for d in single)
-    assert all(bool(jnp.isfinite(d.boxes).all()) for d in single)
-    points, valid = (np.stack(v) for v in zip(*clouds, strict=True))
-    both = jax.jit(jax.vmap(detect, in_axes=(None, 0, 0)))(variables, points, valid)
-    for i, one in enumerate(single):
-        np.testing.assert_allclose(both.scores[i][:20], one.scores[:20], atol=1e-4)
+    detect, variables = make_detect(build_detector(TINY_CONFIG, TINY)), untrained(TINY_CONFIG, TINY)
+    scans = [make_frame(seed, TINY).points for seed in range(2)]
+    points = np.stack([np.pad(s, ((0, 4096 - len(s)), (0, 0)), constant_values=np.nan) for s in scans])
+    valid = np.stack([np.arange(4096) < len(scan) for scan in scans])
+    one_by_one, together = jax.jit(detect), jax.jit(jax.vmap(detect, in_axes=(None, 0, 0)))
+    both = together(variables, points, valid)
+    for i in range(2):
+        one = one_by_one(variables, points[i], valid[i])
+        assert bool(one.valid.any())
+        assert bool(jnp.isfinite(one.boxes).all())
+        np.testing.assert_allclose(both.scores[i], one.scores, atol=1e-4)
         assert int(both.num_dropped[i]) == int(one.num_dropped)
-    empty = jax.jit(detect)(variables, clouds[0][0], np.zeros(4096, bool))
+    empty = one_by_one(variables, points[0], np.zeros(4096, bool))
     assert not empty.valid.any()
     assert not empty.boxes.any()

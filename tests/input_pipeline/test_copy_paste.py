@@ -18,8 +18,15 @@ SPEC = CopyPasteConfig()
 TOY_LAGS = np.array([0, 0.05, 0.1], np.float32)
 
 
-def configured(spec=SPEC, num_sweeps=10, **options):
-    return dataclasses.replace(NUSCENES, copy_paste=spec, num_sweeps=num_sweeps, **options)
+def pasted_into(frame, objects, *, seed=0, targets=None, **options):
+    """What is pasted into a frame, and the rows that it removes; ``targets`` as in :class:`CopyPasteConfig`."""
+    spec = SPEC if targets is None else CopyPasteConfig(targets=targets)
+    config = dataclasses.replace(NUSCENES, copy_paste=spec, **{"num_sweeps": 10, **options})
+    return make_paste(objects, config)(frame, np.random.default_rng(seed))
+
+
+def without_boxes(frame):
+    return Frame(frame.points, frame.boxes[:0], frame.labels[:0], frame.num_points[:0])
 
 
 def rectangles(boxes: np.ndarray) -> np.ndarray:
@@ -36,7 +43,7 @@ def objects(tmp_path_factory):
 @pytest.mark.parametrize("num_sweeps", [1, 2, 3, 10])
 def test_pasted_objects_fill_up_the_classes_without_overlap(objects, seed, num_sweeps):
     frame = toy_frame(100 + seed)
-    paste, removed = make_paste(objects, configured(SPEC, num_sweeps))(frame, np.random.default_rng(seed))
+    paste, removed = pasted_into(frame, objects, seed=seed, num_sweeps=num_sweeps)
     present = np.bincount(frame.labels[frame.num_points >= 1], minlength=10)
     after = present + np.bincount(paste.labels, minlength=10)
     assert (after <= np.maximum(present, NUSCENES.paste_targets)).all()
@@ -64,10 +71,7 @@ def test_pasted_objects_fill_up_the_classes_without_overlap(objects, seed, num_s
 
 def test_a_drawn_object_is_pasted_or_overlaps(objects):
     """On an empty plain, what is left out overlaps something pasted before."""
-    none = np.zeros(0, np.int32)
-    bare = Frame(np.zeros((1, 5), np.float32), np.zeros((0, 9), np.float32), none, none)
-    one_class = CopyPasteConfig(targets=(0, 0, 0, 0, 0, 1000, 0, 0, 0, 0))
-    paste, _ = make_paste(objects, configured(one_class))(bare, np.random.default_rng(0))
+    paste, _ = pasted_into(without_boxes(toy_frame(0)), objects, targets=(0,) * 5 + (1000,) + (0,) * 4)
     usable = objects.table[(objects.table["label"] == 5) & (objects.num_points(1) >= 1)]
     assert set(paste.labels) == {5}
     assert 3 < len(paste.boxes) < len(usable)
@@ -83,50 +87,45 @@ def test_what_was_left_out_takes_no_room(tmp_path):
     boxes[:, 0], boxes[:, 3:6] = [10, 13, 16], [4, 2, 2]
     points = np.zeros((30, 5), np.float32)
     points[:, 0] = np.repeat([9, 13, 17], 10)
-    labels, counts = np.zeros(3, np.int32), np.full(3, 10, np.int32)
-    frames = ListedFrames((Frame(points, boxes, labels, counts),))
-    objects = prepare_database(frames, tmp_path)
-    paste = make_paste(objects, configured(CopyPasteConfig(targets=(3,) + (0,) * 9)))
-    empty = Frame(points[:1] + 50, boxes[:0], labels[:0], counts[:0])
-    seen = {tuple(sorted(paste(empty, np.random.default_rng(s))[0].boxes[:, 0])) for s in range(20)}
-    assert seen == {(13,), (10, 16)}
+    frame = Frame(points, boxes, np.zeros(3, np.int32), np.full(3, 10, np.int32))
+    objects, empty, targets = (
+        prepare_database(ListedFrames((frame,)), tmp_path),
+        without_boxes(frame),
+        (3,) + (0,) * 9,
+    )
+    pasted = [pasted_into(empty, objects, seed=seed, targets=targets)[0] for seed in range(20)]
+    assert {tuple(sorted(paste.boxes[:, 0])) for paste in pasted} == {(13,), (10, 16)}
 
 
 def test_full_classes_get_nothing(objects):
     frame = toy_frame(100)
     present = np.bincount(frame.labels[frame.num_points >= 1], minlength=10)
-    full = CopyPasteConfig(targets=tuple(present.tolist()))
-    paste, removed = make_paste(objects, configured(full))(frame, np.random.default_rng(0))
+    paste, removed = pasted_into(frame, objects, targets=tuple(present.tolist()))
     assert (paste.points.shape, len(paste.boxes), len(removed)) == ((0, 5), 0, 0)
 
 
 def test_boxes_without_points_take_room_but_do_not_count(objects):
     frame = toy_frame(100)
-    hidden = Frame(frame.points, frame.boxes, frame.labels, np.zeros_like(frame.num_points))
-    paste, _ = make_paste(objects, configured(SPEC))(hidden, np.random.default_rng(0))
+    paste, _ = pasted_into(dataclasses.replace(frame, num_points=np.zeros_like(frame.num_points)), objects)
     boxes = rectangles(frame.boxes)
     assert all(area(intersection(r, boxes)).max() < 1e-9 for r in rectangles(paste.boxes))
-    seen, _ = make_paste(objects, configured(SPEC))(frame, np.random.default_rng(0))
+    seen, _ = pasted_into(frame, objects)
     assert len(paste.boxes) > len(seen.boxes)
 
 
 def test_the_generator_decides(objects):
-    paste, frame = make_paste(objects, configured(SPEC)), toy_frame(100)
-    a, b, c = (paste(frame, np.random.default_rng(s))[0].boxes for s in (1, 1, 2))
+    a, b, c = (pasted_into(toy_frame(100), objects, seed=seed)[0].boxes for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
     assert a.shape != c.shape or (a != c).any()
 
 
 def test_objects_of_stale_points_alone_are_not_pasted(tmp_path):
     frame = toy_frame(0)
-    stale = frame.points.copy()
-    stale[:, 4] = 0.05
-    frames = ListedFrames((Frame(stale, frame.boxes, frame.labels, frame.num_points),))
-    objects = prepare_database(frames, tmp_path)
+    frame.points[:, 4] = 0.05
+    objects = prepare_database(ListedFrames((frame,)), tmp_path)
     assert len(objects) > 5
     for num_sweeps in (1, 2, 10):
-        paste, _ = make_paste(objects, configured(SPEC, num_sweeps))(toy_frame(100), np.random.default_rng(0))
-        assert len(paste.boxes) == 0
+        assert len(pasted_into(toy_frame(100), objects, num_sweeps=num_sweeps)[0].boxes) == 0
 
 
 @pytest.fixture(scope="module")
@@ -147,11 +146,7 @@ def long_frame():
 def test_a_model_of_k_sweeps_gets_the_points_of_the_newest_k(tmp_path, long_frame, num_sweeps):
     """As if the database had been cut from frames of k sweeps, and not one point of an older one."""
     objects = prepare_database(ListedFrames((long_frame,)), tmp_path)
-    empty = dataclasses.replace(
-        long_frame, boxes=long_frame.boxes[:0], labels=long_frame.labels[:0], num_points=long_frame.num_points[:0]
-    )
-    everything = CopyPasteConfig(targets=(100,) * 10)
-    paste, _ = make_paste(objects, configured(everything, num_sweeps))(empty, np.random.default_rng(0))
+    paste, _ = pasted_into(without_boxes(long_frame), objects, targets=(100,) * 10, num_sweeps=num_sweeps)
     newest = long_frame.points[long_frame.points[:, 4] < (num_sweeps - 0.5) / 20]
     cut = {}
     for box in long_frame.boxes:
@@ -167,31 +162,25 @@ def test_a_model_of_k_sweeps_gets_the_points_of_the_newest_k(tmp_path, long_fram
 
 def test_more_sweeps_than_are_told_apart_are_refused(objects):
     with pytest.raises(ValueError, match="num_sweeps: got 21, expected 1 to 20 for copy-paste"):
-        make_paste(objects, configured(SPEC, 21))
+        pasted_into(toy_frame(0), objects, num_sweeps=21)
 
 
 def test_classes_are_matched_by_name(objects):
     """The database has the ten classes; a detector of three, one of them its own, gets objects of two."""
-    config = configured(CopyPasteConfig(targets=(50, 50, 50)), classes=("pedestrian", "tram", "car"))
-    bare = dataclasses.replace(
-        toy_frame(0),
-        boxes=np.zeros((0, 9), np.float32),
-        labels=np.zeros(0, np.int32),
-        num_points=np.zeros(0, np.int32),
-    )
-    paste, _ = make_paste(objects, config)(bare, np.random.default_rng(0))
+    classes = ("pedestrian", "tram", "car")
+    paste, _ = pasted_into(without_boxes(toy_frame(0)), objects, targets=(50, 50, 50), classes=classes)
     label_of = {row["box"][:7].tobytes(): objects.manifest.classes[row["label"]] for row in objects.table}
     names = [label_of[box[:7].tobytes()] for box in paste.boxes]
     assert set(names) == {"pedestrian", "car"}
-    assert [config.classes[label] for label in paste.labels] == names
+    assert [classes[label] for label in paste.labels] == names
 
 
 def test_a_database_of_other_classes_is_refused(objects):
     with pytest.raises(ValueError, match=r"classes: got car, truck, .*, expected some of tram, boat"):
-        make_paste(objects, configured(CopyPasteConfig(), classes=("tram", "boat")))
+        pasted_into(toy_frame(0), objects, targets=(1, 1), classes=("tram", "boat"))
 
 
 def test_a_database_of_larger_objects_is_refused(tmp_path):
     objects = prepare_database(ToyFrames(1), tmp_path, min_points=9)
     with pytest.raises(ValueError, match=r"copy_paste\.min_points: got 5, .* database's 9"):
-        make_paste(objects, configured(SPEC))
+        pasted_into(toy_frame(0), objects)

@@ -4,26 +4,23 @@ import dataclasses
 import itertools
 import re
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
 import oracles
 import pytest
+from commands import run_python
 from toy_frames import ListedFrames, ToyFrames, toy_frame
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig
-from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.frame import Frame, GivenFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.input_pipeline.database import prepare_database
 from fcos_lidar_jax.input_pipeline.loader import SampleOrder, make_batches, steps_per_epoch
-from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, QUICKSTART
-from fcos_lidar_jax.sensors import TINY
-from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+from fcos_lidar_jax.sensors import ARGOVERSE2
 
 CONFIG = dataclasses.replace(
     QUICKSTART,
@@ -61,36 +58,38 @@ def assert_same(found, expected):
         assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
 
 
-@pytest.mark.parametrize("class_balanced", [False, True])
-@pytest.mark.parametrize("threads", [1, 2, 4])
-def test_threads_do_not_change_a_bit(objects, threads, class_balanced):
-    config = dataclasses.replace(CONFIG, class_balanced=class_balanced)
-    alone = run(config=config, objects=objects)
-    assert len(alone) == STEPS
-    assert_same(run(config=config, objects=objects, threads=threads), alone)
+@pytest.fixture(scope="module")
+def alone(objects):
+    """All batches of a run without threads and processes."""
+    batches = run(config=CONFIG, objects=objects)
+    assert len(batches) == STEPS
+    return batches
 
 
-@pytest.mark.parametrize(("workers", "threads", "first_step"), [(1, 0, 3), (2, 2, 0), (4, 0, 1)])
-def test_worker_processes_do_not_change_a_bit(objects, workers, threads, first_step):
-    alone = run(config=CONFIG, objects=objects)[first_step:]
-    how = {"workers": workers, "threads": threads, "first_step": first_step}
-    assert_same(run(config=CONFIG, objects=objects, **how), alone)
+@pytest.mark.parametrize(
+    "how",
+    [
+        *({"threads": n} for n in (1, 2, 4)),
+        {"workers": 1, "first_step": 3},
+        {"workers": 2, "threads": 2},
+        {"workers": 4, "first_step": 1},
+        *({"first_step": step, "threads": step % 3} for step in range(STEPS + 1)),
+    ],
+)
+def test_threads_workers_and_resuming_do_not_change_a_bit(objects, alone, how):
+    assert_same(run(config=CONFIG, objects=objects, **how), alone[how.get("first_step", 0) :])
 
 
-def test_a_run_goes_on_at_any_step_with_the_same_bits(objects):
-    alone = run(config=CONFIG, objects=objects)
-    for step in range(STEPS + 1):
-        assert_same(run(config=CONFIG, objects=objects, first_step=step, threads=step % 3), alone[step:])
+def test_threads_do_not_change_a_bit_of_balanced_classes(objects):
+    config = dataclasses.replace(CONFIG, class_balanced=True)
+    assert_same(run(config=config, objects=objects, threads=2), run(config=config, objects=objects))
 
 
 @pytest.mark.parametrize("num_processes", [2, 4])
-def test_the_parts_of_all_processes_are_the_whole(objects, num_processes):
-    whole = run(config=CONFIG, objects=objects)
-    parts = [
-        run(config=CONFIG, objects=objects, num_processes=num_processes, process_index=i)
-        for i in range(num_processes)
-    ]
-    for step, batch in enumerate(whole):
+def test_the_parts_of_all_processes_are_the_whole(objects, alone, num_processes):
+    options = {"config": CONFIG, "objects": objects, "num_processes": num_processes}
+    parts = [run(**options, process_index=i) for i in range(num_processes)]
+    for step, batch in enumerate(alone):
         joined = jax.tree.map(lambda *rows: np.concatenate(rows), *(p[step].batch for p in parts))
         for a, b in zip(jax.tree.leaves(joined), jax.tree.leaves(batch.batch), strict=True):
             np.testing.assert_array_equal(a, b)
@@ -103,24 +102,15 @@ def seen_frames(batches, size=7):
     return [first[tuple(np.asarray(points[0]).tolist())] for b in batches for points in b.batch.points]
 
 
-def test_every_epoch_shows_every_frame_once_in_another_order():
-    seen = seen_frames(run(num_steps=7))  # 28 samples: four epochs of seven
-    epochs = [seen[7 * i : 7 * i + 7] for i in range(4)]
-    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
-    assert len({tuple(epoch) for epoch in epochs}) == 4
-    assert [name for b in run(num_steps=7) for name in b.names] == [f"toy {i}" for i in seen]
-    assert seen != seen_frames(run(num_steps=7, seed=1))
-    assert seen[7:] != seen_frames(run(num_steps=7, seed=1))[:-7]  # neighbouring seeds do not share epochs
-
-
-def test_class_balanced_epochs_are_redrawn_and_a_resumed_run_sees_the_same():
-    config = dataclasses.replace(PLAIN, class_balanced=True)
+@pytest.mark.parametrize("class_balanced", [False, True])
+def test_batches_follow_the_order_of_samples_and_a_resumed_run_too(class_balanced):
+    config = dataclasses.replace(PLAIN, class_balanced=class_balanced)
     order, an_epoch = SampleOrder(ToyFrames(), config, seed=0), steps_per_epoch(ToyFrames(), config)
     steps = 2 * an_epoch
-    seen = seen_frames(run(config=config, num_steps=steps))
+    batches = run(config=config, num_steps=steps)
+    seen = seen_frames(batches)
     assert seen == [order[position] for position in range(4 * steps)]
-    size = order.epoch_size
-    assert sorted(seen[:size]) != sorted(seen[size : 2 * size])
+    assert [name for b in batches for name in b.names] == [f"toy {i}" for i in seen]
     assert seen_frames(run(config=config, num_steps=steps, first_step=an_epoch + 1)) == seen[4 * (an_epoch + 1) :]
 
 
@@ -144,38 +134,21 @@ def test_pasted_objects_arrive_with_their_points_and_nothing_shows_through(objec
     assert batch.counts["pasted_objects"] > 20
     total = 0
     for row, index in enumerate(seen_frames([batch])):
-        frame, truth = toy_frame(index), np.asarray(batch.batch.boxes[row])[batch.batch.box_valid[row]]
-        points = np.asarray(batch.batch.points[row])
+        frame, truth = toy_frame(index), batch.batch.boxes[row][batch.batch.box_valid[row]]
+        points, valid, size = batch.batch.points[row], batch.batch.valid[row], len(toy_frame(index).points)
         pasted = truth[int((frame.num_points >= 1).sum()) :]
         total += len(pasted)
-        scene = points[: len(frame.points)][batch.batch.valid[row][: len(frame.points)]]
-        added = points[len(frame.points) :][batch.batch.valid[row][len(frame.points) :]]
+        scene, added = points[:size][valid[:size]], points[size:][valid[size:]]
         for box in pasted.astype(float):
             assert not any(oracles.inside(p, box) for p in scene[:, :3].astype(float))
             assert sum(oracles.inside(p, box) for p in added[:, :3].astype(float)) >= 5
     assert total == batch.counts["pasted_objects"]
 
 
-def test_single_sweep_models_get_current_points_alone(objects):
-    frames = ListedFrames(tuple(only_current(toy_frame(i)) for i in range(4)))
-    [batch] = run(frames, dataclasses.replace(CONFIG, num_sweeps=1), objects=objects, count=1)
-    assert batch.counts["pasted_objects"] > 5
-    assert not np.asarray(batch.batch.points)[np.asarray(batch.batch.valid)][:, 4].any()
-    [fused] = run(frames, CONFIG, objects=objects, count=1)
-    assert np.asarray(fused.batch.points)[np.asarray(fused.batch.valid)][:, 4].any()
-
-
-def only_current(frame):
-    return dataclasses.replace(frame, points=frame.points[frame.points[:, 4] == 0])
-
-
-def test_pasting_fades_out_by_the_step_alone(objects):
+def test_pasting_fades_out_by_the_step_alone(alone):
     # Seven frames in batches of four: two steps an epoch; three epochs, the last without.
-    counts = [b.counts["pasted_objects"] > 0 for b in run(config=CONFIG, objects=objects)]
-    assert counts == [True] * 4 + [False] * 2
-    assert not run(config=CONFIG, objects=objects, first_step=5)[0].counts["pasted_objects"]
-    plain, faded = run(first_step=4), run(config=CONFIG, objects=objects, first_step=4)
-    assert_same(faded, plain)
+    assert [b.counts["pasted_objects"] > 0 for b in alone] == [True] * 4 + [False] * 2
+    assert_same(alone[4:], run(first_step=4))
 
 
 def test_every_sample_has_its_own_draw(objects):
@@ -183,7 +156,7 @@ def test_every_sample_has_its_own_draw(objects):
     frames = ListedFrames((toy_frame(0),))
     own = int((toy_frame(0).num_points >= 1).sum())
     batches = run(frames, dataclasses.replace(CONFIG, fade_epochs=0), objects=objects, count=3)
-    pasted = [np.asarray(boxes)[own:].tobytes() for b in batches for boxes in b.batch.boxes]
+    pasted = [boxes[own:].tobytes() for b in batches for boxes in b.batch.boxes]
     assert len(set(pasted)) == len(pasted) == 12
 
 
@@ -194,17 +167,12 @@ def test_the_oldest_points_go_first_and_are_counted(objects, pasting):
     tight = run(config=dataclasses.replace(config, max_points=1200), objects=objects, count=1)[0]
     lost = 0
     for row in range(4):
-        every = np.asarray(roomy.batch.points[row])[roomy.batch.valid[row]]
-        kept = np.asarray(tight.batch.points[row])[tight.batch.valid[row]]
+        every, kept = (b.batch.points[row][b.batch.valid[row]] for b in (roomy, tight))
         assert len(kept) == 1200 < len(every)
         lost += len(every) - 1200
         oldest = kept[:, 4].max()
         assert oldest > 0
         np.testing.assert_array_equal(kept[kept[:, 4] < oldest], every[every[:, 4] < oldest])
-        last = {point.tobytes() for point in every[every[:, 4] == oldest]}
-        chosen = [point.tobytes() for point in kept[kept[:, 4] == oldest]]
-        assert len(set(chosen)) == len(chosen) < len(last)
-        assert set(chosen) <= last
     assert tight.counts["truncated_points"] == lost
     assert roomy.counts["truncated_points"] == 0
 
@@ -217,7 +185,7 @@ def test_absurd_points_reach_no_batch_and_are_counted():
     [batch] = run(ListedFrames((dataclasses.replace(frame, points=points),)), count=1)
     assert batch.counts["invalid_points"] == 4 * 4
     for row in range(4):
-        kept = np.asarray(batch.batch.points[row])[batch.batch.valid[row]]
+        kept = batch.batch.points[row][batch.batch.valid[row]]
         np.testing.assert_array_equal(kept, np.delete(frame.points, range(5, 9), axis=0))
 
 
@@ -227,9 +195,8 @@ def test_absurd_points_reach_no_batch_and_are_counted():
 def test_absurd_boxes_stop_the_run_with_their_line(column, value):
     frame = toy_frame(0)
     frame.boxes[7, column] = value
-    with pytest.raises(
-        ValueError, match=r"^frame 'frame 0': box 7: got [^\n]*, expected finite x, y, z, l, w, h, yaw"
-    ):
+    message = r"^frame 'frame 0': box 7: got [^\n]*, expected finite x, y, z, l, w, h, yaw"
+    with pytest.raises(ValueError, match=message):
         run(ListedFrames((frame,)), count=1)
 
 
@@ -247,7 +214,7 @@ def test_boxes_with_the_fewest_points_go_and_are_counted():
 
 
 def test_a_laser_column_travels_too(objects):
-    frames = ListedFrames((toy_frame(0, columns=6),))
+    frames = GivenFrames((toy_frame(0, columns=6),), ARGOVERSE2, NUSCENES_CLASSES)
     [batch] = run(frames, count=1)
     assert batch.batch.points.shape == (4, 3000, 6)
     with pytest.raises(ValueError, match="got points of 5 columns, expected 6 as in the frames"):
@@ -257,13 +224,12 @@ def test_a_laser_column_travels_too(objects):
 def test_frames_without_boxes_or_points():
     nothing = Frame(np.zeros((0, 5), np.float32), np.zeros((0, 9), np.float32), *[np.zeros(0, np.int32)] * 2)
     [batch] = run(ListedFrames((nothing,)), count=1)
-    assert not np.asarray(batch.batch.valid).any()
-    assert not np.asarray(batch.batch.box_valid).any()
+    assert not batch.batch.valid.any()
+    assert not batch.batch.box_valid.any()
 
 
 LEFT_EARLY = """
-import dataclasses, sys
-sys.path[:0] = sys.argv[1:]
+import dataclasses
 from test_loader import PLAIN, STEPS, ToyFrames, make_batches
 if __name__ == "__main__":
     large = dataclasses.replace(PLAIN, max_points=300_000)  # shared memory that takes its time to be freed
@@ -275,26 +241,8 @@ if __name__ == "__main__":
 def test_leaving_early_leaves_nothing_behind(tmp_path):
     script = tmp_path / "leave.py"
     script.write_text(LEFT_EARLY)
-    command = [sys.executable, str(script), str(Path(__file__).parent), str(Path(__file__).parents[1] / "support")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_python(script)
     assert (done.returncode, done.stdout, done.stderr) == (0, "4 4\n", "")
-
-
-def test_the_training_step_takes_a_batch(objects):
-    """Points and boxes reach the device with their bits, in the shapes and types that the step is made for."""
-    config = dataclasses.replace(CONFIG, num_sweeps=1)
-    frames = ListedFrames(tuple(only_current(toy_frame(i)) for i in range(4)))
-    [host] = run(frames, config, objects=objects, count=1)
-    batch = jax.device_put(host.batch)
-    for there, here in zip(jax.tree.leaves(batch), jax.tree.leaves(host.batch), strict=True):
-        assert (there.dtype, there.weak_type) == (here.dtype, False)
-        np.testing.assert_array_equal(there, here)
-    detector, optimizer = build_detector(config, TINY), make_optimizer(config.optimizer, STEPS)
-    step = make_train_step(detector, optimizer)
-    state = jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(0))
-    after, metrics = jax.eval_shape(step, state, batch)
-    assert jax.tree.structure(after) == jax.tree.structure(state)
-    assert metrics["loss/total"].shape == ()
 
 
 def test_workers_need_shared_memory(monkeypatch):
@@ -316,7 +264,7 @@ def test_real_samples_fit_the_presets(real_data, tmp_path, preset):
     for batch in run(frames, config, objects=objects, count=2):
         assert batch.counts["truncated_points"] == batch.counts["truncated_boxes"] == 0
         assert batch.counts["pasted_objects"] > 3
-        points, valid = np.asarray(batch.batch.points), np.asarray(batch.batch.valid)
+        points, valid = batch.batch.points, batch.batch.valid
         filled = valid.sum(axis=1) / preset.max_points
         assert (filled > 0.5).all()  # ten sweeps leave no room for twice as many
         lags = [len(np.unique(cloud[row][:, 4])) for cloud, row in zip(points, valid, strict=True)]
@@ -342,12 +290,7 @@ def test_an_unreadable_file_stops_the_run_with_its_line(threads, workers):
     [
         (ToyFrames(0), PLAIN, {}, "training frames: got none"),
         (ToyFrames(), CONFIG, {}, "copy_paste: got no ground-truth database"),
-        (
-            ToyFrames(),
-            PLAIN,
-            {"num_processes": 3},
-            "process 0 of 3: expected a number that divides the batch of 4",
-        ),
+        (ToyFrames(), PLAIN, {"num_processes": 3}, "process 0 of 3: expected a number that divides .* of 4"),
         (ToyFrames(), PLAIN, {"num_processes": 2, "process_index": 2}, "process 2 of 2"),
         (ToyFrames(), PLAIN, {"num_processes": 0}, "process 0 of 0"),
         (ToyFrames(), PLAIN, {"first_step": 2}, "first_step: got 2, expected 0 to 1"),

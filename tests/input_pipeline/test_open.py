@@ -18,16 +18,12 @@ from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.input_pipeline.open import LayoutError, default_split, find_layout, open_frames
+from fcos_lidar_jax.input_pipeline.open import default_split, find_layout, open_frames
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
-READERS = {
-    "nuscenes": NuScenesFrames,
-    "kitti": KittiFrames,
-    "argoverse2": Argoverse2Frames,
-    "folder": FolderFrames,
-}
+FORMATS = ("nuscenes", "kitti", "argoverse2", "folder")
+READERS = dict(zip(FORMATS, (NuScenesFrames, KittiFrames, Argoverse2Frames, FolderFrames), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +36,6 @@ def roots(tmp_path_factory):
         "argoverse2": make_argoverse2(folder / "argoverse2", sweeps=2, sensor=COARSE),
         "folder": make_folder(folder / "folder", train=2, val=1),
     }
-
-
-FORMATS = ("nuscenes", "kitti", "argoverse2", "folder")
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -143,11 +136,11 @@ def test_what_does_not_fit_gets_one_line(roots, tmp_path, case):
 def test_several_formats_or_versions_are_to_be_named(roots, tmp_path):
     root = shutil.copytree(roots["nuscenes"], tmp_path / "both")
     shutil.copytree(root / VERSION, root / "v2")
-    with pytest.raises(LayoutError, match=r"got versions v1.0-made, v2, expected one: name it"):
+    with pytest.raises(ValueError, match=r"got versions v1.0-made, v2, expected one: name it"):
         open_frames(root)
     assert len(open_frames(root, version="v2")) == 8
     (root / "clouds").mkdir()
-    with pytest.raises(LayoutError, match="looks like nuscenes and folder, expected one format: name it"):
+    with pytest.raises(ValueError, match="looks like nuscenes and folder, expected one format: name it"):
         open_frames(root, version="v2")
     assert len(open_frames(root, format="nuscenes", version="v2")) == 8
 
@@ -159,7 +152,7 @@ def test_default_splits(roots, tmp_path):
     for format in ("kitti", "argoverse2", "folder"):
         assert (split(roots[format], "train"), split(roots[format], "val", required=False)) == ("train", "val")
     root = shutil.copytree(roots["nuscenes"], tmp_path / "nuscenes")
-    with pytest.raises(LayoutError, match="got splits all, scene-0, scene-1, none, lost, none is train: name one"):
+    with pytest.raises(ValueError, match="got splits all, scene-0, scene-1, none, lost, none is train: name one"):
         split(root, "train")
     assert split(root, "val", required=False) is None
     own = root / VERSION / "splits.json"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.simulation.ground import Ground
 from fcos_lidar_jax.simulation.raycast import Fan, cast
@@ -19,17 +20,15 @@ def level(solid, points):
     offset = points - solid["center"]
     c, s = np.cos(solid["yaw"]), np.sin(solid["yaw"])
     along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
-    along = along - solid["lean"] * offset[:, 2]
-    u, v, w = along / solid["half"][0], across / solid["half"][1], offset[:, 2] / solid["half"][2]
+    u, v, w = np.stack([along - solid["lean"] * offset[:, 2], across, offset[:, 2]]) / solid["half"][:, None]
     if solid["kind"] == BALL:
         return np.sqrt(u**2 + v**2 + w**2)
     if solid["kind"] == WHEEL:
         return np.maximum(np.hypot(u, w), np.abs(v))
     # From 1 at the base (w = -1) to the taper at the top.
-    narrow = [1 + (t - 1) * (np.clip(w, -1, 1) + 1) / 2 for t in solid["taper"]]
-    if solid["kind"] == DRUM:
-        return np.maximum(np.hypot(u, v) / narrow[0], np.abs(w))
-    return np.maximum(np.maximum(np.abs(u) / narrow[0], np.abs(v) / narrow[1]), np.abs(w))
+    wide, deep = (1 + (t - 1) * (np.clip(w, -1, 1) + 1) / 2 for t in solid["taper"])
+    round_, flat = np.hypot(u, v) / wide, np.maximum(np.abs(u) / wide, np.abs(v) / deep)
+    return np.maximum(round_ if solid["kind"] == DRUM else flat, np.abs(w))
 
 
 def ground_height(ground, x, y):
@@ -52,29 +51,20 @@ def random_solids(rng, number):
     return solids
 
 
-def tilt(x, y):
-    c, s, d, e = np.cos(x), np.sin(x), np.cos(y), np.sin(y)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ np.array([[d, -e, 0], [e, d, 0], [0, 0, 1]])
-
-
-def make_fan(columns=90, start=2.9):
-    # One more turn than a full one, and lasers that fire one after the other.
-    rows = np.radians(np.linspace(50, -50, 12))
-    return Fan(rows, columns, start, 2 * np.pi / columns * 1.02, np.linspace(0, 0.8, 12))
-
-
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("ground", [FAR_BELOW, HILLS], ids=["air", "hills"])
 def test_rays_end_where_marching_first_meets_something(seed, ground):
     rng = np.random.default_rng(seed)
-    solids, fan, turn = random_solids(rng, 25), make_fan(), tilt(0.05, 1.0)
-    eye = np.array([0.3, -0.4, 0.2])
+    solids, eye = random_solids(rng, 25), np.array([0.3, -0.4, 0.2])
+    turn = Rotation.from_euler("XZ", [0.05, 1.0]).as_matrix()
+    # More than a full turn, and lasers that fire one after the other.
+    fan = Fan(np.radians(np.linspace(50, -50, 12)), 90, 2.9, 2 * np.pi / 90 * 1.02, np.linspace(0, 0.8, 12))
     hits = cast(fan, turn, eye, solids, ground, rng)
     directions = turn @ fan.directions.astype(np.float64)
     way = np.arange(0.02, 45, 0.02)
     met = 0
     for ray in rng.permutation(directions.shape[1])[:450]:
-        d, reach, winner = directions[:, ray], hits.range_m.ravel()[ray], hits.solid.ravel()[ray]
+        d, reach, winner = directions[:, ray], hits.range_m[ray], hits.solid[ray]
         path = eye + way[:, None] * d
         full = np.array([level(s, path) <= 1 for s in solids])
         full = np.vstack([full, path[:, 2] <= ground_height(ground, *path[:, :2].T)]).any(axis=0)
@@ -103,36 +93,32 @@ def test_every_kind_is_met_and_the_nearest_wins():
     rng = np.random.default_rng(0)
     for first in range(4):
         hits = cast(straight, np.eye(3), np.zeros(3), solids[first:], FAR_BELOW, rng)
-        assert (hits.solid[0, 0], hits.range_m[0, 0]) == (0, pytest.approx(5 + 4 * first))
-        assert hits.cosine[0, 0] == pytest.approx(1)
+        assert (hits.solid[0], hits.range_m[0]) == (0, pytest.approx(5 + 4 * first))
+        assert hits.cosine[0] == pytest.approx(1)
     backwards = cast(straight, np.eye(3), np.zeros(3), solids[::-1], FAR_BELOW, rng)
-    assert backwards.solid[0, 0] == 3
+    assert backwards.solid[0] == 3
 
 
 @pytest.mark.parametrize("kind", [BOX, DRUM, BALL, WHEEL])
 def test_incidence_is_that_of_the_level_functions_gradient(kind):
     rng = np.random.default_rng(kind)
     checked = 0
-    for _ in range(12):
-        solid = random_solids(rng, 1)
+    for solid in (random_solids(rng, 1) for _ in range(12)):
         solid["kind"] = kind
         if kind == WHEEL:
             solid["taper"] = 1
-        middle = solid["center"][0]
-        fan = Fan(np.radians(np.linspace(20, -20, 21)), 60, np.arctan2(*middle[1::-1]) + 0.5, 1 / 60, np.zeros(21))
+        start = np.arctan2(*solid["center"][0, 1::-1]) + 0.5
+        fan = Fan(np.radians(np.linspace(20, -20, 21)), 60, start, 1 / 60, np.zeros(21))
         hits = cast(fan, np.eye(3), np.zeros(3), solid, FAR_BELOW, rng)
         ends = fan.directions.T.astype(float)
-        for ray in np.flatnonzero(hits.solid.ravel() == 0)[::7]:
-            at = ends[ray] * hits.range_m.ravel()[ray]
-            steps = [1e-4 * np.eye(3)[i] for i in range(3)]
-            slopes = [
-                [(level(solid[0], (at + s * e)[None])[0] - level(solid[0], at[None])[0]) / s for e in steps]
-                for s in (1, -1)
-            ]
+        for ray in np.flatnonzero(hits.solid == 0)[::7]:
+            at = ends[ray] * hits.range_m[ray]
+            here, ahead, behind = (level(solid[0], at + s * 1e-4 * np.eye(3)) for s in (0, 1, -1))
+            slopes = [ahead - here, here - behind]
             if np.abs(np.subtract(*slopes)).max() > 0.01 * np.abs(slopes).max():
                 continue  # at an edge
             expected = abs(slopes[0] @ ends[ray]) / np.linalg.norm(slopes[0])
-            assert hits.cosine.ravel()[ray] == pytest.approx(expected, abs=0.02)
+            assert hits.cosine[ray] == pytest.approx(expected, abs=0.02)
             checked += 1
     assert checked > 50
 
@@ -153,10 +139,8 @@ def test_reachable_counts_rays_that_others_stop():
     solids = make_solids(BOX, [[20, 0, 0], [10, 1, 0]], [[0.1, 4, 4], [0.1, 1, 4]], owner=np.array([0, 1]))
     fan = Fan(np.zeros(1), 400, 0.35, 0.7 / 400, np.zeros(1))
     hits = cast(fan, np.eye(3), np.zeros(3), solids, FAR_BELOW, np.random.default_rng(0))
-    owners = np.bincount(hits.reachable // 400, minlength=2)
-    seen = np.bincount(hits.solid[hits.solid >= 0], minlength=2)
-    step = 0.7 / 400
-    wide = 2 * np.arctan2(4, 19.9)
-    behind = np.arctan2(2, 9.9)  # the post's far edge; its near one is straight ahead
-    np.testing.assert_allclose(owners, [wide / step, behind / step], atol=1.01)
-    assert seen[0] == pytest.approx((wide - behind) / step, abs=1.51)
+    owners, seen = np.bincount(hits.reachable // 400, minlength=2), (hits.solid == 0).sum()
+    # In steps between rays; behind the post's far edge, for its near one is straight ahead.
+    wide, behind = 2 * np.arctan2(4, 19.9) / (0.7 / 400), np.arctan2(2, 9.9) / (0.7 / 400)
+    np.testing.assert_allclose(owners, [wide, behind], atol=1.01)
+    assert seen == pytest.approx(wide - behind, abs=1.51)

@@ -4,6 +4,7 @@ import numpy as np
 import oracles
 import pytest
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.input_pipeline.batching import make_batch
@@ -11,16 +12,22 @@ from fcos_lidar_jax.projection import image_cells
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, SHORT_RANGE, TINY, WAYMO_TOP
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.types import CLASSES
+
+LAGS = (np.arange(10) * 0.05).astype(np.float32)
+NEAR = {"num_objects": 14, "reach_m": 10.0}
+FUSED = NEAR | {"num_sweeps": 10, "fast_traffic": True}
+
+
+def assert_equal(a, b):
+    for name in vars(a):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 @pytest.mark.parametrize("sensor", [TINY, NUSCENES_HDL32E, WAYMO_TOP, ARGOVERSE2], ids=lambda s: s.name)
 def test_frames_repeat_count_and_fill_one_cell_a_beam(sensor):
     frame = make_frame(11, sensor)
     make_frame(12, sensor)
-    again = make_frame(11, sensor)
-    for a, b in zip(vars(frame).values(), vars(again).values(), strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert_equal(frame, make_frame(11, sensor))
     assert frame.points.shape[1] == sensor.point_columns
     assert (frame.num_points >= 1).all()
     box = int(frame.num_points.argmax())
@@ -33,22 +40,14 @@ def test_frames_repeat_count_and_fill_one_cell_a_beam(sensor):
     assert len(seen) > 0.3 * sensor.num_rows * sensor.num_columns
 
 
-def test_count_inside_is_exact():
-    rng = np.random.default_rng(0)
-    boxes, points = oracles.random_boxes(rng, 8), rng.normal(0, 3, (300, 3))
-    expected = [sum(oracles.inside(p, b) for p in points) for b in boxes]
-    assert count_inside(points, boxes).tolist() == expected
-
-
 def test_frames_are_level_and_show_all_classes_apart_from_each_other():
     labels, moving = [], 0
     for seed in range(40):
         frame = make_frame(seed, TINY)
         labels += frame.labels.tolist()
         boxes = frame.boxes.astype(np.float64)
-        pairs = [(i, j) for i in range(len(boxes)) for j in range(i)]
-        apart = [oracles.iou(boxes[i : i + 1], boxes[j : j + 1], vertical=False)[0] == 0 for i, j in pairs]
-        assert all(apart)
+        one, other = np.triu_indices(len(boxes), 1)
+        assert not oracles.iou(boxes[one], boxes[other], vertical=False).any()
         speed = np.hypot(boxes[:, 7], boxes[:, 8])
         along = boxes[:, 7] * np.cos(boxes[:, 6]) + boxes[:, 8] * np.sin(boxes[:, 6])
         np.testing.assert_allclose(along, speed, atol=1e-5)
@@ -57,8 +56,8 @@ def test_frames_are_level_and_show_all_classes_apart_from_each_other():
         ground = np.median(frame.points[frame.points[:, 2] < -1.5, 2])
         assert ((bottom > ground - 0.15) & (bottom < ground + 0.2)).all()  # on the road or on the pavement
     counts = np.bincount(labels, minlength=10)
-    assert counts.min() >= 15, dict(zip(CLASSES, counts, strict=True))
-    assert counts.max() < 4 * counts.min(), dict(zip(CLASSES, counts, strict=True))
+    assert counts.min() >= 15, dict(zip(NUSCENES_CLASSES, counts, strict=True))
+    assert counts.max() < 4 * counts.min(), dict(zip(NUSCENES_CLASSES, counts, strict=True))
     assert 0.1 < moving / len(labels) < 0.6
 
 
@@ -66,10 +65,8 @@ def test_batches_pad_and_refuse_to_drop():
     frames = [make_frame(i, TINY) for i in range(2)]
     batch = make_batch(frames, max_points=4096, max_boxes=16)
     for i, frame in enumerate(frames):
-        assert batch.valid[i].sum() == len(frame.points)
-        np.testing.assert_array_equal(batch.points[i][batch.valid[i]], frame.points)
-        np.testing.assert_array_equal(batch.boxes[i][batch.box_valid[i]], frame.boxes)
-        np.testing.assert_array_equal(batch.labels[i][batch.box_valid[i]], frame.labels)
+        for name, valid in (("points", batch.valid), ("boxes", batch.box_valid), ("labels", batch.box_valid)):
+            np.testing.assert_array_equal(getattr(batch, name)[i][valid[i]], getattr(frame, name))
     with pytest.raises(ValueError, match=r"frame 0: points: got \d+, expected at most 100"):
         make_batch(frames, max_points=100, max_boxes=16)
     with pytest.raises(ValueError, match=r"boxes: got \d+, expected at most 2"):
@@ -78,7 +75,6 @@ def test_batches_pad_and_refuse_to_drop():
 
 def test_simulated_frames_are_near_and_annotated_where_enough_points_show():
     near, all_of_them = SimulatedFrames(TINY, 6, reach_m=8.0), SimulatedFrames(TINY, 6, reach_m=8.0, min_points=1)
-    far = SimulatedFrames(TINY, 6, reach_m=20.0, min_points=1)
     hidden = 0
     for i in range(6):
         frame, whole = near.frame(i), all_of_them.frame(i)
@@ -86,29 +82,22 @@ def test_simulated_frames_are_near_and_annotated_where_enough_points_show():
         np.testing.assert_array_equal(frame.boxes, whole.boxes[whole.num_points >= 5])
         np.testing.assert_array_equal(near.labels(i), frame.labels)
         hidden += len(whole.boxes) - len(frame.boxes)
-        assert not (np.abs(frame.points[:, :2]) < 1).all(axis=1).any()  # the car itself
+        assert not (np.abs(frame.points[:, :2]) < 1).all(axis=1).any()  # the ego vehicle
     assert hidden > 0
-
-    def median_distance(frames):
-        return np.median(np.concatenate([np.hypot(*frames.frame(i).boxes[:, :2].T) for i in range(6)]))
-
-    assert median_distance(all_of_them) < 0.8 * median_distance(far)
-
-
-LAGS = (np.arange(10) * 0.05).astype(np.float32)
+    sets = all_of_them, SimulatedFrames(TINY, 6, reach_m=20.0, min_points=1)
+    boxes = (np.concatenate([frames.frame(i).boxes for i in range(6)]) for frames in sets)
+    distance, far = (np.median(np.hypot(*b[:, :2].T)) for b in boxes)
+    assert distance < 0.8 * far
 
 
 @pytest.fixture(scope="module")
-def hurried() -> list[Frame]:
-    return [make_frame(seed, SHORT_RANGE, num_objects=14, reach_m=10.0, num_sweeps=10, fast_traffic=True)
-            for seed in range(12)]  # fmt: skip
+def fast_frames() -> list[Frame]:
+    return [make_frame(seed, SHORT_RANGE, **FUSED) for seed in range(12)]
 
 
-def test_fused_frames_repeat_and_are_annotated_as_the_current_sweep_shows(hurried):
-    again = make_frame(3, SHORT_RANGE, num_objects=14, reach_m=10.0, num_sweeps=10, fast_traffic=True)
-    for a, b in zip(vars(hurried[3]).values(), vars(again).values(), strict=True):
-        np.testing.assert_array_equal(a, b)
-    for frame in hurried:
+def test_fused_frames_repeat_and_are_annotated_as_the_current_sweep_shows(fast_frames):
+    assert_equal(fast_frames[3], make_frame(3, SHORT_RANGE, **FUSED))
+    for frame in fast_frames:
         lags = frame.points[:, 4]
         assert (np.diff(lags) >= 0).all()  # the current sweep first, then by age
         np.testing.assert_array_equal(np.unique(lags), LAGS)
@@ -116,7 +105,7 @@ def test_fused_frames_repeat_and_are_annotated_as_the_current_sweep_shows(hurrie
         assert (frame.num_points >= 1).all()
         np.testing.assert_array_equal(frame.num_points, count_inside(now, frame.boxes))
         assert (np.bincount(np.searchsorted(LAGS, lags)) > 0.8 * len(now)).all()
-    assert any((count_inside(f.points, f.boxes) > 5 * f.num_points).any() for f in hurried)
+    assert any((count_inside(f.points, f.boxes) > 5 * f.num_points).any() for f in fast_frames)
     laser = make_frame(0, ARGOVERSE2, num_sweeps=2)
     assert laser.points.shape[1] == 6
     assert set(np.unique(laser.points[:, 5])) <= set(range(64))
@@ -124,30 +113,30 @@ def test_fused_frames_repeat_and_are_annotated_as_the_current_sweep_shows(hurrie
         make_frame(0, TINY, num_sweeps=0)
 
 
-def test_most_of_a_hurried_street_moves_and_moves_fast(hurried):
-    boxes, labels = (np.concatenate([getattr(f, name) for f in hurried]) for name in ("boxes", "labels"))
-    names, speed = np.array(CLASSES)[labels], np.hypot(boxes[:, 7], boxes[:, 8])
+def test_most_of_fast_traffic_moves_and_moves_fast(fast_frames):
+    boxes, labels = (np.concatenate([getattr(f, name) for f in fast_frames]) for name in ("boxes", "labels"))
+    names, speed = np.array(NUSCENES_CLASSES)[labels], np.hypot(boxes[:, 7], boxes[:, 8])
     moving = speed > 0.5
-    calm = [make_frame(seed, SHORT_RANGE, num_objects=14, reach_m=10.0) for seed in range(12)]
-    calm_speed = np.concatenate([np.hypot(*f.boxes[:, 7:].T) for f in calm])
+    usual = np.concatenate([make_frame(seed, SHORT_RANGE, **NEAR).boxes for seed in range(12)])
+    usual_speed = np.hypot(usual[:, 7], usual[:, 8])
     assert 0.5 < moving.mean() < 0.9
-    assert moving.mean() > 1.5 * (calm_speed > 0.5).mean()
-    assert np.median(speed[moving]) > 1.3 * np.median(calm_speed[calm_speed > 0.5])
+    assert moving.mean() > 1.5 * (usual_speed > 0.5).mean()
+    assert np.median(speed[moving]) > 1.3 * np.median(usual_speed[usual_speed > 0.5])
     assert (speed > 8).mean() > 0.4
     driven = moving & np.isin(names, ["car", "truck", "bus", "trailer", "construction_vehicle", "motorcycle"])
     assert speed[driven].min() >= 7.99
     assert speed[driven].max() <= 20.01
     assert moving[np.isin(names, ["pedestrian", "motorcycle", "bicycle"])].all()
     assert not moving[np.isin(names, ["traffic_cone", "barrier"])].any()
-    assert min((boxes[driven, 8] > 0).sum(), (boxes[driven, 8] < 0).sum()) > 5  # the car's way, and oncoming
+    assert min((boxes[driven, 8] > 0).sum(), (boxes[driven, 8] < 0).sum()) > 5  # same way, and oncoming
 
 
-def test_moving_objects_trail_behind_their_boxes_by_speed_times_lag_and_the_rest_stays(hurried):
+def test_moving_objects_trail_behind_their_boxes_by_speed_times_lag_and_the_rest_stays(fast_frames):
     """Boxes put back by velocity x lag hold more of a sweep's points than a twentieth of a second to either side;
     those of what stands hold more than half a metre before and behind."""
     trails, stays = np.zeros((10, 3), int), np.zeros((10, 3), int)
     around = np.array([-1.0, 0, 1])
-    for frame in hurried:
+    for frame in fast_frames:
         for box in frame.boxes.astype(np.float64):
             speed = np.hypot(box[7], box[8])
             if 0 < speed < 6:
@@ -167,14 +156,14 @@ def test_sets_of_fused_frames_drop_close_points_in_each_sweeps_own_frame():
     passed = 0
     for i in range(3):
         frame = frames.frame(i)
-        whole = make_frame(5 + i, SHORT_RANGE, num_objects=14, reach_m=10.0, num_sweeps=10, fast_traffic=True)
+        whole = make_frame(5 + i, SHORT_RANGE, **FUSED)
         shown = whole.num_points >= 5
         np.testing.assert_array_equal(frame.boxes, whole.boxes[shown])
         np.testing.assert_array_equal(frame.num_points, whole.num_points[shown])
         np.testing.assert_array_equal(frames.labels(i), whole.labels[shown])
         dropped = [(whole.points[:, 4] == lag).sum() - (frame.points[:, 4] == lag).sum() for lag in LAGS]
-        assert 0 < 0.9 * max(dropped) < min(dropped)  # the car looks the same from each sweep
+        assert 0 < 0.9 * max(dropped) < min(dropped)  # the ego vehicle looks the same from each sweep
         close, old = (np.abs(frame.points[:, :2]) < 1).all(axis=1), frame.points[:, 4] > 0
         assert not (close & ~old).any()
-        passed += (close & old).sum()  # what stood before the car is under it now
+        passed += (close & old).sum()  # what stood before the ego vehicle is under it now
     assert passed > 20

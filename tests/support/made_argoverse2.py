@@ -73,9 +73,9 @@ def make_log(log: Path, seed: int, *, sweeps: int = 4, sensor: Sensor = ARGOVERS
     city = np.eye(4)
     city[:3, :3] = Rotation.from_euler("zyx", [rng.uniform(-3, 3), 0.01, -0.02]).as_matrix()
     city[:3, 3] = 700, 1300, -24
-    rows, times = [], START_NS + STEP_NS * np.arange(sweeps)
-    poses = [city @ sensor_pose(world, mount, i * seconds) for i in range(sweeps)]
-    for i, time_ns in enumerate(times.tolist()):
+    rows = []
+    for i in range(sweeps):
+        time_ns = START_NS + STEP_NS * i
         scanned = scan(world, sensor, mount, i * seconds, rng)
         points = scanned.points[scanned.returned]
         points[:, 4] = sensor.num_rows - 1 - points[:, 4]
@@ -87,10 +87,9 @@ def make_log(log: Path, seed: int, *, sweeps: int = 4, sensor: Sensor = ARGOVERS
             for k, (label, box, count) in enumerate(zip(world.traffic.labels, boxes, counts, strict=True))
             if count > 0
         ]
-    between = [city @ sensor_pose(world, mount, (i + 0.5) * seconds) for i in range(sweeps)]
-    order = np.argsort(np.concatenate([times, times + STEP_NS // 2]))
-    all_times = np.concatenate([times, times + STEP_NS // 2])[order]
-    write_poses(log, all_times, np.array(poses + between)[order])
+    halves = np.arange(2 * sweeps)
+    poses = np.array([city @ sensor_pose(world, mount, i * seconds / 2) for i in halves])
+    write_poses(log, START_NS + STEP_NS // 2 * halves, poses)
     write_boxes(log, rows)
     return log
 

@@ -5,31 +5,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made_nuscenes import pose
 from scipy.spatial.transform import Rotation
 
-from fcos_lidar_jax.evaluation.boxes import CLASS_ATTRIBUTES
-from fcos_lidar_jax.types import CLASSES
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.data.nuscenes.names import BICYCLE_RACK as RACK
+from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
+from fcos_lidar_jax.evaluation.boxes import ATTRIBUTE_INDEX, CLASS_ATTRIBUTES
+from fcos_lidar_jax.evaluation.results import LIDAR_META
 
 VERSION, SPLIT = "v1.0-mini", "mini_val"
 SCENES = ("scene-0103", "scene-0916")
-RACK = "static_object.bicycle_rack"
-CATEGORIES = {
-    "car": "vehicle.car",
-    "truck": "vehicle.truck",
-    "bus": "vehicle.bus.rigid",
-    "trailer": "vehicle.trailer",
-    "construction_vehicle": "vehicle.construction",
-    "pedestrian": "human.pedestrian.adult",
-    "motorcycle": "vehicle.motorcycle",
-    "bicycle": "vehicle.bicycle",
-    "traffic_cone": "movable_object.trafficcone",
-    "barrier": "movable_object.barrier",
-    RACK: RACK,
-    "animal": "animal",
-}
-ATTRIBUTES = sorted({a for names in CLASS_ATTRIBUTES.values() for a in names})
+CATEGORIES = {name: category for category, name in CATEGORY_TO_CLASS.items()} | {RACK: RACK, "animal": "animal"}
+GROWING = ("scene", "sample", "sample_data", "ego_pose", "instance", "sample_annotation")
+DATA = {"calibrated_sensor_token": "mount", "fileformat": "pcd", "is_key_frame": True, "height": 0, "width": 0}
+"""What all rows of ``sample_data`` have in common."""
 
-Tables = dict[str, list[dict[str, Any]]]
+Rows = list[dict[str, Any]]
+Tables = dict[str, Rows]
+
+
+def random_boxes(rng: np.random.Generator, number: int) -> np.ndarray:
+    """f32[number, 9], up to 60 m away."""
+    boxes = rng.normal(0, [1, 1, 1, 0, 0, 0, 0, 3, 3], (number, 9))
+    boxes[:, :2] = rng.uniform(-60, 60, (number, 2))
+    boxes[:, 3:6] = rng.uniform(0.5, 5, (number, 3))
+    boxes[:, 6] = rng.uniform(-np.pi, np.pi, number)
+    return boxes.astype(np.float32)
 
 
 def make_task(
@@ -45,7 +47,6 @@ def make_task(
     """Tables and a results file.
 
     Args:
-        seed: of everything.
         samples: keyframes of each of the two scenes.
         objects: tracks of each scene.
         absent: classes without truth; they are predicted all the same.
@@ -54,199 +55,154 @@ def make_task(
         empty: share of samples without predictions.
     """
     rng = np.random.default_rng(seed)
-    tables = _empty_tables()
-    results: dict[str, list[dict[str, Any]]] = {}
+    mount = {"rotation": (np.array([0.7, 0, 0, 0.714]) / np.hypot(0.7, 0.714)).tolist()}
+    mount |= {"translation": [0.9, 0.0, 1.8], "camera_intrinsic": []}
+    log = dict.fromkeys(("logfile", "vehicle", "date_captured", "location"), "")
+    tables: Tables = {
+        "category": [{"token": f"c-{n}", "name": c, "description": ""} for n, c in CATEGORIES.items()],
+        "attribute": [{"token": f"a-{a}", "name": a, "description": ""} for a in filter(None, ATTRIBUTE_INDEX)],
+        "visibility": [],
+        "sensor": [{"token": "lidar", "channel": "LIDAR_TOP", "modality": "lidar"}],
+        "calibrated_sensor": [{"token": "mount", "sensor_token": "lidar", **mount}],
+        "log": [{"token": "log", **log}],
+        "map": [{"token": "map", "log_tokens": ["log"], "category": "semantic_prior", "filename": "maps/e.png"}],
+        **{name: [] for name in GROWING},
+    }
     kinds = [name for name in CATEGORIES if name not in absent]
     for s, scene in enumerate(SCENES):
-        tables["scene"].append(
-            {
-                "token": f"scene{s}",
-                "log_token": "log",
-                "nbr_samples": samples,
-                "first_sample_token": f"s{s}k0",
-                "last_sample_token": f"s{s}k{samples - 1}",
-                "name": scene,
-                "description": "",
-            }
-        )
+        row = {"token": f"scene{s}", "log_token": "log", "name": scene, "description": "", "nbr_samples": samples}
+        ends = {"first_sample_token": f"s{s}k0", "last_sample_token": f"s{s}k{samples - 1}"}
+        tables["scene"].append(row | ends)
         where = np.array([600.0, 1600, 1]) + rng.normal(0, 100, 3)
         times = 1_530_000_000_123_456 + s * 10**9 + np.cumsum(rng.integers(400_000, 700_000, samples))
         egos = where + np.cumsum(rng.normal(0, 3, (samples, 3)), axis=0)
+        tokens = ["", *(f"s{s}k{k}" for k in range(samples)), ""]
         for k in range(samples):
-            _add_sample(tables, rng, s, k, samples, int(times[k]), egos[k])
+            before, token, after = tokens[k : k + 3]
+            row = {"timestamp": int(times[k]), "prev": before, "next": after}
+            tables["sample"].append({"token": token, "scene_token": f"scene{s}", **row})
+            turn = Rotation.from_euler("zyx", [rng.uniform(-np.pi, np.pi), *rng.normal(0, 0.02, 2)])
+            tables["ego_pose"].append(
+                {"token": f"pose-{token}", "timestamp": int(times[k]), **pose(turn, egos[k])}
+            )
+            row |= {"prev": before and f"data-{before}", "next": after and f"data-{after}"}
+            row |= {"token": f"data-{token}", "sample_token": token, "ego_pose_token": f"pose-{token}"}
+            tables["sample_data"].append({**DATA, **row, "filename": f"samples/LIDAR_TOP/{token}.pcd.bin"})
         for o in range(objects):
-            # Racks are few and large.
-            kind = str(rng.choice(kinds)) if o else RACK
+            kind = str(rng.choice(kinds)) if o else RACK  # racks are few and large
             _add_track(tables, rng, f"s{s}o{o}", kind, s, egos, times)
-    for sample in rng.permutation([row["token"] for row in tables["sample"]]):
+    results, kind_of = {}, _kinds(tables)
+    for sample in rng.permutation([row["token"] for row in tables["sample"]]).tolist():
         truths = [row for row in tables["sample_annotation"] if row["sample_token"] == sample]
-        boxes = [] if rng.random() < empty else _predictions(rng, str(sample), truths, tables, noise, ties)
-        results[str(sample)] = boxes
-    flags = {f"use_{name}": name == "lidar" for name in ("camera", "lidar", "radar", "map", "external")}
-    return tables, {"meta": flags, "results": results}
-
-
-def _empty_tables() -> Tables:
-    unit = {"translation": [0.9, 0.0, 1.8], "rotation": [0.7, 0.0, 0.0, 0.714]}
-    norm = float(np.linalg.norm(unit["rotation"]))
-    unit["rotation"] = [v / norm for v in unit["rotation"]]
-    return {
-        "category": [{"token": f"c-{n}", "name": c, "description": ""} for n, c in CATEGORIES.items()],
-        "attribute": [{"token": f"a-{a}", "name": a, "description": ""} for a in ATTRIBUTES],
-        "visibility": [],
-        "sensor": [{"token": "lidar", "channel": "LIDAR_TOP", "modality": "lidar"}],
-        "calibrated_sensor": [{"token": "mount", "sensor_token": "lidar", **unit, "camera_intrinsic": []}],
-        "log": [{"token": "log", "logfile": "", "vehicle": "", "date_captured": "", "location": ""}],
-        "map": [
-            {"token": "map", "log_tokens": ["log"], "category": "semantic_prior", "filename": "maps/empty.png"}
-        ],
-        **{n: [] for n in ("scene", "sample", "sample_data", "ego_pose", "instance", "sample_annotation")},
-    }
-
-
-def _add_sample(
-    tables: Tables, rng: np.random.Generator, s: int, k: int, samples: int, time_us: int, ego: np.ndarray
-) -> None:
-    token = f"s{s}k{k}"
-    after = f"s{s}k{k + 1}" if k + 1 < samples else ""
-    before = f"s{s}k{k - 1}" if k else ""
-    links = {"prev": before, "next": after}
-    tables["sample"].append({"token": token, "timestamp": time_us, "scene_token": f"scene{s}", **links})
-    turn = Rotation.from_euler("zyx", [rng.uniform(-np.pi, np.pi), *rng.normal(0, 0.02, 2)])
-    tables["ego_pose"].append(
-        {
-            "token": f"pose-{token}",
-            "timestamp": time_us,
-            "rotation": turn.as_quat(scalar_first=True).tolist(),
-            "translation": ego.tolist(),
-        }
-    )
-    tables["sample_data"].append(
-        {
-            "token": f"data-{token}",
-            "sample_token": token,
-            "ego_pose_token": f"pose-{token}",
-            "calibrated_sensor_token": "mount",
-            "timestamp": time_us,
-            "fileformat": "pcd",
-            "is_key_frame": True,
-            "height": 0,
-            "width": 0,
-            "filename": f"samples/LIDAR_TOP/{token}.pcd.bin",
-            "prev": f"data-{before}" if before else "",
-            "next": f"data-{after}" if after else "",
-        }
-    )
+        results[sample] = [] if rng.random() < empty else _predictions(rng, sample, truths, kind_of, noise, ties)
+    return tables, {"meta": LIDAR_META, "results": results}
 
 
 def _add_track(
     tables: Tables, rng: np.random.Generator, name: str, kind: str, s: int, egos: np.ndarray, times: np.ndarray
 ) -> None:
     """One object through some of the keyframes; there only once, or after a gap, its velocity is unknown."""
-    tables["instance"].append(
-        {
-            "token": name,
-            "category_token": f"c-{kind}",
-            "nbr_annotations": 0,
-            "first_annotation_token": "",
-            "last_annotation_token": "",
-        }
-    )
+    ends = {"nbr_annotations": 0, "first_annotation_token": "", "last_annotation_token": ""}
+    tables["instance"].append({"token": name, "category_token": f"c-{kind}", **ends})
     # From near to beyond the range of the class.
-    start = egos[0] + [*(rng.uniform(5, 60) * _direction(rng)), rng.normal()]
+    distance, angle = rng.uniform(5, 60), rng.uniform(-np.pi, np.pi)
+    start = egos[0] + [distance * np.cos(angle), distance * np.sin(angle), rng.normal()]
     speed = np.append(rng.choice([0.0, 3.0]) * rng.normal(0, 1, 2), 0)
     size = np.array([8.0, 8.0, 4.0]) if kind == RACK else rng.uniform(0.4, 5, 3)
     present = np.flatnonzero(rng.random(len(times)) < rng.choice([0.3, 1.0]))
     turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
     known = CLASS_ATTRIBUTES.get(kind, ())
+    tokens = ["", *(f"{name}-{k}" for k in present), ""]
     for i, k in enumerate(present):
-        drawn = [f"a-{rng.choice(known)}"] if known and rng.random() < 0.8 else []
+        attributes = [f"a-{rng.choice(known)}"] if known and rng.random() < 0.8 else []
+        where = start + speed * (times[k] - times[0]) / 1e6 + rng.normal(0, 0.05, 3)
         tables["sample_annotation"].append(
             {
-                "token": f"{name}-{k}",
+                "token": tokens[i + 1],
                 "sample_token": f"s{s}k{k}",
                 "instance_token": name,
                 "visibility_token": "",
-                "attribute_tokens": drawn,
-                "translation": (start + speed * (times[k] - times[0]) / 1e6 + rng.normal(0, 0.05, 3)).tolist(),
+                "attribute_tokens": attributes,
                 "size": size.tolist(),
-                "rotation": turn.as_quat(scalar_first=True).tolist(),
-                "prev": f"{name}-{present[i - 1]}" if i else "",
-                "next": f"{name}-{present[i + 1]}" if i + 1 < len(present) else "",
+                **pose(turn, where),
+                "prev": tokens[i],
+                "next": tokens[i + 2],
                 "num_lidar_pts": int(rng.integers(0, 4)) * int(rng.integers(0, 9)),
                 "num_radar_pts": int(rng.integers(0, 2)),
             }
         )
 
 
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    angle = rng.uniform(-np.pi, np.pi)
-    return np.array([np.cos(angle), np.sin(angle)])
+def _kinds(tables: Tables) -> dict[str, str]:
+    """Class of every instance."""
+    return {row["token"]: row["category_token"].removeprefix("c-") for row in tables["instance"]}
 
 
 def _predictions(
-    rng: np.random.Generator, token: str, truths: list[dict[str, Any]], tables: Tables, noise: float, ties: bool
-) -> list[dict[str, Any]]:
-    kind_of = {row["token"]: row["category_token"].removeprefix("c-") for row in tables["instance"]}
+    rng: np.random.Generator, token: str, truths: Rows, kinds: dict[str, str], noise: float, ties: bool
+) -> Rows:
     boxes = []
-    for truth in truths:
-        for _ in range(rng.integers(0, 4)):
-            kind = kind_of[truth["instance_token"]]
-            if kind not in CLASSES or rng.random() < 0.1:
-                kind = str(rng.choice(["bicycle", "motorcycle", *CLASSES]))
-            known = (*CLASS_ATTRIBUTES[kind], "")
-            sway = Rotation.from_euler("zyx", rng.normal(0, [0.8, 0.05, 0.05]))
-            rotation = (sway * Rotation.from_quat(truth["rotation"], scalar_first=True)).as_quat(scalar_first=True)
-            score = float(rng.beta(2, 3))
-            boxes.append(
-                {
-                    "sample_token": token,
-                    "translation": (np.array(truth["translation"]) + rng.normal(0, noise, 3)).tolist(),
-                    "size": (np.array(truth["size"]) * rng.uniform(0.7, 1.4, 3)).tolist(),
-                    "rotation": (rotation * rng.choice([1.0, 1.0, -1.0, 2.5])).tolist(),
-                    "velocity": rng.normal(0, 3, 2).tolist() if rng.random() > 0.05 else [float("nan")] * 2,
-                    "detection_name": kind,
-                    "detection_score": round(score, 1) if ties else score,
-                    "attribute_name": str(rng.choice(known)),
-                }
-            )
+    for truth in (truth for truth in truths for _ in range(rng.integers(0, 4))):
+        kind = kinds[truth["instance_token"]]
+        if kind not in NUSCENES_CLASSES or rng.random() < 0.1:
+            kind = str(rng.choice(["bicycle", "motorcycle", *NUSCENES_CLASSES]))
+        sway = Rotation.from_euler("zyx", rng.normal(0, [0.8, 0.05, 0.05]))
+        rotation = (sway * Rotation.from_quat(truth["rotation"], scalar_first=True)).as_quat(scalar_first=True)
+        score = float(rng.beta(2, 3))
+        boxes.append(
+            {
+                "sample_token": token,
+                "translation": (np.array(truth["translation"]) + rng.normal(0, noise, 3)).tolist(),
+                "size": (np.array(truth["size"]) * rng.uniform(0.7, 1.4, 3)).tolist(),
+                "rotation": (rotation * rng.choice([1.0, 1.0, -1.0, 2.5])).tolist(),
+                "velocity": rng.normal(0, 3, 2).tolist() if rng.random() > 0.05 else [float("nan")] * 2,
+                "detection_name": kind,
+                "detection_score": round(score, 1) if ties else score,
+                "attribute_name": str(rng.choice((*CLASS_ATTRIBUTES[kind], ""))),
+            }
+        )
     return [boxes[i] for i in rng.permutation(len(boxes))]
 
 
 def write_task(root: Path, tables: Tables, results: dict[str, Any]) -> Path:
     """The data root on disk, and ``results.json`` beside it."""
-    folder = root / VERSION
-    folder.mkdir(parents=True)
-    for name, rows in tables.items():
-        (folder / f"{name}.json").write_text(json.dumps(rows))
-    (folder / "splits.json").write_text(json.dumps({SPLIT: list(SCENES)}))
+    files = {f"{VERSION}/{name}.json": rows for name, rows in tables.items()}
+    files |= {f"{VERSION}/splits.json": {SPLIT: list(SCENES)}, "results.json": results}
+    (root / VERSION).mkdir(parents=True)
+    for name, value in files.items():
+        (root / name).write_text(json.dumps(value))
     (root / "maps").mkdir()
-    (root / "maps" / "empty.png").touch()
-    (root / "results.json").write_text(json.dumps(results))
+    (root / "maps" / "e.png").touch()
     return root
+
+
+def devkit_summary(data: Any, results: Path, split: str, out: Path) -> dict[str, Any]:
+    """The official summary of a results file, written and read again; ``data`` is the devkit's ``NuScenes``."""
+    from nuscenes.eval.common.config import config_factory
+    from nuscenes.eval.detection.evaluate import DetectionEval
+
+    config = config_factory("detection_cvpr_2019")
+    DetectionEval(data, config, str(results), split, str(out), verbose=False).main(0, False)
+    return json.loads((out / "metrics_summary.json").read_text())
 
 
 def truth_of(tables: Tables) -> dict[str, Any]:
     """The truth of the tables in the form that ``evaluate_detections`` takes, by plain loops."""
     rows = {name: {row["token"]: row for row in table} for name, table in tables.items()}
-    name_of = {row["token"]: row["category_token"].removeprefix("c-") for row in tables["instance"]}
-    poses = {row["sample_token"]: rows["ego_pose"][row["ego_pose_token"]] for row in tables["sample_data"]}
-    truth: dict[str, Any] = {
-        row["token"]: {"ego_translation": poses[row["token"]]["translation"], "boxes": []}
-        for row in tables["sample"]
-    }
+    kinds = _kinds(tables)
+    truth: dict[str, Any] = {}
+    for row in tables["sample_data"]:
+        ego = rows["ego_pose"][row["ego_pose_token"]]
+        truth[row["sample_token"]] = {"ego_translation": ego["translation"], "boxes": []}
     for row in tables["sample_annotation"]:
-        name = name_of[row["instance_token"]]
-        if name == "animal":
+        if kinds[row["instance_token"]] == "animal":
             continue
         truth[row["sample_token"]]["boxes"].append(
             {
-                "translation": row["translation"],
-                "size": row["size"],
-                "rotation": row["rotation"],
+                **{name: row[name] for name in ("translation", "size", "rotation")},
                 "velocity": _velocity(row, rows),
-                "detection_name": name,
-                "attribute_name": row["attribute_tokens"][0].removeprefix("a-") if row["attribute_tokens"] else "",
+                "detection_name": kinds[row["instance_token"]],
+                "attribute_name": "".join(row["attribute_tokens"]).removeprefix("a-"),
                 "num_pts": row["num_lidar_pts"] + row["num_radar_pts"],
             }
         )

@@ -17,26 +17,13 @@ P2 = np.array([[718.0, 0, 606, 44], [0, 718, 178, 0.2], [0, 0, 1, 0.003]])
 MOUNTED = Rotation.from_euler("xyz", [0.7, -0.4, 0.5], degrees=True).as_matrix() @ AXES
 RECTIFIED = Rotation.from_euler("xyz", [0.2, 0.3, -0.3], degrees=True).as_matrix()
 
-_TYPES = {
-    "car": "Car",
-    "truck": "Truck",
-    "bus": "Tram",
-    "trailer": "Misc",
-    "construction_vehicle": "Van",
-    "pedestrian": "Pedestrian",
-    "motorcycle": "Cyclist",
-    "bicycle": "Cyclist",
-}
+_TYPES = {"car": "Car", "truck": "Truck", "bus": "Tram", "trailer": "Misc", "construction_vehicle": "Van"}
+_TYPES |= {"pedestrian": "Pedestrian", "motorcycle": "Cyclist", "bicycle": "Cyclist"}
 
 
 def calibration_text(mounted=MOUNTED, rectified=RECTIFIED) -> str:
-    matrices = {
-        "P0": P2,
-        "P2": P2,
-        "R0_rect": rectified,
-        "Tr_velo_to_cam": np.column_stack([mounted, SHIFT]),
-        "Tr_imu_to_velo": np.eye(4)[:3],
-    }
+    imu, velo = np.eye(4)[:3], np.column_stack([mounted, SHIFT])
+    matrices = {"P0": P2, "P2": P2, "R0_rect": rectified, "Tr_velo_to_cam": velo, "Tr_imu_to_velo": imu}
     lines = (f"{name}: " + " ".join(f"{v:.12e}" for v in matrix.flat) for name, matrix in matrices.items())
     return "\n".join(lines) + "\n\n"
 

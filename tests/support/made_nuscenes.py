@@ -12,6 +12,7 @@ KEYFRAMES, BETWEEN = 4, 3
 STEP_US = 50_000
 FAR = np.array([1000.0, 2000, 0])
 """Where the scenes are in the global frame."""
+SENSORS = (("lidar", "LIDAR_TOP", "mount"), ("camera", "CAM_FRONT", "eye"))
 
 
 def token(*parts: object) -> str:
@@ -30,39 +31,28 @@ def make_tables(scenes: int = 2, seed: int = 0) -> tuple[dict[str, list[dict[str
     tables: dict[str, list[dict[str, Any]]] = {
         "category": [{"token": token("category", i), "name": n, "description": ""} for i, n in enumerate(names)],
         "attribute": [{"token": token("attribute"), "name": "vehicle.moving", "description": ""}],
-        "visibility": [],
-        "sensor": [
-            {"token": token("lidar"), "channel": "LIDAR_TOP", "modality": "lidar"},
-            {"token": token("camera"), "channel": "CAM_FRONT", "modality": "camera"},
-        ],
+        "sensor": [{"token": token(n), "channel": channel} for n, channel, _ in SENSORS],
         "calibrated_sensor": [
-            {"token": token("mount"), "sensor_token": token("lidar"), **pose(*mount), "camera_intrinsic": []},
-            {"token": token("eye"), "sensor_token": token("camera"), **pose(*mount), "camera_intrinsic": []},
+            {"token": token(m), "sensor_token": token(n), **pose(*mount)} for n, _, m in SENSORS
         ],
-        "log": [],
-        "map": [],
         **{n: [] for n in ("scene", "sample", "sample_data", "ego_pose", "instance", "sample_annotation")},
     }
     clouds: dict[str, np.ndarray] = {}
     for s in range(scenes):
         world = rng.uniform(-30, 30, (50, 3)) + FAR
-        sweeps = KEYFRAMES * BETWEEN
-        tables["scene"].append(
-            {"token": token("scene", s), "name": f"scene-{s}", "first_sample_token": token("sample", s, 0)}
-        )
+        first = {"first_sample_token": token("sample", s, 0)}
+        tables["scene"].append({"token": token("scene", s), "name": f"scene-{s}", **first})
         for k in range(KEYFRAMES):
             after = token("sample", s, k + 1) if k + 1 < KEYFRAMES else ""
             time = 1_600_000_000_000_000 + s * 10**8 + k * BETWEEN * STEP_US
             row = {"token": token("sample", s, k), "timestamp": time, "scene_token": token("scene", s)}
             tables["sample"].append({**row, "prev": "", "next": after})
-        for i in range(sweeps):
+        for i in range(KEYFRAMES * BETWEEN):
             ego = Rotation.random(random_state=100 * s + i), rng.normal(0, 20, 3) + FAR
             file = f"samples/LIDAR_TOP/{s}-{i}.pcd.bin"
             to_global = ego[0] * mount[0], ego[0].apply(mount[1]) + ego[1]
             local = to_global[0].inv().apply(world - to_global[1])
-            clouds[file] = np.concatenate([local, np.full((50, 1), 7), np.arange(50)[:, None] % 32], 1).astype(
-                "f4"
-            )
+            clouds[file] = np.column_stack([local, np.full(50, 7), np.arange(50) % 32]).astype("f4")
             tables["ego_pose"].append({"token": token("pose", s, i), "timestamp": 0, **pose(*ego)})
             tables["sample_data"].append(
                 {
@@ -71,16 +61,12 @@ def make_tables(scenes: int = 2, seed: int = 0) -> tuple[dict[str, list[dict[str
                     "ego_pose_token": token("pose", s, i),
                     "calibrated_sensor_token": token("mount"),
                     "timestamp": 1_600_000_000_000_000 + s * 10**8 + i * STEP_US,
-                    "fileformat": "pcd",
                     "is_key_frame": i % BETWEEN == 0,
-                    "height": 0,
-                    "width": 0,
                     "filename": file,
                     "prev": token("data", s, i - 1) if i else "",
-                    "next": token("data", s, i + 1) if i + 1 < sweeps else "",
                 }
             )
-        camera = {**tables["sample_data"][-1], "token": token("photo", s), "prev": "", "next": ""}
+        camera = {**tables["sample_data"][-1], "token": token("photo", s), "prev": ""}
         tables["sample_data"].append({**camera, "calibrated_sensor_token": token("eye"), "filename": "p.jpg"})
         for o in range(len(names)):
             tables["instance"].append({"token": token("instance", s, o), "category_token": token("category", o)})
@@ -92,7 +78,6 @@ def make_tables(scenes: int = 2, seed: int = 0) -> tuple[dict[str, list[dict[str
                         "token": row,
                         "sample_token": token("sample", s, k),
                         "instance_token": token("instance", s, o),
-                        "visibility_token": "",
                         "attribute_tokens": [token("attribute")] if o == 0 else [],
                         "size": [1.5, 4.0, 2.0],
                         **pose(Rotation.from_euler("z", 0.3 * o + k), start + speed * k * BETWEEN * STEP_US / 1e6),

@@ -17,16 +17,22 @@ def project(cell, older, range_m, num_cells, num_rounds):
     return out
 
 
-def rectangles(boxes):
-    """Polygons of boxes x, y, z, l, w, h, yaw in the ground plane."""
+def turns(yaw):
+    """Rotations about z, f64[n, 3, 3]."""
+    c, s, zero, one = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw)), np.ones(len(yaw))
+    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], -1).reshape(-1, 3, 3)
+
+
+def corners(boxes):
+    """Of boxes x, y, z, l, w, h, yaw: four bottom ones, counter-clockwise from the front right, then the top."""
     boxes = np.asarray(boxes, np.float64)
-    c, s = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
-    l, w = boxes[:, 3] / 2, boxes[:, 4] / 2
-    signs = ((1, -1), (1, 1), (-1, 1), (-1, -1))
-    corners = [
-        np.stack([boxes[:, 0] + c * a * l - s * b * w, boxes[:, 1] + s * a * l + c * b * w], -1) for a, b in signs
-    ]
-    return polygons(np.stack(corners, 1))
+    signs = np.array([(*xy, z) for z in (-1, 1) for xy in ((1, -1), (1, 1), (-1, 1), (-1, -1))])
+    return boxes[:, None, :3] + np.einsum("nij,ncj->nci", turns(boxes[:, 6]), signs * boxes[:, None, 3:6] / 2)
+
+
+def rectangles(boxes):
+    """Polygons of boxes in the ground plane."""
+    return polygons(corners(boxes)[:, :4, :2])
 
 
 def iou(a, b, *, vertical):

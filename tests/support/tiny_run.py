@@ -7,11 +7,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from fcos_lidar_jax.config import InferenceConfig, StemConfig
+from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import QUICKSTART
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.sensors import TINY, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.trainer import Schedule, train
 from fcos_lidar_jax.types import Batch, TrainState
@@ -32,6 +32,7 @@ CONFIG = dataclasses.replace(
         fpn_channels=8,
         head_channels=8,
         head_convs=1,
+        tied_heads=True,
     ),
     inference=InferenceConfig(max_detections=20, candidates_per_level=20),
     optimizer=dataclasses.replace(QUICKSTART.optimizer, batch_size=2, ema_decay=0.9),
@@ -41,11 +42,13 @@ NETWORK_OPTIONS = """
     --optimizer.batch-size 2 --optimizer.ema-decay 0.9 --projection.num-rounds 1 --model.row-upscale 1
     --model.stem.channels-per-type 2 --model.stem.out-channels 8 --model.stem.dilations 1
     --model.stem.num-convs 1 --model.backbone-blocks 1 1 1 1 --model.backbone-widths 8 8 8 8
-    --model.fpn-channels 8 --model.head-channels 8 --model.head-convs 1
+    --model.fpn-channels 8 --model.head-channels 8 --model.head-convs 1 --model.tied-heads
 """.split()  # noqa: SIM905
 """The options of ``fcos-lidar train`` that make a preset this network."""
 FRAMES = SimulatedFrames(SENSOR, 12)
 TESTS = SimulatedFrames(SENSOR, 2, 1000)
+TINY_CONFIG = dataclasses.replace(CONFIG, max_points=4096)
+"""For whole clouds of the sensor TINY."""
 
 
 @functools.cache
@@ -58,6 +61,18 @@ def weights():
     return jax.tree.map(jax.numpy.asarray, {"params": params, "batch_stats": statistics})
 
 
+def untrained(config: Config, sensor: Sensor):
+    """Small random kernels without a bias towards the background, so that there are boxes everywhere."""
+
+    def fill(path, leaf):
+        if path[-1].key == "kernel":
+            return np.random.default_rng(leaf.size).normal(0, 0.05, leaf.shape).astype(leaf.dtype)
+        return np.full(leaf.shape, float(path[-1].key in ("scale", "var")), leaf.dtype)
+
+    shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
+    return jax.tree_util.tree_map_with_path(fill, shapes)
+
+
 def train_tiny(folder: Path, *, save: int = 1, evaluate: int = 100, **options) -> TrainState:
     """A run of four steps on simulated frames, that saves after each."""
     options = {"config": CONFIG, "frames": FRAMES, "steps": STEPS, **options}
@@ -65,21 +80,16 @@ def train_tiny(folder: Path, *, save: int = 1, evaluate: int = 100, **options) -
 
 
 def batches(first_step: int = 0):
-    """Its batches."""
     return make_batches(FRAMES, CONFIG, seed=0, num_steps=STEPS, first_step=first_step, threads=0)
 
 
 def host_batch(step: int = 0) -> Batch:
-    """One of its batches."""
     with batches(step) as stream:
         return next(stream).batch
 
 
 def bits(tree) -> list[bytes]:
     """All leaves, to compare bit by bit; random keys as numbers."""
-
-    def raw(leaf):
-        key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return np.asarray(jax.random.key_data(leaf) if key else leaf).tobytes()
-
-    return [raw(leaf) for leaf in jax.tree.leaves(tree)]
+    key, leaves = jax.dtypes.prng_key, jax.tree.leaves(tree)
+    raw = [jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, key) else x for x in leaves]
+    return [np.asarray(leaf).tobytes() for leaf in raw]

@@ -5,10 +5,10 @@ import time
 
 import numpy as np
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, GivenFrames
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
-from fcos_lidar_jax.types import CLASSES
 
 
 def toy_frame(seed: int, *, num_boxes: int = 12, num_points: int = 1500, columns: int = 5) -> Frame:
@@ -38,7 +38,7 @@ class ToyFrames(FrameSet):
 
     size: int = 7
     seconds_each: float = 0.0
-    classes, sensor = CLASSES, NUSCENES_HDL32E
+    classes, sensor = NUSCENES_CLASSES, NUSCENES_HDL32E
 
     def __len__(self) -> int:
         return self.size
@@ -64,18 +64,14 @@ class SceneFrames(FramesOf):
     scenes: tuple[tuple[str, tuple[int, ...]], ...]
     source: str = "f"
 
-    @property
-    def _listed(self) -> list[tuple[str, int]]:
-        return [(name, index) for name, indices in self.scenes for index in indices]
+    def __len__(self) -> int:
+        return sum(len(indices) for _, indices in self.scenes)
 
     def _source(self, index: int) -> int:
-        return self._listed[index][1]
-
-    def __len__(self) -> int:
-        return len(self._listed)
+        return [frame for _, indices in self.scenes for frame in indices][index]
 
     def scene(self, index: int) -> str:
-        return self._listed[index][0]
+        return [name for name, indices in self.scenes for _ in indices][index]
 
     def fingerprint(self) -> str:
         return self.source
@@ -85,4 +81,4 @@ class ListedFrames(GivenFrames):
     """Given frames, labelled by the ten classes."""
 
     def __init__(self, frames: tuple[Frame, ...]) -> None:
-        super().__init__(frames, NUSCENES_HDL32E, CLASSES)
+        super().__init__(frames, NUSCENES_HDL32E, NUSCENES_CLASSES)

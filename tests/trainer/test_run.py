@@ -1,6 +1,7 @@
 """A run in a folder: what it leaves there, how it is stopped and resumed, and what it refuses."""
 
 import dataclasses
+import functools
 import json
 import os
 import shutil
@@ -10,14 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_python
 from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.data.frame import GivenFrames
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.trainer import run as runs
 from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
 from fcos_lidar_jax.training.metrics_log import read_metrics
-from fcos_lidar_jax.types import CLASSES
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,6 +33,7 @@ def traces():
         def shared_step(*args):
             step = make_train_step(*args)
 
+            @functools.wraps(step)  # its name is part of the compiled program's, which other processes share
             def counted(state, batch):
                 found.append(1)
                 return step(state, batch)
@@ -60,11 +64,10 @@ def test_all_that_is_promised_is_recorded(finished):
     tests = [line for line in lines if "test/mAP" in line]
     assert [line["step"] for line in steps] == [1, 2, 3, 4]
     assert [line["step"] for line in tests] == [2, 4]
-    parts = ("total", "classification", "l1", "iou", "iou_prediction")
+    parts = ("classification", "l1", "iou", "iou_prediction")
+    counts = {"truncated_points", "truncated_boxes", "invalid_points", "pasted_objects", "dropped_points"}
     for line in steps:
-        weighed = sum(
-            getattr(CONFIG.loss, f"{part}_weight") * line[f"loss/{part}"] for part in parts if part != "total"
-        )
+        weighed = sum(getattr(CONFIG.loss, f"{part}_weight") * line[f"loss/{part}"] for part in parts)
         assert line["loss/total"] == pytest.approx(weighed, rel=1e-5)
         assert sum(line["positives_per_level"]) == line["positives"] > 0
         assert line["unique_positives"] <= line["positives"]
@@ -73,36 +76,21 @@ def test_all_that_is_promised_is_recorded(finished):
         assert line["gradient_norm"] > 0
         assert line["samples_per_second"] == pytest.approx(CONFIG.optimizer.batch_size / line["seconds"])
         assert 0 <= line["waiting_seconds"] <= line["seconds"]
-        assert {
-            "truncated_points",
-            "truncated_boxes",
-            "invalid_points",
-            "pasted_objects",
-            "dropped_points",
-        } <= line.keys()
+        assert counts <= line.keys()
     peak = CONFIG.optimizer.peak_learning_rate
     # Four steps: the first at a tenth of the peak, the second at the peak.
     np.testing.assert_allclose([line["learning_rate"] for line in steps[:2]], [peak / 10, peak], rtol=1e-5)
     np.testing.assert_allclose([line["b1"] for line in steps[:2]], [0.95, 0.85], rtol=1e-5)
     for line in tests:
-        aps = [line[f"test/AP/{name}"] for name in CLASSES if f"test/AP/{name}" in line]
+        aps = [line[f"test/AP/{name}"] for name in NUSCENES_CLASSES if f"test/AP/{name}" in line]
         assert line["test/mAP"] == pytest.approx(np.mean(aps))
         assert "test/NDS" not in line
 
 
 def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished):
     folder, state, _ = finished
-    assert {path.name for path in folder.iterdir()} == {
-        ".lock",
-        "run.json",
-        "metrics.jsonl",
-        "tensorboard",
-        "checkpoints",
-        "pictures",
-        "loss.png",
-        "scores.png",
-    }
-    assert json.loads((folder / "run.json").read_text())["steps"] == STEPS
+    names = ".lock run.json metrics.jsonl tensorboard checkpoints pictures loss.png scores.png"
+    assert {path.name for path in folder.iterdir()} == set(names.split())
     scores = {line["step"]: line["test/mAP"] for line in read_metrics(folder) if "test/mAP" in line}
     best = max(scores, key=lambda step: (scores[step], step))
     kept = sorted(path.name for path in (folder / "checkpoints").iterdir())
@@ -113,12 +101,9 @@ def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished
         assert picture.read_bytes().startswith(b"\x89PNG")
     last = load_checkpoint(folder / "checkpoints" / "00000004")
     spec = json.loads((folder / "run.json").read_text())
-    assert (spec["data"], spec["frames"]) == (FRAMES.fingerprint(), 12)
-    assert (last.step, last.score, json.loads(last.data)) == (
-        4,
-        read_metrics(folder)[-1]["test/mAP"],
-        {name: spec[name] for name in ("data", "frames", "weights")},
-    )
+    assert (spec["data"], spec["frames"], spec["steps"]) == (FRAMES.fingerprint(), 12, STEPS)
+    assert json.loads(last.data) == {name: spec[name] for name in ("data", "frames", "weights")}
+    assert (last.step, last.score) == (4, read_metrics(folder)[-1]["test/mAP"])
     # Detection gets the running mean of the weights.
     assert bits(last.variables) == bits({"params": state.ema, "batch_stats": state.batch_stats})
     assert bits(load_state(folder / "checkpoints" / "00000004", state)) == bits(state)
@@ -179,27 +164,45 @@ def test_stopped_failed_and_resumed_it_ends_where_the_run_left_alone_ended(
     assert stopped.value.code == 143
     newest = folder / "checkpoints" / "00000003"
     (newest / "checkpoint.json").write_text((newest / "checkpoint.json").read_text()[:-9])
-    told = (
-        r"^step 3: not finite: .*; samples: seed \d+, seed \d+; "
-        r"the last checkpoint is .*checkpoints/0000000[23]$"
-    )
-    with pytest.raises(NonFiniteLossError, match=told):
+    message = r"^step 3: not finite: .*; samples: seed \d+, seed \d+; the last checkpoint is .*/0000000[23]$"
+    with pytest.raises(NonFiniteLossError, match=message):
         train(2, broken, resume=True)
     assert "going back to the checkpoint before" in capsys.readouterr().err
     assert bits(train(-1, None, resume=True)) == bits(state)
-    wanted, found = read_metrics(whole), read_metrics(folder)
     timed = ("seconds", "waiting_seconds", "samples_per_second")
-    assert [{k: v for k, v in line.items() if k not in timed} for line in found] == [
-        {k: v for k, v in line.items() if k not in timed} for line in wanted
-    ]
+    wanted, found = (
+        [{k: v for k, v in line.items() if k not in timed} for line in read_metrics(run)]
+        for run in (whole, folder)
+    )
+    assert found == wanted
 
 
-def altered(folder: Path, change) -> Path:
-    file = folder / "run.json"
-    spec = json.loads(file.read_text())
-    change(spec)
-    file.write_text(json.dumps(spec))
-    return folder
+KILLED = """
+import os, signal, sys
+from tiny_run import train_tiny, weights
+# Called when the third checkpoint is written and not yet in its place.
+os.chmod = lambda path, mode: ".00000003." in str(path) and os.kill(os.getpid(), signal.SIGKILL)
+train_tiny(sys.argv[1], weights=weights())
+"""
+
+
+def test_killed_in_a_save_and_resumed_it_ends_in_the_same_bits(finished, tmp_path):
+    killed = run_python("-c", KILLED, tmp_path)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert [name[:9] for name in names] == [".00000003", "00000001", "00000002"]
+    assert bits(train_tiny(tmp_path, resume=True)) == bits(finished[1])
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000004"]
+
+
+def test_without_a_mean_ap_a_checkpoint_is_saved_without_a_score(tmp_path, capsys):
+    """Test frames without boxes: the mean over no class is not a number."""
+    none = np.zeros(0, np.int32)
+    bare = dataclasses.replace(TESTS.frame(0), boxes=np.zeros((0, 9), np.float32), labels=none, num_points=none)
+    tests = GivenFrames((bare,), TESTS.sensor, NUSCENES_CLASSES)
+    train_tiny(tmp_path, steps=1, evaluate=1, tests=tests, weights=weights())
+    assert "step 1: mAP by centre distance nan" in capsys.readouterr().err
+    assert load_checkpoint(tmp_path / "checkpoints" / "00000001").score is None
 
 
 @pytest.fixture
@@ -212,7 +215,7 @@ def begun(finished, tmp_path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda spec: spec["config"]["loss"].update(l1_weight=9.0), r"config.loss.l1_weight: was 9.0, got 0.25"),
         (lambda spec: spec["sensor"].update(num_columns=8), "sensor.num_columns: was 8, got 64"),
@@ -222,9 +225,11 @@ def begun(finished, tmp_path) -> Path:
         (lambda spec: spec.update(data="other frames"), "data: was 'other frames', got "),
     ],
 )
-def test_another_specification_is_refused_and_the_field_is_named(begun, change, told):
-    altered(begun, change)
-    with pytest.raises(ValueError, match=rf"run.json: {told}.*: only the same run can be resumed$"):
+def test_another_specification_is_refused_and_the_field_is_named(begun, change, message):
+    spec = json.loads((begun / "run.json").read_text())
+    change(spec)
+    (begun / "run.json").write_text(json.dumps(spec))
+    with pytest.raises(ValueError, match=rf"run.json: {message}.*: only the same run can be resumed$"):
         train_tiny(begun, resume=True)
     assert [path.name for path in begun.iterdir()] == ["run.json"]
 

@@ -14,8 +14,6 @@ from fcos_lidar_jax.trainer import evaluate
 from fcos_lidar_jax.training import load_checkpoint
 from fcos_lidar_jax.training.checkpoints import find_checkpoint, shipped_checkpoints
 
-FRAMES = 12
-
 
 def test_shipped_weights_are_small_and_of_todays_preset():
     folder = shipped_checkpoints()["quickstart"]
@@ -28,7 +26,7 @@ def test_shipped_weights_are_small_and_of_todays_preset():
 
 def test_shipped_weights_detect_on_unseen_streets():
     detector = load_detector("quickstart")
-    assert evaluate(detector, unseen_frames(detector.sensor, FRAMES)).summary["mean_ap"] > 0.4
+    assert evaluate(detector, unseen_frames(detector.sensor, 12)).summary["mean_ap"] > 0.4
 
 
 def test_a_name_stands_for_shipped_weights_where_no_folder_has_it(tmp_path, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """The checkpoints of a run: which are kept, and which one a run goes on from."""
 
 import dataclasses
+import functools
 import shutil
 from pathlib import Path
 
@@ -10,33 +11,34 @@ import pytest
 from tiny_run import CONFIG, SENSOR, bits
 
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.training import Checkpoint, CheckpointError, make_optimizer, make_state
+from fcos_lidar_jax.training import Checkpoint, CheckpointError, detection_variables, make_optimizer, make_state
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of, find_checkpoint
 
 
-@pytest.fixture(scope="module")
-def variables():
-    shapes = jax.eval_shape(build_detector(CONFIG, SENSOR).init, jax.random.key(0))
-    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
-
-
-def state_at(variables, step: int):
-    """A state that says where it is from."""
-    filled = jax.tree.map(lambda leaf: jax.numpy.full(leaf.shape, step, leaf.dtype), variables)
+@functools.cache
+def shapes():
     detector, optimizer = build_detector(CONFIG, SENSOR), make_optimizer(CONFIG.optimizer, 10)
-    state = make_state(detector, optimizer, jax.random.key(step), variables=filled)
-    return dataclasses.replace(state, step=jax.numpy.int32(step))
+    return jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(0))
 
 
-def save(checkpoints: Checkpoints, variables, step: int, score: float | None = None) -> None:
-    checkpoints.save(Checkpoint(CONFIG, SENSOR, variables, step, score=score), state_at(variables, step))
+def state_at(step: int):
+    """A state that says where it is from."""
+    arrays = dataclasses.replace(shapes(), key=None)
+    filled = jax.tree.map(lambda leaf: np.full(leaf.shape, step, leaf.dtype), arrays)
+    return dataclasses.replace(filled, key=jax.random.key(step))
+
+
+def save(checkpoints: Checkpoints, step: int, score: float | None = None) -> None:
+    state = state_at(step)
+    checkpoint = Checkpoint(CONFIG, SENSOR, detection_variables(state), step, score=score)
+    checkpoints.save(checkpoint, state)
 
 
 @pytest.fixture(scope="module")
-def three(tmp_path_factory, variables) -> Path:
+def three(tmp_path_factory) -> Path:
     checkpoints = Checkpoints(tmp_path_factory.mktemp("three") / CHECKPOINTS, keep=3)
     for step, score in ((2, 0.3), (4, None), (6, 0.1)):
-        save(checkpoints, variables, step, score)
+        save(checkpoints, step, score)
     return checkpoints.folder
 
 
@@ -54,30 +56,30 @@ def damage(path: Path) -> None:
     largest.write_bytes(largest.read_bytes()[:-1])
 
 
-def test_keeps_the_newest_ones_and_the_best(tmp_path, variables):
+def test_keeps_the_newest_ones_and_the_best(tmp_path):
     checkpoints = Checkpoints(tmp_path / "c", keep=2)
     kept = []
     for step, score in ((1, None), (2, 0.5), (3, 0.4), (4, None), (5, 0.5), (6, None), (7, None), (8, 0.6)):
-        save(checkpoints, variables, step, score)
+        save(checkpoints, step, score)
         kept.append(steps(checkpoints))
     # Of equal scores the newest stays.
     assert kept == [[1], [1, 2], [2, 3], [2, 3, 4], [4, 5], [5, 6], [5, 6, 7], [7, 8]]
 
 
-def test_goes_on_from_the_newest(copy, variables):
-    found = copy.newest(state_at(variables, 0))
+def test_goes_on_from_the_newest(copy):
+    found = copy.newest(state_at(0))
     assert found is not None
     checkpoint, state = found
     assert (checkpoint.step, checkpoint.score) == (6, 0.1)
-    assert bits(state) == bits(state_at(variables, 6))
+    assert bits(state) == bits(state_at(6))
 
 
-def test_a_damaged_one_is_passed_over_with_a_warning(copy, variables, capsys):
+def test_a_damaged_one_is_passed_over_with_a_warning(copy, capsys):
     damage(copy.folder / "00000006")
     (copy.folder / "00000004" / "checkpoint.json").write_text("{")
-    found = copy.newest(state_at(variables, 0))
+    found = copy.newest(state_at(0))
     assert found is not None
-    assert bits(found[1]) == bits(state_at(variables, 2))
+    assert bits(found[1]) == bits(state_at(2))
     warnings = capsys.readouterr().err.splitlines()
     assert [line.startswith("warning: ") for line in warnings] == [True, True]
     assert "00000006" in warnings[0]
@@ -86,28 +88,28 @@ def test_a_damaged_one_is_passed_over_with_a_warning(copy, variables, capsys):
     assert all(line.endswith("going back to the checkpoint before") for line in warnings)
 
 
-def test_where_all_are_damaged_nothing_is_begun_anew(copy, variables):
+def test_where_all_are_damaged_nothing_is_begun_anew(copy):
     for path in copy.paths():
         damage(path)
     with pytest.raises(CheckpointError, match="all 3 checkpoints are damaged, expected a whole one"):
-        copy.newest(state_at(variables, 0))
+        copy.newest(state_at(0))
 
 
-def test_without_any_there_is_none(tmp_path, variables):
-    assert Checkpoints(tmp_path / "none").newest(state_at(variables, 0)) is None
+def test_without_any_there_is_none(tmp_path):
+    assert Checkpoints(tmp_path / "none").newest(state_at(0)) is None
     assert Checkpoints(tmp_path / "none").paths() == []
 
 
-def test_what_killed_saves_left_is_no_checkpoint_and_goes_with_the_next_save(copy, variables):
+def test_what_killed_saves_left_is_no_checkpoint_and_goes_with_the_next_save(copy):
     (copy.folder / ".00000008.abc" / "variables").mkdir(parents=True)
     shutil.copytree(copy.folder / "00000006", copy.folder / ".00000006.abc.old")
     assert steps(copy) == [2, 4, 6]
-    save(copy, variables, 8)
+    save(copy, 8)
     assert [p.name for p in copy.folder.glob(".*")] == []
     assert steps(copy) == [2, 4, 6, 8]
 
 
-def test_a_failed_save_leaves_the_others_and_nothing_of_itself(copy, variables, monkeypatch):
+def test_a_failed_save_leaves_the_others_and_nothing_of_itself(copy, monkeypatch):
     before = {p: p.read_bytes() for p in copy.folder.rglob("*") if p.is_file()}
 
     def full(*_, **__):
@@ -115,7 +117,7 @@ def test_a_failed_save_leaves_the_others_and_nothing_of_itself(copy, variables, 
 
     monkeypatch.setattr("fcos_lidar_jax.training.checkpoint._save_arrays", full)
     with pytest.raises(OSError, match="No space left"):
-        save(copy, variables, 8)
+        save(copy, 8)
     assert {p: p.read_bytes() for p in copy.folder.rglob("*") if p.is_file()} == before
     assert list(copy.folder.glob(".*")) == []
 

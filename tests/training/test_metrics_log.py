@@ -38,24 +38,28 @@ def test_lines_are_read_as_they_were_written(tmp_path):
     ]
 
 
+def steps(folder: Path) -> list[int]:
+    return [line["step"] for line in read_metrics(folder)]
+
+
 def test_a_line_is_on_disk_before_the_next_step(tmp_path):
     records = MetricsLog(tmp_path, first_step=0)
     records.write(1, {"a": 1.0})
-    assert [line["step"] for line in read_metrics(tmp_path)] == [1]
+    assert steps(tmp_path) == [1]
     records.close()
 
 
 def test_a_resumed_run_forgets_what_came_after_its_checkpoint(tmp_path):
     write(tmp_path, [1, 2, 3, 4])
     write(tmp_path, [3, 4, 5], first_step=2)
-    assert [line["step"] for line in read_metrics(tmp_path)] == [1, 2, 3, 4, 5]
+    assert steps(tmp_path) == [1, 2, 3, 4, 5]
 
 
 def test_half_a_line_of_a_killed_run_is_dropped(tmp_path):
     write(tmp_path, [1, 2])
     file = tmp_path / "metrics.jsonl"
     file.write_text(file.read_text()[:-9])
-    assert [line["step"] for line in read_metrics(tmp_path)] == [1]
+    assert steps(tmp_path) == [1]
     write(tmp_path, [2], first_step=1)
     assert [json.loads(line)["step"] for line in file.read_text().splitlines()] == [1, 2]
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
@@ -64,16 +68,9 @@ def test_half_a_line_of_a_killed_run_is_dropped(tmp_path):
 def test_tensorboard_gets_every_number_and_where_a_run_went_on(tmp_path):
     write(tmp_path, [1, 2])
     values = {(v.tag, e.step): v.simple_value for e in events(tmp_path) for v in e.summary.value}
-    assert values == {
-        ("loss/total", 1): 10.0,
-        ("positives", 1): 1.0,
-        ("per_level/0", 1): 1.0,
-        ("per_level/1", 1): 0.0,
-        ("loss/total", 2): 5.0,
-        ("positives", 2): 2.0,
-        ("per_level/0", 2): 2.0,
-        ("per_level/1", 2): 0.0,
-    }
+    tags = ("loss/total", "positives", "per_level/0", "per_level/1")
+    told = {1: (10.0, 1.0, 1.0, 0.0), 2: (5.0, 2.0, 2.0, 0.0)}
+    assert values == {(tag, step): v for step, row in told.items() for tag, v in zip(tags, row, strict=True)}
     write(tmp_path, [2, 3], first_step=1)
     starts = [e.step for e in events(tmp_path) if e.HasField("session_log")]
     assert starts[-1] == 2  # TensorBoard then drops steps from 2 on that were written before

@@ -58,7 +58,7 @@ def test_replicated_arrays_are_equal_copies_that_may_be_given_away(mesh):
 
 
 def test_the_state_is_given_away_and_what_it_was_copied_from_is_not(mesh):
-    original = jax.tree.map(jnp.asarray, {"w": tree()["w"], "step": tree()["step"]}) | {"key": tree()["key"]}
+    original = {**tree(), "w": jnp.asarray(tree()["w"])}
     placed = replicate(original, mesh)
     jit_step(toy_step, mesh)(placed, shard_batch({"x": np.ones((4, 3), np.float32)}, mesh))
     assert placed["w"].is_deleted()
@@ -76,10 +76,8 @@ def test_a_sharded_batch_is_the_batch(mesh):
 def check_pmap_form(mesh) -> None:
     """Two steps of the pmap form are two steps of the jit form."""
     rng = np.random.default_rng(0)
-    state, stacked = (
-        replicate(tree(), mesh),
-        jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (mesh.size, *leaf.shape)), tree()),
-    )
+    state = replicate(tree(), mesh)
+    stacked = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (mesh.size, *leaf.shape)), tree())
     one, many = jit_step(toy_step, mesh), pmap_step(toy_step, mesh)
     for _ in range(2):
         batch = {"x": rng.normal(size=(4, 3)).astype(np.float32)}
@@ -114,12 +112,7 @@ def test_two_devices_share_a_batch_in_both_forms():
         "x = np.zeros(10**5, np.float32); placed = [add(t.replicate({'w': x}, mesh)['w']) for _ in range(20)]; "
         "assert all((np.asarray(s.data) == 1).all() for p in placed for s in p.addressable_shards) and not x.any()"
     )
-    environment = {
-        **os.environ,
-        "JAX_NUM_CPU_DEVICES": "2",
-        "PYTHONPATH": os.pathsep.join(sys.path),
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
-    )
+    environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "2", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -7,7 +7,6 @@ from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.visualization import bev, evaluation_report, range_image
-from fcos_lidar_jax.visualization.report import write_report
 
 RECALL = np.linspace(0, 1, 101).tolist()
 
@@ -23,16 +22,11 @@ def drawn(monkeypatch):
 
 def test_precision_ends_at_the_highest_recall(drawn):
     curve = [0.9] * 41 + [0.0] * 60
-    evaluation_report._draw_precision(
-        "x.png", RECALL, {"0.5": [0.0] * 101, "1.0": curve, "2.0": curve, "4.0": [1.0] * 101}
-    )
+    curves = {"0.5": [0.0] * 101, "1.0": curve, "2.0": curve, "4.0": [1.0] * 101}
+    evaluation_report._draw_precision("x.png", RECALL, curves)
     lines = {line.get_label(): line for line in drawn[0].axes[0].get_lines()}
-    assert {name: len(line.get_xdata()) for name, line in lines.items()} == {
-        "0.5 m": 1,
-        "1 m": 41,
-        "2 m": 41,
-        "4 m": 101,
-    }
+    lengths = {name: len(line.get_xdata()) for name, line in lines.items()}
+    assert lengths == {"0.5 m": 1, "1 m": 41, "2 m": 41, "4 m": 101}
     np.testing.assert_allclose(lines["2 m"].get_ydata(), 0.9)
     # Equal curves: the one below is wider.
     assert lines["2 m"].get_linewidth() > lines["1 m"].get_linewidth()
@@ -70,24 +64,3 @@ def test_global_axes_are_not_called_the_cars(drawn):
         bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=10, classes=(), global_axes=global_axes)
     labels = [figure.axes[0].get_xlabel() for figure in drawn]
     assert labels == ["x [m], right", "x [m], global"]
-
-
-def test_report_with_galleries_and_wide_pictures(tmp_path):
-    picture = tmp_path / "a.png"
-    picture.write_bytes(b"png")
-    page = tmp_path / "r.html"
-    write_report(
-        page,
-        title="t",
-        summary={},
-        galleries=[("Small & many", [("one", picture), ("two", picture)])],
-        pictures=[("three", picture)],
-        wide_pictures=[("four", picture)],
-    )
-    text = page.read_text()
-    gallery = text[text.index('<h2>Small &amp; many</h2><div class="gallery">') : text.index("three")]
-    assert gallery.count("<figcaption>") == 2
-    wide = text[text.index('<div class="wide">') :]
-    assert "four" in wide
-    assert "three" not in wide
-    assert text.count("data:image/png;base64,cG5n") == 4

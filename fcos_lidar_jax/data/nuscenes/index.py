@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.nuscenes.tables import TABLES, TableError
-from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.files import atomic_write, read_json
 
 _FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 2
 _MANIFEST = "index.json"
@@ -23,63 +24,37 @@ class Index:
     order of their scenes and of time, annotations in the order of their samples.
     """
 
-    scene_name: np.ndarray
-    """str[scenes], in the order of the table."""
-    category_name: np.ndarray
-    """str[categories]."""
-    attribute_name: np.ndarray
-    """str[attributes]."""
-    sample_token: np.ndarray
-    """bytes[samples]."""
-    sample_time_us: np.ndarray
-    """i64[samples]."""
-    sample_scene: np.ndarray
-    """i32[samples]: row of the scene."""
-    sample_sweep: np.ndarray
-    """i32[samples]: row of the keyframe's own sweep."""
-    sample_first: np.ndarray
-    """i64[samples + 1]: annotations of sample i are rows ``sample_first[i]:sample_first[i + 1]``."""
-    sweep_file: np.ndarray
-    """bytes[sweeps]: path below the data root."""
-    sweep_time_us: np.ndarray
-    """i64[sweeps]."""
-    sweep_previous: np.ndarray
-    """i32[sweeps]: the sweep before, -1 at the start of a scene."""
-    sweep_sensor: np.ndarray
-    """i32[sweeps]: row of the calibrated sensor."""
-    ego_rotation: np.ndarray
-    """f64[sweeps, 4]: ego to global at the time of the sweep."""
-    ego_translation: np.ndarray
-    """f64[sweeps, 3]."""
-    sensor_rotation: np.ndarray
-    """f64[sensors, 4]: sensor to ego."""
-    sensor_translation: np.ndarray
-    """f64[sensors, 3]."""
-    box_token: np.ndarray
-    """bytes[annotations]."""
-    box_instance: np.ndarray
-    """i32[annotations]: row of the instance; the same object through a scene."""
-    box_category: np.ndarray
-    """i16[annotations]: row of the category."""
-    box_attribute: np.ndarray
-    """i16[annotations]: row of the attribute, -1 for none."""
-    box_translation: np.ndarray
-    """f64[annotations, 3]: centre, global frame."""
-    box_size: np.ndarray
-    """f64[annotations, 3]: width, length, height."""
-    box_rotation: np.ndarray
-    """f64[annotations, 4]: box to global."""
-    box_velocity: np.ndarray
-    """f64[annotations, 3]: m/s in the global frame, NaN where unknown."""
-    box_lidar_points: np.ndarray
-    """i32[annotations]."""
-    box_radar_points: np.ndarray
-    """i32[annotations]."""
+    scene_name: np.ndarray  # str[scenes], in the order of the table
+    category_name: np.ndarray  # str[categories]
+    attribute_name: np.ndarray  # str[attributes]
+    sample_token: np.ndarray  # bytes[samples]
+    sample_time_us: np.ndarray  # i64[samples]
+    sample_scene: np.ndarray  # i32[samples]: row of the scene
+    sample_sweep: np.ndarray  # i32[samples]: row of the keyframe's own sweep
+    sample_first: np.ndarray  # i64[samples + 1]: where the annotations of each sample begin, and the last end
+    sweep_file: np.ndarray  # bytes[sweeps]: path below the data root
+    sweep_time_us: np.ndarray  # i64[sweeps]
+    sweep_previous: np.ndarray  # i32[sweeps]: the sweep before, -1 at the start of a scene
+    sweep_sensor: np.ndarray  # i32[sweeps]: row of the calibrated sensor
+    ego_rotation: np.ndarray  # f64[sweeps, 4]: ego to global at the time of the sweep
+    ego_translation: np.ndarray  # f64[sweeps, 3]
+    sensor_rotation: np.ndarray  # f64[sensors, 4]: sensor to ego
+    sensor_translation: np.ndarray  # f64[sensors, 3]
+    box_token: np.ndarray  # bytes[annotations]
+    box_instance: np.ndarray  # i32[annotations]: row of the instance; the same object through a scene
+    box_category: np.ndarray  # i16[annotations]: row of the category
+    box_attribute: np.ndarray  # i16[annotations]: row of the attribute, -1 for none
+    box_translation: np.ndarray  # f64[annotations, 3]: centre, global frame
+    box_size: np.ndarray  # f64[annotations, 3]: width, length, height
+    box_rotation: np.ndarray  # f64[annotations, 4]: box to global
+    box_velocity: np.ndarray  # f64[annotations, 3]: m/s in the global frame, NaN where unknown
+    box_lidar_points: np.ndarray  # i32[annotations]
+    box_radar_points: np.ndarray  # i32[annotations]
 
 
 def table_sizes(folder: str | Path) -> dict[str, int]:
     """Bytes of every table of a version: what an index is compared with, to notice that it is of other tables."""
-    files = [Path(folder) / f"{name}.json" for name in TABLES]
+    files = [Path(folder) / kind.file for kind in TABLES]
     return {file.name: file.stat().st_size for file in files if file.is_file()}
 
 
@@ -87,23 +62,17 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
     """Write an index; the manifest comes last, so a folder with one is whole.
 
     Args:
-        index: to save.
         folder: for the columns and the manifest.
         tables: ``ROOT/VERSION``, of which the index was made.
     """
     folder = Path(folder)
     (folder / _MANIFEST).unlink(missing_ok=True)
     columns = {}
-    for field in dataclasses.fields(index):
-        column = np.ascontiguousarray(getattr(index, field.name))
-        atomic_write(folder / f"{field.name}.npy", lambda path, column=column: np.save(path, column))
-        columns[field.name] = {"rows": len(column), "blake2b": _digest(column)}
-    manifest = {
-        "format": _FORMAT,
-        "format_version": _FORMAT_VERSION,
-        "tables": table_sizes(tables),
-        "columns": columns,
-    }
+    for name, column in vars(index).items():
+        atomic_write(folder / f"{name}.npy", lambda path, column=column: np.save(path, column))
+        columns[name] = _summary(column)
+    about = {"format": _FORMAT, "format_version": _FORMAT_VERSION, "tables": table_sizes(tables)}
+    manifest = {**about, "columns": columns}
     atomic_write(folder / _MANIFEST, lambda path: path.write_text(json.dumps(manifest, indent=1)))
 
 
@@ -123,14 +92,13 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
         TableError: naming the file, the field, what was found and what was expected.
     """
     folder = Path(folder)
-    manifest = _read_manifest(folder)
-    was, now = manifest["tables"], table_sizes(tables)
+    manifest = _read_manifest(folder / _MANIFEST)
+    was, now = manifest.tables, table_sizes(tables)
     for name in {**now, **was}:
         if was.get(name) != now.get(name):
-            raise TableError(
-                f"{folder / _MANIFEST}: {name}: the index was made when it had {was.get(name)} bytes, now it has "
-                f"{now.get(name)} in {tables}: run prepare again"
-            )
+            then = f"the index was made when it had {was.get(name)} bytes"
+            problem = f"{then}, now it has {now.get(name)} in {tables}: run prepare again"
+            raise TableError(f"{folder / _MANIFEST}: {name}: {problem}")
     columns = {}
     for field in dataclasses.fields(Index):
         file = folder / f"{field.name}.npy"
@@ -138,40 +106,39 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
             column = np.load(file, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
             raise TableError(f"{file}: cannot be read ({error}): run prepare again") from None
-        wanted = manifest["columns"].get(field.name)
-        if wanted != {"rows": len(column), "blake2b": _digest(column)}:
+        if manifest.columns.get(field.name) != _summary(column):
             raise TableError(f"{file}: other content than {_MANIFEST} tells: run prepare again")
         columns[field.name] = column
     return Index(**columns)
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
-    file = folder / _MANIFEST
+class _Manifest(msgspec.Struct):
+    format: str
+    format_version: int
+    tables: dict[str, int]
+    columns: dict[str, dict[str, Any]]
+
+
+def _read_manifest(file: Path) -> _Manifest:
     try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise TableError(f"{file}: no such file, expected a finished index") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise TableError(f"{file}: not JSON: {error}: run prepare again") from None
-    if not isinstance(manifest, dict) or manifest.get("format") != _FORMAT:
+        manifest = read_json(file, _Manifest, what="a finished index")
+    except ValueError as error:
+        raise TableError(f"{error}: run prepare again") from None
+    if manifest.format != _FORMAT:
         raise TableError(f"{file}: format: expected {_FORMAT!r}")
-    if manifest.get("format_version") != _FORMAT_VERSION:
-        raise TableError(
-            f"{file}: format_version: got {manifest.get('format_version')!r}, expected {_FORMAT_VERSION}: "
-            "run prepare again"
-        )
-    for name in ("tables", "columns"):
-        if not isinstance(manifest.get(name), dict):
-            raise TableError(f"{file}: {name}: expected an object: run prepare again")
+    if manifest.format_version != _FORMAT_VERSION:
+        found = manifest.format_version
+        raise TableError(f"{file}: format_version: got {found}, expected {_FORMAT_VERSION}: run prepare again")
     return manifest
 
 
 def column_checksums(index: Index) -> list[tuple[str, str]]:
     """Name and checksum of every column, as the manifest of a saved index holds them."""
-    return [(field.name, _digest(getattr(index, field.name))) for field in dataclasses.fields(index)]
+    return [(name, _summary(column)["blake2b"]) for name, column in vars(index).items()]
 
 
-def _digest(column: np.ndarray) -> str:
+def _summary(column: np.ndarray) -> dict[str, Any]:
     column = np.ascontiguousarray(column)
     described = f"{column.dtype.str}{column.shape}".encode()
-    return hashlib.blake2b(column.data if column.size else b"", digest_size=16, key=described[:64]).hexdigest()
+    digest = hashlib.blake2b(column.data if column.size else b"", digest_size=16, key=described[:64]).hexdigest()
+    return {"rows": len(column), "blake2b": digest}

@@ -20,8 +20,7 @@ CATEGORY_TO_CLASS = {
 }
 """Category -> class; every other category, known or not, is background."""
 
-BICYCLE_RACK = "static_object.bicycle_rack"
-"""The evaluation leaves out what stands in one."""
+BICYCLE_RACK = "static_object.bicycle_rack"  # the evaluation leaves out what stands in one
 
 
 def label_of(category: str) -> int:

@@ -10,32 +10,26 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, has_index, open_index
 from fcos_lidar_jax.data.nuscenes.names import label_of
-from fcos_lidar_jax.data.nuscenes.splits import SplitError, scenes_of_split
+from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import TableError
-from fcos_lidar_jax.data.point_files import MAX_BYTES, PointFileError
+from fcos_lidar_jax.data.point_files import MAX_BYTES
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix, rotation_matrix, wrap_angle
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 
-_COLUMNS = 5
-"""x, y, z, intensity, ring: float32 each."""
+_COLUMNS = 5  # x, y, z, intensity, ring: float32 each
 
 
 @dataclasses.dataclass(frozen=True)
 class Boxes:
     """The boxes of one keyframe in its LiDAR frame, the ten classes only, unpadded."""
 
-    boxes: np.ndarray
-    """f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown."""
-    labels: np.ndarray
-    """i32[m]: index into ``NUSCENES_CLASSES``."""
-    num_lidar_pts: np.ndarray
-    """i32[m]: points of the current sweep inside, counted with the full rotation."""
-    attributes: tuple[str, ...]
-    """Attribute name of every box, ``''`` for none."""
-    tokens: tuple[str, ...]
-    """Annotation token of every box."""
+    boxes: np.ndarray  # f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN velocity where unknown
+    labels: np.ndarray  # i32[m]: index into NUSCENES_CLASSES
+    num_lidar_pts: np.ndarray  # i32[m]: points of the current sweep inside, counted with the full rotation
+    attributes: tuple[str, ...]  # attribute name of every box, '' for none
+    tokens: tuple[str, ...]  # annotation token of every box
 
 
 def default_index(root: str | Path, version: str) -> Path:
@@ -68,26 +62,21 @@ class NuScenes:
         index: str | Path | None = None,
         allow_missing_sweeps: bool = False,
     ) -> None:
-        """Open the index, or read the tables."""
-        self.root, self.version = Path(root), version
-        self.allow_missing_sweeps = allow_missing_sweeps
+        self.root, self.version, self.allow_missing_sweeps = Path(root), version, allow_missing_sweeps
         if not self.root.is_dir():
             raise TableError(f"{root}: no such folder, expected a data root")
         if not self.tables.is_dir():
             there = sorted(p.parent.name for p in self.root.glob("*/sample.json"))
             raise TableError(f"{self.tables}: no such folder, expected one of {', '.join(there) or 'none here'}")
         folder = default_index(root, version) if index is None else Path(index)
-        if index is not None or has_index(folder):
-            self.index: Index = open_index(folder, tables=self.tables)
-        else:
-            self.index = build_index(self.tables)
+        known = index is not None or has_index(folder)
+        self.index: Index = open_index(folder, tables=self.tables) if known else build_index(self.tables)
         self._base = self.root.resolve()
         self._sample_row = {token.decode(): i for i, token in enumerate(self.index.sample_token)}
         self._label = np.array([label_of(str(name)) for name in self.index.category_name], np.int32)
 
     @property
     def tables(self) -> Path:
-        """The folder of the tables."""
         return self.root / self.version
 
     @property
@@ -109,11 +98,11 @@ class NuScenes:
         wanted = scenes_of_split(name, self.tables, file=file)
         for scene in wanted:
             if scene not in row:
-                raise SplitError(f"split {name!r}: {scene}: no such scene in {self.tables / 'scene.json'}")
+                raise ValueError(f"split {name!r}: {scene}: no such scene in {self.tables / 'scene.json'}")
         chosen = np.isin(self.index.sample_scene, [row[scene] for scene in wanted])
         tokens = [token for token, yes in zip(self._sample_row, chosen, strict=True) if yes]
         if not tokens:
-            raise SplitError(f"split {name!r}: got no keyframe, expected at least one")
+            raise ValueError(f"split {name!r}: got no keyframe, expected at least one")
         return tokens
 
     def scene_of(self, sample_token: str) -> str:
@@ -129,7 +118,6 @@ class NuScenes:
         in float64 and times subtracted as whole microseconds.
 
         Args:
-            sample_token: of the keyframe.
             num: sweeps at most, the current one included.
             remove_close: drop the points on the ego vehicle, ``|x|, |y| < close_m`` in their own sweep's frame: of
                 ``"all"`` sweeps as the official devkit does, of the older ``"sweeps"``, or ``"none"``.
@@ -161,10 +149,9 @@ class NuScenes:
         the direction of the heading axis after the full rotation.
         """
         index, own = self.index, self.annotations(sample_token)
-        rows = np.arange(own.start, own.stop)
-        labels = self._label[index.box_category[rows]]
-        rows, labels = rows[labels >= 0], labels[labels >= 0]
-        to_lidar = np.linalg.inv(self._sensor_to_global(self._sweep(sample_token)))
+        labels = self._label[index.box_category[own]]
+        rows, labels = own.start + np.flatnonzero(labels >= 0), labels[labels >= 0]
+        to_lidar = np.linalg.inv(self.sensor_to_global(sample_token))
         centre = index.box_translation[rows] @ to_lidar[:3, :3].T + to_lidar[:3, 3]
         heading = rotation_matrix(index.box_rotation[rows])[:, :, 0] @ to_lidar[:3, :3].T
         velocity = index.box_velocity[rows] @ to_lidar[:3, :3].T
@@ -172,13 +159,9 @@ class NuScenes:
         size = index.box_size[rows][:, [1, 0, 2]]
         boxes = np.concatenate([centre, size, yaw[:, None], velocity[:, :2]], axis=1).astype(np.float32)
         names = ["", *map(str, index.attribute_name)]
-        return Boxes(
-            boxes=boxes,
-            labels=labels,
-            num_lidar_pts=index.box_lidar_points[rows],
-            attributes=tuple(names[i + 1] for i in index.box_attribute[rows]),
-            tokens=tuple(token.decode() for token in index.box_token[rows]),
-        )
+        attributes = tuple(names[i + 1] for i in index.box_attribute[rows])
+        tokens = tuple(token.decode() for token in index.box_token[rows])
+        return Boxes(boxes, labels, index.box_lidar_points[rows], attributes, tokens)
 
     def labels(self, sample_token: str) -> np.ndarray:
         """i32[m]: labels of a keyframe's boxes that hold a LiDAR point."""
@@ -209,10 +192,9 @@ class NuScenes:
         return self.index.ego_translation[self._sweep(sample_token)]
 
     def _row(self, sample_token: str) -> int:
-        row = self._sample_row.get(sample_token)
-        if row is None:
+        if sample_token not in self._sample_row:
             raise TableError(f"{self.tables / 'sample.json'}: {sample_token!r}: no such token")
-        return row
+        return self._sample_row[sample_token]
 
     def _sweep(self, sample_token: str) -> int:
         return int(self.index.sample_sweep[self._row(sample_token)])
@@ -236,14 +218,14 @@ class NuScenes:
     def _read(self, row: int) -> np.ndarray:
         path = self._path(row)
         if not path.is_file():
-            hint = "" if self.allow_missing_sweeps else "; --allow-missing-sweeps goes on with fewer sweeps"
-            raise PointFileError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
+            hint = "" if self.allow_missing_sweeps else "; --allow-missing-sweeps continues with fewer sweeps"
+            raise ValueError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
         if not path.resolve().is_relative_to(self._base):
-            raise PointFileError(f"{path}: leads to {path.resolve()}, expected a file below {self._base}")
+            raise ValueError(f"{path}: resolves to {path.resolve()}, expected a file below {self._base}")
         size = path.stat().st_size
         if size == 0 or size % (4 * _COLUMNS) or size > MAX_BYTES:
             found = "an empty file" if size == 0 else f"{size} bytes"
-            raise PointFileError(
+            raise ValueError(
                 f"{path}: got {found}, expected a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_BYTES}"
             )
         return np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
@@ -254,59 +236,37 @@ class NuScenesFrames(FrameSet):
     """Keyframes of nuScenes as a :class:`fcos_lidar_jax.data.frame.FrameSet`."""
 
     nuscenes: NuScenes
-    """The data."""
-    tokens: tuple[str, ...]
-    """Keyframes, in order."""
-    num_sweeps: int = 10
-    """Sweeps fused, the current one included."""
+    tokens: tuple[str, ...]  # keyframes, in order
+    num_sweeps: int = 10  # this and the next two as in NuScenes.sweeps
     remove_close: str = "all"
-    """As in :meth:`NuScenes.sweeps`."""
     close_m: float = 1.0
-    """As in :meth:`NuScenes.sweeps`."""
-    sensor: Sensor = NUSCENES_HDL32E
-    """Whose points they are; its origin is the frame's."""
+    sensor: Sensor = NUSCENES_HDL32E  # whose points they are; its origin is the frame's
     classes = NUSCENES_CLASSES
 
     def __len__(self) -> int:
-        """Number of keyframes."""
         return len(self.tokens)
 
     def frame(self, index: int) -> Frame:
-        """Fused sweeps and boxes of one keyframe."""
-        truth = self.nuscenes.boxes(self.tokens[index])
-        points, num_close = self._fuse(index)
+        data, token, mode, close_m = self.nuscenes, self.tokens[index], self.remove_close, self.close_m
+        truth = data.boxes(token)
+        points, num_close = data.fuse_sweeps(token, self.num_sweeps, remove_close=mode, close_m=close_m)
         return Frame(points, truth.boxes, truth.labels, truth.num_lidar_pts, num_close)
 
-    def points(self, index: int) -> np.ndarray:
-        """Fused sweeps alone."""
-        return self._fuse(index)[0]
-
-    def _fuse(self, index: int) -> tuple[np.ndarray, int]:
-        return self.nuscenes.fuse_sweeps(
-            self.tokens[index], self.num_sweeps, remove_close=self.remove_close, close_m=self.close_m
-        )
-
     def labels(self, index: int) -> np.ndarray:
-        """Labels of the boxes that hold a point."""
         return self.nuscenes.labels(self.tokens[index])
 
     def name(self, index: int) -> str:
-        """The keyframe's token."""
         return self.tokens[index]
 
     def pose(self, index: int) -> np.ndarray:
-        """f64[4, 4] from the LiDAR frame to the global one."""
         return self.nuscenes.sensor_to_global(self.tokens[index])
 
     def time_us(self, index: int) -> int:
-        """When the keyframe's own sweep was taken, microseconds."""
         return self.nuscenes.time_us(self.tokens[index])
 
     def scene(self, index: int) -> str:
-        """Name of the keyframe's scene."""
         return self.nuscenes.scene_of(self.tokens[index])
 
     def fingerprint(self) -> str:
-        """Checksum of all columns of the index, of the keyframes, and of how they are read."""
         how = self.num_sweeps, self.remove_close, self.close_m
         return checksum(repr((column_checksums(self.nuscenes.index), self.tokens, how)).encode())

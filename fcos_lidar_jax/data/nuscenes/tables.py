@@ -8,13 +8,12 @@ import mmap
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import msgspec
 
 Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-"""w, x, y, z."""
+Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
 _PIECE_BYTES = 1 << 24
 _BETWEEN_ROWS = re.compile(rb"\}(\s*),(\s*)\{")
@@ -25,68 +24,78 @@ class TableError(ValueError):
 
 
 class Row(msgspec.Struct, gc=False):
-    """What all rows have."""
+    """A row of a table."""
 
+    file: ClassVar[str]  # name of the table's file
     token: str
 
 
 class Category(Row):
-    """A row of ``category``."""
+    """What kinds of objects there are."""
 
+    file = "category.json"
     name: str
 
 
 class Attribute(Row):
-    """A row of ``attribute``."""
+    """What objects may be doing."""
 
+    file = "attribute.json"
     name: str
 
 
 class SensorRow(Row):
-    """A row of ``sensor``."""
+    """A sensor."""
 
+    file = "sensor.json"
     channel: str
 
 
 class CalibratedSensor(Row):
-    """A row of ``calibrated_sensor``: sensor to ego."""
+    """Where a sensor is mounted: sensor to ego."""
 
+    file = "calibrated_sensor.json"
     sensor_token: str
     translation: Vector
     rotation: Quaternion
 
 
 class Scene(Row):
-    """A row of ``scene``."""
+    """A drive of 20 s."""
 
+    file = "scene.json"
     name: str
     first_sample_token: str
 
 
 class Sample(Row):
-    """A row of ``sample``: a keyframe."""
+    """A keyframe."""
 
+    file = "sample.json"
     timestamp: int
     scene_token: str
     next: str
 
 
 class Instance(Row):
-    """A row of ``instance``."""
+    """One object through a scene."""
 
+    file = "instance.json"
     category_token: str
 
 
 class EgoPose(Row):
-    """A row of ``ego_pose``: ego to global."""
+    """Ego to global."""
 
+    file = "ego_pose.json"
     translation: Vector
     rotation: Quaternion
 
 
 class SampleData(Row):
-    """A row of ``sample_data``: one file of one sensor."""
+    """One file of one sensor."""
 
+    file = "sample_data.json"
     sample_token: str
     ego_pose_token: str
     calibrated_sensor_token: str
@@ -97,8 +106,9 @@ class SampleData(Row):
 
 
 class SampleAnnotation(Row):
-    """A row of ``sample_annotation``: one box in the global frame; size is width, length, height."""
+    """One box in the global frame; size is width, length, height."""
 
+    file = "sample_annotation.json"
     sample_token: str
     instance_token: str
     attribute_tokens: tuple[str, ...]
@@ -111,44 +121,23 @@ class SampleAnnotation(Row):
     num_radar_pts: int
 
 
-TABLES: dict[str, type[Row]] = {
-    "category": Category,
-    "attribute": Attribute,
-    "sensor": SensorRow,
-    "calibrated_sensor": CalibratedSensor,
-    "scene": Scene,
-    "sample": Sample,
-    "instance": Instance,
-    "ego_pose": EgoPose,
-    "sample_data": SampleData,
-    "sample_annotation": SampleAnnotation,
-}
-"""The tables that a LiDAR detector needs, of the thirteen."""
-
 R = TypeVar("R", bound=Row)
 
-
-def table_file(kind: type[Row]) -> str:
-    """File name of a table.
-
-    >>> table_file(SampleData)
-    'sample_data.json'
-    """
-    return next(f"{name}.json" for name, row in TABLES.items() if row is kind)
+TABLES: tuple[type[Row], ...] = tuple(Row.__subclasses__())
+"""The tables that a LiDAR detector needs, of the thirteen."""
 
 
 def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) -> Iterator[list[R]]:
     """The rows of a table in their order, a piece at a time.
 
     Args:
-        folder: holds the tables of one version.
-        kind: a value of :data:`TABLES`.
+        kind: one of :data:`TABLES`.
         piece_bytes: a piece is the rows of about so much text.
 
     Raises:
         TableError: the table is missing, not JSON, or a row has not the fields of ``kind``.
     """
-    path = folder / table_file(kind)
+    path = folder / kind.file
     if not path.is_file():
         raise TableError(f"{path}: no such file, expected the table")
     if path.stat().st_size == 0:
@@ -180,12 +169,8 @@ def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, seen: int, 
     try:
         return decoder.decode(piece)
     except msgspec.ValidationError as error:
-
-        def in_file(match: re.Match[str]) -> str:
-            return f"$[{int(match[1]) + seen}]"
-
         text, _, place = str(error).rpartition(" - at `")
-        place = re.sub(r"\$\[(\d+)\]", in_file, place.rstrip("`"))
+        place = re.sub(r"\$\[(\d+)\]", lambda match: f"$[{int(match[1]) + seen}]", place.rstrip("`"))
         raise TableError(f"{path}: {place or '$'}: {text or error}") from None
     except msgspec.DecodeError as error:
         at = re.search(r"byte (\d+)", str(error))

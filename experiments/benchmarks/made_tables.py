@@ -1,0 +1,138 @@
+"""Tables in the official nuScenes layout, of any size, without files of points."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
+from fcos_lidar_jax.evaluation.boxes import CLASS_ATTRIBUTES
+from fcos_lidar_jax.simulation.nuscenes_tables import fixed_tables
+from fcos_lidar_jax.simulation.nuscenes_tables import token as name_token
+
+Row = dict[str, Any]
+SHARES = (0.43, 0.08, 0.02, 0.02, 0.02, 0.2, 0.02, 0.02, 0.09, 0.1)  # Of the classes, about as in nuScenes.
+EGO = {"translation": [411.3039349319818, 1180.8903791765097, 0.0], "rotation": [0.9831, 0.0, 0.0, -0.18307]}
+MOUNT = {"translation": [0.9, 0.0, 1.8], "rotation": [1.0, 0.0, 0.0, 0.0]}
+_CATEGORIES = {name: category for category, name in reversed(CATEGORY_TO_CLASS.items())}
+
+
+def write_tables(
+    folder: Path, scenes: Mapping[str, int], files: Mapping[str, int], *, objects: int, seen: int | None = None
+) -> None:
+    """Write all tables into a new folder, that of the version.
+
+    ``scenes`` maps names to numbers of keyframes, ``files`` channels to files a keyframe, the first of them its
+    own. Each of a scene's ``objects`` is there in ``seen`` keyframes in a row, by default in all.
+    """
+    folder.mkdir(parents=True)
+    channels, numbers = list(files), list(scenes.values())
+    tables: dict[str, Any] = {
+        **fixed_tables([]),
+        "sensor": ({"token": _token("e", c), "channel": n, "modality": "lidar"} for c, n in enumerate(channels)),
+        "log": [],
+        "map": [{"token": "map", "log_tokens": [], "category": "semantic_prior", "filename": "map.png"}],
+        "calibrated_sensor": (
+            {"token": _token("m", s, c), "sensor_token": _token("e", c), "camera_intrinsic": [], **MOUNT}
+            for s in range(len(scenes))
+            for c in range(len(channels))
+        ),
+        "scene": (
+            {"token": _token("n", s), "name": name, "log_token": "", "first_sample_token": _token("s", s, 0)}
+            for s, name in enumerate(scenes)
+        ),
+        "sample": (
+            {**_link("s", s, k, of=number), "timestamp": _time_us(s, k), "scene_token": _token("n", s)}
+            for s, number in enumerate(numbers)
+            for k in range(number)
+        ),
+        "sample_data": _sample_data(numbers, files),
+        "ego_pose": (
+            {"token": row["token"], "timestamp": row["timestamp"], **EGO} for row in _sample_data(numbers, files)
+        ),
+        "instance": (
+            {"token": _token("i", s, o), "category_token": name_token("category", _CATEGORIES[class_of(s, o)])}
+            for s in range(len(scenes))
+            for o in range(objects)
+        ),
+        "sample_annotation": (
+            row
+            for s, number in enumerate(numbers)
+            for o in range(objects)
+            for row in annotations(s, o, number, seen or number)
+        ),
+    }
+    for name, rows in tables.items():
+        with (folder / f"{name}.json").open("w") as stream:
+            stream.write("[")
+            for i, row in enumerate(rows):  # one field a line, as in the official tables
+                stream.write(("," if i else "") + "\n" + json.dumps(row, indent=0))
+            stream.write("\n]")
+    (folder.parent / "map.png").touch()
+
+
+def class_of(scene: int, number: int) -> str:
+    """Class of an object of a scene."""
+    return str(np.random.default_rng([scene, number]).choice(NUSCENES_CLASSES, p=SHARES))
+
+
+def annotations(scene: int, number: int, keyframes: int, seen: int) -> Iterator[Row]:
+    """Rows of an object in its keyframes; it stands still or moves on a straight line."""
+    rng, known = np.random.default_rng([1, scene, number]), CLASS_ATTRIBUTES[class_of(scene, number)]
+    start = EGO["translation"] + np.append(rng.normal(0, 22, 2), 0)
+    step = rng.choice([0, 2]) * np.append(rng.normal(0, 1, 2), 0)
+    size, yaw = rng.uniform(0.5, 4.5, 3).tolist(), rng.uniform(-np.pi, np.pi)
+    rotation, first = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], number % (keyframes - seen + 1)
+    for i, points in enumerate(rng.integers(0, 40, seen).tolist()):
+        yield {
+            **_link("a", scene, number, i, of=seen),
+            "sample_token": _token("s", scene, first + i),
+            "instance_token": _token("i", scene, number),
+            "visibility_token": "4",
+            "attribute_tokens": [name_token("attribute", known[number % len(known)])] if known else [],
+            "translation": (start + i * step).tolist(),
+            "size": size,
+            "rotation": rotation,
+            "num_lidar_pts": points,
+            "num_radar_pts": 0,
+        }
+
+
+def _sample_data(keyframes: list[int], files: Mapping[str, int]) -> Iterator[Row]:
+    for s, number in enumerate(keyframes):
+        for c, (channel, each) in enumerate(files.items()):
+            for i in range(number * each):
+                yield {
+                    **_link("d", s, c, i, of=number * each),
+                    "sample_token": _token("s", s, i // each),
+                    "ego_pose_token": _token("d", s, c, i),
+                    "calibrated_sensor_token": _token("m", s, c),
+                    "timestamp": _time_us(s, i / each),
+                    "fileformat": "pcd",
+                    "is_key_frame": i % each == 0,
+                    "height": 0,
+                    "width": 0,
+                    "filename": f"sweeps/{channel}/n000-2018-01-01-00-00-00-0400__{channel}__{s:08}{i:08}.bin",
+                }
+
+
+def _token(kind: str, *numbers: int) -> str:
+    """32 characters, as real tokens have."""
+    return (kind.encode().hex() + "".join(f"{n:06x}" for n in numbers)).ljust(32, "0")
+
+
+def _link(kind: str, *numbers: int, of: int) -> Row:
+    """Token of a row, and of those before and after it among so many that the last number counts."""
+    *chain, i = numbers
+    return {
+        "token": _token(kind, *numbers),
+        "prev": _token(kind, *chain, i - 1) if i else "",
+        "next": _token(kind, *chain, i + 1) if i + 1 < of else "",
+    }
+
+
+def _time_us(scene: int, keyframe: float) -> int:
+    return 1_500_000_000_000_000 + scene * 10**8 + int(keyframe * 500_000)

@@ -1,0 +1,31 @@
+"""Configurations as changes of others."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from fcos_lidar_jax.config import Config
+
+Change = Callable[[Config], Config]
+
+
+def change(**fields: Any) -> Change:
+    """Replace fields of a configuration; dots are double underscores.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> change(projection__num_rounds=3, num_sweeps=1)(QUICKSTART).projection.num_rounds
+    3
+    """
+
+    def apply(config: Config) -> Config:
+        for path, value in fields.items():
+            config = _replaced(config, path.split("__"), value)
+        return config
+
+    return apply
+
+
+def _replaced(config: Any, path: list[str], value: Any) -> Any:
+    first, *rest = path
+    inner = _replaced(getattr(config, first), rest, value) if rest else value
+    return dataclasses.replace(config, **{first: inner})

@@ -1,0 +1,42 @@
+"""The page about own data does what it says: scripts and commands run as they stand, on a smaller network."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+from commands import command
+from tiny_run import NETWORK_OPTIONS
+
+from fcos_lidar_jax.data.folder import FolderFrames
+
+PAGE = (Path(__file__).parents[2] / "docs" / "own_data.md").read_text()
+
+
+def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    namespace: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
+        exec(block, namespace)
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith("('person', 'rider', 'vehicle') 40 frames; 0 boxes")
+    filled, cells, dropped = (int(word) for word in re.findall(r"\d+", printed[1]))
+    assert cells / 3 < filled
+    assert dropped < filled / 50
+
+    commands = [shlex.split(line) for line in re.findall(r"^fcos-lidar .*", PAGE, re.MULTILINE)]
+    assert [command[1] for command in commands] == ["prepare", "train", "evaluate", "detect"]
+    smaller = {"train": [*NETWORK_OPTIONS, "--steps 20 --save-every 20 --evaluate-every 20"]}
+    for _, name, *args in commands:
+        command(name, *args, *smaller.get(name, []))
+    summary = json.loads(Path("evaluation/metrics_summary.json").read_text())
+    assert set(summary["mean_dist_aps"]) == {"person", "rider", "vehicle"}
+    assert Path("evaluation/report.html").exists()
+    assert list(Path("pictures").iterdir())
+
+    # The page's last step: what was detected becomes labels.
+    namespace["as_annotations"](Path("boxes.json"), Path("my_lidar/boxes"))
+    [found] = json.loads(Path("boxes.json").read_text())["files"]
+    relabelled = FolderFrames("my_lidar").frame(35)
+    np.testing.assert_allclose(relabelled.boxes, np.array([box["box"] for box in found["boxes"]]).reshape(-1, 9))
