@@ -154,6 +154,8 @@ def train(
             return start
         step = jit_step(make_train_step(run.detector, optimizer), mesh)
         metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
+        if is_main_process:
+            print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
 
         def report(number: int, record: Record) -> None:
             if metrics is not None:
