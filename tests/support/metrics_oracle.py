@@ -169,7 +169,7 @@ def leaves(value, path=()):
     return {path: value}
 
 
-def assert_numbers(ours, theirs, tolerance=1e-9):
+def assert_numbers(ours, theirs, tolerance=1e-12):
     """All that ``theirs`` holds is in ``ours``, numbers within the tolerance, NaN where it has NaN."""
     ours = leaves(ours)
     for path, value in leaves(theirs).items():
