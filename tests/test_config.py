@@ -124,3 +124,9 @@ def test_what_follows_from_the_names_of_the_classes_and_what_is_given():
     )
     assert (given.ranges_m, given.paste_targets) == ({"crate": 9.0, "pedestrian": 8.0}, (1, 5))
     assert Config(copy_paste=None).paste_targets == (0,) * 10
+
+
+def test_the_papers_presets_keep_close_points_of_the_current_sweep():
+    """Which gives its numbers of points; the shipped weights of the quickstart were trained without them."""
+    modes = {name: preset.projection.remove_close for name, preset in PRESETS.items()}
+    assert modes == dict.fromkeys(PRESETS, "sweeps") | {"quickstart": "all"}
