@@ -1,4 +1,4 @@
-"""The house keeps its order: layers, light imports, one test file a module."""
+"""The structure of the project: layers, light imports, one test file a module."""
 
 import subprocess
 import sys

@@ -25,7 +25,7 @@ Kernel = Float[Array, "_ _ _ _"]
 
 def normal(key: Array, shape: Sequence[int], stddev: Any) -> Array:
     """``stddev * jax.random.normal(key, shape)``, to the bit; compiled for powers of two instead of for every
-    shape, which would take XLA up to a minute and a half on a CPU."""
+    shape, for XLA takes seconds to compile each on a CPU."""
     size = math.prod(shape)
     return jax.random.normal(key, (1 << (size - 1).bit_length(),))[:size].reshape(shape) * stddev
 

@@ -69,8 +69,8 @@ def test_tensorboard_gets_every_number_and_where_a_run_went_on(tmp_path):
     write(tmp_path, [1, 2])
     values = {(v.tag, e.step): v.simple_value for e in events(tmp_path) for v in e.summary.value}
     tags = ("loss/total", "positives", "per_level/0", "per_level/1")
-    told = {1: (10.0, 1.0, 1.0, 0.0), 2: (5.0, 2.0, 2.0, 0.0)}
-    assert values == {(tag, step): v for step, row in told.items() for tag, v in zip(tags, row, strict=True)}
+    expected = {1: (10.0, 1.0, 1.0, 0.0), 2: (5.0, 2.0, 2.0, 0.0)}
+    assert values == {(tag, step): v for step, row in expected.items() for tag, v in zip(tags, row, strict=True)}
     write(tmp_path, [2, 3], first_step=1)
     starts = [e.step for e in events(tmp_path) if e.HasField("session_log")]
     assert starts[-1] == 2  # TensorBoard then drops steps from 2 on that were written before
