@@ -9,7 +9,7 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.evaluation.frames import frame_columns
 from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
-from fcos_lidar_jax.inference import TrainedDetector, load_detector
+from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.trainer import Schedule, predict, train
 from fcos_lidar_jax.trainer.run import RUN_SPEC
 from fcos_lidar_jax.types import Detections
@@ -26,7 +26,7 @@ def trained(
     defaults = {"threads": 1, "devices": jax.devices()[:1], "schedule": Schedule(-(-steps // 5), steps)}
     resume = (folder / RUN_SPEC).exists()
     train(config, frames, folder, steps=steps, seed=seed, resume=resume, **{**defaults, **options})
-    return load_detector(folder)
+    return load_trained(folder)
 
 
 def detections(detector: TrainedDetector, frames: FrameSet) -> tuple[list[Detections], list[Frame]]:

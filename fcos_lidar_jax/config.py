@@ -17,6 +17,9 @@ def _check(condition: bool, field: str, got: object, expected: str) -> None:
         raise ValueError(f"{field}: got {got!r}, expected {expected}")
 
 
+MAX_ROUNDS = 100  # Of the projection, each a pass over the points and an image: far more than ever helped.
+
+
 def _check_least(config: Any, least: int, *fields: str) -> None:
     for field in fields:
         _check(getattr(config, field) >= least, field, getattr(config, field), f"at least {least}")
@@ -43,7 +46,7 @@ class ProjectionConfig:
     close_m: float = 1.0  # Reading: half the side of the square that ``remove_close`` empties, metres.
 
     def __post_init__(self) -> None:
-        _check_least(self, 1, "num_rounds")
+        _check(1 <= self.num_rounds <= MAX_ROUNDS, "num_rounds", self.num_rounds, f"1 to {MAX_ROUNDS}")
         _check(self.close_m > 0, "close_m", self.close_m, "a positive number of metres")
         _check_choices(self)
 
@@ -318,6 +321,7 @@ def _from_json(kind: Any, value: Any, where: str) -> Any:
     if args:  # AugmentConfig | None
         return None if value is None else _from_json(args[0], value, where)
     accepted = (int, float) if kind is float else kind
-    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+    fits = kind is not float or (isinstance(value, int | float) and not 1e300 < abs(value) < math.inf)
+    if not (isinstance(value, accepted) and fits) or (isinstance(value, bool) and kind is not bool):
         raise ValueError(f"{where}: got {value!r}, expected {kind.__name__}")
     return kind(value)

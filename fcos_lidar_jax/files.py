@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
             the extension.
 
     Raises:
-        OSError: a folder stands at ``path``, or what the file system and ``write`` raise.
+        OSError: a folder, a link or a device stands at ``path``, or what the file system and ``write`` raise.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "new" / "a.txt"
@@ -35,16 +36,86 @@ def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
     ('whole', ['a.txt'])
     """
     path = Path(path)
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: found a folder, expected a file to write")
+    _check_kind(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # The writer itself creates the file, so that its permissions are those of any other new file.
     temporary = path.with_name(f".{secrets.token_hex(6)}{path.suffix}")
     try:
-        write(temporary)
+        with naming(path):
+            write(temporary)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+class FileState(msgspec.Struct, frozen=True):
+    """What tells a file from an altered one: as build tools do, without reading it, and its checksum."""
+
+    bytes: int
+    mtime_ns: int
+    inode: int
+    blake2b: str
+
+    @classmethod
+    def of(cls, file: Path) -> "FileState":
+        found = file.stat()
+        return cls(found.st_size, found.st_mtime_ns, found.st_ino, file_checksum(file))
+
+    def holds(self, file: Path) -> bool:
+        """Whether the file is the same: by size, time and inode, else, as after a copy, by its content.
+
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "a"
+        >>> _ = file.write_text("one")
+        >>> state = FileState.of(file)
+        >>> file.touch(), state.holds(file)
+        (None, True)
+        >>> file.write_text("two"), state.holds(file)
+        (3, False)
+        """
+        found = file.stat()
+        if (found.st_size, found.st_mtime_ns, found.st_ino) == (self.bytes, self.mtime_ns, self.inode):
+            return True
+        return found.st_size == self.bytes and file_checksum(file) == self.blake2b
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Make errors of writing a file name it: where the disk is full, the system's own do not."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        raise OSError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a path at which :func:`atomic_write` would fail, as far as can be told without writing.
+
+    Raises:
+        OSError: naming what stands in the way.
+
+    >>> check_writable(Path("/dev/null/boxes.json"))
+    Traceback (most recent call last):
+    NotADirectoryError: /dev/null: found a file, expected a folder to write to
+    """
+    _check_kind(path)
+    folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{folder}: found a file, expected a folder to write to")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"{folder}: no right to write there")
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse what must not be replaced by a file: folders, devices, and links, whose targets would stay."""
+    if path.is_symlink():
+        raise FileExistsError(f"{path}: found a link to {path.readlink()}, expected a file to write")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: found a folder, expected a file to write")
+    if path.exists() and not path.is_file():
+        raise FileExistsError(f"{path}: found a device or a pipe, expected a file to write")
 
 
 @contextlib.contextmanager
@@ -109,6 +180,8 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
         raise ValueError(f"{path}: not JSON: {error}") from None
     try:
         return msgspec.convert(content, kind)
+    except (OverflowError, UnicodeError) as error:  # an integer that no float holds, half a pair of surrogates
+        raise ValueError(f"{path}: {error}") from None
     except msgspec.ValidationError as error:
         raise ValueError(f"{path}: {_explain(str(error), content)}") from None
 
@@ -135,9 +208,20 @@ def checksum(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
+def file_checksum(path: Path) -> str:
+    """:func:`checksum` of a file of any size."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+_held: dict[Path, int] = {}  # folders that this process has locked -> the thread that did
+
+
 @contextlib.contextmanager
 def folder_lock(folder: Path, doing: str) -> Iterator[None]:
     """Keep other processes from working in a folder, by a file ``.lock`` in it that names the process.
+
+    The thread that holds it may take it again. The lock ends with the process, whatever ends it.
 
     Args:
         folder: made if missing.
@@ -145,12 +229,26 @@ def folder_lock(folder: Path, doing: str) -> Iterator[None]:
 
     Raises:
         OSError: another process works there; with its number and its machine.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with folder_lock(folder, "writing"), folder_lock(folder, "writing"):
+    ...     (folder / ".lock").read_text().split()[-2:]
+    ['is', 'writing']
     """
-    file = folder / ".lock"
+    file, key = folder / ".lock", folder.resolve()
+    if _held.get(key) == threading.get_ident():
+        yield
+        return
     with file_lock(file) as held:
         if not held:
-            owner = file.read_text(encoding="utf-8") or "another process"
+            owner = file.read_text(encoding="utf-8", errors="replace")[:200] or "another process"
             raise BlockingIOError(f"{folder}: in use: {owner}, expected no other process")
-        file.write_text(f"process {os.getpid()} on {socket.gethostname()} is {doing}", encoding="utf-8")
-        yield
-        file.write_text("", encoding="utf-8")
+        _held[key] = threading.get_ident()
+        try:
+            file.write_text(f"process {os.getpid()} on {socket.gethostname()} is {doing}", encoding="utf-8")
+            yield
+        finally:
+            del _held[key]
+            with contextlib.suppress(OSError):  # the folder may be gone
+                os.truncate(file, 0)

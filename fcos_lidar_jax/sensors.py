@@ -154,6 +154,9 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     return dataclasses.asdict(sensor)
 
 
+_MAX_ROWS = 4096  # far more than any LiDAR has: a damaged number must not exhaust the memory
+
+
 def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     """A sensor from a JSON object.
 
@@ -178,8 +181,9 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
         if not isinstance(even, dict) or set(even) != {"lowest", "highest", "rows"}:
             raise ValueError(f"{where}: inclinations_deg: expected an object with lowest, highest and rows")
         low, high = (_number(even[end], f"{where}: inclinations_deg.{end}") for end in ("lowest", "highest"))
-        if not isinstance(even["rows"], int) or even["rows"] < 2:
-            raise ValueError(f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected an integer >= 2")
+        if not isinstance(even["rows"], int) or not 2 <= even["rows"] <= _MAX_ROWS:
+            expected = f"an integer of 2 to {_MAX_ROWS}"
+            raise ValueError(f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected {expected}")
         record["inclinations_rad"] = even_inclinations(low, high, even["rows"])
     fields = {f.name: f for f in dataclasses.fields(Sensor)}
     unknown = sorted(set(record) - set(fields))
@@ -224,12 +228,15 @@ def load_sensor(path: str | Path) -> Sensor:
         raise ValueError(f"{path}: no such sensor file, and no preset ({', '.join(PRESETS)})")
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not JSON: {error}") from None
     return sensor_from_json(record, str(path))
 
 
+_MAX_NUMBER = 1e30  # also excludes NaN and integers that no float can hold
+
+
 def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MAX_NUMBER:
         raise ValueError(f"{where}: got {value!r}, expected a finite number")
     return float(value)

@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import pytest
 from jaxtyping import install_import_hook
+from quick import compile_quickly
 
 # The containers are left out: tree transformations fill their annotated fields with other things. Sensors and
 # configurations check themselves, in their own words.
@@ -36,10 +37,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _optimisation(request: pytest.FixtureRequest) -> None:
-    quick = request.path.parent.name in _QUICK
-    if jax.config.read("jax_disable_most_optimizations") != quick:
-        jax.config.update("jax_disable_most_optimizations", quick)
-        jax.clear_caches()
+    compile_quickly(request.path.parent.name in _QUICK)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from fcos_lidar_jax.config import (
     config_from_json,
     config_to_json,
 )
-from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, PRESETS, QUICKSTART
+from fcos_lidar_jax.presets import COMPACT, NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, PRESETS, QUICKSTART
 
 MISSING = object()
 
@@ -38,16 +38,19 @@ def test_presets_are_the_papers():
     assert (NUSCENES_TEST.model.head_channels, NUSCENES_TEST.fade_epochs) == (128, 5)
 
 
-def test_small_preset_differs_in_numbers_only():
+@pytest.mark.parametrize(("preset", "own"), [(QUICKSTART, ()), (COMPACT, ("circular_width",))])
+def test_small_presets_differ_in_numbers_only(preset, own):
     def kinds(value):
         if dataclasses.is_dataclass(value):
             return {f.name: kinds(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return value if isinstance(value, bool | str) else type(value)
 
-    small, full = kinds(QUICKSTART), kinds(NUSCENES)
+    small, full = kinds(preset), kinds(NUSCENES)
     for record in (small, full):
         del record["name"], record["sensor"]
         del record["projection"]["remove_close"]  # as the shipped weights were trained
+        for name in own:
+            del record["model"][name]
     assert small == full
 
 
@@ -127,6 +130,6 @@ def test_what_follows_from_the_names_of_the_classes_and_what_is_given():
 
 
 def test_the_papers_presets_keep_close_points_of_the_current_sweep():
-    """Which gives its numbers of points; the shipped weights of the quickstart were trained without them."""
+    """Which gives its numbers of points; the presets of the shipped weights do without them."""
     modes = {name: preset.projection.remove_close for name, preset in PRESETS.items()}
-    assert modes == dict.fromkeys(PRESETS, "sweeps") | {"quickstart": "all"}
+    assert modes == dict.fromkeys(PRESETS, "sweeps") | {"compact": "all", "quickstart": "all"}

@@ -4,10 +4,11 @@ import contextlib
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from fcos_lidar_jax.files import atomic_write, file_lock
+from fcos_lidar_jax.files import atomic_write, file_lock, folder_lock
 
 
 def test_atomic_write_replaces_a_file_whole(tmp_path):
@@ -89,3 +90,21 @@ def test_waiting_for_a_lock_ends_when_it_is_given_up(tmp_path):
                 second.wait(1)
             first.close()
             assert second.stdout.read() == "True\n"
+
+
+def test_a_folder_is_locked_for_other_threads_and_processes_and_again_for_the_one_that_holds_it(tmp_path):
+    with folder_lock(tmp_path, "writing"), folder_lock(tmp_path, "reading"), ThreadPoolExecutor() as pool:
+        for another in (folder_lock(tmp_path, "x"), folder_lock(tmp_path / "." / "", "x")):
+            with pytest.raises(
+                BlockingIOError, match=rf"in use: process {os.getpid()} on .* is writing, expected"
+            ):
+                pool.submit(another.__enter__).result()
+        with holding(tmp_path / ".lock") as other:
+            assert other.stdout.readline() == "False\n"
+    assert (tmp_path / ".lock").read_text() == ""
+    with holding(tmp_path / ".lock") as other:
+        assert other.stdout.readline() == "True\n"
+        (tmp_path / ".lock").write_text("process 1\x00" * 1000)
+        with pytest.raises(BlockingIOError) as caught, folder_lock(tmp_path, "x"):
+            pass
+        assert len(str(caught.value)) < 200 + 2 * len(str(tmp_path)) + 60

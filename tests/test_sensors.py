@@ -56,6 +56,8 @@ BAD = [
     ({**GOOD, "inclinations_rad": [None, 0.0]}, "got None, expected a finite number"),
     ({**GOOD, "inclinations_deg": {"lowest": 1}}, "lowest, highest and rows"),
     ({**GOOD, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 1}}, "rows: got 1"),
+    ({**GOOD, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 2**32}}, "rows: got 4294967296"),
+    ({**GOOD, "limit_xy_m": 10**400}, "limit_xy_m: got 10000"),
     ({**GOOD, "origin_m": [1, 2]}, "origin_m"),
     ({**GOOD, "limit_xy_m": -1}, "limit_xy_m: got -1"),
     ({**GOOD, "limit_z_m": [3, 1]}, "limit_z_m"),

@@ -23,13 +23,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.benchmarks.peers import turn_by_turn
-from experiments.benchmarks.stages import Stages, training_steps
+from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, find_real_data, run_measurement
-from experiments.statistics import Call, interleaved
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.inference import make_detect
+from fcos_lidar_jax.inference.stages import Stages
+from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters

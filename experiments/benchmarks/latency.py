@@ -25,17 +25,17 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from experiments.benchmarks.stages import Stages
 from experiments.changes import change
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, find_real_data, run_measurement
-from experiments.statistics import Call, Times, interleaved
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
 from fcos_lidar_jax.inference.detect import select_candidates
+from fcos_lidar_jax.inference.stages import Stages
+from fcos_lidar_jax.inference.timing import Call, Times, interleaved
 from fcos_lidar_jax.locations import image_layout, locate
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.models.modality import Form, Stem

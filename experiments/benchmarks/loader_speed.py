@@ -28,13 +28,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.benchmarks.stages import training_steps
+from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.script import Options, find_real_data, run_measurement
-from experiments.statistics import interleaved
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase, prepare_database

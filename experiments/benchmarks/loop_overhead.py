@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from experiments.benchmarks.stages import training_steps
+from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.data.frame import GivenFrames
 from fcos_lidar_jax.presets import QUICKSTART

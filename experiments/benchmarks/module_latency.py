@@ -24,10 +24,10 @@ from experiments.benchmarks.latency import STEM_FORMS
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, run_measurement
-from experiments.statistics import Call, interleaved
 from fcos_lidar_jax.config import StemConfig
+from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.locations import image_layout
-from fcos_lidar_jax.models.layers import convolve
+from fcos_lidar_jax.models.convolution import convolve
 from fcos_lidar_jax.models.modality import Form, Stem, bundles, channel_groups
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E

@@ -23,7 +23,7 @@ from experiments.benchmarks.latency import ROWS, fused_cloud, padded
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, run_measurement
-from experiments.statistics import interleaved
+from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.projection import project_points, remove_close
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 

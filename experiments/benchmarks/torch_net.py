@@ -1,9 +1,10 @@
 """The same network in PyTorch, as a peer for timings: what its users would write.
 
-Modality-wise stem by ``groups=9``, LiDAR-Net, feature pyramid, heads with group norm, 1x1 merges per branch. Sizes
-come from the environment: ``HEIGHT`` and ``WIDTH`` of the image, ``WIDTHS_OVER`` (divides the channels), ``FPN``
-(channels before the division), ``BATCH``. ``FNS["train"]`` is a forward and a backward pass in ``channels_last``;
-there is no assignment, no optimizer and no projection in it. Needs torch, which the project itself does not.
+Modality-wise stem by ``groups=9``, LiDAR-Net, feature pyramid, heads with group norm, 1x1 merges per branch.
+Sizes come from the environment: ``BATCH``, ``HEIGHT`` and ``WIDTH`` of the image, its ``ROUNDS``, and the
+channels of each ``TYPE``, of ``STEM``, ``PYRAMID``, ``HEAD`` and the backbone's stages (``WIDTHS``).
+``FNS["train"]`` is a forward and a backward pass in ``channels_last``; there is no assignment, no optimizer and
+no projection in it. Needs torch, which the project itself does not.
 """
 
 import os
@@ -12,11 +13,12 @@ import torch  # type: ignore[import-not-found]
 import torch.nn.functional as F  # type: ignore[import-not-found]
 from torch import nn  # type: ignore[import-not-found]
 
-HEIGHT, WIDTH = int(os.environ.get("HEIGHT", "64")), int(os.environ.get("WIDTH", "1088"))
-OVER, BATCH = int(os.environ.get("WIDTHS_OVER", "1")), int(os.environ.get("BATCH", "1"))
-FPN = int(os.environ.get("FPN", "256")) // OVER
-TYPE, STEM, HEAD = 32 // OVER, 64 // OVER, 64 // OVER
-BLOCKS, WIDTHS, STRIDES = (4, 4, 1, 1), tuple(w // OVER for w in (64, 128, 128, 128)), (1, 2, 2, 2)
+_SIZES = {"HEIGHT": 64, "WIDTH": 1088, "ROUNDS": 5, "BATCH": 1}
+_CHANNELS = {"TYPE": 32, "STEM": 64, "PYRAMID": 256, "HEAD": 64}
+HEIGHT, WIDTH, ROUNDS, BATCH = (int(os.environ.get(name, value)) for name, value in _SIZES.items())
+TYPE, STEM, PYRAMID, HEAD = (int(os.environ.get(name, value)) for name, value in _CHANNELS.items())
+WIDTHS = tuple(map(int, os.environ.get("WIDTHS", "64,128,128,128").split(",")))
+BLOCKS, STRIDES = (4, 4, 1, 1), (1, 2, 2, 2)
 
 
 def conv(inputs: int, outputs: int, size: int, **options: int) -> nn.Conv2d:
@@ -47,7 +49,7 @@ class Bottleneck(nn.Module):
 
 def _tower() -> nn.Sequential:
     layers = []
-    for inputs in (FPN, HEAD, HEAD, HEAD):
+    for inputs in (PYRAMID, HEAD, HEAD, HEAD):
         layers += [conv(inputs, HEAD, 3), nn.GroupNorm(min(32, HEAD // 2), HEAD), nn.ReLU(True)]
     return nn.Sequential(*layers)
 
@@ -59,7 +61,7 @@ class Network(nn.Module):
         super().__init__()
         self.branches = nn.ModuleList(
             nn.Sequential(
-                _normed(45, 9 * TYPE, 3, dilation=d, groups=9),
+                _normed(9 * ROUNDS, 9 * TYPE, 3, dilation=d, groups=9),
                 _normed(9 * TYPE, 9 * TYPE, 3, dilation=d, groups=9),
                 conv(9 * TYPE, STEM, 1),
             )
@@ -71,8 +73,8 @@ class Network(nn.Module):
             later = (Bottleneck(4 * width, width, 1, False) for _ in range(count - 1))
             self.stages.append(nn.Sequential(Bottleneck(inputs, width, stride, True), *later))
             inputs = 4 * width
-        self.laterals = nn.ModuleList(nn.Conv2d(4 * w, FPN, 1) for w in WIDTHS)
-        self.outputs = nn.ModuleList(nn.Conv2d(FPN, FPN, 3, 1 if i < 4 else 2, 1) for i in range(6))
+        self.laterals = nn.ModuleList(nn.Conv2d(4 * w, PYRAMID, 1) for w in WIDTHS)
+        self.outputs = nn.ModuleList(nn.Conv2d(PYRAMID, PYRAMID, 3, 1 if i < 4 else 2, 1) for i in range(6))
         self.heads = nn.ModuleList(
             nn.ModuleList([_tower(), nn.Conv2d(HEAD, 11, 3, 1, 1), _tower(), nn.Conv2d(HEAD, 110, 3, 1, 1)])
             for _ in range(6)
@@ -97,7 +99,7 @@ class Network(nn.Module):
 
 
 network = Network().to(memory_format=torch.channels_last)
-images = torch.randn(BATCH, 45, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
+images = torch.randn(BATCH, 9 * ROUNDS, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
 
 
 def train() -> None:

@@ -3,27 +3,40 @@
     python -m experiments.benchmarks.train_speed --torch-python PYTHON  # an interpreter that has torch
     python -m experiments.benchmarks.train_speed --torch-python PYTHON --peer FILE
 
-Ours is the whole step: augmentation, projection, network, assignment, losses, gradients, AdamW. The peer's is the
-network alone with a plain loss (``torch_net.py``, or any file with ``FNS["train"]``). Both run turn by turn, batch
-1, float32, at full size (64x1088) and at a reduced one (32x288, a quarter of the channels). Cost: about ten
-minutes on two CPU cores and 12 GB. Expected: at most 1.75 of the peer's time at full size, 2 at the reduced one.
+Ours is the whole step: augmentation, projection, network, assignment, losses, gradients, AdamW. The peer's is
+the network alone with a plain loss (``torch_net.py``, or any file with ``FNS["train"]``). Both run turn by
+turn, batch 1, float32: ``reduced`` (32x288, five rounds, a quarter of the channels), ``slim`` (32x1088, one
+round, 0.9 M parameters), ``full`` (64x1088, five rounds, the paper's channels) and ``full_64``, whose pyramid
+has 64 channels. Beside it the seconds that the step takes to compile, and those with the library's weight
+gradients, turn by turn as well. Cost: about half an hour on two CPU cores and 12 GB. Expected: at most 1.4 of
+the peer's time when slim, 1.25 at full size, 2 when reduced; at most 1.2 of the library's time to compile.
 """
 
 import dataclasses
+import functools
 import json
+import math
+import statistics
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from unittest import mock
+
+import jax
 
 from experiments.benchmarks.peers import turn_by_turn
-from experiments.benchmarks.stages import training_steps
+from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import without_close
+from fcos_lidar_jax.models import convolution
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 
+Size = Literal["reduced", "slim", "full_64", "full"]
 _PEER = Path(__file__).with_name("torch_net.py")
 
 
@@ -33,41 +46,73 @@ class Args(Options):
 
     torch_python: Path  # Interpreter that has torch.
     peer: Path = _PEER  # Program with FNS["train"].
-    fpn: tuple[int, ...] = (64, 256)  # Channels of the pyramid at full size, a comparison each.
-    repeats: int = 5  # Turns at full size; ten times as many at the reduced size.
+    sizes: tuple[Size, ...] = ("reduced", "slim", "full_64", "full")  # Which to compare.
+    repeats: int = 15  # Turns; ten times as many when reduced.
+    compilations: int = 3  # Of each form of the step, also turn by turn.
 
 
-def of_size(over: int, fpn: int) -> tuple[Config, Sensor]:
-    """The paper's detector on one sweep, full size, or 32x288 with channels divided by ``over``."""
-    model, stem = NUSCENES.model, NUSCENES.model.stem
+_FULL = {"HEIGHT": 64, "WIDTH": 1088, "ROUNDS": 5, "TYPE": 32, "STEM": 64, "WIDTHS": "64,128,128,128", "HEAD": 64}
+_SLIM = {"HEIGHT": 32, "WIDTH": 1088, "ROUNDS": 1, "TYPE": 4, "STEM": 16, "WIDTHS": "16,32,32,32", "HEAD": 32}
+_REDUCED = {"HEIGHT": 32, "WIDTH": 288, "ROUNDS": 5, "TYPE": 8, "STEM": 16, "WIDTHS": "16,32,32,32", "HEAD": 16}
+_SIZES: dict[Size, dict[str, Any]] = {
+    "reduced": {**_REDUCED, "PYRAMID": 16},
+    "slim": {**_SLIM, "PYRAMID": 32},
+    "full_64": {**_FULL, "PYRAMID": 64},
+    "full": {**_FULL, "PYRAMID": 256},
+}
+
+
+def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
+    """The paper's detector on one sweep, with these numbers."""
     config = change(
         num_sweeps=1,
         max_points=40_000,
-        model__row_upscale=2 if over == 1 else 1,
-        model__stem__channels_per_type=stem.channels_per_type // over,
-        model__stem__out_channels=stem.out_channels // over,
-        model__backbone_widths=tuple(w // over for w in model.backbone_widths),
-        model__fpn_channels=fpn // over,
-        model__head_channels=model.head_channels // over,
+        projection__num_rounds=size["ROUNDS"],
+        model__row_upscale=size["HEIGHT"] // NUSCENES_HDL32E.num_rows,
+        model__stem__channels_per_type=size["TYPE"],
+        model__stem__out_channels=size["STEM"],
+        model__backbone_widths=tuple(map(int, size["WIDTHS"].split(","))),
+        model__fpn_channels=size["PYRAMID"],
+        model__head_channels=size["HEAD"],
     )(NUSCENES)
-    return config, dataclasses.replace(NUSCENES_HDL32E, num_columns={1: 1086, 4: 288}[over])
+    return config, dataclasses.replace(NUSCENES_HDL32E, num_columns=min(size["WIDTH"], 1086))
+
+
+def compile_seconds(steps: Callable[[], Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Medians of the time to compile the step, as it is and with the library's weight gradients; their ratio."""
+
+    def seconds() -> float:
+        step, times = steps(), []
+        for _ in range(2):
+            began = time.perf_counter()
+            jax.block_until_ready(step())
+            times.append(time.perf_counter() - began)
+        return times[0] - times[1]
+
+    found: dict[str, list[float]] = {"ours": [], "library": []}
+    for _ in range(repeats):
+        found["ours"].append(seconds())
+        with mock.patch.object(convolution, "LARGE", math.inf):
+            found["library"].append(seconds())
+    medians = {name: round(statistics.median(values), 2) for name, values in found.items()}
+    return {**medians, "ratio": round(medians["ours"] / medians["library"], 3)}
 
 
 def measure(args: Args) -> dict[str, Any]:
     """Compare at all sizes."""
     record: dict[str, Any] = {"peer": args.peer.name}
-    for over, fpn in [(4, args.fpn[0]), *((1, fpn) for fpn in args.fpn)]:
-        config, sensor = of_size(over, fpn)
-        height, width = (64, 1088) if over == 1 else (32, 288)
-        sizes = {"HEIGHT": height, "WIDTH": width, "WIDTHS_OVER": over, "FPN": fpn}
-        sizes |= {"NH": height, "NW": width, "Q": over, "TRAIN": 1, "CL": 1}  # what other peers call them
-        step = training_steps(config, sensor, [without_close(make_frame(0, sensor, num_objects=30), sensor)])
-        repeats = args.repeats * (1 if over == 1 else 10)
+    for name in args.sizes:
+        size = _SIZES[name]
+        config, sensor = of_size(size)
+        frames = [without_close(make_frame(0, sensor, num_objects=30), sensor)]
+        steps = functools.partial(training_steps, config, sensor, frames)
+        over = 64 // size["STEM"]
+        others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
+        sizes = {**size, **others, "TRAIN": 1, "CL": 1}  # and what other peers call them
         peer = {"peer": args.peer, "name": "train", "environment": sizes, "python": args.torch_python}
-        figures = turn_by_turn(step, repeats, **peer)
-        name = f"{height}x{width}, channels / {over}, pyramid {fpn // over}"
-        record[name] = figures
-        print(f"{name}: {json.dumps(figures)}", flush=True)
+        figures = turn_by_turn(steps(), args.repeats * (10 if name == "reduced" else 1), **peer)
+        record[name] = {**figures, "compile_s": compile_seconds(steps, args.compilations)}
+        print(f"{name}: {json.dumps(record[name])}", flush=True)
     return record
 
 

@@ -30,7 +30,7 @@ from fcos_lidar_jax.evaluation.metrics import evaluate
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
 from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.files import checksum, file_lock
-from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.inference import CloudDetector
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
@@ -71,7 +71,7 @@ class Simulated:
     fast_traffic: bool = True  # The ego vehicle drives at 10 to 20 m/s, and nearly all objects that can move do.
 
     def describe(self) -> dict[str, Any]:
-        """What of the scale decides a cell's result, as JSON."""
+        """What of the scale decides a cell's result, as JSON; the streets are plain ones in all of them."""
         return {
             "scale": self.name,
             "sensor": describe_sensor(self.sensor),
@@ -249,7 +249,7 @@ class NuScenesLayout:
 Scale = Simulated | NuScenesLayout  # Where and how long cells are trained.
 
 
-def write_submission(detector: TrainedDetector, frames: NuScenesFrames, file: Path) -> None:
+def write_submission(detector: CloudDetector, frames: NuScenesFrames, file: Path) -> None:
     """Detect in keyframes and write the benchmark's results file; an interrupted call resumes."""
     data, tokens = frames.nuscenes, frames.tokens
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -2,19 +2,23 @@
 
     python -m experiments.studies.simulated_vs_real --data FOLDER --pictures /tmp/pictures
 
-FOLDER holds ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_scene0061/`` (one keyframe of
-another) and ``ten_sweep_cloud/`` (one fused cloud). Prints, of simulated and real, the points that show an object
-by class and range, what one sweep fills of the range image, and what multi-round projection keeps of ten sweeps;
-draws objects of every class side by side where a folder is named for them.
+FOLDER holds ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_scene0103/`` (two of another),
+``nuscenes_scene0061/`` (one of a third) and ``ten_sweep_cloud/`` (one fused cloud). Prints, of simulated and real,
+the points that show an object by class and range, what one sweep fills of the range image, what multi-round
+projection keeps of ten sweeps, and what ground, rings, intensities and clutter look like, in varied streets
+("city": drives and training frames) and in plain ones; draws objects of every class side by side where a folder is
+named for them.
 
 The real figures are those of two streets: an object of the first is seen up to forty times. Medians are over the
 boxes that hold a point; "visible" counts those alone that are annotated as 80-100 % visible, in the cameras of the
-real scene, by the rays of the simulated LiDAR. Cost: a minute on a CPU core, 550 MB. The result is in README.md.
+real scene, by the rays of the simulated LiDAR. Cost: two minutes on a CPU core, 550 MB. The result is in
+README.md.
 """
 
 import dataclasses
 import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +27,14 @@ import numpy as np
 from experiments.benchmarks.latency import fused_cloud
 from experiments.benchmarks.mrv_figures import ROUNDS, kept_by_rounds
 from experiments.script import Options, real_data, run_script, save
+from experiments.sweep_statistics import Figures, sweep_statistics
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.projection import close_to_sensor, project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E as SENSOR
+from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames, city_frames
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.visualization.figure import new_figure, save_png
@@ -36,7 +42,6 @@ from fcos_lidar_jax.visualization.figure import new_figure, save_png
 RANGES_M = ((0, 10), (10, 20), (20, 30), (30, 50))
 EXAMPLES = 3
 FEW = 10  # Boxes with a point, below which a median is not compared.
-Figures = dict[str, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +53,8 @@ class Args(Options):
     """Folder for pictures, which show real data: not in a repository. None draws none."""
     scenes: int = 24  # Simulated scenes of four keyframes.
     seed: int = 0  # Of the simulated scenes.
-    rolling_shutter: bool = False  # Simulate with a rolling shutter.
+    rolling_shutter: bool = True  # Simulate with a rolling shutter.
+    frames: int = 40  # Simulated training frames, of varied and of plain streets.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,6 +125,29 @@ def round_figures(cloud: np.ndarray) -> Figures:
     row["cells of the current sweep with priority"] = with_priority["current"]["1"]
     row["cells of the current sweep without priority"] = without["current"]["1"]
     return {name: round(float(value), 1) for name, value in row.items()}
+
+
+def street_figures(args: Args, real: list[Keyframe], simulated: list[Keyframe]) -> dict[str, Figures]:
+    """Mean sweep statistics of real keyframes, simulated drives and simulated training frames."""
+    folder = real_data(args.data, "nuscenes_scene0103")
+    plain = SimulatedFrames(SENSOR, args.frames, UNSEEN_SEED, num_objects=40, reach_m=45.0, min_points=1)
+    city = city_frames(SENSOR, args.frames, UNSEEN_SEED)
+    sets: dict[str, Sequence[Frame]] = {
+        "scene-0523, even": real[:-1:2],
+        "scene-0103": [read_keyframe(folder, SENSOR, i) for i in range(2)],
+        "scene-0061": real[-1:],
+        "city drives": simulated,
+        "city frames": [city.frame(i) for i in range(args.frames)],
+        "plain frames": [plain.frame(i) for i in range(args.frames)],
+    }
+    return {name: _averaged([sweep_statistics(f, SENSOR) for f in frames], 3) for name, frames in sets.items()}
+
+
+def print_streets(figures: dict[str, Figures]) -> None:
+    """One line a figure, one column a set."""
+    print(f"\n{'':34}" + "".join(name.rjust(18) for name in figures))
+    for name in next(iter(figures.values())):
+        print(f"{name:34}" + "".join(f"{row[name]:18.3f}" for row in figures.values()))
 
 
 def _padded(points: np.ndarray, size: int) -> np.ndarray:
@@ -226,6 +255,8 @@ def main(args: Args) -> None:
         record[title] = dict(zip(("simulated", "real"), figures, strict=True))
         _print_figures(title, **record[title])
     print_objects(*objects)
+    record["streets"] = street_figures(args, real, simulated)
+    print_streets(record["streets"])
     spread = {name: [min(row[name] for row in each), max(row[name] for row in each)] for name in each[0]}
     least_and_most = {"ten sweeps, least and most of simulated scenes": spread}
     record |= least_and_most | {"objects": dict(zip(("simulated", "real"), objects, strict=True))}

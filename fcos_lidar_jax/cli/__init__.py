@@ -1,76 +1,218 @@
-"""The command line: parse, run, and turn every foreseeable failure into one line."""
+"""The command line: whatever a command does, a failure becomes one line and an exit code here."""
 
+import contextlib
+import os
+import platform
+import select
+import signal
 import sys
-from collections.abc import Callable, Sequence
-from functools import reduce
-from operator import or_
-from typing import Annotated, Any
-
-import tyro
-
-from fcos_lidar_jax.cli import demo, detect, evaluate, prepare, project, synthesize, train
-
-_COMMANDS = {
-    "demo": (demo.Demo, demo.run),
-    "synthesize": (synthesize.Synthesize, synthesize.run),
-    "prepare": (prepare.Prepare, prepare.run),
-    "train": (train.Train, train.run),
-    "evaluate": (evaluate.Evaluate, evaluate.run),
-    "detect": (detect.Detect, detect.run),
-    "project": (project.Project, project.run),
-}  # name -> its options and what it does
-
-Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _) in _COMMANDS.items()))
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import NoReturn, TextIO
 
 _LESS_MEMORY = (
     "in training --optimizer.accumulate N takes a batch in N parts, --model.precision bfloat16 halves the "
     "activations, and --model.remat computes the largest ones again instead of keeping them; elsewhere "
     "--batch-size 1 needs the least"
 )
+_MAX_LINE = 1000
+_CLOSED_PIPE = 128 + signal.SIGPIPE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, by default that of the process's arguments (``argv`` is without the program's name).
 
     Returns:
-        exit code: 0, 1 after a failure that one line on standard error explains, 130 when interrupted. Usage
-        errors leave with 2.
+        exit code, see :func:`exit_code`. Usage errors leave with 2.
     """
-    command = tyro.cli(
-        Command,
-        prog="fcos-lidar",
-        description="FCOS-LiDAR in JAX: 3D object detection on LiDAR range images.",
-        args=argv,
-        config=(tyro.conf.CascadeSubcommandArgs,),  # a command's options may stand behind its preset
-    )  # type: ignore[call-overload]
-    run = next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))
-    return exit_code("fcos-lidar", lambda: run(command))
+
+    def work() -> None:
+        with _importing("fcos-lidar"):
+            from fcos_lidar_jax.cli.commands import parse
+        parse(argv)()
+
+    return exit_code("fcos-lidar", work)
 
 
 def exit_code(program: str, work: Callable[[], object]) -> int:
     """Call ``work``; one line on standard error, which begins with the program's name, says why it failed.
 
+    What is no foreseeable failure is a defect: the line then says where the full report is. SIGTERM and SIGHUP end
+    the work like an exception, so that nothing is left half-written.
+
     Returns:
-        0, 1 after a foreseeable failure, 130 when interrupted.
+        0, 1 after a failure, 130 when interrupted, 141 where nobody reads the output any more.
+
+    Raises:
+        SystemExit: with 143 or 129 after SIGTERM or SIGHUP; and what ``work`` raises of it.
 
     >>> exit_code("example", lambda: 0)
     0
     """
+    stopped = None
     try:
-        work()
-    except (ValueError, OSError, ArithmeticError) as error:
-        line = " ".join(str(error).split())
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        line = f"out of memory: {_LESS_MEMORY}"
+        with _ending_signals():
+            code = _attempt(program, work)
+    except BrokenPipeError:
+        code = _CLOSED_PIPE
+    except SystemExit as stop:
+        code, stopped = 0, stop
+    if not all([_flushed(stream) for stream in (sys.stdout, sys.stderr)]):
+        return _CLOSED_PIPE
+    if stopped is not None:
+        raise stopped
+    return code
+
+
+def _attempt(program: str, work: Callable[[], object]) -> int:
+    try:
+        with _raising_again():
+            work()
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130
-    else:
-        return 0
-    print(f"{program}: error: {line}", file=sys.stderr)
-    return 1
+    except Exception as error:
+        if isinstance(error, BrokenPipeError) and any(map(_is_unread, (sys.stdout, sys.stderr))):
+            raise
+        line = _explain(error) or f"unexpected {type(error).__name__}: {_write_report(error)}: {_words(error)}"
+        print(f"{program}: error: {line if len(line) <= _MAX_LINE else line[:_MAX_LINE] + '...'}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _words(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _explain(error: Exception) -> str | None:
+    """What to tell about a failure that is no defect of the program; None for others."""
+    text = _words(error)
+    if isinstance(error, RecursionError):
+        return "nested too deeply: expected a file or an option with fewer levels"
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
+        return f"out of memory: {_LESS_MEMORY}"
+    if isinstance(error, RuntimeError) and "nitialize backend" in text:
+        return (
+            f"JAX_PLATFORMS: got {os.environ.get('JAX_PLATFORMS')!r}, expected a platform of this machine: {text}"
+        )
+    if isinstance(error, ValueError | OSError | ArithmeticError):
+        return text or f"{type(error).__name__} without a message"
+    return None
+
+
+def _write_report(error: Exception) -> str:
+    """Write all that is known of a defect to a file; returns where it is and what to do with it."""
+    lines = [f"arguments: {sys.argv}", f"python {platform.python_version()} on {platform.platform()}"]
+    for package in ("fcos-lidar-jax", "jax", "jaxlib", "flax", "numpy"):
+        with contextlib.suppress(PackageNotFoundError):
+            lines.append(f"{package} {version(package)}")
+    try:
+        handle, name = tempfile.mkstemp(prefix="fcos-lidar-", suffix=".txt")
+        with open(handle, "w", encoding="utf-8", errors="replace") as file:
+            file.write("\n".join([*lines, "", *traceback.format_exception(error)]))
+    except OSError:
+        return "a defect; its report could not be written"
+    return f"a defect: the full report is {name}, please attach it to an issue of the project"
+
+
+def _is_unread(stream: TextIO) -> bool:
+    """Whether an output is a pipe of which the other end is closed."""
+    try:
+        (poll := select.poll()).register(stream.fileno(), 0)
+    except (OSError, ValueError):  # no file at all
+        return False
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _flushed(stream: TextIO) -> bool:
+    """Write what is waiting; False where nobody reads it. What still follows then leads nowhere, in silence."""
+    try:
+        stream.flush()
+        return True
+    except BrokenPipeError:
+        return False
+    except (OSError, ValueError):  # closed, or a full disk
+        return True
+    finally:
+        if _is_unread(stream):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+@contextlib.contextmanager
+def _ending_signals() -> Iterator[None]:
+    """Make the signals that would end the process at once raise SystemExit, in the main thread."""
+    own = threading.current_thread() is threading.main_thread()
+    asked = [n for n in (signal.SIGTERM, signal.SIGHUP) if own and signal.getsignal(n) is signal.SIG_DFL]
+
+    def end(number: int, _: object) -> NoReturn:
+        raise SystemExit(128 + number)
+
+    for number in asked:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in asked:
+            signal.signal(number, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def _raising_again() -> Iterator[None]:
+    """Raise again what a signal raised in a finalizer or a weak reference's callback, where Python drops it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    report, dropped = sys.unraisablehook, list[BaseException]()
+
+    def keep(unraisable: "sys.UnraisableHookArgs") -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
+            dropped.append(unraisable.exc_value)
+            signal.setitimer(signal.ITIMER_REAL, 0.01)
+        else:
+            report(unraisable)
+
+    def raise_again(*_: object) -> NoReturn:
+        raise dropped[-1]
+
+    before = signal.signal(signal.SIGALRM, raise_again)
+    sys.unraisablehook = keep
+    try:
+        yield
+        if dropped:
+            raise dropped[-1]
+    except Exception as error:
+        cause: BaseException | None = error
+        while (cause := cause.__cause__ or cause.__context__) is not None:
+            if isinstance(cause, KeyboardInterrupt | SystemExit):  # which a library took for a failure of its own
+                raise cause from None
+        raise
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+        sys.unraisablehook = report
+
+
+@contextlib.contextmanager
+def _importing(program: str) -> Iterator[None]:
+    """Let Ctrl-C end the process at once: half an import may turn it into any other error."""
+    own = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT)
+    if not own or before is not signal.default_int_handler:
+        yield
+        return
+
+    def end(*_: object) -> NoReturn:
+        os.write(2, f"{program}: interrupted\n".encode())
+        os._exit(130)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 if __name__ == "__main__":

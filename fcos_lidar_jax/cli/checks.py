@@ -1,6 +1,9 @@
 """What several commands refuse, in the same words."""
 
+from collections.abc import Iterable
 from pathlib import Path
+
+from fcos_lidar_jax.files import check_writable
 
 
 def check_at_least(args: object, least: int, *options: str) -> None:
@@ -15,11 +18,31 @@ def check_at_least(args: object, least: int, *options: str) -> None:
             raise ValueError(f"--{name.replace('_', '-')}: got {value}, expected at least {least}")
 
 
-def check_out_folder(out: Path) -> None:
-    """Refuse a file where ``--out`` is to be a folder.
+def check_out_folder(out: Path, option: str = "--out") -> None:
+    """Refuse what cannot be a folder to write to, before any work is done.
 
     Raises:
-        ValueError: naming the file.
+        ValueError: naming the option and the file.
+        OSError: it cannot be written to.
     """
     if out.exists() and not out.is_dir():
-        raise ValueError(f"--out: {out}: found a file, expected a folder")
+        raise ValueError(f"{option}: {out}: found a file, expected a folder")
+    check_writable(out / ".lock")
+
+
+def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
+    """Refuse a place that no file can be written to, before any work is done.
+
+    Args:
+        option: as it is typed.
+        out: its value.
+        keep: files that the command reads or writes besides.
+
+    Raises:
+        ValueError: it is one of those to keep.
+        OSError: it is a folder, a device or a link, or cannot be written.
+    """
+    for other in keep:
+        if out.resolve() == other.resolve() or (out.exists() and other.exists() and out.samefile(other)):
+            raise ValueError(f"{option}: {out}: the same file as {other}, expected another one")
+    check_writable(out)

@@ -1,7 +1,6 @@
 """The options that name a data set, the same for every command."""
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +9,7 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.classes import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.input_pipeline.open import Format, Layout, default_split, find_layout, open_frames
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 
@@ -27,6 +27,7 @@ class DataOptions:
     splits: Path | None = None
     """JSON file with own splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
     class_map: Path | None = None  # JSON file {name in the data: name to use, or null for objects to leave out}.
+    follow_links: bool = False  # Read files to which links lead outside of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps where files of older sweeps are missing.
 
     def layout(self) -> Layout:
@@ -88,6 +89,7 @@ class DataOptions:
             index=self.index,
             splits=self.splits,
             allow_missing_sweeps=self.allow_missing_sweeps,
+            follow_links=self.follow_links,
             **{"remove_close": "all", **options},
         )
         if isinstance(frames, NuScenesFrames):
@@ -105,13 +107,7 @@ def read_class_map(file: Path | None) -> ClassMap | None:
     """
     if file is None:
         return None
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{file}: cannot be read: {error}") from None
-    if not isinstance(found, dict) or not all(v is None or isinstance(v, str) for v in found.values()):
-        raise ValueError(f"{file}: expected a JSON object {{name: name or null}}")
-    return found
+    return read_json(file, dict[str, str | None], what="a translation of class names")
 
 
 def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]:

@@ -7,13 +7,17 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
+from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.sweeps import read_list
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.inference.cloud import expect_points
 from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.trainer import predict
+from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Detect:
     """Point files, one cloud each (.pcd.bin, .bin, .npy, .npz or .pcd), or folders of them."""
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")]
     """Trained detector: a checkpoint; a run, which stands for its last one, RUN/best for its best; or
-    `quickstart`, which comes with the package."""
+    `hdl32e` or `quickstart`, which come with the package."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]  # Where the JSON goes.
     sweeps: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
     """Instead of files: a list of sweeps to fuse, [{"file", "timestamp_us", "sensor_to_world": 4x4}], the first
@@ -42,6 +46,7 @@ class Detect:
     columns: int | None = None
     """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
     dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
+    max_file_points: int = MAX_POINTS  # Refuse a point file of more points.
     batch_size: int = 1  # Clouds that a device takes at once; more than one changes boxes and scores by rounding.
 
 
@@ -49,15 +54,26 @@ def run(args: Detect) -> None:
     """Detect in all files, then write."""
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected point files or --sweeps, one of the two")
+    check_at_least(args, 1, "batch_size", "max_file_points")
+    if not 0 <= args.min_score <= 1:
+        raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
+    files = find_clouds(args.files) if args.sweeps is None else (args.sweeps,)
+    sweeps = () if args.sweeps is None else (args.sweeps.parent / each.file for each in read_list(args.sweeps))
+    check_out_file("--out", args.out, keep=(*files, *sweeps))
+    if args.pictures is not None:
+        check_out_folder(args.pictures, "--pictures")
+    if find_checkpoint(args.checkpoint).resolve() in args.out.resolve().parents:
+        raise ValueError(f"--out: {args.out}: found a place in the checkpoint, expected one elsewhere")
     detector = load_detector(args.checkpoint)
     projection = detector.config.projection
     clouds = CloudFiles(
-        find_clouds(args.files) if args.sweeps is None else (args.sweeps,),
+        files,
         detector.sensor,
         args.remove_close or projection.remove_close,
         projection.close_m,
         columns=args.columns,
         dtype=args.dtype,
+        max_points=args.max_file_points,
     )
     progress = Progress("files", len(clouds))
     results: list[dict[str, Any]] = []

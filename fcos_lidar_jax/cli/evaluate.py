@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -26,7 +26,7 @@ from fcos_lidar_jax.evaluation.results import read_results, result_entries, writ
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
-from fcos_lidar_jax.inference import TrainedDetector, load_detector
+from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.records import as_records
 from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
@@ -34,7 +34,7 @@ from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.trainer.results import write_predictions
 from fcos_lidar_jax.types import Detections
-from fcos_lidar_jax.visualization.evaluation_report import Example, write_evaluation_report
+from fcos_lidar_jax.visualization.evaluation_report import Example, clear_report, write_evaluation_report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Evaluate:
     """FIRST:LAST: frames of the split in their order, LAST excluded; several, separated by commas."""
     checkpoint: Path | None = None
     """Trained detector to run: a checkpoint; a run, which stands for its last one, RUN/best for its best; or
-    `quickstart`, which comes with the package."""
+    `hdl32e` or `quickstart`, which come with the package."""
     results: Path | None = None  # Results file to evaluate: the benchmark's, or detections.json.
     ground_truth: Path | None = None
     """Truth as JSON, instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
@@ -83,26 +83,25 @@ def run(args: Evaluate) -> None:
         given = args.results if compared.metric.benchmark else None
         if given is not None and not (file.exists() and file.samefile(given)):
             atomic_write(file, lambda path: shutil.copyfile(given, path))
+        clear_report(args.out)  # of other numbers
         evaluation = evaluate(compared.predictions, compared.truth, compared.metric)
         progress = Progress("sets", args.bootstrap)
         intervals = write_evaluation(
             args.out, evaluation, compared.meta, repeats=args.bootstrap, report=progress.show
         )
-        report = args.out / "report.html"
-        report.unlink(missing_ok=True)  # of other numbers
         if args.report:
             write_evaluation_report(
                 args.out,
                 title=f"{(args.checkpoint or args.results or Path()).name} on {compared.name}",
                 num_samples=len(compared.truth.tokens),
-                examples=_examples(evaluation, compared),
+                examples=examples(evaluation, compared.frames, compared.truth.ego_translation),
                 sensor=sensor,
                 global_axes=compared.frames is None,
             )
     for line in warnings(evaluation, len(compared.predictions)):
         print(line, file=sys.stderr)
     print(describe(evaluation, intervals))
-    print(f"look at {report if args.report else args.out / 'metrics_summary.json'}")
+    print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
 
 
 def _check(args: Evaluate) -> None:
@@ -119,6 +118,12 @@ def _check(args: Evaluate) -> None:
     check_at_least(args, 1, "batch_size")
     check_at_least(args, 0, "bootstrap")
     check_out_folder(args.out)
+    given = [] if args.results is None else [args.results]
+    truth = [] if args.ground_truth is None else [args.ground_truth]
+    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html"):
+        check_out_file("--out", args.out / name, keep=[*given, *truth])
+    for name in ("results_nusc.json", "detections.json"):  # may be evaluated again where they are
+        check_out_file("--out", args.out / name, keep=truth)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +138,7 @@ class _Compared:
     frames: FrameSet | None
 
 
-def _compared(args: Evaluate, detector: TrainedDetector | None, sensor: Sensor) -> _Compared:
+def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) -> _Compared:
     if args.ground_truth is not None:
         truth = read_truth(args.ground_truth)
         return _official(args, truth, None, of=str(args.ground_truth), name=args.ground_truth.name)
@@ -171,10 +176,10 @@ def _official(args: Evaluate, truth: GroundTruth, frames: FrameSet | None, *, of
 
 
 def _keyframes(
-    args: Evaluate, layout: Layout, detector: TrainedDetector | None, sensor: Sensor, split: str | None
+    args: Evaluate, layout: Layout, detector: CloudDetector | None, sensor: Sensor, split: str | None
 ) -> NuScenesFrames:
-    missing = args.data.allow_missing_sweeps
-    data = NuScenes(layout.root, str(layout.version), index=args.data.index, allow_missing_sweeps=missing)
+    allowed = {name: getattr(args.data, name) for name in ("allow_missing_sweeps", "follow_links")}
+    data = NuScenes(layout.root, str(layout.version), index=args.data.index, **allowed)
     tokens = data.sample_tokens if split is None else data.split(split, file=args.data.splits)
     if args.samples is not None:
         tokens = [tokens[i] for i in parse_ranges(args.samples, len(tokens))]
@@ -183,7 +188,7 @@ def _keyframes(
     return NuScenesFrames(data, tuple(tokens), config.num_sweeps, close.remove_close, close.close_m, sensor)
 
 
-def _detect_keyframes(args: Evaluate, detector: TrainedDetector, frames: NuScenesFrames) -> None:
+def _detect_keyframes(args: Evaluate, detector: CloudDetector, frames: NuScenesFrames) -> None:
     def entries(index: int, found: Detections) -> list[dict[str, Any]]:
         token = frames.tokens[index]
         return result_entries(found, token, frames.nuscenes.sensor_to_global(token), detector.classes)
@@ -192,7 +197,7 @@ def _detect_keyframes(args: Evaluate, detector: TrainedDetector, frames: NuScene
 
 
 def _detect(
-    args: Evaluate, detector: TrainedDetector, frames: FrameSet, file: Path, entries: Any, write: Any
+    args: Evaluate, detector: CloudDetector, frames: FrameSet, file: Path, entries: Any, write: Any
 ) -> None:
     """Write the detections, and report what was removed of the points but for those on the ego vehicle."""
     options = {"entries": entries, "write": write, "batch_size": args.batch_size}
@@ -203,16 +208,19 @@ def _detect(
         print(f"{removed['invalid']} points dropped: not finite, or beyond physical limits", file=sys.stderr)
 
 
-def _examples(evaluation: Evaluation, compared: _Compared) -> Iterator[Example]:
-    """The best, a typical and the worst sample; without a data set in the global frame, and without points."""
+def examples(evaluation: Evaluation, frames: FrameSet | None, centres: np.ndarray) -> Iterator[Example]:
+    """The best, a typical and the worst sample.
+
+    Without frames they are in the global frame, around their ``centres`` f64[samples, 3], and without points.
+    """
     chosen = choose_examples(evaluation)
     for kind, row in chosen.rows.items():
         pose, points = np.eye(4), np.zeros((0, 5), np.float32)
-        pose[:3, 3] = compared.truth.ego_translation[row]
-        if compared.frames is not None:
-            points = compared.frames.frame(row).points
+        pose[:3, 3] = centres[row]
+        if frames is not None:
+            points = frames.frame(row).points
             points = points[points[:, 4] == 0]
-            own_pose = compared.frames.pose(row) if compared.metric is NUSCENES_METRIC else None
+            own_pose = frames.pose(row) if evaluation.metric is NUSCENES_METRIC else None
             pose = np.eye(4) if own_pose is None else own_pose
         found, true = sensor_boxes(evaluation, row, pose, min_score=chosen.min_score)
-        yield Example(kind, compared.truth.tokens[row], points, found, true)
+        yield Example(kind, evaluation.tokens[row], points, found, true)

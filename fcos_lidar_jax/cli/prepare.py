@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
@@ -46,6 +46,7 @@ def run(args: Prepare) -> None:
     if layout.format == "simulated":
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
     folder = args.data.index or layout.index
+    check_out_folder(folder, "--index")
     with folder_lock(folder, "preparing"):
         record = _prepare(args, layout, folder)
     record["seconds"] = round(time.monotonic() - began, 1)

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least
-from fcos_lidar_jax.config import Config, ProjectionConfig
-from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
+from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
+from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference.cloud import expect_points, make_cloud
 from fcos_lidar_jax.projection import project_points
@@ -38,13 +38,21 @@ class Project:
     columns: int | None = None
     """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
     dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
+    max_file_points: int = MAX_POINTS  # Refuse a point file of more points.
 
 
 def run(args: Project) -> None:
     """Project the file, write the image, and print the counts."""
-    check_at_least(args, 1, "rounds")
+    check_at_least(args, 1, "rounds", "max_file_points")
+    if args.rounds > MAX_ROUNDS:
+        raise ValueError(f"--rounds: got {args.rounds}, expected at most {MAX_ROUNDS}")
+    check_out_file("--out", args.out, keep=[args.file])
+    if args.png is not None:
+        check_out_file("--png", args.png, keep=[args.file, args.out])
     sensor = load_sensor(args.sensor)
-    points = read_points(args.file, sensor, columns=args.columns, dtype=args.dtype)
+    points = read_points(
+        args.file, sensor, columns=args.columns, dtype=args.dtype, max_points=args.max_file_points
+    )
     config = Config(max_points=max(len(points), 1), projection=ProjectionConfig(remove_close=args.remove_close))
     cloud = make_cloud(points, config, sensor=sensor)
     rounds = {"num_rounds": args.rounds, "prioritize_current": args.prioritize_current}

@@ -5,11 +5,13 @@ import json
 import sys
 from pathlib import Path
 
-from fcos_lidar_jax.cli.checks import check_at_least
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
+from fcos_lidar_jax.data.classes import unknown_name
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset
 from fcos_lidar_jax.simulation.render import SWEEPS_PER_KEYFRAME, DatasetSpec
+from fcos_lidar_jax.simulation.streets import STREETS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Synthesize:
     seed: int = 0  # Another seed gives other streets.
     keyframes: int = 40  # Annotated keyframes a scene, at 2 Hz, with nine sweeps between two of them.
     sensor: str = "nuscenes_hdl32e"  # Sensor preset, or a sensor file.
-    rolling_shutter: bool = False
+    streets: str = "city"  # Varied streets (city), or such with few things besides objects (plain).
+    rolling_shutter: bool = True
     """Car and objects move while the sensor turns, as they do in real data; takes about twice as long."""
     workers: int = 1  # Processes.
     version: str = "v1.0-synthetic"  # Folder of the tables.
@@ -41,8 +44,11 @@ def run(args: Synthesize) -> None:
         raise ValueError(f"--version: got {args.version!r}, expected a folder's name")
     if args.version in ("samples", "sweeps", "maps"):
         raise ValueError(f"--version: got {args.version!r}, which is the name of another folder")
-    sensor = load_sensor(args.sensor)
-    order = DatasetSpec(args.scenes, args.seed, args.keyframes, sensor, args.rolling_shutter, args.version)
+    if args.streets not in STREETS:
+        raise ValueError(f"--streets: {unknown_name(args.streets, STREETS)}")
+    check_out_folder(args.out)
+    fields = args.scenes, args.seed, args.keyframes, load_sensor(args.sensor), args.rolling_shutter, args.version
+    order = DatasetSpec(*fields, STREETS[args.streets])
     sweeps = args.scenes * ((args.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1)
     progress = Progress("sweeps", sweeps)
     if not write_dataset(order, args.out, workers=args.workers, report=progress.show):

@@ -1,5 +1,6 @@
 """``fcos-lidar train``: train a preset on a data set."""
 
+import contextlib
 import dataclasses
 import json
 import sys
@@ -12,11 +13,12 @@ import jax
 import tyro
 from jax.experimental import multihost_utils
 
-from fcos_lidar_jax.cli.checks import check_at_least
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
+from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import Layout
@@ -30,6 +32,7 @@ _ABOUT = {
     "nuscenes_test": "the paper's test-set model",
     "kitti": "one sweep of KITTI's camera view, three classes",
     "argoverse2": "one sweep of Argoverse 2, 26 classes",
+    "compact": "one sweep of nuScenes, quick on two CPU cores",
     "quickstart": "small enough for two CPU cores",
 }
 _PRESETS: Any = (
@@ -89,6 +92,7 @@ def run(args: Train) -> None:
         copy_paste=None if args.no_copy_paste else args.config.copy_paste,
     )
     check_run(args.out, resume=args.resume)
+    check_out_folder(args.out)
     layout = args.data.layout()
     index = args.data.index or layout.index
     if layout.format == "nuscenes" and (layout.root / str(layout.version)).is_dir() and not has_index(index):
@@ -105,19 +109,26 @@ def run(args: Train) -> None:
             f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
             f"{steps} steps: nothing would ever be pasted"
         )
-    objects = None if config.copy_paste is None else _database(args, config, layout, frames, split)
+    own = args.samples is not None or layout.format == "simulated"  # objects of these frames alone, cut in OUT
     checkpoints = Checkpoints(args.out / CHECKPOINTS)
     try:
-        state = train(
-            config,
-            frames,
-            args.out,
-            steps=steps,
-            tests=tests,
-            objects=objects,
-            schedule=Schedule(args.save_every, args.evaluate_every, args.keep),
-            **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
-        )
+        with contextlib.ExitStack() as held:
+            if own and config.copy_paste is not None and jax.process_index() == 0:
+                held.enter_context(folder_lock(args.out, "training"))
+                check_run(args.out, resume=args.resume)  # another process may have been faster
+            objects = None
+            if config.copy_paste is not None:
+                objects = _own_database(args, frames) if own else _database(args, config, layout, split)
+            state = train(
+                config,
+                frames,
+                args.out,
+                steps=steps,
+                tests=tests,
+                objects=objects,
+                schedule=Schedule(args.save_every, args.evaluate_every, args.keep),
+                **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
+            )
     except (KeyboardInterrupt, SystemExit):
         if jax.process_index() == 0 and checkpoints.paths():
             print("the same command with --resume goes on", file=sys.stderr)
@@ -132,6 +143,8 @@ def run(args: Train) -> None:
 def _check(args: Train) -> None:
     check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep", "num_processes")
     check_at_least(args, 0, "threads", "workers", "seed")
+    if args.seed >= 2**63:
+        raise ValueError(f"--seed: got {args.seed}, expected less than 2**63")
     given = [option is not None for option in (args.coordinator, args.num_processes, args.process_index)]
     if any(given) and not all(given):
         raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
@@ -139,30 +152,31 @@ def _check(args: Train) -> None:
         raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
 
 
-def _database(
-    args: Train, config: Config, layout: Layout, frames: FrameSet, split: str | None
-) -> database.GroundTruthDatabase:
-    """The prepared objects of the split, or, of a part of it or simulated frames, objects of these alone."""
-    if args.samples is None and layout.format != "simulated":
-        folder = database.objects_folder(args.data.index or layout.index, split)
-        if not folder.is_dir():
-            of = "" if split is None else f" --train-split {split}"
-            raise ValueError(
-                f"{folder}: no objects here, expected those of the training frames: run fcos-lidar prepare{of}, "
-                "or train with --no-copy-paste"
-            )
-        source = database.read_manifest(folder).source
-        # Objects of more sweeps than are fused will do: those too many are left out.
-        sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
-        if not any(source == args.data.open_whole(split, num_sweeps=n).fingerprint() for n in sweeps):
-            raise ValueError(
-                f"{folder}: cut from other frames than those of split {split!r}, or from fewer sweeps than "
-                f"{config.num_sweeps}, expected these: run fcos-lidar prepare again"
-            )
-        return database.open_database(folder)
+def _database(args: Train, config: Config, layout: Layout, split: str | None) -> database.GroundTruthDatabase:
+    """The prepared objects of the split."""
+    folder = database.objects_folder(args.data.index or layout.index, split)
+    if not folder.is_dir():
+        of = "" if split is None else f" --train-split {split}"
+        raise ValueError(
+            f"{folder}: no objects here, expected those of the training frames: run fcos-lidar prepare{of}, "
+            "or train with --no-copy-paste"
+        )
+    source = database.read_manifest(folder).source
+    # Objects of more sweeps than are fused will do: those too many are left out.
+    sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
+    if not any(source == args.data.open_whole(split, num_sweeps=n).fingerprint() for n in sweeps):
+        raise ValueError(
+            f"{folder}: cut from other frames than those of split {split!r}, or from fewer sweeps than "
+            f"{config.num_sweeps}, expected these: run fcos-lidar prepare again"
+        )
+    return database.open_database(folder)
+
+
+def _own_database(args: Train, frames: FrameSet) -> database.GroundTruthDatabase:
+    """Objects of these frames alone, cut in the run's folder, which is locked."""
     folder = args.out / "objects"
-    if jax.process_count() > 1:  # one cuts, the others find it done
-        if jax.process_index() == 0:
-            database.prepare_database(frames, folder)
+    if jax.process_index() == 0:  # one cuts, the others find it done
+        database.prepare_database(frames, folder)
+    if jax.process_count() > 1:
         multihost_utils.sync_global_devices("objects")
-    return database.prepare_database(frames, folder)
+    return database.open_database(folder)

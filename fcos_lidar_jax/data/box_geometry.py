@@ -134,7 +134,8 @@ def _near_boxes(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> n
         occupied[i:k, j:l] = True
     cells = []
     for axis in (0, 1):
-        cell = (points[:, axis] - points.dtype.type(low[axis])) * points.dtype.type(1 / cell_m)
+        with np.errstate(over="ignore", invalid="ignore"):  # of what is far away or not finite
+            cell = (points[:, axis] - points.dtype.type(low[axis])) * points.dtype.type(1 / cell_m)
         # fmax and fmin turn NaN into a number, so that the conversion is defined.
         np.fmax(cell, 0, out=cell)
         np.fmin(cell, shape[axis] - 1, out=cell)

@@ -10,6 +10,7 @@ import numpy as np
 
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf
+from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, read_json
 
 _DESCRIPTION = "frames.json"
@@ -62,9 +63,8 @@ class CachedFrames(FramesOf):
         """One frame, read from its file; made and written where there is none."""
         file = self.folder / f"{index:06d}.npz"
         try:
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in _ARRAYS}
-                return Frame(**arrays, num_close=int(archive["num_close"]))
+            arrays = parse_npz(file.read_bytes(), [*_ARRAYS, "num_close"])
+            return Frame(**{**arrays, "num_close": int(arrays["num_close"])})
         except FileNotFoundError:
             pass
         except Exception as error:  # wrong bytes in an archive raise nearly anything

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
-from fcos_lidar_jax.data.point_files import ENDINGS, read_points
+from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.sensors import Sensor
 
@@ -21,6 +21,7 @@ class CloudFiles(FrameSet):
     close_m: float = 1.0  # half the side of the square that is emptied
     columns: int | None = None  # of a raw file of another layout
     dtype: str | None = None  # likewise
+    max_points: int = MAX_POINTS  # of a file; a larger one is refused
     classes: tuple[str, ...] = ()  # none: there are no boxes
 
     def __len__(self) -> int:
@@ -29,9 +30,11 @@ class CloudFiles(FrameSet):
     def frame(self, index: int) -> Frame:
         file, mode, close_m = self.files[index], self.remove_close, self.close_m
         if file.suffix == ".json":
-            points, num_close = read_sweeps(file, self.sensor, remove_close=mode, close_m=close_m)
+            how = {"remove_close": mode, "close_m": close_m, "max_points": self.max_points}
+            points, num_close = read_sweeps(file, self.sensor, **how)
         else:
-            cloud = read_points(file, self.sensor, columns=self.columns, dtype=self.dtype)
+            layout = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
+            cloud = read_points(file, self.sensor, **layout)
             points, num_close = drop_close(cloud, self.sensor, mode=mode, close_m=close_m)
         none = np.zeros(0, np.int32)
         return Frame(points, np.zeros((0, 9), np.float32), none, none, num_close)

@@ -58,6 +58,7 @@ class FolderFrames(FrameSet):
         splits: JSON file with them; default: ``splits.json``.
         num_sweeps: clouds to fuse at most, from the first of the list on.
         remove_close, close_m: as in :func:`~fcos_lidar_jax.data.sweeps.fuse_sweeps`.
+        follow_links: read files that lie outside the folder.
 
     Raises:
         ValueError: here or on reading a frame, naming the file, the field, what was found and what was expected.
@@ -85,16 +86,19 @@ class FolderFrames(FrameSet):
         num_sweeps: int = 10,
         remove_close: Literal["all", "sweeps", "none"] = "all",
         close_m: float = 1.0,
+        follow_links: bool = False,
     ) -> None:
         root = Path(root)
+        self._inside = None if follow_links else root
         if num_sweeps < 1:
             raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
         if remove_close not in ("all", "sweeps", "none"):
             raise ValueError(f"remove_close: got {remove_close!r}, expected 'all', 'sweeps' or 'none'")
         self.root, self.num_sweeps, self.remove_close, self.close_m = root, num_sweeps, remove_close, close_m
-        self._clouds = _list_files(root, "clouds", point_files.ENDINGS)
-        self._boxes = _list_files(root, "boxes", (".json",))
-        self._sweeps = _list_files(root, "sweeps", (".json",)) if (root / "sweeps").exists() else {}
+        self._clouds = _list_files(root, "clouds", point_files.ENDINGS, self._inside)
+        self._boxes = _list_files(root, "boxes", (".json",), self._inside)
+        listed = (root / "sweeps").exists()
+        self._sweeps = _list_files(root, "sweeps", (".json",), self._inside) if listed else {}
         if not self._clouds:
             raise ValueError(f"{root / 'clouds'}: no point file in it, expected at least one")
         for files in (self._boxes, self._sweeps):
@@ -105,7 +109,7 @@ class FolderFrames(FrameSet):
             raise ValueError(f"{self._clouds[name]}: no {root / 'boxes' / name}.json, expected {expected}")
         self.names = tuple(sorted(self._clouds))
         """Names of the frames: of their files, without the extension."""
-        self.sensor = _read_sensor(root) if sensor is None else sensor
+        self.sensor = _read_sensor(root, self._inside) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
             self.names = _read_split(root / SPLITS if splits is None else Path(splits), split, self._clouds)
@@ -153,7 +157,7 @@ class FolderFrames(FrameSet):
             return drop_close(points, self.sensor, mode=mode, close_m=close_m)
         files = [sweep.file for sweep in read_list(listed)]
         for i, file in enumerate(files):
-            _expect_file(listed.parent / file, self.root, f"{listed}: $[{i}].file")
+            _expect_file(listed.parent / file, self._inside, f"{listed}: $[{i}].file")
         if (listed.parent / files[0]).resolve() != cloud.resolve():
             expected = f"the frame's own cloud, '../clouds/{cloud.name}'"
             raise ValueError(f"{listed}: $[0].file: got {files[0]!r}, expected {expected}")
@@ -182,7 +186,7 @@ class FolderFrames(FrameSet):
         file = self.root / "classes.json"
         own: list[str] | dict[str, str | None] = {}
         if os.path.lexists(file):
-            _expect_file(file, self.root, str(file))
+            _expect_file(file, self._inside, str(file))
             own = read_json(file, list[str] | dict[str, str | None])
         if isinstance(own, list):
             if not own or len(set(own)) < len(own):
@@ -192,7 +196,7 @@ class FolderFrames(FrameSet):
         return tuple(sorted(name for name in found if name is not None)), own
 
 
-def _list_files(root: Path, folder: str, endings: tuple[str, ...]) -> dict[str, Path]:
+def _list_files(root: Path, folder: str, endings: tuple[str, ...], inside: Path | None) -> dict[str, Path]:
     """Name without extension -> file; hidden files are left out."""
     if not (root / folder).is_dir():
         raise ValueError(f"{root / folder}: no such folder, expected one with {', '.join(endings)} files")
@@ -203,7 +207,7 @@ def _list_files(root: Path, folder: str, endings: tuple[str, ...]) -> dict[str, 
         ending = next((e for e in endings if file.name.lower().endswith(e)), None)
         if ending is None:
             raise ValueError(f"{file}: unknown extension {file.suffix!r}, expected {', '.join(endings)}")
-        _expect_file(file, root, str(file))
+        _expect_file(file, inside, str(file))
         name = file.name[: -len(ending)]
         if name in files:
             raise ValueError(f"{file}: a second file named {name} beside {files[name].name}, expected one")
@@ -211,17 +215,19 @@ def _list_files(root: Path, folder: str, endings: tuple[str, ...]) -> dict[str, 
     return files
 
 
-def _expect_file(file: Path, root: Path, where: str) -> None:
-    if not file.is_file():
+def _expect_file(file: Path, inside: Path | None, where: str) -> None:
+    """Refuse a file that is not there, or that a link or ``..`` takes out of a folder, if one is given."""
+    if not os.path.isfile(file):
         raise ValueError(f"{where}: no such file" + ("" if where == str(file) else f": {file}"))
     real = os.path.realpath(file)
-    if not Path(real).is_relative_to(os.path.realpath(root)):
-        raise ValueError(f"{where}: resolves to {real}, expected a file inside {root}")
+    if inside is not None and not Path(real).is_relative_to(os.path.realpath(inside)):
+        found = f"resolves to {real}, expected a file inside {inside}"
+        raise ValueError(f"{where}: {found}; --follow-links allows links that lead out")
 
 
-def _read_sensor(root: Path) -> Sensor:
+def _read_sensor(root: Path, inside: Path | None) -> Sensor:
     file = root / "sensor.json"
-    _expect_file(file, root, str(file))
+    _expect_file(file, inside, str(file))
     record = read_json(file, str | dict[str, Any])
     if isinstance(record, dict):
         return sensor_from_json(record, str(file))

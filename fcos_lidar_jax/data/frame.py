@@ -56,6 +56,13 @@ class FrameSet(Protocol):
         """A checksum of all that the frames follow from, as far as it can be known without reading the points."""
         ...
 
+    def clouds_fingerprint(self, indices: Iterable[int]) -> str:
+        """Checksum of the point files of some frames by name, size and time of their last change.
+
+        For sets whose :meth:`fingerprint` does not see them; ``""`` where it does.
+        """
+        return ""
+
     def pose(self, index: int) -> np.ndarray | None:
         """f64[4, 4] from the points' frame to the world's, None where it is not known."""
         return None
@@ -128,6 +135,9 @@ class FramesOf(FrameSet):
     def fingerprint(self) -> str:
         return self.frames.fingerprint()
 
+    def clouds_fingerprint(self, indices: Iterable[int]) -> str:
+        return self.frames.clouds_fingerprint(map(self._source, indices))
+
     def pose(self, index: int) -> np.ndarray | None:
         return self.frames.pose(self._source(index))
 
@@ -167,8 +177,17 @@ def files_fingerprint(files: Iterable[Path], root: Path, reading: object) -> str
         root: names are relative to it, so that a data set may be moved as a whole.
         reading: options of the reader, distinguished by ``repr``.
     """
-    states = [(str(file.relative_to(root)), (s := file.stat()).st_size, s.st_mtime_ns) for file in sorted(files)]
+    states = [(str(file.relative_to(root)), *_size_and_time(file)) for file in sorted(files)]
     return checksum(repr((states, reading)).encode())
+
+
+def _size_and_time(file: Path) -> tuple[int, ...]:
+    """Bytes, and nanoseconds of the last change; nothing where there is no file."""
+    try:
+        found = file.stat()
+    except FileNotFoundError:
+        return ()
+    return found.st_size, found.st_mtime_ns
 
 
 def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], where: str) -> tuple[str, ...]:

@@ -31,14 +31,18 @@ def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
     try:
         record = record[number] if isinstance(record, list) else record
         rows = [b for b in record["boxes"] if b["class"] in NUSCENES_CLASSES]
-        boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in LIMITS] for b in rows], np.float32)
+        boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in LIMITS] for b in rows])
         known = "num_lidar_pts" if all("num_lidar_pts" in b for b in rows) else "num_lidar_pts_at_key_frame"
         counts = np.array([int(b[known]) for b in rows], np.int32)
         cloud = file.parent / str(record["lidar_file"])
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{file}: a field is missing or of another kind: {error}") from None
     boxes = boxes.reshape(-1, 9)
     if (bad := find_bad_box(boxes)) is not None:
         raise ValueError(f"{file}: box {bad[0]} of the ten classes: {bad[1]}")
     labels = np.array([NUSCENES_CLASSES.index(b["class"]) for b in rows], np.int32)
-    return Frame(read_points(cloud, sensor), boxes, labels, counts)
+    try:
+        points = read_points(cloud, sensor)
+    except ValueError as error:
+        raise ValueError(f"{file}: lidar_file: {error}") from None
+    return Frame(points, boxes.astype(np.float32), labels, counts)

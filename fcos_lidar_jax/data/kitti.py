@@ -91,7 +91,10 @@ class KittiFrames(FrameSet):
         name = self.names[index]
         calibration = read_calibration(self._file("calib", name))
         camera_boxes, labels = read_labels(self._file("label_2", name))
-        boxes = to_lidar(camera_boxes, calibration["velo_to_rect"]).astype(np.float32)
+        boxes = to_lidar(camera_boxes, calibration["velo_to_rect"])
+        if (bad := find_bad_box(boxes)) is not None:
+            raise ValueError(f"{self._file('calib', name)}: takes box {bad[0]} of the labels far away: {bad[1]}")
+        boxes = boxes.astype(np.float32)
         points = read_points(self._file("velodyne", name), self.sensor)
         kept = np.ones(len(points), bool)
         if self.image_size is not None:

@@ -1,6 +1,7 @@
 """PCD files by their header: ascii, binary and binary_compressed."""
 
 import dataclasses
+import re
 
 import numpy as np
 
@@ -9,12 +10,18 @@ _COLUMNS["laser"] = ("laser_number", "laser", "ring")
 """Column -> the field names it goes by, the most telling first. Other fields are skipped."""
 _KINDS = {"F": ("f", "248"), "I": ("i", "1248"), "U": ("u", "1248")}
 """TYPE -> NumPy's letter, and the sizes it comes in."""
+_SPACE, _PART_BYTES = re.compile(rb"\s"), 2**20
 _MAX_COUNT = 1_000_000  # values a field of one point may have; more is a damaged header
 _MAX_EXPANSION = 88  # three bytes of LZF stand for 264 at most
 
 
-def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
+def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, np.ndarray]:
     """Named columns of a PCD file, from the whole of it.
+
+    Args:
+        content: the whole file.
+        max_points: that the header may tell.
+        max_bytes: of all points, unpacked.
 
     Returns:
         x, y, z, and of intensity, time_lag and laser those that are there; one value a point each, in the
@@ -24,7 +31,8 @@ def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
         ValueError: one line that names the header's field, what was found and what was expected.
 
     >>> header = "FIELDS x y z ring\\nSIZE 4 4 4 1\\nTYPE F F F U\\nPOINTS 1\\nDATA ascii\\n"
-    >>> {name: column.tolist() for name, column in parse_pcd(header.encode() + b"5 0 -1.5 31\\n").items()}
+    >>> table = parse_pcd(header.encode() + b"5 0 -1.5 31\\n", max_points=10, max_bytes=1000)
+    >>> {name: column.tolist() for name, column in table.items()}
     {'x': [5.0], 'y': [0.0], 'z': [-1.5], 'laser': [31.0]}
     """
     header, body = _read_header(content)
@@ -32,6 +40,9 @@ def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
     number = _num_points(header)
     if number == 0:
         raise ValueError("POINTS: got 0, no points in it, expected at least one")
+    if number > max_points or number * _size(fields) > max_bytes:
+        found = f"{number} points of {_size(fields)} bytes"
+        raise ValueError(f"POINTS: got {found}, expected at most {max_points} and {max_bytes} bytes in all")
     form = " ".join(header["DATA"]).lower()
     if form not in _FORMS:
         raise ValueError(f"DATA: got {form!r}, expected {', '.join(_FORMS)}")
@@ -47,7 +58,7 @@ def parse_pcd(content: bytes) -> dict[str, np.ndarray]:
     return dict(zip(chosen, columns, strict=True))
 
 
-def _read_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
+def _read_header(content: bytes) -> tuple[dict[str, list[str]], memoryview]:
     """Entry -> its words, and what comes after the DATA line."""
     header, position = dict[str, list[str]](), 0
     while position < len(content) and len(header) <= 32:  # no header is that long: not a PCD file
@@ -58,7 +69,7 @@ def _read_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
         if words and not words[0].startswith("#"):
             header[words[0].upper()] = words[1:]
             if words[0].upper() == "DATA":
-                return header, content[position:]
+                return header, memoryview(content)[position:]
     raise ValueError("not a PCD file: no DATA line in its header")
 
 
@@ -117,19 +128,26 @@ def _num_points(header: dict[str, list[str]]) -> int:
     return points
 
 
-def _from_ascii(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
-    words, width = body.split(), sum(field.count for field in fields)
-    if len(words) != number * width:
-        cause = "truncated" if len(words) < number * width else "too long"
-        raise ValueError(f"DATA: {cause}: got {len(words)} values, expected {number} points of {width}")
-    try:
-        values = np.array(words, np.float64).reshape(number, width)
-    except ValueError as error:
-        raise ValueError(f"DATA: {error}, expected a number") from None
+def _from_ascii(body: memoryview, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
+    width, parts, found, first = sum(field.count for field in fields), list[np.ndarray](), 0, 0
+    while first < len(body):  # in parts, since words take many times the memory of their bytes
+        cut = _SPACE.search(body, first + _PART_BYTES)
+        last = cut.start() if cut else len(body)
+        words = bytes(body[first:last]).split()
+        found, first = found + len(words), last
+        if found > number * width:
+            raise ValueError(f"DATA: too long: got {found} values and more, expected {number} points of {width}")
+        try:
+            parts.append(np.array(words, np.float64))
+        except ValueError as error:
+            raise ValueError(f"DATA: {error}, expected a number") from None
+    if found < number * width:
+        raise ValueError(f"DATA: truncated: got {found} values, expected {number} points of {width}")
+    values = np.concatenate(parts).reshape(number, width)
     return [values[:, sum(field.count for field in fields[:i])] for i in chosen]
 
 
-def _from_binary(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
+def _from_binary(body: memoryview, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
     """Points stored one after the other."""
     record = _size(fields)
     if len(body) < number * record:
@@ -138,10 +156,10 @@ def _from_binary(body: bytes, fields: list[_Field], number: int, chosen: list[in
     return [np.ndarray((number,), fields[i].dtype, body, _size(fields[:i]), (record,)) for i in chosen]
 
 
-def _from_compressed(body: bytes, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
+def _from_compressed(body: memoryview, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
     """Points stored field by field and packed by LZF, behind the packed and the plain size."""
     expected = number * _size(fields)
-    packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
+    packed, plain = (int(v) for v in np.frombuffer(bytes(body[:8]).ljust(8, b"\0"), "<u4"))
     if len(body) < 8 + packed:
         raise ValueError(f"DATA: truncated: got {max(len(body) - 8, 0)} compressed bytes, expected {packed}")
     if plain != expected:
@@ -155,7 +173,7 @@ def _from_compressed(body: bytes, fields: list[_Field], number: int, chosen: lis
 _FORMS = {"ascii": _from_ascii, "binary": _from_binary, "binary_compressed": _from_compressed}
 
 
-def _unpack_lzf(packed: bytes, size: int) -> bytes:
+def _unpack_lzf(packed: memoryview, size: int) -> bytearray:
     """LZF: runs of literal bytes, and copies of what was already written."""
     out, position = bytearray(), 0
     try:
@@ -182,4 +200,4 @@ def _unpack_lzf(packed: bytes, size: int) -> bytes:
         raise ValueError("DATA: the compressed bytes are damaged: they end within a copy") from None
     if len(out) != size:
         raise ValueError(f"DATA: the compressed bytes are damaged: they do not unpack to {size} bytes")
-    return bytes(out)
+    return out

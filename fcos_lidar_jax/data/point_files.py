@@ -1,19 +1,21 @@
 """Point clouds from files: raw nuScenes and KITTI, NumPy, PCD, Feather of Argoverse 2."""
 
-import io
-import math
-import zipfile
+import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.data.npy_files import npz_names, parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.sensors import Sensor
 
 ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # file names that are read, the longest first
 _RAW_COLUMNS = (3, 4, 5, 6)
-MAX_BYTES = 2**31  # of one cloud, as a file and unpacked: more is no LiDAR's, and would exhaust the memory
+MAX_POINTS = 10_000_000  # of one cloud, unless another limit is given: far more than any LiDAR's
+BYTES_A_POINT = 64  # of a cloud of so many points at most, as a file and unpacked
+_HEADER_BYTES = 2**20
 _RAW_DTYPES = ("float16", "float32", "float64")
 
 # Criteria of whether a raw file is read with the layout it was written with.
@@ -26,7 +28,12 @@ _MIN_VALUES = 200  # below this the contrast of the columns is chance
 
 
 def read_points(
-    path: str | Path, sensor: Sensor, *, columns: int | None = None, dtype: str | None = None
+    path: str | Path,
+    sensor: Sensor,
+    *,
+    columns: int | None = None,
+    dtype: str | None = None,
+    max_points: int = MAX_POINTS,
 ) -> np.ndarray:
     """The points of a file.
 
@@ -42,6 +49,7 @@ def read_points(
         sensor: scales the intensity and says whether a laser number is needed.
         columns: values a point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
+        max_points: a larger cloud is refused, by its header or its size and so before it takes memory.
 
     Returns:
         f32[n, c]: x, y, z (metres, the file's frame), intensity (0-255), time lag (seconds), and the laser number
@@ -67,18 +75,22 @@ def read_points(
     if not kind.endswith(".bin") and (columns is not None or dtype is not None):
         raise ValueError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
     if kind == ".feather":
-        table = read_feather(path, dict.fromkeys(("x", "y", "z", "intensity", "laser_number"), "fiu"))
+        names = ("x", "y", "z", "intensity", "laser_number")
+        table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)
         return _assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
-    content = _read_whole(path)
+    content = _read_whole(path, max_points)
     if kind == ".pcd":
         try:
-            table = parse_pcd(content)
+            table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_A_POINT)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return _assemble_points(path, sensor, table)
     if not kind.endswith(".bin"):
-        return points_from_array(_read_numpy(path, content, kind), sensor, str(path))
-    rows = _read_raw(path, content, columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32")
+        return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
+    columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
+    if (number := len(content) // (columns * np.dtype(dtype).itemsize)) > max_points:
+        raise ValueError(f"{path}: got {number} points, expected at most {max_points}")
+    rows = _read_raw(path, content, columns, dtype)
     if kind != ".pcd.bin":
         return points_from_array(rows, sensor, str(path))
     return _assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
@@ -113,12 +125,13 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
     return _assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
 
 
-def read_feather(path: Path, kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
+def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_POINTS) -> dict[str, np.ndarray]:
     """Columns of an Apache Feather file (version 2); needs the extra ``argoverse2``.
 
     Args:
         kinds: column -> NumPy's letters of the types that will do: ``"fiu"`` numbers, ``"iu"`` whole ones, ``"O"``
             texts.
+        max_rows: a longer table is refused.
 
     Raises:
         ValueError: not such a file, a column that is missing, of another type or without a value in some row, or
@@ -129,30 +142,44 @@ def read_feather(path: Path, kinds: Mapping[str, str]) -> dict[str, np.ndarray]:
     except ImportError:
         how = "pip install 'fcos-lidar-jax[argoverse2]'"
         raise ValueError(f"{path}: pyarrow is not installed, which reads .feather: {how}") from None
-    found = {}
+    content = _read_whole(path, max_rows)
     try:
-        table = pyarrow.ipc.open_file(_read_whole(path)).read_all()
-        for name, kind in kinds.items():
-            if table.column_names.count(name) != 1:
-                raise ValueError(f"{path}: got columns {', '.join(table.column_names)}, expected one {name}")
-            column = table.column(name)
-            column.validate(full=True)  # offsets and lengths, which a crafted file may have wrong
-            found[name] = column.to_numpy()
-            if column.null_count or found[name].dtype.kind not in kind:
-                got = f"{column.null_count} rows without a value" if column.null_count else column.type
-                expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
-                raise ValueError(f"{path}: {name}: got {got}, expected {expected}")
-    except pyarrow.ArrowException as error:
+        return _read_columns(pyarrow, content, kinds, max_rows)
+    except Exception as error:  # damaged files raise what Arrow likes: of its own, of the system, of texts
         raise ValueError(f"{path}: not a readable .feather file: {' '.join(str(error).split())}") from None
+
+
+def _read_columns(pyarrow: Any, content: bytes, kinds: Mapping[str, str], max_rows: int) -> dict[str, np.ndarray]:
+    reader, batches, num_rows, found = pyarrow.ipc.open_file(content), [], 0, {}
+    for i in range(reader.num_record_batches):
+        batches.append(reader.get_batch(i))
+        num_rows += batches[-1].num_rows
+        if num_rows > max_rows:
+            raise ValueError(f"got more than {max_rows} rows, expected at most as many")
+    table = pyarrow.Table.from_batches(batches, reader.schema)
+    for name, kind in kinds.items():
+        if table.column_names.count(name) != 1:
+            raise ValueError(f"got columns {', '.join(table.column_names)}, expected one {name}")
+        column = table.column(name)
+        column.validate(full=True)  # offsets and lengths, which a crafted file may have wrong
+        found[name] = column.to_numpy()
+        fits = found[name].dtype.kind in kind and (
+            kind != "O" or all(isinstance(text, str) for text in found[name])
+        )
+        if column.null_count or not fits:
+            got = f"{column.null_count} rows without a value" if column.null_count else column.type
+            expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
+            raise ValueError(f"{name}: got {got}, expected {expected}")
     return found
 
 
-def _read_whole(path: Path) -> bytes:
+def _read_whole(path: Path, max_points: int) -> bytes:
     """The bytes of a file that may be one cloud's."""
+    limit = max_points * BYTES_A_POINT + _HEADER_BYTES
     try:
         size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise ValueError(f"{path}: got {size} bytes, expected at most {MAX_BYTES} for one cloud")
+        if size > limit:
+            raise ValueError(f"{path}: got {size} bytes, expected at most {limit} for {max_points} points")
         content = path.read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
@@ -162,9 +189,9 @@ def _read_whole(path: Path) -> bytes:
 
 
 def _kind(path: Path) -> str:
-    if path.is_dir():
+    if os.path.isdir(path):
         raise ValueError(f"{path}: found a folder, expected a point file")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise ValueError(f"{path}: no such file")
     for ending in ENDINGS:
         if path.name.lower().endswith(ending):
@@ -241,46 +268,21 @@ def _column_contrast(content: bytes, columns: int, dtype: str) -> float:
     return max(float(v.mean(axis=0).var() / max(v.var(), 1e-12)) for v in (rows, np.abs(rows)))
 
 
-def _read_numpy(path: Path, content: bytes, kind: str) -> np.ndarray:
+def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.ndarray:
     magic = b"\x93NUMPY" if kind == ".npy" else b"PK"
     if not content.startswith(magic):
         raise ValueError(f"{path}: not a readable {kind} file: got {content[:6]!r}, expected {magic!r} first")
     try:
-        return _parse_npy(content if kind == ".npy" else _member(content))
-    except Exception as error:  # damaged archives and headers fail in a dozen ways, down to the tokenizer's
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{path}: not a readable {kind} file: {reason}") from None
-
-
-def _member(content: bytes) -> bytes:
-    """The array's file in an archive, unpacked; its size is known before."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        if len(members) != 1 and "points" not in members:
-            raise ValueError(f"got arrays {', '.join(members) or 'none'}, expected one, or one named points")
-        member = members.get("points") or next(iter(members.values()))
-        if member.file_size > MAX_BYTES:
-            raise ValueError(f"got {member.file_size} bytes unpacked, expected at most {MAX_BYTES}")
-        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError("got another compression, expected none or deflate")
-        with archive.open(member) as stream:
-            return stream.read(member.file_size + 1)  # a limit, for what it unpacks to may be more than it says
-
-
-def _parse_npy(content: bytes) -> np.ndarray:
-    """An array from the bytes of its file, whose header is checked against their number first."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in read_header:
-        raise ValueError(f"version: got {version}, expected 1.0 or 2.0")
-    shape, fortran, dtype = read_header[version](stream)
-    if dtype.hasobject:
-        raise ValueError("got pickled objects, expected an array without pickled objects")
-    size, found = math.prod(shape) * dtype.itemsize, len(content) - stream.tell()
-    if size != found or min(shape, default=0) < 0:
-        raise ValueError(f"got {found} bytes of values, expected {size} for {shape} of {dtype}")
-    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
+        if kind == ".npy":
+            return parse_npy(content, max_rows=max_points)
+        names = npz_names(content)
+        if len(names) != 1 and "points" not in names:
+            raise ValueError(f"got arrays {', '.join(names) or 'none'}, expected one, or one named points")
+        name = "points" if "points" in names else names[0]
+        max_bytes = max_points * BYTES_A_POINT
+        return parse_npz(content, [name], max_rows=max_points, max_bytes=max_bytes)[name]
+    except ValueError as error:
+        raise ValueError(f"{path}: not a readable {kind} file: {error}") from None
 
 
 def _assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
@@ -295,6 +297,7 @@ def _assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarr
             if name in table:
                 points[:, i] = table[name]
         points[:, 3] *= np.float32(sensor.intensity_scale)
+        points *= np.float32(1)  # signalling NaNs, which would make noise later, become quiet ones
     negative = np.flatnonzero(points[:, 4] < 0)
     if len(negative):
         found = f"{points[negative[0], 4]:g} in row {negative[0]}"

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.projection import close_to_sensor
 from fcos_lidar_jax.sensors import Sensor
@@ -26,6 +26,7 @@ class Sweep:
     points: np.ndarray  # f32[n, c] in its own frame: x, y, z, intensity, (anything,) and what more there is
     sensor_to_world: np.ndarray  # f64[4, 4] from that frame
     time_us: int  # when it was taken
+    name: str = ""  # what messages and results call it
 
 
 class ListedSweep(msgspec.Struct):
@@ -85,21 +86,33 @@ def fuse_sweeps(
 
 
 def read_sweeps(
-    path: Path, sensor: Sensor, *, remove_close: str, close_m: float, num_sweeps: int | None = None
+    path: Path,
+    sensor: Sensor,
+    *,
+    remove_close: str,
+    close_m: float,
+    num_sweeps: int | None = None,
+    max_points: int = MAX_POINTS,
 ) -> tuple[np.ndarray, int]:
     """The fused cloud of a JSON list of sweeps, as :func:`fuse_sweeps` gives it.
 
     Args:
         path: the JSON file, see :func:`read_list`.
         num_sweeps: how many of the list to read at most, from the current one on; None for all.
+        max_points: of a file.
 
     Raises:
         ValueError: naming the file, the entry, the field, what was found and what was expected.
     """
-    sweeps = (
-        Sweep(read_points(path.parent / each.file, sensor), np.array(each.sensor_to_world), each.timestamp_us)
-        for each in read_list(path)[:num_sweeps]
-    )
+
+    def read(index: int, each: ListedSweep) -> Sweep:
+        try:
+            points = read_points(path.parent / each.file, sensor, max_points=max_points)
+        except ValueError as error:
+            raise ValueError(f"{path}: $[{index}].file: {error}") from None
+        return Sweep(points, np.array(each.sensor_to_world), each.timestamp_us)
+
+    sweeps = (read(index, each) for index, each in enumerate(read_list(path)[:num_sweeps]))
     return fuse_sweeps(sweeps, sensor, remove_close=remove_close, close_m=close_m)
 
 
@@ -111,8 +124,18 @@ def read_list(path: Path) -> list[ListedSweep]:
     Raises:
         ValueError: naming the file, the entry, the field, what was found and what was expected.
     """
-    sweeps = read_json(path, Annotated[list[ListedSweep], msgspec.Meta(min_length=1)], what="sweeps")
+    sweeps = read_entries(path)
     now_us = sweeps[0].timestamp_us
+    for index, sweep in enumerate(sweeps[1:], 1):
+        if sweep.timestamp_us >= now_us:
+            where, found = f"{path}: $[{index}]", sweep.timestamp_us
+            raise ValueError(f"{where}.timestamp_us: got {found}, expected less than the current sweep's {now_us}")
+    return sweeps
+
+
+def read_entries(path: Path) -> list[ListedSweep]:
+    """As :func:`read_list`, in any order of time."""
+    sweeps = read_json(path, Annotated[list[ListedSweep], msgspec.Meta(min_length=1)], what="sweeps")
     for index, sweep in enumerate(sweeps):
         where, pose = f"{path}: $[{index}]", np.array(sweep.sensor_to_world)
         if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
@@ -120,9 +143,6 @@ def read_list(path: Path) -> list[ListedSweep]:
             raise ValueError(f"{where}.sensor_to_world: last row: got {found}, expected (0, 0, 0, 1)")
         if not is_rotation(pose[:3, :3]):
             raise ValueError(f"{where}.sensor_to_world: the upper left 3x3 is not a rotation")
-        if index > 0 and sweep.timestamp_us >= now_us:
-            found = sweep.timestamp_us
-            raise ValueError(f"{where}.timestamp_us: got {found}, expected less than the current sweep's {now_us}")
     return sweeps
 
 
@@ -146,7 +166,8 @@ def find_bad_pose(rotation: np.ndarray, translation: np.ndarray) -> tuple[int, s
     (0, 'rotation: got [2.0, 0.0, 0.0, 0.0], expected a unit quaternion w, x, y, z')
     """
     near = (np.abs(translation) <= FARTHEST_M).all(axis=1)
-    unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) < 1e-3
+    with np.errstate(over="ignore"):  # an infinite length is none of a unit
+        unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) < 1e-3
     for name, values, good, expected in (
         ("translation", translation, near, f"finite numbers of at most {FARTHEST_M:g} m"),
         ("rotation", rotation, unit, "a unit quaternion w, x, y, z"),

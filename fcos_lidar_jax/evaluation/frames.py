@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation.boxes import NO_BOXES, BoxColumns, GroundTruth, join, make_columns
 from fcos_lidar_jax.evaluation.json_io import expect, expect_samples, index_of, read_json
 from fcos_lidar_jax.evaluation.metrics import Evaluation, Metric, evaluate
@@ -110,10 +111,22 @@ def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) ->
     for name in names:
         boxes, where = by_name[name], f"{path}: frame {name}"
         labels = index_of(boxes, "label", {known: label for label, known in enumerate(classes)}, where)
-        columns = np.array([box.box for box in boxes], np.float32).reshape(-1, 9)
-        expect((columns[:, 3:6] > 0).all(axis=1), boxes, "box", where, "three positive sizes")
-        scores = np.array([box.score for box in boxes], np.float32)
-        expect(scores >= 0, boxes, "score", where, "a number of at least 0")
-        arrays: Any = (columns, scores, labels.astype(np.int32), np.ones(len(boxes), bool), np.int32(0))
+        columns = np.array([box.box for box in boxes], np.float64).reshape(-1, 9)
+        near = ~(np.abs(columns) > FARTHEST_M).any(axis=1)
+        expect(near, boxes, "box", where, f"numbers of at most {FARTHEST_M:g}")
+        expect(
+            (columns[:, 3:6] >= np.finfo(np.float32).tiny).all(axis=1), boxes, "box", where, "three positive sizes"
+        )
+        unknown = np.isnan(columns[:, 7:])
+        expect(unknown[:, 0] == unknown[:, 1], boxes, "box", where, "a velocity of two numbers or of two nulls")
+        scores = np.array([box.score for box in boxes])
+        expect((scores >= 0) & (scores <= FARTHEST_M), boxes, "score", where, "a number of at least 0")
+        arrays: Any = (
+            columns.astype(np.float32),
+            scores.astype(np.float32),
+            labels.astype(np.int32),
+            np.ones(len(boxes), bool),
+            np.int32(0),
+        )
         found.append(Detections(*arrays))
     return found

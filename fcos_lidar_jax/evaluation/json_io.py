@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation.boxes import heading_yaw
 
 _NOT_FINITE = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|(NaN|-?Infinity)')
@@ -160,7 +161,13 @@ def geometry(boxes: Sequence[JsonBox], where: str) -> tuple[dict[str, np.ndarray
     table = np.array(list(chain.from_iterable(rows)), np.float64).reshape(-1, 12)
     translation, size, rotation, velocity = np.split(table, (3, 6, 10), axis=1)
     expect((size > 0).all(axis=1), boxes, "size", where, "three positive lengths")
-    expect((rotation != 0).any(axis=1), boxes, "rotation", where, "a quaternion w, x, y, z that is not zero")
+    for name, values in (("translation", translation), ("size", size), ("velocity", velocity)):
+        near = ~(np.abs(values) > FARTHEST_M).any(axis=1)
+        expect(near, boxes, name, where, f"numbers of at most {FARTHEST_M:g}")
+    largest = np.abs(rotation).max(axis=1, initial=0.0)  # whose square neither vanishes nor overflows
+    expect(
+        (largest > 1e-8) & (largest < 1e8), boxes, "rotation", where, "a quaternion w, x, y, z that is not zero"
+    )
     columns = {"translation": translation, "size": size, "yaw": heading_yaw(rotation), "velocity": velocity}
     return columns, rotation
 

@@ -9,8 +9,8 @@ from typing import Any
 class ResumeLog:
     """Entries of the samples that are done, one line each, in a file that is only appended to.
 
-    A line that an interruption truncated is dropped. The first line is the fingerprint of detector and data: a
-    file with another one is begun anew.
+    A line that an interruption truncated, or that is damaged, is dropped with all behind it. The first line is the
+    fingerprint of detector and data: a file with another one is begun anew.
 
     Args:
         path: of the file.
@@ -34,10 +34,14 @@ class ResumeLog:
         if self._stream.readline() == first:
             end = len(first)
             for line in self._stream:
-                token, separator, entries = line.partition(b"\t")
-                if not separator or not line.endswith(b"\n"):
+                name, separator, entries = line.partition(b"\t")
+                try:
+                    token = json.loads(name)
+                except (ValueError, RecursionError):  # damaged, as is what follows
                     break
-                self.places[json.loads(token)] = end + len(token) + 1, len(entries) - 1
+                if not isinstance(token, str) or not separator or not line.endswith(b"\n"):
+                    break
+                self.places[token] = end + len(name) + 1, len(entries) - 1
                 end += len(line)
         self._stream.truncate(end)
         self._stream.seek(end)

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.names import BICYCLE_RACK, label_of
+from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation import json_io
 from fcos_lidar_jax.evaluation.boxes import (
     ATTRIBUTE_INDEX,
@@ -28,7 +29,7 @@ _RACK = -1  # label of bicycle racks while they are among the boxes
 class Box(json_io.JsonBox, gc=False):
     """One annotation in the global frame."""
 
-    num_pts: int
+    num_pts: Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
 
 
 class Sample(msgspec.Struct, gc=False):
@@ -50,6 +51,9 @@ def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
     raw, name = json_io.read_json(source, msgspec.Raw, given="ground truth")
     ego, parts, rotations = dict[str, json_io.Vector](), [NO_BOXES], [np.zeros((0, 4))]
     for row, (token, sample) in enumerate(json_io.decode_samples(raw, Sample, name)):
+        if not max(map(abs, sample.ego_translation)) <= FARTHEST_M:
+            got, expected = list(sample.ego_translation), f"numbers of at most {FARTHEST_M:g}"
+            raise ValueError(f"{name}: sample {token}: ego_translation: got {got}, expected {expected}")
         ego[token] = sample.ego_translation
         boxes, where = sample.boxes, f"{name}: sample {token}"
         label = json_io.index_of(boxes, "detection_name", {**LABELS, BICYCLE_RACK: _RACK}, where)

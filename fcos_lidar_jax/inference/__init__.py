@@ -1,6 +1,15 @@
 """From points to boxes."""
 
 from fcos_lidar_jax.inference.detect import make_detect, postprocess, select_candidates
-from fcos_lidar_jax.inference.detector import TrainedDetector, load_detector
+from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
+from fcos_lidar_jax.inference.load import load_detector, load_trained
 
-__all__ = ["TrainedDetector", "load_detector", "make_detect", "postprocess", "select_candidates"]
+__all__ = [
+    "CloudDetector",
+    "TrainedDetector",
+    "load_detector",
+    "load_trained",
+    "make_detect",
+    "postprocess",
+    "select_candidates",
+]

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.projection import image_cells
@@ -99,15 +100,17 @@ def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:
     return np.pad(points[:, :columns], ((0, 0), (0, max(columns - points.shape[1], 0))))
 
 
-def usable_rows(points: np.ndarray) -> np.ndarray:
-    """Which rows of f32[n, 5 or 6] are finite and within physical limits, bool[n].
+def usable_rows(points: np.ndarray | Array) -> np.ndarray | Array:
+    """Which rows of f32[n, 5 or 6] are finite and within physical limits, bool[n]; NumPy or JAX, as is the answer.
 
     >>> usable_rows(np.array([[1, 2, 0, 255, 0.45], [1, 2, 0, 1e30, 0], [1, np.nan, 0, 0, 0]])).tolist()
     [True, False, False]
     """
-    lag, finite = points[:, 4], np.isfinite(points)
-    usable = (np.abs(points[:, 3]) <= MAX_INTENSITY) & (lag >= 0) & (lag <= MAX_TIME_LAG_S)
-    return usable if finite.all() else usable & finite.all(axis=1)
+    lag, finite = points[:, 4], points.__array_namespace__().isfinite(points)
+    usable = (abs(points[:, 3]) <= MAX_INTENSITY) & (lag >= 0) & (lag <= MAX_TIME_LAG_S)
+    if isinstance(points, np.ndarray) and finite.all():  # `all` by rows takes far longer
+        return usable
+    return usable & finite.all(axis=1)
 
 
 def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarray, valid: np.ndarray) -> int:

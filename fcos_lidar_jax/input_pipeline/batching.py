@@ -5,9 +5,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.box_geometry import find_bad_box
+from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.inference.cloud import usable_rows, write_points
 from fcos_lidar_jax.types import Batch
+
+_INSPECTED = 20  # Frames whose counts of points are looked at.
 
 
 def empty_batch(size: int, *, max_points: int, max_boxes: int, columns: int) -> Batch:
@@ -88,10 +91,26 @@ def check_boxes(boxes: np.ndarray, name: str) -> None:
     Raises:
         ValueError: naming the frame and the first such box; NaN velocities are fine, they are unknown ones.
     """
-    shapes = boxes[:, :7]
-    bad = np.flatnonzero(~np.isfinite(shapes).all(axis=1) | (shapes[:, 3:6] <= 0).any(axis=1))
-    if len(bad):
-        found = ", ".join(f"{value:g}" for value in shapes[bad[0]])
+    if (bad := find_bad_box(boxes)) is not None:
+        raise ValueError(f"frame {name!r}: box {bad[0]}: {bad[1]}")
+
+
+def check_counts(frames: FrameSet) -> None:
+    """Refuse frames whose boxes are all without points: training would see no object.
+
+    Some frames are read, the first alone where it has a box with a point.
+
+    Raises:
+        ValueError: naming the first frame with a box.
+    """
+    empty = None
+    for index in np.unique(np.linspace(0, max(len(frames) - 1, 0), _INSPECTED).round().astype(int))[: len(frames)]:
+        frame = frames.frame(int(index))
+        if (frame.num_points >= 1).any():
+            return
+        empty = frames.name(int(index)) if empty is None and len(frame.boxes) else empty
+    if empty is not None:
         raise ValueError(
-            f"frame {name!r}: box {bad[0]}: got {found}, expected finite x, y, z, l, w, h, yaw with sizes above 0"
+            f"frame {empty!r}: box 0: got 0 points, as for all boxes of {min(_INSPECTED, len(frames))} frames, "
+            "expected some with points: are points and boxes in the same frame?"
         )

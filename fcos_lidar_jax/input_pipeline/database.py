@@ -8,13 +8,11 @@ object is read.
 """
 
 import dataclasses
-import io
 import multiprocessing
 import os
 import re
 import signal
 import threading
-import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -27,6 +25,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, checksum
 from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
@@ -99,6 +98,10 @@ class GroundTruthDatabase:
     def __len__(self) -> int:
         return len(self.table)
 
+    def fingerprint(self) -> str:
+        """Checksum of all objects, by the table, which holds the checksum of every object's points."""
+        return checksum(repr((self.manifest.classes, self.manifest.columns)).encode() + self.table.tobytes())
+
     def num_points(self, num_sweeps: int) -> np.ndarray:
         """Points of every object in the newest sweeps, at most :data:`MAX_SWEEPS`, of its frame, i32[n]."""
         if not 1 <= num_sweeps <= MAX_SWEEPS:
@@ -160,7 +163,10 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
 
 def objects_folder(index: Path, split: str | None) -> Path:
     """Where the objects of a split are, apart from those of others, which must not get into its training."""
-    return index / "objects" / (split or "all_frames")
+    name = split or "all_frames"
+    if name in (".", "..") or "/" in name or "\0" in name:
+        raise ValueError(f"split: got {name!r}, expected a name that a folder can have")
+    return index / "objects" / name
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -177,7 +183,7 @@ def read_manifest(folder: Path) -> Manifest:
                 f"{_VERSION}; build it anew: fcos-lidar prepare"
             )
         return msgspec.json.decode(data, type=Manifest)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DatabaseError(f"{file}: {error}") from None
 
 
@@ -223,6 +229,8 @@ def prepare_database(
     jobs, done = [], 0
     for name, indices in shards.items():
         follows_from = _FORMAT, _VERSION, tuple(frames.classes), source, min_points, name, indices
+        if clouds := frames.clouds_fingerprint(indices):
+            follows_from = *follows_from, clouds
         job = _Job(folder, name, indices, min_points, columns, checksum(repr(follows_from).encode()))
         if _finished(job):
             done += len(indices)
@@ -322,8 +330,8 @@ def _pooled(frames: FrameSet, jobs: Sequence[_Job], workers: int) -> Iterator[in
     number, context = min(workers, max(len(jobs), 1)), multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(number, mp_context=context, initializer=_begin_worker, initargs=(frames,))
     try:
-        # The workers inherit the mask: an interruption is this process's to answer.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        # The workers inherit the mask: what ends a job is this process's to answer.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         try:
             futures = [pool.submit(_work, job) for job in jobs]
         finally:
@@ -365,13 +373,18 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
     if expected is not None and found != expected:
         raise DatabaseError(f"{file}: checksum differs from the manifest's; build it anew")
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            rows, recipe = arrays["rows"], str(arrays["recipe"])
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        arrays = parse_npz(data, ["rows", "recipe"])
+        rows, recipe = arrays["rows"], str(arrays["recipe"])
+    except ValueError as error:
         raise DatabaseError(f"{file}: not a table of objects: {error}") from None
     if rows.dtype != _ROW or rows.ndim != 1:
         raise DatabaseError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; build it anew")
-    table = _Table(rows, recipe, found, int(rows["count"].sum(dtype=np.int64)))
+    ends = rows["count"].cumsum(dtype=np.int64)
+    newest = rows["newest"]
+    placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)
+    if not (placed & (newest >= 0).all(axis=1) & (newest <= rows["count"][:, None]).all(axis=1)).all():
+        raise DatabaseError(f"{file}: got objects whose points lie outside of the shard's; build it anew")
+    table = _Table(rows, recipe, found, int(ends[-1]) if len(ends) else 0)
     size = 4 * columns * table.num_points
     found = f"{points_file.stat().st_size} bytes" if points_file.is_file() else "no file"
     if found != f"{size} bytes":

@@ -9,6 +9,7 @@ share it.
 import contextlib
 import dataclasses
 import shutil
+import signal
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -165,10 +166,18 @@ def make_batches(
         _check_shared_memory(config, workers, num_processes)
         if not flags.FLAGS.is_parsed():  # which grain's worker processes read
             flags.FLAGS.mark_as_parsed()
-        stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1))
+        stream = stream.mp_prefetch(
+            grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1), _leave_signals
+        )
     prepared: Any = _from_workers(stream) if workers else iter(stream)
     with contextlib.closing(prepared) as batches:
         yield batches
+
+
+def _leave_signals(worker: int, workers: int) -> None:
+    """Ctrl-C and SIGTERM reach all processes of a job: they are the main process's to answer."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _check_shared_memory(config: Config, workers: int, num_processes: int) -> None:

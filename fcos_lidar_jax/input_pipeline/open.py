@@ -12,7 +12,7 @@ from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenes, NuScenesFrames
 from fcos_lidar_jax.data.nuscenes.splits import own_splits
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
-from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
+from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames, city_frames
 
 Format = Literal["nuscenes", "kitti", "argoverse2", "folder", "simulated"]
 
@@ -144,6 +144,7 @@ def open_frames(
     index: str | Path | None = None,
     splits: str | Path | None = None,
     allow_missing_sweeps: bool = False,
+    follow_links: bool = False,
 ) -> FrameSet:
     """The frames of a data set in any layout that there is a reader for.
 
@@ -162,6 +163,7 @@ def open_frames(
         index: of nuScenes, where ``prepare`` has put it.
         splits: JSON file of own splits, ``{"name": [scene, ...]}`` for nuScenes, of frames for a folder.
         allow_missing_sweeps: of nuScenes: continue without older sweeps whose file is missing.
+        follow_links: of nuScenes and folders: read files to which links lead outside of the root.
 
     Returns:
         frames whose labels count their own classes; :class:`~fcos_lidar_jax.data.classes.MappedFrames` brings them
@@ -188,7 +190,8 @@ def open_frames(
     if layout.format == "simulated":
         frames = _simulated_frames(split, sensor or NUSCENES_HDL32E, num_sweeps, remove_close, close_m)
     elif layout.format == "nuscenes":
-        data = NuScenes(layout.root, str(layout.version), index=index, allow_missing_sweeps=allow_missing_sweeps)
+        allowed = {"allow_missing_sweeps": allow_missing_sweeps, "follow_links": follow_links}
+        data = NuScenes(layout.root, str(layout.version), index=index, **allowed)
         tokens = data.sample_tokens if split is None else data.split(split, file=splits)
         frames = NuScenesFrames(data, tuple(tokens), num_sweeps, sensor=sensor or NUSCENES_HDL32E, **close)
     elif layout.format == "kitti":
@@ -196,6 +199,7 @@ def open_frames(
     elif layout.format == "argoverse2":
         frames = Argoverse2Frames(layout.root, split, sensor=sensor or ARGOVERSE2, num_sweeps=num_sweeps, **close)
     else:
+        close["follow_links"] = follow_links
         frames = FolderFrames(layout.root, sensor, split=split, splits=splits, num_sweeps=num_sweeps, **close)
     if class_map is None:
         return frames
@@ -205,14 +209,13 @@ def open_frames(
 def _simulated_frames(
     split: str | None, sensor: Sensor, num_sweeps: int, remove_close: str, close_m: float
 ) -> FrameSet:
-    """Streets that fit the sensor: what is near for one of a short reach, else up to 45 m."""
+    """Streets that fit the sensor: what is near in plain ones for one of a short reach, else varied ones."""
     split = split or "train"
     if split not in _SIMULATED:
         raise ValueError(f"split: {unknown_name(split, _SIMULATED)}")
     number, first = _SIMULATED[split]
     # The simulated ego vehicle has no body that the sensor could see: what is close is the road.
     close_m = 0.0 if remove_close == "none" else close_m
-    frames = SimulatedFrames(sensor, number, first, num_sweeps=num_sweeps, close_m=close_m)
     if sensor.limit_xy_m < _FULL_REACH_M:
-        return frames
-    return dataclasses.replace(frames, num_objects=40, reach_m=_FULL_REACH_M)
+        return SimulatedFrames(sensor, number, first, num_sweeps=num_sweeps, close_m=close_m)
+    return dataclasses.replace(city_frames(sensor, number, first), num_sweeps=num_sweeps, close_m=close_m)

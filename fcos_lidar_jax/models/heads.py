@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from fcos_lidar_jax.models.layers import Conv, GroupNorm, Image, at_least_float32, convolve, normal, pieces
+from fcos_lidar_jax.models.convolution import Image, convolve
+from fcos_lidar_jax.models.layers import Conv, GroupNorm, at_least_float32, normal, pieces
 from fcos_lidar_jax.types import Outputs
 
 _REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}  # Numbers a class of the four sibling layers.

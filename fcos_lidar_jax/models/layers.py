@@ -17,10 +17,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-Image = Float[Array, "b _ _ _"]  # Height, width and channels change from layer to layer.
-Kernel = Float[Array, "_ _ _ _"]
+from fcos_lidar_jax.models.convolution import Image, convolve
 
 
 def normal(key: Array, shape: Sequence[int], stddev: Any) -> Array:
@@ -33,46 +32,6 @@ def normal(key: Array, shape: Sequence[int], stddev: Any) -> Array:
 def kernel_init(key: Array, shape: Sequence[int]) -> Array:
     """He's, over the outputs, as in ResNet."""
     return normal(key, shape, jnp.sqrt(jnp.float32(2.0 / math.prod((*shape[:-2], shape[-1])))))
-
-
-_NARROW = range(9, 17)
-"""Convolutions of so many outputs get zeros up to 32, which makes their gradients faster on CPU. Their weight
-gradients are then summed as those of wide ones, less exactly; the smallest networks do without."""
-_PADDED = 32
-
-
-def convolve(
-    x: Image, kernel: Kernel, *, stride: int = 1, dilation: int = 1, groups: int = 1, circular: bool = False
-) -> Image:
-    """Convolution with ``k // 2 * dilation`` zeros on both sides, or wrapped around the width.
-
-    Stride and dilation are those of both axes, ``groups`` is the ``feature_group_count``, the kernel's sizes are
-    odd. The result has the type of ``x``.
-
-    >>> convolve(jnp.ones((1, 8, 8, 2)), jnp.ones((3, 3, 2, 4)), stride=2).shape
-    (1, 4, 4, 4)
-    """
-    kernel = kernel.astype(x.dtype)
-    high, wide = (size // 2 * dilation for size in kernel.shape[:2])
-    if kernel.shape[:2] == (1, 1) and groups == 1:
-        # As a matrix product: the weight gradient of a 1x1 convolution is 15 times slower on CPU.
-        return jnp.einsum("bhwc,co->bhwo", x[:, ::stride, ::stride], kernel[0, 0])
-    if circular and wide:
-        x = jnp.concatenate([x[:, :, -wide:], x, x[:, :, :wide]], axis=2)
-        wide = 0
-    outputs = kernel.shape[-1]
-    if groups == 1 and outputs in _NARROW:
-        kernel = jnp.pad(kernel, [(0, 0)] * 3 + [(0, _PADDED - outputs)])
-    y = lax.conv_general_dilated(
-        x,
-        kernel,
-        (stride, stride),
-        [(high, high), (wide, wide)],
-        rhs_dilation=(dilation, dilation),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        feature_group_count=groups,
-    )
-    return y[..., :outputs]
 
 
 class Conv(nn.Module):
@@ -115,8 +74,10 @@ class BatchNorm(nn.Module):
         given, parts = parts[0].dtype, [at_least_float32(part) for part in parts]
         if train:
             mean = jnp.concatenate([part.mean((0, 1, 2)) for part in parts])
+            # Its derivative by the mean is zero; left out, the backward pass reads the image once less.
+            fixed = lax.stop_gradient(mean)
             var = jnp.concatenate(
-                [jnp.square(part - mean[cut]).mean((0, 1, 2)) for part, cut in zip(parts, cuts, strict=True)]
+                [jnp.square(part - fixed[cut]).mean((0, 1, 2)) for part, cut in zip(parts, cuts, strict=True)]
             )
             if not self.is_initializing():
                 running_mean.value = self.momentum * running_mean.value + (1 - self.momentum) * mean
@@ -183,6 +144,6 @@ class GroupNorm(nn.Module):
             return jnp.repeat(grouped, channels // groups, axis=1)[:, None, None]
 
         mean = of_group(x.mean((1, 2)))
-        var = of_group(jnp.square(x - mean).mean((1, 2)))
+        var = of_group(jnp.square(x - lax.stop_gradient(mean)).mean((1, 2)))
         gain = scale * lax.rsqrt(var + self.epsilon)
         return (x * gain + (bias - mean * gain)).astype(given)

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from fcos_lidar_jax.config import StemConfig
-from fcos_lidar_jax.models.layers import BatchNorm, Image, Kernel, convolve, kernel_init, pieces
+from fcos_lidar_jax.models.convolution import Image, Kernel, convolve, pointwise
+from fcos_lidar_jax.models.layers import BatchNorm, kernel_init, pieces
 
 Form = Literal["split", "dense", "grouped"]  # How the stem's convolutions are computed, see :class:`Stem`.
 _MODALITIES = (3, 3, 1, 1, 1)
@@ -148,7 +149,7 @@ class Stem(nn.Module):
             computed = features[0].dtype
             # Accumulated group by group: no concatenation of all features is ever written.
             for feature, rows in zip(features, pieces([f.shape[-1] for f in features]), strict=True):
-                kernel = kernels[index % num_kernels][rows].astype(feature.dtype)
-                merged = merged + jnp.einsum("bhwc,co->bhwo", feature, kernel, preferred_element_type=image.dtype)
+                kernel = kernels[index % num_kernels][rows]
+                merged = merged + pointwise(feature, kernel, dtype=image.dtype)
         (merged,) = BatchNorm(name="norm")([merged], train=train)
         return jax.nn.relu(merged).astype(computed)

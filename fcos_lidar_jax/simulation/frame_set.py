@@ -9,6 +9,7 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +35,7 @@ class SimulatedFrames(FrameSet):
     close_m: float = 1.0
     num_sweeps: int = 1
     fast_traffic: bool = False
+    streets: Streets = PLAIN
     classes = NUSCENES_CLASSES
 
     def __len__(self) -> int:
@@ -50,6 +52,7 @@ class SimulatedFrames(FrameSet):
             close_m=self.close_m,
             num_sweeps=self.num_sweeps,
             fast_traffic=self.fast_traffic,
+            streets=self.streets,
         )
 
     def name(self, index: int) -> str:
@@ -58,6 +61,17 @@ class SimulatedFrames(FrameSet):
     def fingerprint(self) -> str:
         """Checksum of the fields and the package's version, which decide every byte of the frames."""
         return checksum(repr((__version__, self)).encode())
+
+
+def city_frames(sensor: Sensor, number: int, first_seed: int = 0, *, streets: Streets = CITY) -> SimulatedFrames:
+    """Training frames for a sensor that sees far: varied streets with objects in all of its view.
+
+    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+    >>> city_frames(NUSCENES_HDL32E, 10).reach_m
+    54.0
+    """
+    extent = {"num_objects": 60, "reach_m": sensor.limit_xy_m, "min_points": 1}
+    return SimulatedFrames(sensor, number, first_seed, **extent, streets=streets)
 
 
 UNSEEN_SEED = 1_000_000  # seeds of test frames start here; training frames never get that far

@@ -9,7 +9,8 @@ from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.lidar import SWEEP_S, sample_mount, scan, sensor_pose
 from fcos_lidar_jax.simulation.motion import velocity_at
-from fcos_lidar_jax.simulation.world import World, sample_world
+from fcos_lidar_jax.simulation.streets import PLAIN, Streets
+from fcos_lidar_jax.simulation.world import World, class_shares, sample_world
 
 
 def make_frame(
@@ -22,19 +23,21 @@ def make_frame(
     num_sweeps: int = 1,
     fast_traffic: bool = False,
     close_m: float = 0.0,
+    streets: Streets = PLAIN,
 ) -> Frame:
-    """A simulated frame of a level street; the same seed gives the same bytes, in whatever order frames are made.
+    """A simulated frame of a street; the same seed gives the same bytes, in whatever order frames are made.
 
-    All ten classes occur equally often; rays without a return are left out.
+    In plain streets all ten classes occur equally often; rays without a return are left out.
 
     Args:
         seed: any non-negative integer.
-        num_objects: to place; fewer where there is no room.
+        num_objects: to place, on average where the streets are crowded or empty; fewer where there is no room.
         reach_m: greatest distance along the street at which they are placed; default: four fifths of the sensor's.
         min_points: objects that fewer points of the current sweep show are not annotated.
         num_sweeps: fused, the current one included; with more than one the world moves.
         fast_traffic: as of :func:`~.world.sample_world`.
         close_m: as of :func:`scan_sweeps`.
+        streets: how varied they are.
 
     Raises:
         ValueError: fewer than one sweep.
@@ -47,12 +50,19 @@ def make_frame(
     if num_sweeps < 1:
         raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
     rng = np.random.default_rng([seed, 0xF0C5])
-    labels = rng.permutation(np.resize(rng.permutation(len(NUSCENES_CLASSES)), num_objects))
+    mixed = rng.spawn(1)[0]
+    if streets.setting:
+        num_objects = round(num_objects * np.clip(mixed.lognormal(-0.15, 0.6), 0.05, 2.5))
+    if streets.city_classes:
+        shares = class_shares(streets.city_classes) * np.exp(streets.class_mix * mixed.standard_normal(10))
+        labels = rng.choice(len(NUSCENES_CLASSES), num_objects, p=shares / shares.sum())
+    else:
+        labels = rng.permutation(np.resize(rng.permutation(len(NUSCENES_CLASSES)), num_objects))
     reach = 0.8 * sensor.limit_xy_m if reach_m is None else reach_m
-    now_s = (num_sweeps - 1) * SWEEP_S
-    options = {"level": True, "fused": True, "fast_traffic": fast_traffic}
+    now_s = (num_sweeps - 1 + streets.rolling_shutter) * SWEEP_S
+    options = {"level": not streets.slopes, "fused": True, "fast_traffic": fast_traffic, "streets": streets}
     world = sample_world(rng, reach_m=reach, beyond_m=2 * reach, duration_s=now_s, labels=labels, **options)
-    mount = sample_mount(rng, sensor, level=True)
+    mount = sample_mount(rng, sensor, level=not streets.slopes, streets=streets)
     points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, num_sweeps=num_sweeps, close_m=close_m)
     boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, now_s), now_s).astype(np.float32)
     counts = count_inside(points[points[:, 4] == 0], boxes)
@@ -86,7 +96,7 @@ def scan_sweeps(
 
     def take_sweep(age: int) -> Sweep:
         then_s = time_s - age * SWEEP_S
-        sweep = scan(world, sensor, mount, then_s, rng)
+        sweep = scan(world, sensor, mount, then_s, rng, rolling_shutter=world.streets.rolling_shutter)
         points = sweep.points[sweep.returned]
         columns = [points[:, :4], np.zeros((len(points), 1), np.float32)]
         if sensor.row_source == "laser":

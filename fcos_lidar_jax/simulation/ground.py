@@ -1,11 +1,16 @@
-"""Ground: sloping planes with streets let into it."""
+"""Ground: sloping planes with streets let into it, even or uneven."""
 
 import dataclasses
 
 import numpy as np
 
+from fcos_lidar_jax.simulation.relief import Relief
+
 LANE_M = 3.5
 _MARK_HALF_M = 0.08
+_DIRECTIONS = 720  # in which profiles of uneven ground are taken
+_PROFILE_M = np.geomspace(1.0, 120.0, 144)  # where, from the sensor
+_HALVINGS = 5  # of the piece of a profile that holds a hit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +27,9 @@ class Ground:
     kerb: float  # height of everything beside the carriageways above them
     pavement: float  # width of the pavements
     brightness: tuple[float, float, float]  # albedo of carriageway, pavement and what lies beyond
+    crown: float = 0.0  # the carriageways' middles stand this far above their gutters
+    relief: Relief | None = None  # undulations, metres
+    shading: Relief | None = None  # logarithm of brightness
 
     def on_road(self, x: np.ndarray, y: np.ndarray, margin: np.ndarray | float = 0.0) -> np.ndarray:
         """Whether places lie on a carriageway, or within ``margin`` of one."""
@@ -29,8 +37,12 @@ class Ground:
         return main | (np.abs(x - self.crossing_x) < self.crossing_half_width + margin)
 
     def slope_height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Height of the carriageways' planes."""
-        return np.max([a * x + b * y + c for a, b, c in self.planes], axis=0)
+        """Height of the carriageways, and of what lies beside them without its kerb."""
+        height = np.max([a * x + b * y + c for a, b, c in self.planes], axis=0)
+        if self.crown:
+            off = np.minimum(np.abs(y) / self.half_width, np.abs(x - self.crossing_x) / self.crossing_half_width)
+            height = height - self.crown * np.minimum(off, 1) ** 2
+        return height if self.relief is None else height + self.relief.at(x, y)
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Height of the ground, kerbs included."""
@@ -46,6 +58,8 @@ class Ground:
         Returns:
             range f32[k], inf for rays that never do, and the cosine of incidence f32[k].
         """
+        if self.crown or self.relief is not None:
+            return self._uneven_hits(d, origin)
         low, cosine = self._plane_hits(d, origin, 0.0)
         if self.kerb:
             high, _ = self._plane_hits(d, origin, self.kerb)
@@ -57,6 +71,41 @@ class Ground:
             low[face] = self._kerb_hits(d[:, face], origin, high[face], low[face])
             cosine[face] = np.hypot(d[0, face], d[1, face])
         return low, cosine
+
+    def _uneven_hits(self, d: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`first_hits`: the first piece of the profile ahead that rises to a ray, then halved.
+
+        What is nearer than the profiles' beginning or beyond their end is not met.
+        """
+        flat = np.maximum(np.hypot(d[0], d[1]), np.float32(1e-9))
+        towards, rise = d[:2] / flat, d[2] / flat
+        sector = ((np.arctan2(d[1], d[0]) / (2 * np.pi) % 1) * _DIRECTIONS).astype(np.int32) % _DIRECTIONS
+        used, row = np.unique(sector, return_inverse=True)
+        angle = (used[:, None] + 0.5) * (2 * np.pi / _DIRECTIONS)
+        x, y = origin[0] + np.cos(angle) * _PROFILE_M, origin[1] + np.sin(angle) * _PROFILE_M
+        highest = np.maximum.accumulate((self.height(x, y) - origin[2]) / _PROFILE_M, axis=1)
+        # One search for all: rows of slopes, which are small, one above the other.
+        spread = 4.0 * np.arange(len(used))
+        found = np.searchsorted((np.clip(highest, -2, 2) + spread[:, None]).ravel(), rise + spread[row])
+        piece = found - row * len(_PROFILE_M)
+        met = np.flatnonzero((piece < len(_PROFILE_M)) & (rise > -2))
+        last = _PROFILE_M[np.maximum(piece[met], 1)].astype(np.float32)
+        first = _PROFILE_M[np.maximum(piece[met], 1) - 1].astype(np.float32)
+        towards, rise = towards[:, met], rise[met]
+        eye = origin.astype(np.float32)
+        for _ in range(_HALVINGS):
+            middle = (first + last) / 2
+            x, y = eye[0] + towards[0] * middle, eye[1] + towards[1] * middle
+            under = self.height(x, y) > eye[2] + rise * middle
+            first, last = np.where(under, first, middle), np.where(under, middle, last)
+        way = (first + last) / 2
+        x, y = eye[0] + towards[0] * way, eye[1] + towards[1] * way
+        here = self.slope_height(x, y)
+        a, b = (2 * (self.slope_height(x + u, y + v) - here) for u, v in ((0.5, 0.0), (0.0, 0.5)))
+        cosine = (a * d[0, met] + b * d[1, met] - d[2, met]) / np.sqrt(1 + a * a + b * b)
+        range_m, cosines = np.full(d.shape[1], np.inf, np.float32), np.zeros(d.shape[1], np.float32)
+        range_m[met], cosines[met] = way / flat[met], np.clip(cosine, 0.01, 1)
+        return range_m, cosines
 
     def _plane_hits(self, d: np.ndarray, origin: np.ndarray, lift: float) -> tuple[np.ndarray, np.ndarray]:
         best, cosine = np.full(d.shape[1], np.inf, np.float32), np.zeros(d.shape[1], np.float32)
@@ -91,4 +140,5 @@ class Ground:
         marked = main & dashed & (lanes < _MARK_HALF_M)
         # A zebra crossing on either side of the junction.
         zebra = (np.abs(y) < self.half_width) & (np.abs(off - self.crossing_half_width - 3) < 1.5) & (y % 1 < 0.5)
-        return np.where(marked | zebra, 0.35, shade)
+        bright = np.where(marked | zebra, 0.35, shade)
+        return bright if self.shading is None else bright * np.exp(self.shading.at(x, y))

@@ -10,6 +10,7 @@ from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.raycast import Fan, cast
 from fcos_lidar_jax.simulation.solids import BOX, EGO, make_solids, place_solids
+from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.world import World
 
 SWEEP_S = 0.05  # duration of a turn
@@ -19,12 +20,20 @@ _SURPLUS = 1.0009  # a file's columns span slightly more than a turn
 _SECTORS = 10  # parts of a sweep with a time of their own, with rolling shutter
 _TILT_RAD = 0.1  # the sensor leans by less
 _FARTHEST_M = 105.0
-_RANGE_NOISE_M = 0.012
 _RANGE_STEP_M = 0.002
 _LOST = 0.015  # of strong returns
-_FAINT = 0.07  # strength at which 63 % return
 _NO_RETURN_NOISE_M = 0.02
 _NO_RETURN_INTENSITY = 12.0  # mean of the noise that is written where nothing came back
+_ROUGH_BESIDE = 3.0  # as rough as the carriageways is what lies beyond the pavements
+# The ego vehicle's outline in nuScenes: the lowest free beam of an HDL-32E at every 8 degrees clockwise from 176
+# degrees left of ahead, the lowest of all being 0.
+_OUTLINE = (
+    *(10, 8, 7, 7, 5, 3, 2, 1, 0, 0, 0, 0.5, 2, 2, 2, 3.5, 5, 8, 6, 6, 7, 7, 8),
+    *(7, 7, 6, 6, 8, 4.5, 3, 2, 1, 2, 0.5, 0, 0, 0, 0, 1, 3, 4.5, 6, 7, 8, 9.5),
+)
+_EDGES_M = (1.4, 1.0), (1.75, 1.15)  # least and greatest distance of nuScenes' vehicles' bonnet, and of their roof
+_EDGE_HALVES_M = 0.62, 0.35
+_EDGE_RETURNS = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,15 +45,17 @@ class Scan:
     seen_share: np.ndarray  # f64[m]: share of the rays towards each object that nothing else stops; 0 without any
 
 
-def sample_mount(rng: Generator, sensor: Sensor, *, level: bool = False) -> np.ndarray:
+def sample_mount(rng: Generator, sensor: Sensor, *, level: bool = False, streets: Streets = PLAIN) -> np.ndarray:
     """The points' frame in the ego vehicle's, f64[4, 4]: y forward, x right, tilted a little unless level."""
     tilt, roll, turn = (0.0, 0.0, 0.0) if level else np.clip(rng.normal(0, (0.016, 0.01, 0.005)), -0.04, 0.04)
+    tilt -= 0.0 if level else streets.pitch_rad
+    height = _HEIGHT_M + streets.mount_m * rng.spawn(1)[0].standard_normal()
     c, s = np.cos(turn - np.pi / 2), np.sin(turn - np.pi / 2)
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     rotation = rotation @ np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     rotation = rotation @ np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
     mount = np.eye(4)
-    mount[:3, :3], mount[:3, 3] = rotation, (_FORWARD_M, 0, _HEIGHT_M) - rotation @ np.array(sensor.origin_m)
+    mount[:3, :3], mount[:3, 3] = rotation, (_FORWARD_M, 0, height) - rotation @ np.array(sensor.origin_m)
     return mount
 
 
@@ -80,43 +91,97 @@ def scan(
     """
     now = sensor_pose(world, mount, time_s)
     begin = rng.uniform(-1, 1)
+    rings = _sample_rings(world, sensor)
     edges = np.linspace(0, sensor.num_columns, (_SECTORS if rolling_shutter else 1) + 1).astype(int)
     sectors = []
     for first, last in itertools.pairwise(edges.tolist()):
         age = SWEEP_S * (1 - (first + last) / 2 / sensor.num_columns) if rolling_shutter else 0.0
-        fan = _make_fan(sensor, begin, first, last)
-        sectors.append(_scan_sector(world, sensor, fan, mount, max(time_s - age, 0.0), now, rng))
+        fan = _make_fan(sensor, rings, begin, first, last)
+        sectors.append(_scan_sector(world, sensor, rings, fan, mount, max(time_s - age, 0.0), now, rng))
     points, returned, towards, seen = zip(*sectors, strict=True)
     return Scan(np.concatenate(points), np.concatenate(returned), sum(seen) / np.maximum(sum(towards), 1))
 
 
+@dataclasses.dataclass(frozen=True)
+class _Rings:
+    """What differs from laser to laser, the highest first, and is the same in all sweeps of a world."""
+
+    elevation_rad: np.ndarray  # f64[h]: to add
+    range_m: np.ndarray  # f32[h]: to add
+    gain: np.ndarray  # f32[h]: of the intensity
+    faint: np.float32  # strength at which 63 % return
+    edges_m: np.ndarray  # f64[2]: from the sensor to the edges of the bonnet ahead and of the roof behind
+
+
+def _sample_rings(world: World, sensor: Sensor) -> _Rings:
+    streets, rng = world.streets, np.random.default_rng(world.unit_seed)
+    elevation, offset, gain = rng.standard_normal((3, sensor.num_rows))
+    return _Rings(
+        streets.ring_elevation_rad * elevation,
+        (streets.ring_range_m * offset).astype(np.float32),
+        np.exp(streets.ring_gain * gain).astype(np.float32),
+        np.float32(streets.faint * np.exp(streets.weather * rng.standard_normal())),
+        rng.uniform(*_EDGES_M),
+    )
+
+
 def _scan_sector(
-    world: World, sensor: Sensor, fan: Fan, mount: np.ndarray, time_s: float, now: np.ndarray, rng: Generator
+    world: World,
+    sensor: Sensor,
+    rings: _Rings,
+    fan: Fan,
+    mount: np.ndarray,
+    time_s: float,
+    now: np.ndarray,
+    rng: Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points, which of them returned, and for every object the rays towards it and those that reach it."""
+    streets = world.streets
     pose = sensor_pose(world, mount, time_s)
     rotation, eye = pose[:3, :3], pose[:3, 3] + pose[:3, :3] @ np.array(sensor.origin_m)
     farthest = min(_FARTHEST_M, 2 * sensor.limit_xy_m)
-    everything = np.concatenate([world.solids(time_s), _ego_solids(rotation, eye)])
+    everything = world.solids(time_s)
+    if not streets.ego_outline:
+        everything = np.concatenate([everything, _ego_solids(rotation, eye)])
     solids = _in_view(everything, fan, rotation, eye, farthest)
     hits = cast(fan, rotation, eye, solids, world.ground, rng)
     range_m, shape = hits.range_m, (fan.num_columns, sensor.num_rows)
+    if streets.ego_outline:
+        blocked = _behind_ego(fan)
+        range_m[blocked], hits.solid[blocked] = np.inf, -1
+        if streets.ego_edges:
+            edge, away = _ego_edges(fan, blocked, rings.edges_m)
+            edge &= rng.random(len(edge)) < _EDGE_RETURNS
+            range_m[edge] = away[edge]
     albedo = np.append(solids["albedo"], 0.0).astype(np.float32)[hits.solid]
     ground = np.flatnonzero((hits.solid < 0) & np.isfinite(range_m))
     towards = rotation.astype(np.float32) @ fan.directions
-    albedo[ground] = world.ground.albedo(*(eye[:2, None] + towards[:2, ground] * range_m[ground]))
+    place = eye[:2, None] + towards[:2, ground] * range_m[ground]
+    albedo[ground] = world.ground.albedo(*place)
+    if streets.roughness_m:
+        on_street = world.ground.on_road(place[0], place[1], world.ground.pavement)
+        beside = np.where(on_street, 1, _ROUGH_BESIDE)
+        rough = streets.roughness_m * beside * rng.standard_normal(len(ground))
+        range_m[ground] += rough / np.maximum(hits.cosine[ground], 0.1)
+    if world.ground.shading is not None:
+        struck = np.flatnonzero(hits.solid >= 0)
+        x, y, z = eye[:, None] + towards[:, struck] * range_m[struck]
+        albedo[struck] *= np.exp(world.ground.shading.at(x + z, y + z))
     # Strong rays come back nearly all, faint ones (far, grazing) in part.
     strength = albedo * hits.cosine / np.maximum(range_m / 100, np.float32(1e-3)) ** 2
-    chance = (1 - _LOST) * -np.expm1(-strength / np.float32(_FAINT))
+    chance = (1 - _LOST) * -np.expm1(-strength / rings.faint)
     returned = (rng.random(len(range_m), np.float32) < chance) & (range_m < farthest)
 
-    local = _measure(fan.directions, range_m, returned, rng) + np.array(sensor.origin_m, np.float32)[:, None]
+    range_m += np.tile(rings.range_m, fan.num_columns)
+    local = _measure(fan.directions, range_m, returned, streets.range_noise_m, rng)
+    local += np.array(sensor.origin_m, np.float32)[:, None]
     if not np.array_equal(pose, now):
         motion = np.linalg.inv(now) @ pose
         local = motion[:3, :3].astype(np.float32) @ local + motion[:3, 3:].astype(np.float32)
     intensity = rng.standard_exponential(len(albedo), np.float32) * np.float32(_NO_RETURN_INTENSITY)
     back = np.flatnonzero(returned)
-    speckle = np.exp(np.float32(0.3) * rng.standard_normal(len(back), np.float32))
+    speckle = np.exp(np.float32(streets.speckle) * rng.standard_normal(len(back), np.float32))
+    speckle *= rings.gain[back % sensor.num_rows]
     intensity[back] = 255 * albedo[back] * (0.35 + 0.65 * hits.cosine[back]) * speckle
 
     points = np.empty((*shape, 5), np.float32)
@@ -130,9 +195,11 @@ def _scan_sector(
     return points.reshape(-1, 5), returned.reshape(shape)[:, ::-1].ravel(), reachable, seen
 
 
-def _measure(d: np.ndarray, range_m: np.ndarray, returned: np.ndarray, rng: Generator) -> np.ndarray:
+def _measure(
+    d: np.ndarray, range_m: np.ndarray, returned: np.ndarray, noise_m: float, rng: Generator
+) -> np.ndarray:
     """Measured points about the sensor, f32[3, n]; those without a return lie where it is, and a little off."""
-    noise = rng.standard_normal(len(range_m), np.float32) * np.float32(_RANGE_NOISE_M)
+    noise = rng.standard_normal(len(range_m), np.float32) * np.float32(noise_m)
     noisy = np.round((range_m + noise) / np.float32(_RANGE_STEP_M)) * np.float32(_RANGE_STEP_M)
     points = d * np.where(returned, noisy, np.float32(0))
     lost = np.flatnonzero(~returned)
@@ -140,14 +207,33 @@ def _measure(d: np.ndarray, range_m: np.ndarray, returned: np.ndarray, rng: Gene
     return points
 
 
-def _make_fan(sensor: Sensor, begin: float, first: int, last: int) -> Fan:
+def _make_fan(sensor: Sensor, rings: _Rings, begin: float, first: int, last: int) -> Fan:
     rows = sensor.num_rows
     step = 2 * np.pi / sensor.num_columns * _SURPLUS
     # The lasers fire in turn, one of the lower half and one of the upper half alternately.
     rising = np.arange(rows)
     slot = np.where(rising < rows // 2, 2 * rising, 2 * (rising - rows // 2) + 1)
     start = np.pi - step * (0.1 + begin + first)
-    return Fan(np.array(sensor.inclinations_rad), last - first, start, step, delay=0.83 * slot[::-1] / rows)
+    inclinations = np.sort(np.array(sensor.inclinations_rad) + rings.elevation_rad)[::-1]
+    return Fan(inclinations, last - first, start, step, delay=0.83 * slot[::-1] / rows)
+
+
+def _behind_ego(fan: Fan) -> np.ndarray:
+    """Rays that the ego vehicle stops, bool[w * h]."""
+    right, ahead, up = fan.directions
+    clockwise = np.degrees(np.arctan2(right, ahead))
+    lowest = np.interp(clockwise, np.linspace(-176, 176, len(_OUTLINE)), _OUTLINE, period=360)
+    return np.degrees(np.arcsin(up)) < -30.67 + (lowest - 0.5) * 41.34 / 31
+
+
+def _ego_edges(fan: Fan, blocked: np.ndarray, edges_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The highest of the blocked rays of each column that meet an edge, bool[w * h], and the range of the edge."""
+    right, ahead, _ = fan.directions
+    high = blocked.reshape(fan.num_columns, -1).copy()
+    high[:, 1:] &= ~high[:, :-1].copy()  # the highest ray comes first
+    away = np.where(ahead > 0, edges_m[0], -edges_m[1]) / ahead
+    across = np.abs(right * away)
+    return high.ravel() & (across < np.where(ahead > 0, *_EDGE_HALVES_M)) & (np.abs(ahead) > 0.5), away
 
 
 def _in_view(solids: np.ndarray, fan: Fan, rotation: np.ndarray, eye: np.ndarray, farthest: float) -> np.ndarray:

@@ -15,16 +15,18 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-from fcos_lidar_jax.files import atomic_write, read_json
+from fcos_lidar_jax.files import atomic_write, file_checksum, folder_lock, naming, read_json
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL, MAP_FILE, fixed_tables, scene_name
-from fcos_lidar_jax.simulation.render import DatasetSpec, naming, render_scene
+from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL, MAP_FILE, fixed_tables, scene_name, sweep_file
+from fcos_lidar_jax.simulation.render import DatasetSpec, render_scene
 
 _WORK = ".synthesize"
-_FORMAT = 1  # rises when the same data set gets other bytes
+_ORDER, _TABLES = f"{_WORK}/order.json", f"{_WORK}/tables.json"  # checksums of the tables
+_FORMAT = 2  # rises when the same data set gets other bytes
 _POLL_S = 0.5
 
 
@@ -41,11 +43,20 @@ def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callab
 
     Raises:
         ValueError: the folder holds something else; one line that says what.
-        OSError: what cannot be written.
+        OSError: what cannot be written, or another process writes there.
     """
-    _claim(spec, root)
-    if (root / spec.version).is_dir():
+    if _finished(spec, root, _check_order(spec, root)):  # before anything is written
         return False
+    with folder_lock(root / _WORK, "synthesizing"):
+        order = _check_order(spec, root)
+        if _finished(spec, root, order):  # another process was faster
+            return False
+        atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
+        _write_rest(spec, root, workers, report)
+    return True
+
+
+def _write_rest(spec: DatasetSpec, root: Path, workers: int, report: Callable[[int], object]) -> None:
     for folder in ("samples", "sweeps"):
         (root / folder / CHANNEL).mkdir(parents=True, exist_ok=True)
     todo = [index for index in range(spec.scenes) if not _shard(root, index).is_dir()]
@@ -57,26 +68,48 @@ def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callab
     else:
         _write_in_processes(spec, root, todo, workers, lambda done: report(before + done))
     _write_tables(spec, root)
-    return True
 
 
-def _claim(spec: DatasetSpec, root: Path) -> None:
-    """Make the folder this data set's, or check that it is."""
+def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
+    """What decides the bytes of this data set, as JSON; refuses a folder of anything else."""
     asked = {"format": _FORMAT, **dataclasses.asdict(spec), "sensor": sensor_to_json(spec.sensor)}
     wanted = json.loads(json.dumps(asked))
     if root.exists() and not root.is_dir():
         raise ValueError(f"{root}: found a file, expected a folder")
-    file = root / _WORK / "order.json"
+    file = root / _ORDER
     if not file.is_file():
         if root.is_dir() and any(p.name != _WORK for p in root.iterdir()):
             raise ValueError(f"{root}: not empty, and not begun by this command: expected a new folder")
-        atomic_write(file, lambda p: _write_text(p, json.dumps(wanted, indent=1) + "\n"))
-        return
+        return wanted
     found = read_json(file, dict[str, Any])
     for name, value in wanted.items():
         if found.get(name) != value:
-            got, expected = (v["name"] if name == "sensor" and v else v for v in (value, found.get(name)))
+            got, expected = (v.get("name") if isinstance(v, dict) else v for v in (value, found.get(name)))
             raise ValueError(f"{root}: {name}: got {got}, but the data set there was begun with {expected}")
+    return wanted
+
+
+def _finished(spec: DatasetSpec, root: Path, order: dict[str, Any]) -> bool:
+    """Whether all is there; refuses a finished data set of which something was lost or altered later."""
+    folder = root / spec.version
+    if not folder.is_dir():
+        return False
+    written = read_json(root / _TABLES, dict[str, str]) if (root / _TABLES).is_file() else {}
+    size = spec.sensor.num_rows * spec.sensor.num_columns * 5 * 4
+    clouds = itertools.product(range(spec.scenes), range(spec.sweeps))
+    files = (root / sweep_file(spec.seed, index, number) for index, number in clouds)
+    damaged = itertools.chain(
+        (file for file in files if not file.is_file() or file.stat().st_size != size),
+        (
+            folder / n
+            for n, c in written.items()
+            if not os.path.isfile(folder / n) or file_checksum(folder / n) != c
+        ),
+    )
+    if (file := next(damaged, None)) is not None:
+        found = "another content" if os.path.isfile(file) else "nothing"
+        raise ValueError(f"{file}: found {found}, expected the file as written: remove {root}, and run again")
+    return True
 
 
 def _shard(root: Path, index: int) -> Path:
@@ -121,6 +154,8 @@ def _write_in_processes(
                 for future in finished:
                     future.result()
                 report(counter.value)
+        except BrokenProcessPool:
+            raise OSError("a worker died, perhaps for want of memory: try fewer workers") from None
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(multiprocessing.active_children()) - others:
@@ -164,6 +199,8 @@ def _write_tables(spec: DatasetSpec, root: Path) -> None:
         for name, rows in fixed_tables(logs).items():
             _write_text(folder / f"{name}.json", json.dumps(rows, indent=0) + "\n")
         _write_text(folder / "splits.json", json.dumps(splits(spec.scenes), indent=1) + "\n")
+        written = {file.name: file_checksum(file) for file in sorted(folder.iterdir())}
+        atomic_write(root / _TABLES, lambda path: _write_text(path, json.dumps(written, indent=1) + "\n"))
         (root / MAP_FILE).parent.mkdir(exist_ok=True)
         _write_text(root / MAP_FILE, "")
     for index in range(spec.scenes):

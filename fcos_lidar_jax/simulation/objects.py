@@ -11,6 +11,7 @@ from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, WHEEL, make_solids
 
 _MARGIN_M = 0.04  # an annotated box stands off from the solids by this on every side, as hand-drawn boxes do
 _KINDS = {"box": BOX, "drum": DRUM, "ball": BALL, "wheel": WHEEL}
+_FULL = 0.96  # parts that reach this share of a side of the box are what it is drawn around
 _MATERIALS = {  # albedo (None: the object's own paint) and density
     "paint": (None, np.inf),
     "glass": (0.03, 0.5),
@@ -21,6 +22,10 @@ _MATERIALS = {  # albedo (None: the object's own paint) and density
     "skin": (0.25, np.inf),
     "dirt": (0.15, np.inf),
     "screen": (0.08, 40.0),
+    "leaves": (0.15, 3.0),
+    "mesh": (0.12, 4.0),
+    "stone": (0.2, np.inf),
+    "wood": (0.15, np.inf),
 }
 
 
@@ -37,6 +42,7 @@ class ObjectModel:
     speed_mps: tuple[float, float] = (0.0, 0.0)
     paint: tuple[float, float] = (0.1, 0.7)
     rider: bool = False
+    city_share: float | None = None
 
 
 def _make_model(parts: list[dict[str, Any]], **fields: Any) -> ObjectModel:
@@ -59,17 +65,25 @@ def _make_model(parts: list[dict[str, Any]], **fields: Any) -> ObjectModel:
     return ObjectModel(solids=np.concatenate(solids), painted=np.array(painted), **fields)
 
 
-OBJECT_MODELS: dict[str, tuple[ObjectModel, ...]] = {
-    name: tuple(_make_model(**model) for model in models)
-    for name, models in tomllib.loads(Path(__file__).with_name("objects.toml").read_text(encoding="utf-8")).items()
-}
+def _read_models(file: str) -> dict[str, tuple[ObjectModel, ...]]:
+    tables = tomllib.loads(Path(__file__).with_name(file).read_text(encoding="utf-8"))
+    return {name: tuple(_make_model(**model) for model in models) for name, models in tables.items()}
+
+
+OBJECT_MODELS = _read_models("objects.toml")
 """The models of every class."""
 
+CLUTTER_MODELS = _read_models("clutter.toml")
+"""Things that are no objects, by where they stand."""
 
-def sample_object_model(rng: np.random.Generator, name: str, *, moving: bool = False) -> ObjectModel:
+
+def sample_object_model(
+    rng: np.random.Generator, name: str, *, moving: bool = False, city: bool = False
+) -> ObjectModel:
     """A model of a class, by their shares; ``moving``: one that moves, where the class has one."""
     models = OBJECT_MODELS[name]
-    shares = np.cumsum([model.share for model in models])
+    in_city = [model.share if model.city_share is None else model.city_share for model in models]
+    shares = np.cumsum(in_city if city else [model.share for model in models])
     able = [model.speed_mps[1] > 0 for model in models]
     while True:
         drawn = int(np.searchsorted(shares, rng.random() * shares[-1], side="right"))
@@ -77,9 +91,12 @@ def sample_object_model(rng: np.random.Generator, name: str, *, moving: bool = F
             return models[drawn]
 
 
-def sample_size(rng: np.random.Generator, model: ObjectModel) -> np.ndarray:
-    """Length, width and height of a box, metres, within two and a half deviations of the mean."""
-    return np.array(model.size_m) + np.array(model.spread) * np.clip(rng.standard_normal(3), -2.5, 2.5)
+def sample_size(rng: np.random.Generator, model: ObjectModel, factor: float = 1.0) -> np.ndarray:
+    """Length, width and height of a box, metres, within two and a half deviations of the mean.
+
+    ``factor`` is that of the model's deviations.
+    """
+    return np.array(model.size_m) + factor * np.array(model.spread) * np.clip(rng.standard_normal(3), -2.5, 2.5)
 
 
 def sample_paint(rng: np.random.Generator, model: ObjectModel) -> float:
@@ -108,3 +125,25 @@ def object_solids(model: ObjectModel, size_m: np.ndarray, paint: float) -> np.nd
     solids["lean"] *= scale[0] / scale[2]
     solids["albedo"][model.painted] = paint
     return solids
+
+
+def vary_shape(rng: np.random.Generator, solids: np.ndarray, size_m: np.ndarray, deviation: float) -> None:
+    """Change the extents of an object's parts in place, each for itself, so that the box stays as tight.
+
+    Sides of parts at a side of the box stay there; wheels, and what stands out of the box, such as the fence on a
+    barrier, keep their shapes.
+
+    Args:
+        solids: [s], in the frames of their boxes.
+        size_m: f64[3] or f64[s, 3], of the annotated box.
+        deviation: of a side, in fractions of the part's own extent.
+    """
+    low, high = solids["center"] - solids["half"], solids["center"] + solids["half"]
+    least, most = size_m * (-0.5, -0.5, 0), size_m * (0.5, 0.5, 1)
+    inside = np.all((low >= least - 1e-6) & (high <= most + 1e-6), axis=1)
+    near = (1 - _FULL) / 2 * size_m + _MARGIN_M
+    free = inside[:, None] & (solids["kind"] != WHEEL)[:, None]
+    step = 2 * solids["half"] * deviation * rng.standard_normal((2, *low.shape))
+    low = np.where(free & (low > least + near), np.maximum(low + step[0], least), low)
+    high = np.where(free & (high < most - near), np.minimum(high + step[1], most), high)
+    solids["center"], solids["half"] = (low + high) / 2, (high - low) / 2

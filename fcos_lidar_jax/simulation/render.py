@@ -1,20 +1,21 @@
 """One scene of a synthetic data set: its point files and its rows of the tables."""
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import count_inside
+from fcos_lidar_jax.files import naming
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation import nuscenes_tables as tables
 from fcos_lidar_jax.simulation.lidar import SWEEP_S, sample_mount, scan
 from fcos_lidar_jax.simulation.motion import travelled
 from fcos_lidar_jax.simulation.nuscenes_tables import SWEEPS_PER_KEYFRAME, Row, pose_fields
+from fcos_lidar_jax.simulation.streets import CITY, Streets
 from fcos_lidar_jax.simulation.world import World, sample_labels, sample_world
 
 _OBJECTS = 150  # around an ego vehicle that stands; one that drives meets more
@@ -31,20 +32,12 @@ class DatasetSpec:
     sensor: Sensor
     rolling_shutter: bool
     version: str  # folder of the tables
+    streets: Streets = CITY
 
     @property
     def sweeps(self) -> int:
         """Of a scene."""
         return (self.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1
-
-
-@contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Make errors of writing a file name it: where the disk is full, the system's own do not."""
-    try:
-        yield
-    except OSError as error:
-        raise OSError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[], object]) -> dict[str, list[Row]]:
@@ -64,7 +57,7 @@ def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[]
     rng = np.random.default_rng([spec.seed, index])
     world = sample_scene(rng, spec)
     traffic = world.traffic
-    sensor_to_ego = sample_mount(rng, spec.sensor)
+    sensor_to_ego = sample_mount(rng, spec.sensor, streets=spec.streets)
     street_to_global = _sample_placement(rng)
     mount, egos = pose_fields(sensor_to_ego), []
     boxes, counts, shares, attributes = [], [], [], []
@@ -93,9 +86,12 @@ def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[]
 def sample_scene(rng: np.random.Generator, spec: DatasetSpec) -> World:
     """The world of one scene of a data set."""
     duration = (spec.sweeps - 1) * SWEEP_S
-    labels = sample_labels(rng, _OBJECTS + int(_OBJECTS_PER_M * 7 * duration))
+    crowd = np.clip(rng.spawn(1)[0].lognormal(-0.6, 0.5), 0.2, 1.5) if spec.streets.setting else 1
+    labels = sample_labels(rng, int(crowd * (_OBJECTS + int(_OBJECTS_PER_M * 7 * duration))))
     reach = min(80.0, 1.5 * spec.sensor.limit_xy_m)
-    return sample_world(rng, reach_m=reach, beyond_m=1.2 * reach, duration_s=duration, labels=labels)
+    return sample_world(
+        rng, reach_m=reach, beyond_m=1.2 * reach, duration_s=duration, labels=labels, streets=spec.streets
+    )
 
 
 def _sample_placement(rng: np.random.Generator) -> np.ndarray:

@@ -5,6 +5,8 @@ from numpy.random import Generator
 
 from fcos_lidar_jax.simulation.ground import Ground
 from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, SOLID, make_solids
+from fcos_lidar_jax.simulation.streets import PLAIN, Streets
+from fcos_lidar_jax.simulation.surroundings import Side, sample_setting, sample_surroundings
 
 _LEAVES = 0.55  # rays stopped by a metre of foliage
 _FENCES = ((0.08, 5.0), (0.24, np.inf), (0.24, np.inf), (0.8, 2.5))
@@ -12,11 +14,20 @@ _FENCES = ((0.08, 5.0), (0.24, np.inf), (0.24, np.inf), (0.8, 2.5))
 
 
 def sample_scenery(
-    rng: Generator, ground: Ground, low: np.ndarray, high: np.ndarray, *, beyond_m: float
+    rng: Generator,
+    surroundings: Generator,
+    ground: Ground,
+    low: np.ndarray,
+    high: np.ndarray,
+    *,
+    beyond_m: float,
+    streets: Streets = PLAIN,
 ) -> np.ndarray:
     """Scenery on both sides of both streets.
 
     Args:
+        rng: for houses, fences, trees and poles.
+        surroundings: for what the streets have besides.
         low: f64[2], least x and y that the sensor comes to.
         high: f64[2], greatest.
         beyond_m: how far around that there is anything.
@@ -25,13 +36,16 @@ def sample_scenery(
         solids [s] of :data:`SOLID` in the street's frame.
     """
     parts = [np.zeros(0, SOLID)]
+    setting = sample_setting(surroundings) if streets.setting else "city"
+    plain = [_fences, _trees, _poles] if streets.facades else [_houses, _fences, _trees, _poles]
     for along, half in ((0, ground.half_width), (1, ground.crossing_half_width)):
         span = low[along] - beyond_m, high[along] + beyond_m
         across = ground.crossing_x if along else 0.0
         if not low[1 - along] - beyond_m < across < high[1 - along] + beyond_m:
             continue
         for side in (-1, 1):
-            parts += [draw(rng, ground, along, side, half, span) for draw in (_houses, _fences, _trees, _poles)]
+            parts += [draw(rng, ground, along, side, half, span) for draw in plain]
+            parts.append(sample_surroundings(surroundings, Side(ground, along, side, span), streets, setting))
     return np.concatenate(parts)
 
 

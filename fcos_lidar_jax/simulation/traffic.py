@@ -11,6 +11,7 @@ from fcos_lidar_jax.data.box_geometry import footprints_overlap
 from fcos_lidar_jax.simulation.ground import LANE_M, Ground
 from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, travelled
 from fcos_lidar_jax.simulation.objects import ObjectModel, sample_object_model, sample_size
+from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 
 # Where objects of a class are, and how often; first where they move, if they do.
 _PLACES: dict[str, tuple[tuple[str, float], ...]] = {
@@ -60,11 +61,12 @@ def sample_traffic(
     duration_s: float,
     fused: bool,
     fast_traffic: bool,
+    streets: Streets = PLAIN,
 ) -> Traffic:
     """Objects that never touch each other, the ego vehicle or what stands already.
 
-    Every object is within reach of the sensor at some moment, at a distance drawn evenly. Options are those of
-    :func:`~.world.sample_world`.
+    Every object is within reach of the sensor at some moment, at a distance drawn evenly or as the streets say.
+    Options are those of :func:`~.world.sample_world`.
 
     Args:
         ego: [1] of ``motion.MOTION``.
@@ -76,26 +78,32 @@ def sample_traffic(
     vehicle = pose_at(ego, times)
     vehicle[:, :2] += EGO_MIDDLE_M * np.stack([np.cos(vehicle[:, 2]), np.sin(vehicle[:, 2])], axis=1)
     taken.add(vehicle, EGO_SIZE_M)
-    places = _Places(rng, ground, ego, reach_m, fast_traffic)
+    places = _Places(rng, ground, ego, reach_m, fast_traffic, streets.spread)
+    groups, walker = rng.spawn(1)[0], None
     found: list[tuple[int, ObjectModel, np.ndarray, np.ndarray, bool]] = []
     for label in labels:
         name = NUSCENES_CLASSES[label]
         for _ in range(_TRIES):
-            model = sample_object_model(rng, name, moving=fast_traffic)
-            size = sample_size(rng, model)
+            model = sample_object_model(rng, name, moving=fast_traffic, city=streets.round_cars)
+            size = sample_size(rng, model, streets.sizes)
             place, clearance = places.sample_place(name, model), _CLEARANCE_M
             moment = rng.uniform(duration_s if fused else 0.0, duration_s)
             if place == "row":
                 row, clearance = places.row_for(name, moment, model, size), _ROW_CLEARANCE_M
                 if row.model is not model and name in ("traffic_cone", "barrier"):  # in a row all are alike
                     model = row.model
-                    size = sample_size(rng, model)
+                    size = sample_size(rng, model, streets.sizes)
                 motion = places.next_in_row(row, size)
+            elif walker is not None and name == "pedestrian" and groups.random() < streets.groups:
+                motion, clearance = walker.copy(), _ROW_CLEARANCE_M
+                motion["x"] += groups.normal(0, 1.2)
+                motion["y"] += groups.normal(0, 0.8)
             else:
                 motion = places.sample_motion(place, moment, model, size)
             if motion is not None and taken.has_room(pose_at(motion, times), size, clearance):
                 taken.add(pose_at(motion, times), size)
                 found.append((label, model, size, motion, place in _PARKED))
+                walker = motion if name == "pedestrian" else walker
                 break
     return Traffic(
         np.array([f[0] for f in found], np.int32),
@@ -110,15 +118,15 @@ class _Taken:
     """Rectangles on the ground that are taken, at a few moments."""
 
     def __init__(self, times: np.ndarray, occupied: np.ndarray) -> None:
-        self._poses = list(np.repeat(occupied[:, None, [0, 1, 4]], len(times), axis=1))
-        self._sizes = [tuple(size) for size in occupied[:, 2:4]]
+        self._poses = np.repeat(occupied[:, None, [0, 1, 4]], len(times), axis=1)
+        self._sizes = occupied[:, 2:4]
 
     def add(self, poses: np.ndarray, size: np.ndarray | tuple[float, float]) -> None:
-        self._poses.append(poses)
-        self._sizes.append((size[0], size[1]))
+        self._poses = np.concatenate([self._poses, poses[None]])
+        self._sizes = np.concatenate([self._sizes, [[size[0], size[1]]]])
 
     def has_room(self, poses: np.ndarray, size: np.ndarray, clearance: float) -> bool:
-        others, sizes = np.array(self._poses), np.array(self._sizes)
+        others, sizes = self._poses, self._sizes
         reach = np.hypot(sizes[:, 0], sizes[:, 1])[:, None] / 2 + np.hypot(size[0], size[1]) / 2 + clearance
         which, when = np.nonzero(np.hypot(*(others[..., :2] - poses[:, :2]).transpose(2, 0, 1)) < reach)
         own = _footprints(poses[when], size[:2] + 2 * clearance)
@@ -154,6 +162,7 @@ class _Places:
     ego: np.ndarray
     reach_m: float  # greatest distance from the ego vehicle
     fast_traffic: bool  # every lane flows, fast and steadily, and few stand
+    spread: float  # power of an even number that says how far off an object is
     # Class -> the row that is being filled.
     rows: dict[str, _Row] = dataclasses.field(default_factory=dict)
     # Street, side and lane -> speed and acceleration, the same for all in the lane: they keep their distances.
@@ -257,7 +266,7 @@ class _Places:
     def _sample_station(self, moment: float) -> tuple[int, float]:
         """A street (0 main, 1 the other) and a place along it, by its distance from the sensor at a moment."""
         x, y, _ = pose_at(self.ego, moment)[0]
-        distance = self.reach_m * self.rng.uniform(0.05, 1)
+        distance = self.reach_m * self.rng.uniform(0.05, 1) ** self.spread
         stations = []
         for along, (here, off) in enumerate(((x, y), (y, x - self.ground.crossing_x))):
             if distance > abs(off):

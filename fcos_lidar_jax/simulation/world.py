@@ -8,9 +8,11 @@ from numpy.random import Generator
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.simulation.ground import LANE_M, Ground
 from fcos_lidar_jax.simulation.motion import make_motion, pose_at
-from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_paint
+from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_paint, vary_shape
+from fcos_lidar_jax.simulation.relief import sample_relief
 from fcos_lidar_jax.simulation.scenery import sample_scenery
 from fcos_lidar_jax.simulation.solids import SOLID, place_solids
+from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.traffic import Traffic, sample_traffic
 
 _SHARES = np.array([0.36, 0.08, 0.02, 0.04, 0.015, 0.17, 0.015, 0.02, 0.09, 0.19])
@@ -27,6 +29,8 @@ class World:
     traffic: Traffic
     parts: np.ndarray  # [s] solids of the objects, each in the frame of the object that it names as its owner
     ego: np.ndarray  # [1] of motion.MOTION: the rear axle of the ego vehicle
+    streets: Streets = PLAIN
+    unit_seed: int = 0  # of what is particular to the sensor's lasers
 
     def object_poses(self, time_s: float) -> np.ndarray:
         """``x, y, z, yaw`` of the middles of all objects' undersides, f64[m, 4]."""
@@ -61,6 +65,7 @@ def sample_world(
     level: bool = False,
     fused: bool = False,
     fast_traffic: bool = False,
+    streets: Streets = PLAIN,
 ) -> World:
     """A random world.
 
@@ -79,10 +84,12 @@ def sample_world(
     >>> len(world.traffic.labels) <= 10, world.object_poses(0.0).shape[1]
     (True, 4)
     """
-    ground = _sample_ground(rng, level)
+    shapes, grounds, surroundings, unit = rng.spawn(4)
+    ground = _uneven(grounds, _sample_ground(rng, level), streets)
     ego = _sample_ego(rng, ground, duration_s, fast_traffic)
     path = pose_at(ego, np.arange(0, duration_s + 0.1, 0.5))[:, :2]
-    scenery = sample_scenery(rng, ground, path.min(axis=0), path.max(axis=0), beyond_m=beyond_m)
+    around = {"low": path.min(axis=0), "high": path.max(axis=0), "beyond_m": beyond_m}
+    scenery = sample_scenery(rng, surroundings, ground, **around, streets=streets)
     center, half, yaw = scenery["center"], scenery["half"], scenery["yaw"]
     standing = center[:, 2] - half[:, 2] < 2 + ground.height(*center[:, :2].T)
     traffic = sample_traffic(
@@ -95,12 +102,25 @@ def sample_world(
         duration_s=duration_s,
         fused=fused,
         fast_traffic=fast_traffic,
+        streets=streets,
     )
     parts = [np.zeros(0, SOLID)]
     for index, (model, size) in enumerate(zip(traffic.models, traffic.sizes, strict=True)):
         parts.append(object_solids(model, size, sample_paint(rng, model)))
+        if streets.shape:
+            vary_shape(shapes, parts[-1], size, streets.shape)
         parts[-1]["owner"] = index
-    return World(ground, scenery, traffic, np.concatenate(parts), ego)
+    return World(ground, scenery, traffic, np.concatenate(parts), ego, streets, int(unit.integers(2**63)))
+
+
+def class_shares(power: float) -> np.ndarray:
+    """How often objects are of each class, f64[10]: 1 as in the streets of nuScenes, 0 all equally often.
+
+    >>> class_shares(0.0).round(6).tolist()
+    [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]
+    """
+    shares = _SHARES**power
+    return shares / shares.sum()
 
 
 def sample_labels(rng: Generator, number: int) -> np.ndarray:
@@ -109,7 +129,7 @@ def sample_labels(rng: Generator, number: int) -> np.ndarray:
     >>> len(np.unique(sample_labels(np.random.default_rng(0), 40)))
     10
     """
-    more = rng.choice(len(NUSCENES_CLASSES), max(number - len(NUSCENES_CLASSES), 0), p=_SHARES / _SHARES.sum())
+    more = rng.choice(len(NUSCENES_CLASSES), max(number - len(NUSCENES_CLASSES), 0), p=class_shares(1.0))
     return np.concatenate([np.arange(len(NUSCENES_CLASSES)), more]).astype(np.int32)[:number]
 
 
@@ -136,6 +156,20 @@ def _sample_ground(rng: Generator, level: bool) -> Ground:
         pavement=rng.uniform(2.5, 4.5),
         brightness=(rng.uniform(0.03, 0.08), rng.uniform(0.07, 0.16), rng.uniform(0.05, 0.14)),
     )
+
+
+def _uneven(rng: Generator, ground: Ground, streets: Streets) -> Ground:
+    """The ground with undulations, crowns, other kerbs and shades; as it is where the streets have none."""
+    height, shade = rng.spawn(2)
+    if streets.relief_m:
+        deviation = streets.relief_m * np.exp(0.5 * rng.standard_normal())
+        ground = dataclasses.replace(ground, relief=sample_relief(height, deviation, 2.2))
+    if streets.crown_m:
+        crown, kerb = streets.crown_m * rng.random(), rng.choice([0.03, 0.1, 0.13, 0.16, 0.2])
+        ground = dataclasses.replace(ground, crown=float(crown), kerb=float(kerb))
+    if streets.shading:
+        ground = dataclasses.replace(ground, shading=sample_relief(shade, streets.shading, 1.0))
+    return ground
 
 
 def _sample_ego(rng: Generator, ground: Ground, duration_s: float, fast_traffic: bool) -> np.ndarray:

@@ -16,9 +16,9 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
-from fcos_lidar_jax.inference.detector import TrainedDetector, sharded_detect
+from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
-from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
+from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
 from fcos_lidar_jax.types import Detections
 
 _AHEAD = 2  # Groups of frames that are read while the devices work on others.
@@ -35,7 +35,7 @@ class Prediction:
 
 
 def predict(
-    detector: TrainedDetector,
+    detector: CloudDetector,
     frames: FrameSet,
     *,
     indices: Sequence[int] | None = None,
@@ -61,8 +61,7 @@ def predict(
     if batch_size < 1:
         raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
-    program = sharded_detect(detector.model, mesh, batch_size)
-    variables = replicate(detector.variables, mesh)
+    program = detector.program(mesh, batch_size)
     todo = list(range(len(frames)) if indices is None else indices)
     size = batch_size * mesh.size
     groups = [todo[i : i + size] for i in range(0, len(todo), size)]
@@ -99,7 +98,7 @@ def predict(
             loaded, clouds = reading.popleft().result()
             if number + _AHEAD < len(groups):
                 reading.append(pool.submit(read, groups[number + _AHEAD]))
-            found = program(variables, *shard_batch(clouds, mesh))
+            found = program(*shard_batch(clouds, mesh))
             if running is not None:
                 yield from finished(*running)
             running = group, loaded, found
@@ -108,7 +107,7 @@ def predict(
 
 
 def evaluate(
-    detector: TrainedDetector, frames: FrameSet, *, batch_size: int = 1, devices: Sequence[Any] | None = None
+    detector: CloudDetector, frames: FrameSet, *, batch_size: int = 1, devices: Sequence[Any] | None = None
 ) -> Evaluation:
     """Detect in every frame and compare with its boxes, by centre distance; arguments as in :func:`predict`.
 

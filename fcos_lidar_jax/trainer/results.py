@@ -1,18 +1,17 @@
 """Detections of many frames in a results file; an interrupted run resumes."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
-from fcos_lidar_jax.inference.detector import TrainedDetector
+from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.prediction import predict
@@ -20,7 +19,7 @@ from fcos_lidar_jax.types import Detections
 
 
 def write_predictions(
-    detector: TrainedDetector,
+    detector: CloudDetector,
     frames: FrameSet,
     path: Path,
     *,
@@ -59,11 +58,8 @@ def write_predictions(
     return removed
 
 
-def _fingerprint(detector: TrainedDetector, frames: FrameSet, batch_size: int) -> str:
+def _fingerprint(detector: CloudDetector, frames: FrameSet, batch_size: int) -> str:
     """What detections follow from: weights, configuration, sensor, frames, and how many are computed at once."""
-    digest = hashlib.blake2b(digest_size=16)
-    for leaf in jax.tree.leaves(detector.variables):
-        digest.update(np.ascontiguousarray(leaf).data)
     described = config_to_json(detector.config), sensor_to_json(detector.sensor), frames.fingerprint(), batch_size
-    digest.update(json.dumps(described, sort_keys=True).encode())
-    return digest.hexdigest()
+    described = detector.fingerprint, *described, frames.clouds_fingerprint(range(len(frames)))
+    return checksum(json.dumps(described, sort_keys=True).encode())

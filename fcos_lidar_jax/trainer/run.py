@@ -22,15 +22,22 @@ from jax.experimental import multihost_utils
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.classes import MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.files import atomic_write, folder_lock
+from fcos_lidar_jax.files import atomic_write, folder_lock, read_json
 from fcos_lidar_jax.inference.detector import TrainedDetector
+from fcos_lidar_jax.input_pipeline.batching import check_counts
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.trainer.prediction import evaluate, predict
-from fcos_lidar_jax.training.checkpoint import Checkpoint, NonFiniteStateError, check_arrays, load_checkpoint
+from fcos_lidar_jax.training.checkpoint import (
+    Checkpoint,
+    NonFiniteStateError,
+    check_arrays,
+    load_checkpoint,
+    with_later_fields,
+)
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, find_checkpoint
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
 from fcos_lidar_jax.training.metrics_log import MetricsLog
@@ -41,6 +48,7 @@ from fcos_lidar_jax.training.step import detection_variables, make_state, make_t
 from fcos_lidar_jax.types import TrainState
 
 _NUM_PICTURES = 2  # Test frames that are drawn at an evaluation.
+_LATER_FIELDS = ("ground_truth_database",)  # that the specification did not have at first
 RUN_SPEC = "run.json"  # Name of the file in a run's folder that says what the run is.
 
 Hook = Callable[[int, Record], None]  # Called with (steps done, metrics of the last of them) after every step.
@@ -128,6 +136,7 @@ def train(
     frames = MappedFrames(frames, config.classes)
     tests = None if tests is None else MappedFrames(tests, config.classes)
     mesh = make_mesh(devices)
+    check_counts(frames)
     check_batch_size(config.optimizer.batch_size, mesh)
     # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
     spec = {
@@ -138,13 +147,14 @@ def train(
         "frames": len(frames),
         "data": frames.fingerprint(),
         "objects": None if objects is None else objects.manifest.source,
+        "ground_truth_database": None if objects is None else objects.fingerprint(),
         "weights": str(weights) if isinstance(weights, str | Path) else None,
     }
     spec, detector = json.loads(json.dumps(spec)), build_detector(config, frames.sensor)
     run = _Run(Path(out), detector, schedule, steps, tests, devices, spec)
     is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
     check_run(run.folder, run.spec, resume=resume)
-    given = None if resume else _given_weights(run.detector, weights)
+    given = weights if resume else _given_weights(run.detector, weights)  # needed where no checkpoint is yet
     with _claimed(run, resume=resume):
         optimizer = make_optimizer(config.optimizer, steps)
         start = _start(run, optimizer, seed, resume, given)
@@ -214,13 +224,16 @@ def train(
     return state
 
 
-def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> None:
+def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
     """Refuse a folder that cannot take a run.
 
     Args:
         folder: of the run.
         spec: what ``run.json`` must hold; None to check only whether there is a run.
         resume: the run is to be resumed.
+
+    Returns:
+        fields of the specification that an older run does not have, and that were not compared.
 
     Raises:
         ValueError: there is a run and it is not to be resumed, or none to resume, or another one, with the first
@@ -233,15 +246,19 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     if not file.is_file():
         if resume:
             raise ValueError(f"{file}: found nothing, expected the run to resume")
-        return
+        return []
     if not resume:
         raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError:
-        raise ValueError(f"{file}: not JSON, expected the specification of a run") from None
-    for name, (was, wanted) in _differences(found, spec) if spec is not None else ():
+    found = read_json(file, dict[str, Any], what="the specification of a run")
+    if spec is None:
+        return []
+    missing = [name for name in _LATER_FIELDS if name not in found]
+    found |= {name: spec[name] for name in missing}
+    if isinstance(config := found.get("config"), dict):
+        found["config"] = with_later_fields(config)
+    for name, (was, wanted) in _differences(found, spec):
         raise ValueError(f"{file}: {name}: was {was!r}, got {wanted!r}: only the same run can be resumed")
+    return missing
 
 
 @contextlib.contextmanager
@@ -252,7 +269,9 @@ def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
         if jax.process_index() == 0:
             try:
                 held.enter_context(folder_lock(run.folder, "training"))
-                check_run(run.folder, run.spec, resume=resume)  # another process may have been faster
+                missing = check_run(run.folder, run.spec, resume=resume)  # another process may have been faster
+                if missing:
+                    print(f"{run.folder}: an older run, without {', '.join(missing)} to compare", file=sys.stderr)
                 text = json.dumps(run.spec, indent=1)
                 if not resume:
                     atomic_write(run.folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
@@ -275,7 +294,9 @@ def _given_weights(detector: Detector, weights: str | Path | Variables | None) -
     return variables
 
 
-def _start(run: _Run, optimizer: Any, seed: int, resume: bool, weights: Variables | None) -> TrainState:
+def _start(
+    run: _Run, optimizer: Any, seed: int, resume: bool, weights: str | Path | Variables | None
+) -> TrainState:
     """The state of the newest checkpoint, or one of given or random weights."""
     key = jax.random.key(seed)
     if resume:
@@ -283,7 +304,7 @@ def _start(run: _Run, optimizer: Any, seed: int, resume: bool, weights: Variable
         found = run.checkpoints.newest(like)
         if found is not None:
             return found[1]
-    return make_state(run.detector, optimizer, key, variables=weights)
+    return make_state(run.detector, optimizer, key, variables=_given_weights(run.detector, weights))
 
 
 def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | None) -> float | None:

@@ -1,7 +1,8 @@
 """Checkpoints that explain themselves: orbax arrays beside the configuration and the sensor as JSON.
 
 A checkpoint is a folder: ``checkpoint.json`` says what it is and lists every file with its hash, ``variables`` is
-what detection needs, ``state`` is there where training can resume from it.
+what detection needs, ``state`` is there where training can resume from it. A ``README.md`` beside them is no part
+of it and may say more.
 """
 
 import dataclasses
@@ -19,9 +20,10 @@ import numpy as np
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
-from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.files import checksum, naming, read_json
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
+from fcos_lidar_jax.training.preemption import after_the_block
 from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
@@ -29,6 +31,7 @@ _OLD_FORMAT = 2
 _LATER_FIELDS = {"model": {"remat": False}}
 """Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
 _DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
+_CARD = "README.md"
 _ROOM_FOR_NAMES = 2**20  # Bytes on disk for what describes the arrays.
 
 
@@ -42,7 +45,7 @@ class CheckpointError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A trained detector."""
+    """A trained detector; weights of another precision, such as float16, are read as float32."""
 
     config: Config
     sensor: Sensor
@@ -85,7 +88,8 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
             "files": _hashes(beside),
         }
         description["hash"] = checksum(_canonical(description))
-        (beside / _DESCRIPTION).write_text(json.dumps(description, indent=1), encoding="utf-8")
+        with naming(folder):
+            (beside / _DESCRIPTION).write_text(json.dumps(description, indent=1), encoding="utf-8")
         os.chmod(beside, 0o755)
         old = beside.with_name(beside.name + ".old")
         if folder.exists():
@@ -152,7 +156,7 @@ def _checkpointer() -> Any:
 
 
 def _check_room(folder: Path, tree: Any) -> None:
-    """A disk that is full ends orbax's threads with a page of tracebacks: ask before."""
+    """Where a disk, a quota or a limit of file sizes is full, orbax's threads print tracebacks: try before."""
     needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) * 9 // 8 + _ROOM_FOR_NAMES
     free = shutil.disk_usage(folder.parent).free
     if free < needed:
@@ -160,11 +164,14 @@ def _check_room(folder: Path, tree: Any) -> None:
             f"{folder}: cannot be written: no space left on device: "
             f"{free >> 10} KiB are free, expected {needed >> 10} KiB"
         )
+    if hasattr(os, "posix_fallocate"):  # not on macOS
+        with naming(folder), tempfile.TemporaryFile(dir=folder.parent) as file:
+            os.posix_fallocate(file.fileno(), 0, needed)
 
 
 def _save_arrays(folder: Path, tree: Any) -> None:
     try:
-        with _checkpointer() as checkpointer:
+        with after_the_block(), _checkpointer() as checkpointer:
             checkpointer.save(folder, tree)
         # It holds a path of this machine; that the checkpoint is whole follows from its hashes.
         (folder / "commit_success.txt").unlink(missing_ok=True)
@@ -176,7 +183,7 @@ def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
     where = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     target = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where), expected)
     try:
-        with _checkpointer() as checkpointer:
+        with after_the_block(), _checkpointer() as checkpointer:
             metadata: Any = checkpointer.metadata(folder).item_metadata
             whose = f"the configuration {config.name!r} beside them"
             check_arrays(folder.parent, expected, metadata.tree, whose=whose)
@@ -197,11 +204,11 @@ def _canonical(description: dict[str, Any]) -> bytes:
 
 
 def _hashes(folder: Path) -> dict[str, str]:
-    """Checksum of every file below a folder but the description."""
+    """Checksum of every file below a folder but the description and the card."""
     return {
         file.relative_to(folder).as_posix(): checksum(file.read_bytes())
         for file in sorted(folder.rglob("*"))
-        if file.is_file() and file.name != _DESCRIPTION
+        if file.is_file() and file not in (folder / _DESCRIPTION, folder / _CARD)
     }
 
 
@@ -232,9 +239,9 @@ def read_description(folder: Path) -> dict[str, Any]:
     if not file.is_file():
         raise CheckpointError(f"{folder}: no {_DESCRIPTION} in it, expected a checkpoint folder")
     try:
-        description = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{file}: not JSON: {error}") from None
+        description = read_json(file)
+    except ValueError as error:
+        raise CheckpointError(str(error)) from None
     if not isinstance(description, dict) or description.get("format") not in (_OLD_FORMAT, _FORMAT):
         found = description.get("format") if isinstance(description, dict) else type(description).__name__
         raise CheckpointError(f"{file}: format: got {found!r}, expected {_FORMAT}")
@@ -243,12 +250,33 @@ def read_description(folder: Path) -> dict[str, Any]:
     for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
         if not isinstance(description.get(name), kind):
             raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
-    config = description["config"]
-    if description["format"] == _OLD_FORMAT:
+    try:
+        config = with_later_fields(_converted(description["config"], description["format"]))
+    except (KeyError, TypeError, AttributeError):  # with a hash that fits: forged
+        written = description["format"]
+        raise CheckpointError(f"{file}: config: got fields that format {written} does not have") from None
+    return {**description, "format": _FORMAT, "config": config}
+
+
+def _converted(config: dict[str, Any], written: int) -> dict[str, Any]:
+    """A configuration of an older format in today's."""
+    if written == _OLD_FORMAT:
         del config["model"]["stem"]["form"], config["model"]["num_classes"], config["inference"]["nms_form"]
         config |= {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}
-    later = {section: {**fields, **config.get(section, {})} for section, fields in _LATER_FIELDS.items()}
-    return {**description, "format": _FORMAT, "config": {**config, **later}}
+    return config
+
+
+def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
+    """A configuration's JSON object with the fields that older ones do not have.
+
+    >>> with_later_fields({"model": {}})
+    {'model': {'remat': False}}
+    """
+    later = dict[str, Any]()
+    for section, fields in _LATER_FIELDS.items():
+        if isinstance(found := config.get(section, {}), dict):
+            later[section] = {**fields, **found}
+    return {**config, **later}
 
 
 def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:

@@ -1,13 +1,15 @@
 """The metrics of a run: one line of JSON a step, and the same for TensorBoard."""
 
+import contextlib
 import json
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.files import atomic_write, naming
 
 _FILE = "metrics.jsonl"
 
@@ -19,40 +21,61 @@ class MetricsLog:
     """
 
     def __init__(self, folder: Path, *, first_step: int) -> None:
-        from tensorboardX import SummaryWriter
+        from tensorboardX.proto.event_pb2 import SessionLog  # type: ignore[attr-defined]
+        from tensorboardX.record_writer import RecordWriter  # a SummaryWriter's thread prints what fails in it
 
         file = folder / _FILE
         if file.exists():
             kept = [json.dumps(line) + "\n" for line in read_metrics(folder) if line["step"] <= first_step]
             atomic_write(file, lambda path: path.write_text("".join(kept), encoding="utf-8"))
         self._lines = file.open("a", encoding="utf-8")
-        self._events = SummaryWriter(str(folder / "tensorboard"), purge_step=first_step + 1)
+        self._folder = folder / "tensorboard"
+        self._folder.mkdir(exist_ok=True)
+        with naming(self._folder):
+            self._events = RecordWriter(str(self._folder / f"events.out.tfevents.{time.time_ns()}"))
+            self._write_event(first_step + 1, file_version="brain.Event:2")
+            # TensorBoard drops what was written before of these steps.
+            self._write_event(first_step + 1, session_log=SessionLog(status=SessionLog.START))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Record numbers and lists of numbers by name."""
-        self._lines.write(json.dumps({"step": step, **values}) + "\n")
-        self._lines.flush()
+        with naming(Path(self._lines.name)):
+            self._lines.write(json.dumps({"step": step, **values}) + "\n")
+            self._lines.flush()
+        scalars = dict[str, Any]()
         for name, value in values.items():
-            numbers = {f"{name}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
-            for tag, number in numbers.items():
-                if np.isscalar(number):
-                    self._events.add_scalar(tag, float(number), step)  # type: ignore[arg-type]
+            scalars |= (
+                {f"{name}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
+            )
+        numbers = [
+            {"tag": tag, "simple_value": float(value)}  # type: ignore[arg-type]
+            for tag, value in scalars.items()
+            if np.isscalar(value)
+        ]
+        with naming(self._folder):
+            self._write_event(step, summary={"value": numbers})
 
     def flush(self) -> None:
         """Write what is waiting, so that a checkpoint never knows of more steps than the records."""
-        self._events.flush()
+        with naming(self._folder):
+            self._events.flush()
 
     def close(self) -> None:
-        self._lines.close()
-        self._events.close()
+        with naming(Path(self._lines.name)), self._lines, naming(self._folder):
+            self._events.close()
+
+    def _write_event(self, step: int, **content: Any) -> None:
+        from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
+
+        self._events.write(Event(step=step, wall_time=time.time(), **content).SerializeToString())
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """All lines of a run, in order; half a line, of a run that was killed as it wrote, is left out."""
+    """All lines of a run, in order; what is no line is left out, such as half of one that a killed run wrote."""
     lines = []
-    for text in (folder / _FILE).read_text(encoding="utf-8").splitlines():
-        try:
-            lines.append(json.loads(text))
-        except json.JSONDecodeError:
-            break
+    for text in (folder / _FILE).read_bytes().splitlines():
+        with contextlib.suppress(ValueError, RecursionError):  # of JSON and of UTF-8
+            line = json.loads(text)
+            if isinstance(line, dict) and isinstance(line.get("step"), int):
+                lines.append(line)
     return lines

@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import threading
 from collections.abc import Iterator
 from types import FrameType
 
@@ -35,3 +36,16 @@ def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def after_the_block() -> Iterator[None]:
+    """Let the first Ctrl-C or SIGTERM act only when the block has ended.
+
+    In a library's event loop it would be reported as a failure of the library. Outside the main thread, which no
+    signal interrupts, nothing changes.
+    """
+    with stop_requests(active=threading.current_thread() is threading.main_thread()) as request:
+        yield
+    if request.signal is not None:
+        signal.raise_signal(request.signal)

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png
+from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, set_title
 
 _SIZE_IN = 9.0
 _DASHES = (0, (3, 2))
 _TEXT_POINTS = 7.0
 _LEGEND_CLASSES = 30
+_HIGH_M = 3.0  # Points this high above the ground, and higher ones, are darkest.
 
 
 def draw_bev(
@@ -40,8 +41,27 @@ def draw_bev(
         global_axes: x and y are the directions of the global frame and not the ego vehicle's.
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
-    axis = figure.add_subplot()
+    options = {"limit_m": limit_m, "detections": detections, "truth": truth, "global_axes": global_axes}
+    present = bev_on(figure.add_subplot(), points, **options)
+    class_legend(figure, sorted(present), classes, detections=detections is not None, truth=truth is not None)
+    if title:
+        set_title(figure.axes[0], title, fontsize=11)
+    save_png(figure, path)
+
+
+def bev_on(
+    axis: Any,
+    points: np.ndarray,
+    *,
+    limit_m: float,
+    detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    global_axes: bool = False,
+    scores: bool = True,
+) -> set[int]:
+    """As :func:`draw_bev`, on an axis of a figure, with or without scores; returns the labels that show."""
     _draw_points(axis, points, limit_m)
+    axis.plot(0, 0, marker="+" if global_axes else "^", color="black", markersize=8, zorder=2)
     present: set[int] = set()
     for box, label in zip(*(truth or ()), strict=True):
         if _in_view(box, limit_m):
@@ -52,27 +72,30 @@ def draw_bev(
     for box, label, _ in shown:
         _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
         present.add(int(label))
-    _write_scores(axis, shown, limit_m)
-    _legend(figure, sorted(present), classes, detections is not None, truth is not None)
+    if scores:
+        _write_scores(axis, shown, limit_m)
     right, forward = ("global", "global") if global_axes else ("right", "forward")
     axis.set(xlim=(-limit_m, limit_m), ylim=(-limit_m, limit_m), aspect="equal")
     axis.set(xlabel=f"x [m], {right}", ylabel=f"y [m], {forward}")
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
-    if title:
-        axis.set_title(title, fontsize=11)
-    save_png(figure, path)
+    return present
 
 
 def _draw_points(axis: Any, points: np.ndarray, limit_m: float) -> None:
     cloud = points[np.isfinite(points[:, :3]).all(axis=1) & (np.abs(points[:, :2]) < limit_m).all(axis=1)]
     if len(cloud):
         # The ground stays light, what stands on it is dark, whatever the height of the frame's origin.
-        low, high = np.quantile(cloud[:, 2], (0.1, 0.9))
-        shade = 0.35 + 0.4 * np.clip((cloud[:, 2] - low) / max(high - low, 1.0), 0, 1)
-        dot = float(np.clip(3e4 / len(cloud), 0.8, 7))  # sparse clouds get larger dots
-        axis.scatter(*cloud[:, :2].T, c=shade, s=dot, cmap="Greys", vmin=0, vmax=1, linewidths=0, zorder=2)
-    axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
+        ground = np.quantile(cloud[:, 2], 0.1)
+        dot = float(np.clip(3e4 / len(cloud), 1.6, 7))  # sparse clouds get larger dots
+        colors = {"c": cloud[:, 2] - ground, "cmap": _height_colors(), "vmin": 0, "vmax": _HIGH_M}
+        axis.scatter(*cloud[:, :2].T, s=dot, linewidths=0, zorder=2, **colors)
+
+
+def _height_colors() -> Any:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("height", ["#c4c4c4", "#8aa0b8", "#3f5f86", "#1c1c3c"])
 
 
 def _in_view(box: np.ndarray, limit_m: float) -> bool:
@@ -112,7 +135,10 @@ def _write_scores(axis: Any, shown: list[tuple[np.ndarray, int, float]], limit_m
             text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
-def _legend(figure: Any, present: list[int], classes: Sequence[str], detections: bool, truth: bool) -> None:
+def class_legend(
+    figure: Any, present: Sequence[int], classes: Sequence[str], *, detections: bool, truth: bool
+) -> None:
+    """The colours of the classes that are present, and how detections and truth are drawn, below the figure."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -46,6 +46,7 @@ def write_evaluation_report(
     examples: Iterable[Example],
     sensor: Sensor,
     global_axes: bool = False,
+    pictures: Sequence[Picture] = (),
 ) -> None:
     """Write ``report.html``, one file that needs nothing else, and its pictures into ``pictures/``.
 
@@ -56,6 +57,7 @@ def write_evaluation_report(
         out: folder that holds these files.
         sensor: of their range images.
         global_axes: x and y of the examples are the directions of the global frame.
+        pictures: more of them, which stand first.
     """
     summary, curves = (json.loads((out / f"{name}.json").read_text()) for name in ("metrics_summary", "curves"))
     file, folder = out / "bootstrap.json", out / "pictures"
@@ -81,9 +83,17 @@ def write_evaluation_report(
         summary=_scores(summary, intervals, defined),
         tables=[("By class", ("class", "AP", *(f"AP {float(d):g} m" for d in distances), *short), rows)],
         galleries=[("Precision over recall", precisions), ("Mean errors of the hits, up to each recall", errors)],
-        pictures=views,
+        pictures=[*pictures, *views],
         wide_pictures=images,
     )
+
+
+def clear_report(out: Path) -> None:
+    """Remove the report and the pictures of an earlier evaluation."""
+    (out / "report.html").unlink(missing_ok=True)
+    for file in (out / "pictures").glob("*.png"):
+        if re.fullmatch(r"(precision|errors)_\d+_.*|(best|typical|worst)_(bev|range)\.png", file.name):
+            file.unlink()
 
 
 def _lead(summary: Mapping[str, Any], num_samples: int, defined: Sequence[str]) -> str:

@@ -45,6 +45,12 @@ def new_axis(width_in: float, height_in: float) -> tuple[Any, Any]:
     return figure, axis
 
 
+def set_title(place: Any, title: str, **style: Any) -> None:
+    """Write a title over a figure or an axis as it is: ``$`` begins no formula, and any file name will do."""
+    write = place.suptitle if hasattr(place, "suptitle") else place.set_title
+    write(title.encode("utf-8", "replace").decode(), **style).set_parse_math(False)
+
+
 def save_png(figure: Any, path: str | Path, *, dpi: int = 110) -> None:
     """Write a figure as PNG, whole or not at all."""
     atomic_write(path, lambda file: figure.savefig(file, dpi=dpi, format="png"))

@@ -8,7 +8,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.types import CHANNELS, RangeImage
-from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
+from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set_title
 
 _RANGE, _INCLINATION, _INTENSITY, _EXISTENCE, _LAG = (
     CHANNELS.index(c) for c in ("range", "inclination", "intensity", "existence", "time_lag")
@@ -44,7 +44,7 @@ def draw_range_image(
     panels += [(_RANGE, r, None) for r in range(1, rounds)]
     figure = new_figure(13, 1.5 * len(panels) + 0.6)
     if title:
-        figure.suptitle(title, fontsize=12)
+        set_title(figure, title, fontsize=12)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     ticks = np.unique(np.linspace(0, rows - 1, 5).round().astype(int))
     degrees = np.degrees(_row_inclinations(features))[ticks]

@@ -9,7 +9,7 @@ from fcos_lidar_jax.files import atomic_write
 
 Cell = str | float | int
 Table = tuple[str, Sequence[str], Sequence[Sequence[Cell]]]  # caption, header, rows
-Picture = tuple[str, str | Path]  # caption and PNG file
+Picture = tuple[str, str | Path]  # caption and PNG or GIF file
 
 _STYLE = """
 :root { color-scheme: light dark; }
@@ -51,7 +51,7 @@ def write_report(
         lead: one paragraph below the heading.
         tables: caption, header and rows each; the first column names the row.
         galleries: heading and small pictures each, as many side by side as there is room for.
-        pictures: caption and PNG each, curves too; the files are embedded.
+        pictures: caption and PNG or GIF each, curves too; the files are embedded.
         wide_pictures: more of them, which a narrow screen scrolls sideways instead of shrinking.
 
     >>> import tempfile
@@ -86,7 +86,8 @@ def _text(value: Cell) -> str:
 
 def _figure(caption: str, file: str | Path, *, wide: bool = False) -> str:
     data = base64.b64encode(Path(file).read_bytes()).decode("ascii")
-    image = f'<img alt="{_text(caption)}" src="data:image/png;base64,{data}">'
+    kind = Path(file).suffix.removeprefix(".")
+    image = f'<img alt="{_text(caption)}" src="data:image/{kind};base64,{data}">'
     if wide:
         image = f'<div class="wide">{image}</div>'
     return f"<figure>{image}<figcaption>{_text(caption)}</figcaption></figure>"

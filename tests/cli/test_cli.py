@@ -2,16 +2,18 @@
 
 import dataclasses
 import json
+import os
 import shutil
 
 import jax
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command
+from PIL import Image
 from tiny_run import TINY_CONFIG, bits, untrained
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli import main
+from fcos_lidar_jax.cli import demo, main
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -45,6 +47,7 @@ def home(tmp_path_factory):
     np.save(folder / "flat.npy", np.zeros(4, np.float32))
     np.save(folder / "future.npy", np.full((4, 5), -1.0, np.float32))
     (folder / "nothing").mkdir()
+    (folder / "link.json").symlink_to("good.npy")
     (folder / "empty.bin").write_bytes(b"")
     (folder / "cut.pcd.bin").write_bytes(points.tobytes()[:-3])
     (folder / "text.txt").write_text("1 2 3")
@@ -73,6 +76,17 @@ def test_detect_writes_the_contract(home, tmp_path, capsys):
     assert len(scores) > 0
     assert scores == sorted(scores, reverse=True)
     assert len(list(tmp_path.glob("*.png"))) == 2
+
+
+def test_a_file_name_is_no_formula(home, tmp_path):
+    """Nor need it be text."""
+    cloud = tmp_path / os.fsdecode(b"$\\frac{a$\xff.npy")
+    shutil.copy(home / "good.npy", cloud)
+    where = ["--out", tmp_path / "a.json", "--pictures", tmp_path / "pictures"]
+    command("detect", cloud, "--checkpoint", home / "checkpoint", *where)
+    assert json.loads((tmp_path / "a.json").read_text())["files"][0]["file"] == str(cloud)
+    assert len(list((tmp_path / "pictures").iterdir())) == 1
+    command("project", cloud, "--sensor tiny --out", tmp_path / "a.npz", "--png", tmp_path / "a.png")
 
 
 def test_detect_fuses_sweeps(home, tmp_path):
@@ -150,8 +164,35 @@ BAD = {
     "project away": ("project HOME/away.npy", "away.npy: none of its"),
     "project laser": ("project HOME/good.npy --sensor argoverse2", "good.npy: no laser number"),
     "project into a folder": ("project HOME/good.npy --out HOME", "found a folder"),
+    "detect into its input": ("detect HOME/good.npy --out HOME/good.npy", "--out: .*the same file as .*good.npy"),
+    "detect into its input by a link": ("detect HOME/good.npy --out HOME/link.json", "--out: .*the same file as"),
+    "detect into another link": ("detect HOME/none.npy --out HOME/link.json", "link.json: found a link to .*good"),
+    "detect into a device": ("detect HOME/none.npy --out /dev/null", "/dev/null: found a device or a pipe"),
+    "detect into a checkpoint": (
+        "detect HOME/none.npy --out HOME/checkpoint/boxes.json",
+        "--out: .*found a place in the checkpoint",
+    ),
+    "detect below a file": (
+        "detect HOME/none.npy --out HOME/good.npy/x",
+        "good.npy: found a file, expected a fol",
+    ),
+    "pictures in a file": (
+        "detect HOME/none.npy --pictures HOME/good.npy",
+        "--pictures: .*: found a file, expect",
+    ),
+    "score beyond one": ("detect HOME/good.npy --min-score 50", "--min-score: got 50, expected a score of 0 to 1"),
+    "score that is none": ("detect HOME/good.npy --min-score nan", "--min-score: got nan, expected a score"),
+    "too many points": ("detect HOME/good.npy --max-file-points 10", r"good.npy: .*points, expected at most 10$"),
+    "picture into the image": (
+        "project HOME/good.npy --out OUT --png OUT",
+        "--png: .*out: the same file as .*out",
+    ),
+    "picture into the input": ("project HOME/good.npy --png HOME/good.npy", "--png: .*the same file as"),
+    "project too many points": ("project HOME/good.npy --max-file-points 10", "points, expected at most 10$"),
     "demo into a file": ("demo --out HOME/good.npy", "--out: .*: found a file"),
     "demo with fewer than no steps": ("demo --steps -1", "--steps: got -1"),
+    "demo of steps without training": ("demo --steps 5", "--steps: expected --train with it"),
+    "demo without a keyframe": ("demo --keyframes 0", "--keyframes: got 0"),
 }
 
 
@@ -179,7 +220,9 @@ def test_usage_error_names_the_nearest_option(capsys):
     assert "--checkpoint" in shown.err + shown.out
 
 
-@pytest.mark.parametrize("name", ["demo", "synthesize", "train", "evaluate", "detect", "project"])
+@pytest.mark.parametrize(
+    "name", ["demo", "synthesize", "train", "evaluate", "detect", "export", "benchmark", "project"]
+)
 def test_help_explains(name, capsys):
     with pytest.raises(SystemExit) as stopped:
         main([name, "--help"])
@@ -187,16 +230,49 @@ def test_help_explains(name, capsys):
     assert "--out" in capsys.readouterr().out
 
 
-def test_demo_from_nothing_to_report(tmp_path):
-    out, boxes = tmp_path / "demo", tmp_path / "boxes.json"
-    command("demo --steps 2 --test-frames 3 --out", out)
+@pytest.fixture(scope="module")
+def drive(home):
+    """The demo's results for a network that compiles in seconds; three keyframes, and two steps of training."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "WEIGHTS", str(home / "checkpoint"))
+        command("demo --keyframes 3 --train --steps 2 --test-frames 3 --out", home / "demo")
+    return home / "demo"
+
+
+def test_demo_writes_the_benchmarks_numbers_of_its_drive(drive, home, tmp_path):
+    """Those that ``evaluate`` finds in the data set that it leaves."""
+    place = ["--data-root", drive / "drive", "--split", "train", "--checkpoint", home / "checkpoint"]
+    command("evaluate --no-report --out", tmp_path / "evaluation", *place)
+    ours, again = (
+        json.loads((folder / "metrics_summary.json").read_text()) for folder in (drive, tmp_path / "evaluation")
+    )
+    assert ours.pop("eval_time") > 0 < again.pop("eval_time")
+    assert ours["cfg"]["max_boxes_per_sample"] == 500
+    assert json.dumps(ours) == json.dumps(again)
+    assert set(json.loads((drive / "bootstrap.json").read_text())) >= {"mean_ap", "nd_score", "level"}
+
+
+def test_demo_draws_an_animation_and_reports(drive):
+    with Image.open(drive / "drive.gif") as animation:
+        assert (animation.n_frames, animation.info["loop"]) == (3, 0)
+        for i in range(3):
+            with Image.open(drive / f"drive_{i:02d}.png") as picture:
+                assert picture.size == animation.size
+    report = (drive / "report.html").read_text()
+    assert report.count("data:image/gif;base64,") == 1
+    assert "NDS" in report
+    assert "://" not in report  # no outside address; base64 has no colon
+
+
+def test_demo_trains_from_nothing_to_report(drive, tmp_path):
+    out, boxes = drive / "training", tmp_path / "boxes.json"
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["training"]["steps"] == 2
     for model in ("shipped", "before", "after"):
         assert {*metrics[model]["label_aps"], *metrics[model]["absent_classes"]} == set(QUICKSTART.classes)
     report = (out / "report.html").read_text()
     assert report.count("data:image/png;base64,") == 9
-    assert "http" not in report
+    assert "://" not in report  # no outside address; base64 has no colon
     unseen = out / "unseen" / "frame_000.npy"
     command("detect", unseen, "--checkpoint", out / "run", "--out", boxes)
     assert json.loads(boxes.read_text())["files"][0]["num_points"] == len(np.load(unseen))

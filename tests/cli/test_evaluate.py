@@ -2,12 +2,13 @@
 
 import dataclasses
 import json
+import os
 import re
 
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error
+from commands import assert_one_line_error, in_use
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
@@ -163,7 +164,20 @@ def test_a_resume_log_of_another_detector_is_not_used(home):
     frames, fewer = (NuScenesFrames(data, chosen, 1, sensor=TINY) for chosen in (tokens, tokens[1:]))
     other = dataclasses.replace(detector, variables=jax.tree.map(lambda leaf: leaf + 1, detector.variables))
     runs = ((detector, frames, 1), (other, frames, 1), (detector, fewer, 1), (detector, frames, 2))
-    assert len({_fingerprint(*run) for run in runs}) == len(runs)
+    found = {_fingerprint(*run) for run in runs}
+    assert len(found) == len(runs)
+    os.utime(home / next(iter(data.sweep_files(tokens[0], 1))))  # a cloud was written anew
+    assert _fingerprint(*runs[0]) not in found
+
+
+def test_no_report_is_left_beside_other_numbers(home, tmp_path):
+    by_files(tmp_path, read(home / "results.json"), read(home / "truth.json"))
+    assert (tmp_path / "out" / "report.html").is_file()
+    mine = tmp_path / "out" / "pictures" / "mine.png"
+    mine.write_bytes(b"")
+    by_files(tmp_path, read(home / "results.json"), read(home / "truth.json"), report=False)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES | {"pictures"}
+    assert list(mine.parent.iterdir()) == [mine]
 
 
 @pytest.mark.parametrize("empty", ["truth", "results", "both"])
@@ -189,6 +203,14 @@ def test_classes_without_truth_are_named(home, tmp_path, capsys):
     assert re.search("no ground truth counts of .*bus.*barrier", capsys.readouterr().err)
 
 
+@pytest.mark.parametrize("what", ["checkpoint", "results"])
+def test_a_folder_in_use_is_left_alone(home, tmp_path, what):
+    given = {what: home / {"checkpoint": "checkpoint", "results": "results.json"}[what]}
+    with in_use(tmp_path), pytest.raises(BlockingIOError, match="in use: process "):
+        run(Evaluate(out=tmp_path, **given, **place(home)))
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
 TRUTH = "--ground-truth HOME/truth.json"
 MISTAKES = {
     "neither": ("", "expected --checkpoint or --results"),
@@ -205,6 +227,10 @@ MISTAKES = {
     "batch": (f"--results x {TRUTH} --batch-size 0", "--batch-size: got 0, expected at least 1"),
     "bootstrap": (f"--results x {TRUTH} --bootstrap -1", "--bootstrap: got -1, expected at least 0"),
     "no such sensor": (f"--results x {TRUTH} --sensor sonar", "sonar: no such sensor"),
+    "truth in the place of results": (
+        "--results HOME/results.json --ground-truth HOME/results_nusc.json --out HOME",
+        "--out: .*results_nusc.json: the same file as",
+    ),
     "file for a folder": (f"--results x {TRUTH} --out HOME/truth.json", "--out: .*found a file"),
 }
 

@@ -3,6 +3,7 @@
 The folder of own data is that of tests/cli/test_own_data.py.
 """
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -106,7 +107,9 @@ def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path):
     detector = fcos.load_detector("quickstart")
     for i, frame in enumerate(evaluated):
         assert frame["boxes"] == by_command[i]["boxes"]
-        found = detector(np.load(root / "clouds" / f"{frame['name']}.npy"))
+        dense = frame["name"] == "000"
+        with pytest.warns(UserWarning, match="share a cell") if dense else contextlib.nullcontext():
+            found = detector(np.load(root / "clouds" / f"{frame['name']}.npy"))
         count = int(found.valid.sum())
         assert count == len(frame["boxes"]) > 0
         assert [box["box"] for box in frame["boxes"]] == found.boxes[:count].tolist()

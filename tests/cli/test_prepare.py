@@ -7,8 +7,9 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
-from commands import assert_one_line_error, command, run_python
+from commands import assert_one_line_error, command, in_use, run_python
 from made_nuscenes import VERSION, make_tables, write
 
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -50,7 +51,7 @@ def test_says_what_there_is_and_a_second_run_changes_nothing(root, tmp_path, cap
 
 KILLED = """
 import os, random, signal, sys, time
-from fcos_lidar_jax.cli import main
+from fcos_lidar_jax.cli import commands, main
 index, command, draw = sys.argv[1], sys.argv[2:], random.Random(0)
 def start(name):
     child = os.fork()
@@ -86,6 +87,12 @@ def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     assert len(states - {(), tuple(wanted)}) >= 3  # they were killed at work
 
 
+def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
+    with in_use(tmp_path / "i"):
+        assert_one_line_error(capsys, prepare(root, tmp_path / "i"), "i: in use: process ")
+        assert list(contents(tmp_path / "i")) == [".lock"]
+
+
 def test_objects_come_from_the_training_split_alone(root, tmp_path):
     command(*prepare(root, tmp_path / "i", "--train-split", "scene-1"))
     objects = open_database(tmp_path / "i" / "objects" / "scene-1")
@@ -110,10 +117,22 @@ def test_a_stale_index_is_made_anew_and_said(root, tmp_path, capsys):
     capsys.readouterr()
     command(*prepare(copy, tmp_path / "i"))
     out, err = capsys.readouterr()
-    assert "sample_annotation.json: the index was made when" in err
+    assert "sample_annotation.json: the index was made of another one" in err
     assert json.loads(out)["annotations"] == 16 * SCENES - 1
     command(*prepare(copy, tmp_path / "new"))
     assert contents(tmp_path / "i") == contents(tmp_path / "new")
+
+
+def test_objects_are_cut_anew_from_changed_clouds(root, tmp_path):
+    copy, objects = shutil.copytree(root, tmp_path / "copy"), tmp_path / "i" / "objects" / "all"
+    command(*prepare(copy, tmp_path / "i"))
+    before = open_database(objects).fingerprint()
+    for file in copy.glob("samples/*/0-*"):
+        points = np.fromfile(file, np.float32).reshape(-1, 5)
+        points[:, 3] += 1
+        points.tofile(file)
+    command(*prepare(copy, tmp_path / "i"))
+    assert open_database(objects).fingerprint() != before
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, child_environment, command
+from commands import assert_one_line_error, child_environment, command, in_use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax import cli
@@ -203,6 +203,13 @@ def test_mistakes_get_one_line_and_leave_nothing(root, tmp_path, capsys, name):
     args = line.replace("HOME", str(root.parent)).split()
     assert_one_line_error(capsys, train(root, tmp_path / "out", *args), message)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
+    """The objects of some samples are cut in the run's folder, so before they are."""
+    with in_use(tmp_path / "run"):
+        assert_one_line_error(capsys, train(root, tmp_path / "run", "--samples", "0:1"), "run: in use: process ")
+        assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize(

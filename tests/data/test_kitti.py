@@ -167,6 +167,7 @@ BAD = {
     "long matrix": (C, calibration_text().replace("P2: ", "P2: 1 "), "line 2: P2: got 13 numbers, expected 12"),
     "infinite": (C, re.sub("P2: [^ ]*", "P2: inf", calibration_text()), "line 2: P2: got 'inf', expected a"),
     "scaled": (C, calibration_text(rectified=2 * RECTIFIED), "line 3: R0_rect: got no rotation"),
+    "far away": (C, calibration_text().replace(f"{SHIFT[0]:.12e}", "1e7"), "takes box 0 of the labels far away"),
     "mirrored": (C, calibration_text(mounted=-MOUNTED), "line 4: Tr_velo_to_cam: got no rotation"),
     "unknown frame": (S, "000007\n../label_2/000007\n", "line 2: got '../label_2/000007', expected the name of"),
     "frame twice": (S, "000007\n\n000007\n", "line 3: got '000007' a second time"),

@@ -3,6 +3,7 @@
 import itertools
 import json
 import pickle
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -207,6 +208,8 @@ BAD = {
     "big": (rewrite(P, lambda t: t.replace('lation": [', 'lation":[1e999,')), "[0].translation[0]: Number out of"),
     "chain against time": (change(D, 1, prev=token("data", 0, 2)), "data-0-1", "prev", "earlier"),
     "keyframe without a sweep": (change(D, 3, is_key_frame=False), "sample.json", "sample-0-1", "LIDAR_TOP"),
+    "absurd count": (change(B, 2, num_lidar_pts=2**40), f"{B}.json", "[2].num_lidar_pts", "<= 2147483647"),
+    "absurd time": (change(S, 2, timestamp=2**63), "sample.json", "[2].timestamp"),
     "token twice": (change(D, 1, token=token("data", 0, 2)), f"{D}.json", "data-0-2", "twice"),
     "path above the root": (change(D, 3, filename="../x.pcd.bin"), "data-0-3", "filename", "'../x.pcd.bin'"),
     "absolute path": (change(D, 3, filename="/etc/passwd"), "data-0-3", "filename", "'/etc/passwd'"),
@@ -247,6 +250,32 @@ def test_bad_tables_get_one_line(case, tmp_path):
         data.sweeps(token("sample", 0, 1), 2)
 
 
+def test_an_index_is_of_the_content_of_its_tables(made, tmp_path):
+    root = shutil.copytree(made, tmp_path / "root")
+    table = root / VERSION / "sample_annotation.json"
+    save_index(build_index(root / VERSION), tmp_path / "index", tables=root / VERSION)
+    text = table.read_text()
+    table.write_text(text.replace('"size": [\n1.5', '"size": [\n2.5'))
+    assert table.stat().st_size == len(text)
+    with refused("sample_annotation.json: the index was made of another one"):
+        NuScenes(root, VERSION, index=tmp_path / "index")
+    table.write_text(text)  # other times, and in a copy other inodes, are no other content
+    NuScenes(root, VERSION, index=tmp_path / "index")
+    NuScenes(shutil.copytree(root, tmp_path / "copy"), VERSION, index=tmp_path / "index")
+
+
+def test_a_link_out_of_the_root_may_be_followed(tmp_path):
+    root = write(tmp_path / "root", *make_tables(1))
+    (root / "samples").rename(tmp_path / "disk")
+    (root / "samples").symlink_to(tmp_path / "disk")
+    with refused("resolves to", "--follow-links allows"):
+        NuScenes(root, VERSION).sweeps(token("sample", 0, 1), 2)
+    assert (
+        len(NuScenes(root, VERSION, follow_links=True).sweeps(token("sample", 0, 1), 2, remove_close="none"))
+        == 100
+    )
+
+
 def test_bad_roots_and_indexes_get_one_line(made, tmp_path):
     for message, root, version, index in (
         ("no such folder, expected a data root", made / "gone", VERSION, None),
@@ -261,11 +290,12 @@ def test_bad_roots_and_indexes_get_one_line(made, tmp_path):
     save_index(build_index(made / VERSION), folder, tables=made / VERSION)
     manifest, column = folder / "index.json", folder / "box_size.npy"
     record, content = json.loads(manifest.read_text()), bytearray(column.read_bytes())
-    other_size = {**record["tables"], "sample.json": 3}
+    state = record["tables"]["sample.json"]
+    other = {**record["tables"], "sample.json": {**state, "mtime_ns": 3, "blake2b": "of other content"}}
     for message, changes in (
-        ("index.json: format_version: got 99, expected 2: run prepare again", {"format_version": 99}),
+        ("index.json: format_version: got 99, expected 3: run prepare again", {"format_version": 99}),
         ("index.json: format: expected 'fcos", {"format": "pickle"}),
-        ("sample.json: the index was made when it had 3 bytes", {"tables": other_size}),
+        ("sample.json: the index was made of another one", {"tables": other}),
         ("index.json: $.columns: got 3, expected object: run prepare", {"columns": 3}),
     ):
         manifest.write_text(json.dumps({**record, **changes}))
@@ -276,7 +306,13 @@ def test_bad_roots_and_indexes_get_one_line(made, tmp_path):
         open_index(folder, tables=made / VERSION)
     manifest.write_text(json.dumps(record))
     content[-1] ^= 1
-    for spoiled, message in ((content, "other content than index.json tells"), (content[:99], "cannot be read")):
+    header = b"\x93NUMPY\x01\x00v\x00" + b"(" * 118
+    for spoiled, message in (
+        (content, "other content than index.json tells"),
+        (content[:99], "cannot be read"),
+        (header + content[128:], "cannot be read"),
+        (content.replace(b"(8, 3)", b"(9**9)").replace(b"(32, 3)", b"(9**9,)"), "cannot be read"),
+    ):
         column.write_bytes(spoiled)
         with refused(f"box_size.npy: {message}"):
             open_index(folder, tables=made / VERSION)

@@ -8,6 +8,8 @@ import tracemalloc
 import zipfile
 
 import numpy as np
+import pyarrow
+import pyarrow.feather
 import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
@@ -295,8 +297,8 @@ BAD = {
     "pickled.npz": ({"points": np.array([{"a": 1}], object)}, "without pickled objects"),
     "truncated.npy": (NPY[:-7], "not a readable .npy file"),
     "header.npy": (npy_header((9, 4)).replace(b"}", b","), "not a readable .npy file"),
-    "huge.npy": (npy_header((2 * 10**13, 4)), "got 0 bytes of values, expected 320000000000000 fo"),
-    "wrapping.npy": (npy_header((2**62, 4)), "got 0 bytes of values, expected 73786976294838206464"),
+    "huge.npy": (npy_header((2 * 10**13, 4)), "got 20000000000000 points, expected at most 10000000"),
+    "wrapping.npy": (npy_header((4, 2**62)), "got 0 bytes of values, expected 73786976294838206464"),
     "negative.npy": (npy_header((-4, -4)) + bytes(64), "for (-4, -4) of float32"),
     "bomb.npz": (with_size(zipped(zipfile.ZIP_DEFLATED), 3 * 2**30), "got 3221225472 bytes unpacked"),
     "bzip2.npz": (zipped(zipfile.ZIP_BZIP2), "got another compression, expected none or deflate"),
@@ -326,13 +328,13 @@ BAD = {
     "size.pcd": (pcd_header("ascii", 1, sizes="4 4 1 4") + b"1 2 3 4\n", "got F 1 for field z"),
     "lists.pcd": (pcd_header("ascii", 1, sizes="4 4") + b"1 2 3 4\n", "SIZE: got 2 entries, expected 4"),
     "count.pcd": (pcd_header("ascii", 1, counts="1 1 1 0") + b"1 2 3\n", "COUNT: got 0 for field intensity"),
-    "wrapping.pcd": (wrapping_pcd(403, 10**6), "DATA: truncated: got 4096 bytes, expected 3224000012"),
+    "wrapping.pcd": (wrapping_pcd(403, 10**6), "POINTS: got 1 points of 3224000012 bytes, expected"),
     # 2**32 + 12 bytes a point: 12 where they wrap in 32 bits.
-    "wrapping_32.pcd": (wrapping_pcd(8192, 2**16), "DATA: truncated: got 4096 bytes, expected 4294967308"),
-    "wrapping_64.pcd": (pcd_header("binary", 2**60) + bytes(4096), "DATA: truncated: got 4096 bytes, expected 18"),
+    "wrapping_32.pcd": (wrapping_pcd(8192, 2**16), "POINTS: got 1 points of 4294967308 bytes, expec"),
+    "wrapping_64.pcd": (pcd_header("binary", 2**60) + bytes(4096), f"POINTS: got {2**60} points of 16 bytes"),
     "expanding.pcd": (
-        pcd_header("binary_compressed", 2**27) + np.array([3, 2**31], "<u4").tobytes() + b"\x00aa",
-        "got 3 compressed bytes, expected more: they cannot unpack to 2147483648",
+        pcd_header("binary_compressed", 2**22) + np.array([3, 2**26], "<u4").tobytes() + b"\x00aa",
+        "got 3 compressed bytes, expected more: they cannot unpack to 67108864",
     ),
     "huge.pcd": (pcd_header("binary", 1, counts=f"1 1 1 {10**15}"), "COUNT: got 1000000000000000 for field int"),
     "double_z.pcd": (pcd_header("ascii", 1, counts="1 1 2 1") + b"1 2 3 3 4\n", "COUNT: got 2 for field z"),
@@ -376,8 +378,36 @@ def test_an_archive_that_unpacks_to_more_than_it_says_is_read_no_further(tmp_pat
 def test_a_file_larger_than_any_cloud_is_refused_before_it_is_read(tmp_path, name):
     with (tmp_path / name).open("wb") as file:
         file.truncate(2**40)  # takes no room on the disk
-    with refused("got 1099511627776 bytes, expected at most 2147483648"):
+    with refused("got 1099511627776 bytes, expected at most", "for 10000000 points"):
         read_points(tmp_path / name, NUSCENES_HDL32E)
+
+
+@pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.npz", "a.pcd", "packed.pcd", "ascii.pcd", "a.feather"])
+def test_a_cloud_of_too_many_points_is_refused_before_it_takes_memory(tmp_path, name):
+    """A packed million of points; the limit is an option."""
+    number, path, zeros = 10**6, tmp_path / name, np.zeros((10**6, 4), np.float32)
+    if name == "a.npz":
+        np.savez_compressed(path, zeros)
+    elif name == "a.feather":
+        columns = {c: zeros[:, 0] for c in ("x", "y", "z", "intensity")}
+        table = pyarrow.table({**columns, "laser_number": np.zeros(number, np.uint8)})
+        pyarrow.feather.write_feather(table, path, compression="zstd", chunksize=1000)
+    elif name == "packed.pcd":
+        # One literal zero, then copies of the 264 bytes before: LZF's longest.
+        packed = b"\x00\x00" + b"\xe0\xff\x00" * (16 * number // 264 + 1)
+        sizes = np.array([len(packed), 16 * number], "<u4").tobytes()
+        path.write_bytes(pcd_header("binary_compressed", number) + sizes + packed)
+    else:
+        body = zeros.tobytes() if name != "ascii.pcd" else b"0 0 0 0\n" * number
+        form = "ascii" if name == "ascii.pcd" else "binary"
+        header = {".npy": npy_header(zeros.shape), ".pcd": pcd_header(form, number)}.get(path.suffix, b"")
+        path.write_bytes(header + body)
+    tracemalloc.start()
+    with refused(str(number - 1), path):
+        read_points(path, NUSCENES_HDL32E, max_points=number - 1)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.1 * path.stat().st_size + 2**21
 
 
 @pytest.mark.parametrize("value", [-1, 64, 1.5])

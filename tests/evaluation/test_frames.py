@@ -204,6 +204,8 @@ def one_box(label="barrier", score=1, size=1):
         ("ab", [{}], "label"),
         ("ab", [one_box("x")], "frame b: box 0: label: got 'x', expected one of crate/box, traffic_cone"),
         ("ab", [one_box(size=0)], r"frame b: box 0: box: got \[0\.0, .*expected three positive sizes"),
+        ("ab", [one_box(size=1e300)], r"frame b: box 0: box: got .*expected numbers of at most 1e\+08"),
+        ("ab", [one_box(size=1e-300)], "frame b: box 0: box: got .*expected three positive sizes"),
         ("ab", [one_box(score=-1)], "frame b: box 0: score: got -1.0, expected a number of at least 0"),
     ],
 )

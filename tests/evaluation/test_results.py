@@ -52,6 +52,11 @@ BOXES = {
     "negative size": ({"size": [2, 4, -1]}, r"size: got \[2\.0, 4\.0, -1\.0\], expected three positive"),
     "two sizes": ({"size": [2, 4]}, "size: expected `array` of length 3$"),
     "NaN size": ({"size": [2, float("nan"), 1]}, r"size\[1\]: expected `float`, got null or NaN"),
+    "far away": ({"translation": [1e300, 0, 0]}, r"translation: got .*, expected numbers of at most 1e\+08"),
+    "vanishing quaternion": (
+        {"rotation": [1e-200, 0, 0, 0]},
+        "rotation: got .*, expected a quaternion w, x, y, z",
+    ),
     "zero quaternion": ({"rotation": [0, 0, 0, 0]}, "rotation: got .*, expected a quaternion w, x, y, z"),
     "yaw for rotation": ({"rotation": 0.3}, "rotation: expected `array`, got `float`"),
     "NaN translation": ({"translation": [1, float("nan"), 0]}, r"translation\[1\]: expected `float`, got null"),
@@ -238,5 +243,10 @@ def test_a_resume_log_survives_interruptions(tmp_path):
         assert file.read_bytes() == whole
     with ResumeLog(file, "one") as resume_log:
         assert dict(resume_log.entries(("b", "a"))) == {"b": b"[]", "a": b'[{"x": 1}]'}
+    for damaged in (b'{"a":', b"[1]", b'"a\xff"', b"[" * 100_000):
+        file.write_bytes(whole + damaged + b"\t[]\n" + b'"c"\t[]\n')
+        with ResumeLog(file, "one") as resume_log:
+            assert list(resume_log.places) == ["a", "b"]
+        assert file.read_bytes() == whole
     with ResumeLog(file, "another") as resume_log:
         assert len(resume_log) == 0

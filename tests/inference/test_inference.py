@@ -5,15 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from tiny_run import TINY_CONFIG, untrained
+from tiny_run import TINY_CONFIG, bits, untrained
 
 from fcos_lidar_jax.coding import decode
 from fcos_lidar_jax.config import InferenceConfig
-from fcos_lidar_jax.inference import make_detect, postprocess, select_candidates
+from fcos_lidar_jax.inference import TrainedDetector, make_detect, postprocess, select_candidates
 from fcos_lidar_jax.locations import ImageLayout, locate
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.types import Outputs
 
@@ -103,3 +103,14 @@ def test_detection_ignores_padding_and_is_the_same_under_vmap():
     empty = one_by_one(variables, points[0], np.zeros(4096, bool))
     assert not empty.valid.any()
     assert not empty.boxes.any()
+
+
+def test_a_trained_detector_takes_a_file_as_its_points_and_tells_another_sensors(tmp_path):
+    detector = TrainedDetector(build_detector(TINY_CONFIG, TINY), untrained(TINY_CONFIG, TINY))
+    points = make_frame(0, TINY).points
+    np.save(tmp_path / "cloud.npy", points)
+    found = detector(points)
+    assert found.valid.any()
+    assert bits(detector(tmp_path / "cloud.npy")) == bits(detector(str(tmp_path / "cloud.npy"))) == bits(found)
+    with pytest.warns(UserWarning, match=r"^points hardly of sensor 'tiny' .*; expect poor detections$"):
+        detector(make_frame(0, NUSCENES_HDL32E).points)

@@ -18,7 +18,14 @@ from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import GivenFrames
-from fcos_lidar_jax.input_pipeline.database import DatabaseError, open_database, prepare_database, shards_by_scene
+from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.input_pipeline.database import (
+    DatabaseError,
+    objects_folder,
+    open_database,
+    prepare_database,
+    shards_by_scene,
+)
 from fcos_lidar_jax.sensors import ARGOVERSE2
 
 SCENES = (("scene-b", (0, 1, 2)), ("scene-a", (3,)), ("scene-c", (6, 4)))
@@ -74,10 +81,38 @@ def test_absurd_points_are_not_cut(tmp_path):
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
+def test_a_split_stays_in_the_index():
+    for name in ("../elsewhere", "..", "a/b", "/tmp"):
+        with pytest.raises(ValueError, match="expected a name that a folder can have"):
+            objects_folder(Path("index"), name)
+
+
+@pytest.mark.parametrize(("field", "value"), [("count", -1), ("start", 2**40), ("label", -1), ("newest", 2**20)])
+def test_a_crafted_table_is_refused(tmp_path, field, value):
+    build(tmp_path)
+    file = tmp_path / "scene-a.objects.npz"
+    with np.load(file) as arrays:
+        table = dict(arrays)
+    table["rows"][field][1] = value
+    np.savez(file, **table)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    entry = next(shard for shard in manifest["shards"] if shard["name"] == "scene-a")
+    entry["table_blake2b"] = checksum(file.read_bytes())
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(DatabaseError, match=r"scene-a\.objects\.npz: got objects whose points lie outside"):
+        open_database(tmp_path)
+
+
+def test_the_fingerprint_is_of_the_objects_alone(tmp_path):
+    first, again = build(tmp_path / "a"), build(tmp_path / "b", source="g")
+    assert first.fingerprint() == again.fingerprint()
+    assert build(tmp_path / "c", min_points=6).fingerprint() != first.fingerprint()
+
+
 def test_an_absurd_box_is_one_line(tmp_path):
     frame = toy_frame(0)
     frame.boxes[3, 4] = 0
-    with pytest.raises(ValueError, match=r"frame 'frame 1': box 3: got .*, expected finite .* sizes above 0$"):
+    with pytest.raises(ValueError, match=r"frame 'frame 1': box 3: w: got 0, expected a size above 0 m$"):
         build(tmp_path, ListedFrames((toy_frame(1), frame)), scenes=(("s", (0, 1)),))
 
 

@@ -2,8 +2,11 @@
 
 import dataclasses
 import itertools
+import multiprocessing
+import os
 import re
 import shutil
+import signal
 
 import jax
 import numpy as np
@@ -195,7 +198,7 @@ def test_absurd_points_reach_no_batch_and_are_counted():
 def test_absurd_boxes_stop_the_run_with_their_line(column, value):
     frame = toy_frame(0)
     frame.boxes[7, column] = value
-    message = r"^frame 'frame 0': box 7: got [^\n]*, expected finite x, y, z, l, w, h, yaw"
+    message = r"^frame 'frame 0': box 7: \w+: got [^\n]*, expected "
     with pytest.raises(ValueError, match=message):
         run(ListedFrames((frame,)), count=1)
 
@@ -243,6 +246,18 @@ def test_leaving_early_leaves_nothing_behind(tmp_path):
     script.write_text(LEFT_EARLY)
     done = run_python(script)
     assert (done.returncode, done.stdout, done.stderr) == (0, "4 4\n", "")
+
+
+def test_workers_leave_the_signals_of_a_job_to_its_main_process(alone, objects):
+    with make_batches(
+        ToyFrames(), CONFIG, seed=0, num_steps=STEPS, threads=0, objects=objects, workers=1
+    ) as stream:
+        found = [next(stream)]
+        for process in multiprocessing.active_children():
+            os.kill(process.pid, signal.SIGTERM)
+            os.kill(process.pid, signal.SIGINT)
+        found += stream
+    assert_same(found, alone)
 
 
 def test_workers_need_shared_memory(monkeypatch):

@@ -21,7 +21,7 @@ VERSION = "v1.0-synthetic"
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("devkit") / "data"
-    run(Synthesize(out, scenes=2, seed=2, keyframes=3))
+    run(Synthesize(out, scenes=2, seed=2, keyframes=3, streets="plain"))
     return out
 
 

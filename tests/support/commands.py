@@ -1,13 +1,19 @@
 """Commands of ``fcos-lidar``, in this process and in others."""
 
+import contextlib
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import jax
+import quick
 
 from fcos_lidar_jax.cli import main
+from fcos_lidar_jax.files import folder_lock
 
 
 def command(*args: object) -> None:
@@ -24,6 +30,18 @@ def assert_one_line_error(capsys, args: list[str], message: str) -> None:
     assert re.search(message, errors[0]), errors[0]
 
 
+@contextlib.contextmanager
+def in_use(folder: Path) -> Iterator[None]:
+    """Another thread works in a folder, which is to commands what another process is."""
+    with ThreadPoolExecutor(1) as other:
+        lock = folder_lock(folder, "at work")
+        other.submit(lock.__enter__).result()
+        try:
+            yield
+        finally:
+            other.submit(lock.__exit__, None, None, None).result()
+
+
 def run_python(*words: object, **variables: str) -> subprocess.CompletedProcess[str]:
     """Another Python process, which may fail."""
     command_line = [sys.executable, *map(str, words)]
@@ -37,6 +55,5 @@ def child_environment(**more: str) -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join(sys.path),
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": str(int(jax.config.read("jax_disable_most_optimizations"))),
     }
-    return os.environ | shared | more
+    return os.environ | quick.environment(quick.is_quick()) | shared | more

@@ -15,8 +15,10 @@ from commands import run_python
 from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
 from fcos_lidar_jax.data.frame import GivenFrames
 from fcos_lidar_jax.input_pipeline import loader
+from fcos_lidar_jax.input_pipeline.database import prepare_database
 from fcos_lidar_jax.trainer import run as runs
 from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
@@ -195,6 +197,28 @@ def test_killed_in_a_save_and_resumed_it_ends_in_the_same_bits(finished, tmp_pat
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000004"]
 
 
+FULL = """
+import resource, sys
+from tiny_run import train_tiny, weights
+from fcos_lidar_jax.cli import exit_code
+def fill(step, _):
+    if step == 3:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, 2**20))
+sys.exit(exit_code("program", lambda: train_tiny(sys.argv[1], weights=weights(), hooks=[fill])))
+"""
+
+
+def test_a_full_disk_is_one_line_and_loses_no_checkpoint(finished, tmp_path):
+    """Writes beyond a file size fail, as they do where there is no room, from the third checkpoint on."""
+    done = run_python("-c", FULL, tmp_path)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith(("compiling ", "steps "))]
+    refused = tmp_path / "checkpoints" / "00000003"
+    assert (done.returncode, lines) == (1, [f"program: error: {refused}: cannot be written: File too large"])
+    kept = sorted(refused.parent.iterdir())
+    assert [path.name for path in kept] == ["00000001", "00000002"]
+    assert [load_checkpoint(path).step for path in kept] == [1, 2]
+
+
 def test_without_a_mean_ap_a_checkpoint_is_saved_without_a_score(tmp_path, capsys):
     """Test frames without boxes: the mean over no class is not a number."""
     none = np.zeros(0, np.int32)
@@ -222,6 +246,7 @@ def begun(finished, tmp_path) -> Path:
         (lambda spec: spec.update(steps=5), "steps: was 5, got 4"),
         (lambda spec: spec.update(seed=1), "seed: was 1, got 0"),
         (lambda spec: spec.pop("seed"), "seed: was None, got 0"),
+        (lambda spec: spec.update(ground_truth_database="x"), "ground_truth_database: was 'x', got None"),
         (lambda spec: spec.update(data="other frames"), "data: was 'other frames', got "),
     ],
 )
@@ -234,6 +259,40 @@ def test_another_specification_is_refused_and_the_field_is_named(begun, change, 
     assert [path.name for path in begun.iterdir()] == ["run.json"]
 
 
+def test_an_older_run_is_compared_by_what_it_has(begun):
+    spec = json.loads((begun / "run.json").read_text())
+    older = {name: value for name, value in spec.items() if name != "ground_truth_database"}
+    older["config"] = spec["config"] | {
+        "model": {k: v for k, v in spec["config"]["model"].items() if k != "remat"}
+    }
+    (begun / "run.json").write_text(json.dumps(older))
+    spec["ground_truth_database"] = "any"
+    assert runs.check_run(begun, spec, resume=True) == ["ground_truth_database"]
+    with pytest.raises(ValueError, match=r"run.json: objects: was None, got 'x'"):
+        runs.check_run(begun, spec | {"objects": "x"}, resume=True)
+
+
+def test_another_ground_truth_database_is_refused(begun, tmp_path):
+    """Cut from the same frames, and yet of other objects."""
+    config = dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())
+    first, other = (prepare_database(FRAMES, tmp_path / str(n), min_points=n) for n in (5, 6))
+    assert first.manifest.source == other.manifest.source
+    spec = json.loads((begun / "run.json").read_text()) | {"objects": first.manifest.source}
+    spec |= {"config": config_to_json(config), "ground_truth_database": first.fingerprint()}
+    (begun / "run.json").write_text(json.dumps(spec))
+    message = f"ground_truth_database: was '{first.fingerprint()}', got '{other.fingerprint()}': only the same run"
+    with pytest.raises(ValueError, match=message):
+        train_tiny(begun, resume=True, config=config, objects=other)
+
+
+def test_frames_whose_boxes_have_no_point_are_refused(tmp_path):
+    frames = [FRAMES.frame(index) for index in range(3)]
+    empty = tuple(dataclasses.replace(frame, num_points=0 * frame.num_points) for frame in frames)
+    with pytest.raises(ValueError, match=r"^frame 'frame 0': box 0: got 0 points, as for all boxes of 3 frames"):
+        train_tiny(tmp_path / "run", frames=GivenFrames(empty, FRAMES.sensor, FRAMES.classes))
+    assert not (tmp_path / "run").exists()
+
+
 def test_what_is_no_run_or_another_one_is_refused(begun, tmp_path):
     with pytest.raises(ValueError, match="holds a run, expected --resume or another folder"):
         train_tiny(begun)
@@ -241,7 +300,7 @@ def test_what_is_no_run_or_another_one_is_refused(begun, tmp_path):
         train_tiny(tmp_path / "nothing", resume=True)
     assert not (tmp_path / "nothing").exists()
     (begun / "run.json").write_text("{")
-    with pytest.raises(ValueError, match=r"run.json: not JSON, expected the specification of a run"):
+    with pytest.raises(ValueError, match=r"run.json: not JSON"):
         train_tiny(begun, resume=True)
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="found a file, expected a folder"):

@@ -4,24 +4,27 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from experiments.studies.shipped_weights import CONFIGS
 from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.inference import load_detector
-from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
-from fcos_lidar_jax.simulation.frame_set import fresh_streets, unseen_frames
+from fcos_lidar_jax.simulation.frame_set import unseen_frames
 from fcos_lidar_jax.trainer import evaluate
 from fcos_lidar_jax.training import load_checkpoint
 from fcos_lidar_jax.training.checkpoints import find_checkpoint, shipped_checkpoints
 
+NAMES = sorted(shipped_checkpoints())
 
-def test_shipped_weights_are_small_and_of_todays_preset():
-    folder = shipped_checkpoints()["quickstart"]
-    assert sum(path.stat().st_size for path in folder.rglob("*")) < 4 * 2**20
-    shipped, (preset, _) = load_checkpoint(folder), fresh_streets(QUICKSTART, steps=1)
-    assert shipped.sensor == load_sensor(QUICKSTART.sensor)
-    same_training = dataclasses.replace(shipped.config, optimizer=preset.optimizer)
-    assert same_training == preset
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_weights_are_small_and_of_todays_preset(name):
+    folder, config = shipped_checkpoints()[name], CONFIGS[name]
+    assert sum(path.stat().st_size for path in folder.rglob("*")) < 8 * 2**20
+    shipped = load_checkpoint(folder)
+    assert shipped.sensor == load_sensor(config.sensor)
+    assert dataclasses.replace(shipped.config, optimizer=config.optimizer) == config
 
 
 def test_shipped_weights_detect_on_unseen_streets():
@@ -40,8 +43,9 @@ def test_a_name_stands_for_shipped_weights_where_no_folder_has_it(tmp_path, monk
     assert "quickstart" in capsys.readouterr().err
 
 
-def test_shipped_weights_name_no_folder_of_the_machine_that_made_them():
-    for path in shipped_checkpoints()["quickstart"].rglob("*"):
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_weights_name_no_folder_of_the_machine_that_made_them(name):
+    for path in shipped_checkpoints()[name].rglob("*"):
         assert path.is_dir() or not any(
             root in path.read_bytes() for root in (b"/tmp/", b"/home/", b"/root/", b"/work")
         )

@@ -1,6 +1,7 @@
 """MetricsLog: one line of JSON a step, TensorBoard's events beside it, and what a killed run leaves."""
 
 import json
+import resource
 import struct
 from pathlib import Path
 
@@ -55,6 +56,15 @@ def test_a_resumed_run_forgets_what_came_after_its_checkpoint(tmp_path):
     assert steps(tmp_path) == [1, 2, 3, 4, 5]
 
 
+def test_what_is_no_line_is_left_out(tmp_path):
+    write(tmp_path, [1, 2])
+    with (tmp_path / "metrics.jsonl").open("ab") as file:
+        file.write(b'{"step": 3, "a": "\xff"}\n[]\n{"step": "x"}\n' + b"[" * 10**5 + b'\n{"step": 3}\n')
+    assert steps(tmp_path) == [1, 2, 3]
+    write(tmp_path, [3, 4], first_step=2)
+    assert steps(tmp_path) == [1, 2, 3, 4]
+
+
 def test_half_a_line_of_a_killed_run_is_dropped(tmp_path):
     write(tmp_path, [1, 2])
     file = tmp_path / "metrics.jsonl"
@@ -74,6 +84,20 @@ def test_tensorboard_gets_every_number_and_where_a_run_went_on(tmp_path):
     write(tmp_path, [2, 3], first_step=1)
     starts = [e.step for e in events(tmp_path) if e.HasField("session_log")]
     assert starts[-1] == 2  # TensorBoard then drops steps from 2 on that were written before
+
+
+def test_where_there_is_no_room_it_is_told_at_once_and_nothing_is_printed(tmp_path, capfd):
+    records = MetricsLog(tmp_path, first_step=0)
+    records.write(1, {"loss": 1.0})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (9, limits[1]))
+    try:
+        for fail in (records.flush, records.close):
+            with pytest.raises(OSError, match=r"/tensorboard: cannot be written: File too large$"):
+                fail()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_without_a_file_there_is_a_clear_error(tmp_path):

@@ -2,10 +2,11 @@
 
 import os
 import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from fcos_lidar_jax.training.preemption import stop_requests
+from fcos_lidar_jax.training.preemption import after_the_block, stop_requests
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -54,3 +55,29 @@ def test_inactive_leaves_the_signals_alone(before):
         with pytest.raises(Before):
             os.kill(os.getpid(), signal.SIGINT)
     assert request.signal is None
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_acts_when_the_block_has_ended(before, number):
+    done = []
+
+    def work():
+        with after_the_block():
+            os.kill(os.getpid(), number)
+            done.append(number)
+
+    with pytest.raises(Before):
+        work()
+    assert done == [number]
+    assert signal.getsignal(number) == before
+
+
+def test_elsewhere_than_in_the_main_thread_nothing_changes(before):
+    with ThreadPoolExecutor(1) as pool, after_the_block():
+        held = signal.getsignal(signal.SIGINT)
+
+        def inside():
+            with after_the_block():
+                return signal.getsignal(signal.SIGINT)
+
+        assert pool.submit(inside).result() == held

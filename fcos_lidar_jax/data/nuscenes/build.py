@@ -105,7 +105,7 @@ def _keyframes(tables: _Tables) -> Columns:
     order = np.lexsort((times, scene_of))
     return {
         "scene_name": np.array([scene.name for scene in scenes], np.str_),
-        "sample_token": np.array([samples[i].token for i in order], np.bytes_),
+        "sample_token": np.array([samples[i].token.encode() for i in order], np.bytes_),
         "sample_time_us": times[order],
         "sample_scene": scene_of[order],
     }

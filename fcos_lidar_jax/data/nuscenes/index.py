@@ -2,17 +2,17 @@
 
 import dataclasses
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from fcos_lidar_jax.data.npy_files import parse_npy
 from fcos_lidar_jax.data.nuscenes.tables import TABLES, TableError
-from fcos_lidar_jax.files import atomic_write, read_json
+from fcos_lidar_jax.files import FileState, atomic_write, read_json
 
-_FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 2
+_FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 3
 _MANIFEST = "index.json"
 
 
@@ -52,10 +52,10 @@ class Index:
     box_radar_points: np.ndarray  # i32[annotations]
 
 
-def table_sizes(folder: str | Path) -> dict[str, int]:
-    """Bytes of every table of a version: what an index is compared with, to notice that it is of other tables."""
-    files = [Path(folder) / kind.file for kind in TABLES]
-    return {file.name: file.stat().st_size for file in files if file.is_file()}
+def _tables(folder: str | Path) -> dict[str, Path]:
+    """The tables of a version that there are."""
+    files = (Path(folder) / kind.file for kind in TABLES)
+    return {file.name: file for file in files if file.is_file()}
 
 
 def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
@@ -66,14 +66,15 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
         tables: ``ROOT/VERSION``, of which the index was made.
     """
     folder = Path(folder)
+    states = {name: FileState.of(file) for name, file in _tables(tables).items()}
     (folder / _MANIFEST).unlink(missing_ok=True)
     columns = {}
     for name, column in vars(index).items():
         atomic_write(folder / f"{name}.npy", lambda path, column=column: np.save(path, column))
         columns[name] = _summary(column)
-    about = {"format": _FORMAT, "format_version": _FORMAT_VERSION, "tables": table_sizes(tables)}
-    manifest = {**about, "columns": columns}
-    atomic_write(folder / _MANIFEST, lambda path: path.write_text(json.dumps(manifest, indent=1)))
+    about = {"format": _FORMAT, "format_version": _FORMAT_VERSION, "tables": states}
+    text = msgspec.json.format(msgspec.json.encode({**about, "columns": columns}), indent=1)
+    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
 
 
 def has_index(folder: str | Path) -> bool:
@@ -93,20 +94,20 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
     """
     folder = Path(folder)
     manifest = _read_manifest(folder / _MANIFEST)
-    was, now = manifest.tables, table_sizes(tables)
+    was, now = manifest.tables, _tables(tables)
     for name in {**now, **was}:
-        if was.get(name) != now.get(name):
-            then = f"the index was made when it had {was.get(name)} bytes"
-            problem = f"{then}, now it has {now.get(name)} in {tables}: run prepare again"
+        if name not in was or name not in now or not was[name].holds(now[name]):
+            problem = f"the index was made of another one than that in {tables}: run prepare again"
             raise TableError(f"{folder / _MANIFEST}: {name}: {problem}")
     columns = {}
     for field in dataclasses.fields(Index):
         file = folder / f"{field.name}.npy"
         try:
-            column = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+            column = parse_npy(file.read_bytes())
+            summary = _summary(column)
+        except (OSError, ValueError) as error:
             raise TableError(f"{file}: cannot be read ({error}): run prepare again") from None
-        if manifest.columns.get(field.name) != _summary(column):
+        if manifest.columns.get(field.name) != summary:
             raise TableError(f"{file}: other content than {_MANIFEST} tells: run prepare again")
         columns[field.name] = column
     return Index(**columns)
@@ -115,7 +116,7 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
 class _Manifest(msgspec.Struct):
     format: str
     format_version: int
-    tables: dict[str, int]
+    tables: dict[str, FileState]
     columns: dict[str, dict[str, Any]]
 
 

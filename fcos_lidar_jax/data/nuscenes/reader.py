@@ -1,18 +1,21 @@
 """Keyframes of nuScenes: fused sweeps and boxes in the LiDAR frame (spec of the data set's official tables)."""
 
 import dataclasses
+import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, has_index, open_index
 from fcos_lidar_jax.data.nuscenes.names import label_of
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import TableError
-from fcos_lidar_jax.data.point_files import MAX_BYTES
+from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix, rotation_matrix, wrap_angle
@@ -49,6 +52,7 @@ class NuScenes:
         index: of ``prepare``; by default ``ROOT/.fcos_lidar/VERSION``.
         allow_missing_sweeps: older sweeps whose file is missing are left out instead of refused;
             :meth:`missing_sweeps` counts them. The current sweep is never left out.
+        follow_links: read files to which links lead outside of the root.
 
     Raises:
         ValueError: naming the file, the record, the field, what was found and what was expected.
@@ -61,8 +65,10 @@ class NuScenes:
         *,
         index: str | Path | None = None,
         allow_missing_sweeps: bool = False,
+        follow_links: bool = False,
     ) -> None:
         self.root, self.version, self.allow_missing_sweeps = Path(root), version, allow_missing_sweeps
+        self.follow_links = follow_links
         if not self.root.is_dir():
             raise TableError(f"{root}: no such folder, expected a data root")
         if not self.tables.is_dir():
@@ -102,7 +108,7 @@ class NuScenes:
         chosen = np.isin(self.index.sample_scene, [row[scene] for scene in wanted])
         tokens = [token for token, yes in zip(self._sample_row, chosen, strict=True) if yes]
         if not tokens:
-            raise ValueError(f"split {name!r}: got no keyframe, expected at least one")
+            raise ValueError(f"{self.tables}: split {name!r}: got no keyframe, expected at least one")
         return tokens
 
     def scene_of(self, sample_token: str) -> str:
@@ -137,10 +143,32 @@ class NuScenes:
         """As :meth:`sweeps`, and how many points on the ego vehicle were dropped."""
         chain = self._chain(sample_token, num)
         if self.allow_missing_sweeps:
-            chain = [row for row in chain if row == chain[0] or self._path(row).is_file()]
+            chain = [row for row in chain if row == chain[0] or os.path.isfile(self._path(row))]
         times = self.index.sweep_time_us
         sweeps = (Sweep(self._read(row), self._sensor_to_global(row), times[row]) for row in chain)
         return fuse_sweeps(sweeps, NUSCENES_HDL32E, remove_close=remove_close, close_m=close_m)
+
+    def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
+        """The sweeps of a scene in the order of time, read as they are asked for; only keyframes if so wished.
+
+        Raises:
+            ValueError: no such scene, with the names that there are.
+        """
+        names = self.index.scene_name.astype(str).tolist()
+        if scene not in names:
+            raise ValueError(f"{self.tables}: scene: {unknown_name(scene, names)}")
+        rows = self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
+        if not keyframes:
+            following = {int(before): row for row, before in enumerate(self.index.sweep_previous) if before >= 0}
+            while rows[-1] in following:
+                rows.append(following[rows[-1]])
+            rows = self._chain_of(rows[-1], len(self.index.sweep_file))[::-1]
+        times = self.index.sweep_time_us
+        poses = map(self._sensor_to_global, rows)
+        return (
+            Sweep(self._read(row), pose, int(times[row]), str(self._path(row)))
+            for row, pose in zip(rows, poses, strict=True)
+        )
 
     def boxes(self, sample_token: str) -> Boxes:
         """The boxes of the ten classes in the keyframe's LiDAR frame, those without points included.
@@ -177,7 +205,11 @@ class NuScenes:
     def missing_sweeps(self, sample_tokens: list[str], num: int = 10) -> int:
         """How many sweep files of these keyframes are missing, each counted once."""
         rows = {row for token in sample_tokens for row in self._chain(token, num)}
-        return sum(not self._path(row).is_file() for row in rows)
+        return sum(not os.path.isfile(self._path(row)) for row in rows)
+
+    def sweep_files(self, sample_token: str, num: int = 10) -> list[Path]:
+        """Files of the sweeps up to a keyframe, the current one first, whether they are there or not."""
+        return [self._path(row) for row in self._chain(sample_token, num)]
 
     def sensor_to_global(self, sample_token: str) -> np.ndarray:
         """f64[4, 4]: from a keyframe's LiDAR frame to the global frame."""
@@ -202,7 +234,11 @@ class NuScenes:
     def _chain(self, sample_token: str, num: int) -> list[int]:
         if num < 1:
             raise ValueError(f"num: got {num}, expected at least 1 sweep")
-        chain = [self._sweep(sample_token)]
+        return self._chain_of(self._sweep(sample_token), num)
+
+    def _chain_of(self, row: int, num: int) -> list[int]:
+        """A sweep and those before it, at most so many."""
+        chain = [row]
         while len(chain) < num and (before := int(self.index.sweep_previous[chain[-1]])) >= 0:
             chain.append(before)
         return chain
@@ -217,16 +253,18 @@ class NuScenes:
 
     def _read(self, row: int) -> np.ndarray:
         path = self._path(row)
-        if not path.is_file():
+        if not os.path.isfile(path):
             hint = "" if self.allow_missing_sweeps else "; --allow-missing-sweeps continues with fewer sweeps"
             raise ValueError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
-        if not path.resolve().is_relative_to(self._base):
-            raise ValueError(f"{path}: resolves to {path.resolve()}, expected a file below {self._base}")
+        if not self.follow_links and not path.resolve().is_relative_to(self._base):
+            found = f"resolves to {path.resolve()}, expected a file below {self._base}"
+            raise ValueError(f"{path}: {found}; --follow-links allows links that lead out")
         size = path.stat().st_size
-        if size == 0 or size % (4 * _COLUMNS) or size > MAX_BYTES:
+        if size == 0 or size % (4 * _COLUMNS) or size > 4 * _COLUMNS * MAX_POINTS:
             found = "an empty file" if size == 0 else f"{size} bytes"
             raise ValueError(
-                f"{path}: got {found}, expected a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_BYTES}"
+                f"{path}: got {found}, expected a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_POINTS} "
+                "points"
             )
         return np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
 
@@ -266,6 +304,11 @@ class NuScenesFrames(FrameSet):
 
     def scene(self, index: int) -> str:
         return self.nuscenes.scene_of(self.tokens[index])
+
+    def clouds_fingerprint(self, indices: Iterable[int]) -> str:
+        data = self.nuscenes
+        files = {file for index in indices for file in data.sweep_files(self.tokens[index], self.num_sweeps)}
+        return files_fingerprint(files, data.root, None)
 
     def fingerprint(self) -> str:
         how = self.num_sweeps, self.remove_close, self.close_m

@@ -8,10 +8,12 @@ import mmap
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
+_Count = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
+_Time = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]  # microseconds
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
@@ -72,7 +74,7 @@ class Sample(Row):
     """A keyframe."""
 
     file = "sample.json"
-    timestamp: int
+    timestamp: _Time
     scene_token: str
     next: str
 
@@ -99,7 +101,7 @@ class SampleData(Row):
     sample_token: str
     ego_pose_token: str
     calibrated_sensor_token: str
-    timestamp: int
+    timestamp: _Time
     is_key_frame: bool
     filename: str
     prev: str
@@ -117,8 +119,8 @@ class SampleAnnotation(Row):
     rotation: Quaternion
     prev: str
     next: str
-    num_lidar_pts: int
-    num_radar_pts: int
+    num_lidar_pts: _Count
+    num_radar_pts: _Count
 
 
 R = TypeVar("R", bound=Row)
@@ -177,7 +179,7 @@ def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, seen: int, 
         place = int(at[1]) if at else len(piece)
         what = re.sub(r" ?\(byte \d+\)", "", str(error))
         raise TableError(f"{path}: byte {place + offset}{_record_at(piece, place)}: not JSON: {what}") from None
-    except UnicodeDecodeError as error:
+    except (UnicodeDecodeError, RecursionError) as error:
         raise TableError(f"{path}: not JSON: {error}") from None
 
 

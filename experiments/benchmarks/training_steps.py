@@ -1,0 +1,28 @@
+"""Whole training steps, to be timed."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+
+from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.input_pipeline.batching import make_batch
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+
+
+def training_steps(config: Config, sensor: Sensor, frames: Sequence[Frame]) -> Callable[[], dict[str, Any]]:
+    """Whole training steps on one batch of the frames, one a call, which returns the metrics."""
+    detector, optimizer = build_detector(config, sensor), make_optimizer(config.optimizer, 1000)
+    step = jax.jit(make_train_step(detector, optimizer), donate_argnums=0)
+    state = make_state(detector, optimizer, jax.random.key(0))
+    batch = jax.device_put(make_batch(frames, max_points=config.max_points, max_boxes=config.max_boxes))
+
+    def once() -> dict[str, Any]:
+        nonlocal state
+        state, metrics = step(state, batch)
+        return metrics
+
+    return once

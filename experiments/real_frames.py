@@ -1,0 +1,111 @@
+"""The real keyframes as frame sets, and scores by class and by range."""
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.script import real_data
+from fcos_lidar_jax import open_frames
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import ProjectionConfig
+from fcos_lidar_jax.data.frame import ChosenFrames, Frame, FrameSet
+from fcos_lidar_jax.data.keyframe import read_keyframe
+from fcos_lidar_jax.evaluation.bootstrap import bootstrap
+from fcos_lidar_jax.evaluation.frames import evaluate_frames
+from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
+from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.projection import close_to_sensor
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
+from fcos_lidar_jax.types import Detections
+
+SPANS_M = ((0, 20), (20, 40))
+
+
+@dataclasses.dataclass(frozen=True)
+class Keyframes(FrameSet):
+    """Annotated keyframes of one folder, without the points close to the sensor."""
+
+    folder: Path
+    number: int
+    close_m: float
+    sensor: Sensor = NUSCENES_HDL32E
+    classes = NUSCENES_CLASSES
+
+    def __len__(self) -> int:
+        return self.number
+
+    def frame(self, index: int) -> Frame:
+        frame = read_keyframe(self.folder, self.sensor, index)
+        close = close_to_sensor(frame.points, self.sensor, self.close_m)
+        return dataclasses.replace(frame, points=frame.points[~close], num_close=int(close.sum()))
+
+    def fingerprint(self) -> str:
+        return checksum((self.folder / "boxes.json").read_bytes())
+
+    def name(self, index: int) -> str:
+        return f"{self.folder.name} {index}"
+
+
+def real_frames(data: Path | None, projection: ProjectionConfig) -> dict[str, FrameSet]:
+    """Name -> keyframes: those of scene-0523 to choose by (even) and to report (odd), and two other scenes.
+
+    Args:
+        data: folder of the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
+        projection: says which points are too close.
+    """
+    close = {"remove_close": projection.remove_close, "close_m": projection.close_m}
+    scene = open_frames(real_data(data, "nuscenes_scene0523"), split="scene0523", **close)
+    sets: dict[str, FrameSet] = {
+        "scene-0523, even": ChosenFrames(scene, tuple(range(0, len(scene), 2))),
+        "scene-0523, odd": ChosenFrames(scene, tuple(range(1, len(scene), 2))),
+    }
+    for number, frames in (("0103", 2), ("0061", 1)):
+        sets[f"scene-{number}"] = Keyframes(real_data(data, f"nuscenes_scene{number}"), frames, projection.close_m)
+    return sets
+
+
+def scores_by_range(
+    found: Iterable[Detections], frames: Iterable[Frame], *, repeats: int = 0
+) -> dict[str, dict[str, Any]]:
+    """mAP and AP by class of all boxes, and of those whose centres lie in a span of distances from the sensor.
+
+    Truth and detections are divided alike, so a hit across a border counts in neither span. With ``repeats`` sets
+    of frames drawn anew the mAPs have intervals.
+    """
+    found, frames = list(found), list(frames)
+    spans = {f"{low}-{high} m": within(found, frames, low, high) for low, high in SPANS_M}
+    return {name: _scores(*boxes, repeats) for name, boxes in {"all": (found, frames), **spans}.items()}
+
+
+def within(
+    found: Iterable[Detections], frames: Iterable[Frame], low_m: float, high_m: float
+) -> tuple[list[Detections], list[Frame]]:
+    """Detections and truth whose centres, seen from above, are that far from the sensor, ``high_m`` excluded."""
+
+    def inside(boxes: Any) -> np.ndarray:
+        distance = np.hypot(*np.asarray(boxes)[:, :2].T)
+        return (distance >= low_m) & (distance < high_m)
+
+    kept = [(frame, inside(frame.boxes)) for frame in frames]
+    near = [
+        dataclasses.replace(f, boxes=f.boxes[k], labels=f.labels[k], num_points=f.num_points[k]) for f, k in kept
+    ]
+    return [dataclasses.replace(d, valid=d.valid & inside(d.boxes)) for d in found], near
+
+
+def _scores(found: list[Detections], frames: list[Frame], repeats: int) -> dict[str, Any]:
+    evaluation = evaluate_frames(found, frames, metric_of(NUSCENES_CLASSES))
+    pairs = zip(NUSCENES_CLASSES, evaluation.rankings, strict=True)
+    truths = {name: len(ranking.truth_sample) for name, ranking in pairs}
+    aps = {k: round(v, 4) for k, v in evaluation.summary["mean_dist_aps"].items() if truths[k]}
+    scores = {"mAP": round(evaluation.summary["mean_ap"], 4), "AP": aps, "truths": {k: truths[k] for k in aps}}
+    return {**scores, "interval": interval_of(evaluation, "mean_ap", repeats)} if repeats and aps else scores
+
+
+def interval_of(evaluation: Evaluation, score: str, repeats: int) -> list[float]:
+    """Low and high end of a score's 95 % interval, over frames drawn anew."""
+    interval = bootstrap(evaluation, repeats=repeats)[score]
+    return [round(interval[end], 4) for end in ("low", "high")]

@@ -1,0 +1,121 @@
+"""The model card of shipped weights, from the measured figures alone.
+
+    python -m experiments.studies.model_card --name hdl32e
+
+Writes ``fcos_lidar_jax/weights/NAME/README.md`` from ``NAME.json``, as ``shipped_weights --export`` measured it,
+and ``transfer.json`` of the same folder; figures of other weights than those in the package are left out.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import fcos_lidar_jax
+from experiments.script import run_script
+from fcos_lidar_jax.files import atomic_write, read_json
+from fcos_lidar_jax.inference import load_trained
+from fcos_lidar_jax.models.detector import count_parameters
+from fcos_lidar_jax.training.checkpoint import read_description
+
+RESULTS = Path("experiments/results")
+SHIPPED = Path(fcos_lidar_jax.__file__).parent / "weights"
+_BANDS = ("all", "0-20 m", "20-40 m")
+_WEAK_AP, _WEAK_BOXES = 0.05, 10
+"""Classes with fewer boxes say nothing; those with less AP are listed as hardly found."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Whose card."""
+
+    name: Literal["quickstart", "hdl32e"]  # Weights.
+    results: Path = RESULTS  # Folder of the figures.
+
+
+def write_card(name: str, results: Path, training: Mapping[str, Any] | None = None) -> Path:
+    """Write the card of shipped weights beside them.
+
+    Args:
+        name: of the weights.
+        results: folder of ``NAME.json`` and, where it was measured, ``transfer.json``.
+        training: what ``NAME.json`` will hold; default: what it holds.
+
+    Returns:
+        the file.
+    """
+    folder = SHIPPED / name
+    record = training or read_json(results / f"{name}.json", dict[str, Any])
+    lines = [*_about(name, record), *_figures(results / "transfer.json", read_description(folder)["hash"])]
+    path = folder / "README.md"
+    atomic_write(path, lambda file: file.write_text("\n".join(lines) + "\n", encoding="utf-8"))
+    return path
+
+
+def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
+    detector, trained = load_trained(SHIPPED / name), record["training"]
+    parameters = count_parameters(detector.variables["params"])["total"]
+    low, high = record["interval"]["low"], record["interval"]["high"]
+    yield f"# {name}\n"
+    yield f"Preset `{trained['preset']}` for the sensor `{detector.sensor.name}`: {parameters:,} parameters,"
+    yield f"{record['bytes'] / 2**20:.1f} MiB as float16. Classes: {', '.join(detector.classes)}.\n"
+    yield "## Trained on\n"
+    yield "Simulated streets alone, never real ones, each frame another street:\n"
+    for leg in (*record["earlier"], trained):
+        done = f"{leg['frames_seen']:,} frames, step {leg['steps']:,} of {leg['steps_planned']:,}"
+        hours = f"{leg['seconds_of_steps'] / 3600:.1f} hours of steps"
+        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {hours}"
+    yield ""
+    scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
+    yield f"On {record['unseen_frames']} unseen frames of the same kind: {scored}.\n"
+    yield f"Made by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`.\n"
+    yield "## What it finds\n"
+
+
+def _figures(file: Path, weights: str) -> Iterator[str]:
+    command = "`python -m experiments.studies.transfer --data FOLDER`"
+    record = read_json(file, dict[str, Any]) if file.exists() else {}
+    if record.get("checkpoint", {}).get("hash") != weights:
+        yield f"Not measured yet with these weights: {command} does."
+        return
+    yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, as {command} measured it; boxes in"
+    yield "brackets. The intervals are of keyframes drawn anew, and too narrow: keyframes of a scene are alike."
+    for name, part in record.items():
+        if isinstance(part, dict) and "all" in part:
+            yield from _part(name, part)
+    if found := record.get("fine_tuning"):
+        ours, other = (found[start]["all"]["mAP"] for start in ("from the checkpoint", "from scratch"))
+        yield f"\n### Fine-tuned on {found['keyframes']} real keyframes, {found['steps']} steps\n"
+        yield f"mAP on other keyframes of the scene: {ours:.3f} from these weights, {other:.3f} from random ones."
+
+
+def _part(name: str, part: Mapping[str, Any]) -> Iterator[str]:
+    scores = [f"mAP {part['all']['mAP']:.3f} ({_text(part['all']['interval'])})"]
+    for key in ("official mAP", "official NDS"):
+        if found := part.get(key):
+            scores.append(f"{key} {found['score']:.3f} ({_text(found['interval'])})")
+    source = "simulated drives" if name == "simulated" else f"real, {name}"
+    yield f"\n### {source[0].upper()}{source[1:]}: {part['keyframes']} keyframes\n"
+    yield f"{', '.join(scores)}.\n"
+    yield f"| class | {' | '.join(_BANDS)} |\n|---|{'---|' * len(_BANDS)}"
+    aps, truths = part["all"]["AP"], part["all"]["truths"]
+    for label in aps:
+        bands = [part[band] for band in _BANDS]
+        shown = [f"{b['AP'][label]:.3f} ({b['truths'][label]})" if label in b["AP"] else "-" for b in bands]
+        yield f"| {label.replace('_', ' ')} | {' | '.join(shown)} |"
+    often = [label for label, boxes in truths.items() if boxes >= _WEAK_BOXES]
+    if weak := [label.replace("_", " ") for label in often if aps[label] < _WEAK_AP]:
+        yield f"\nHardly found here (AP below {_WEAK_AP:g}): {', '.join(weak)}."
+
+
+def _text(interval: Any) -> str:
+    return " to ".join(f"{value:.3f}" for value in interval)
+
+
+def main(args: Args) -> None:
+    """Write the card and say where it is."""
+    print(write_card(args.name, args.results))
+
+
+if __name__ == "__main__":
+    run_script(main, Args, __doc__)

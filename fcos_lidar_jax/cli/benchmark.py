@@ -1,0 +1,152 @@
+"""``fcos-lidar benchmark``: how long a detector takes, stage by stage and for several clouds at once."""
+
+import dataclasses
+import functools
+import itertools
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
+from fcos_lidar_jax.data.clouds import find_clouds
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.inference import CloudDetector, TrainedDetector, load_detector
+from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
+from fcos_lidar_jax.inference.export import ExportedDetector
+from fcos_lidar_jax.inference.stages import Stages
+from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
+from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
+
+_SIMULATED = 3  # Clouds, where no files are given.
+
+
+@dataclasses.dataclass(frozen=True)
+class Benchmark:
+    """Time a detector on one device: each stage, the whole from file to boxes, and clouds a second.
+
+    Stages take turns, and each its clouds in turn, after a run that compiles; `detect` is one program of the three
+    stages above it. Of an exported detector there is no more than `detect` to see.
+    """
+
+    files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]] = ()
+    """Point files, one cloud each, or folders of them. Default: simulated clouds of the detector's sensor."""
+    checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")] = tyro.MISSING
+    """Trained detector: a checkpoint; a run, which stands for its last one, RUN/best for its best; a file of
+    `export`; or `hdl32e` or `quickstart`, which come with the package."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None  # Also write the figures as JSON.
+    batch: tuple[int, ...] = ()
+    """Clouds at once. Default: 1, 2 and 4, or what the file was exported for."""
+    repeats: int = 20  # Turns.
+
+
+def run(args: Benchmark) -> None:
+    """Measure, print, and write."""
+    check_at_least(args, 1, "repeats")
+    if any(size < 1 for size in args.batch):
+        raise ValueError(f"--batch: got {min(args.batch)}, expected at least 1")
+    files = find_clouds(args.files)
+    if args.out is not None:
+        check_out_file("--out", args.out, keep=files)
+    detector = load_detector(args.checkpoint)
+    record = {
+        "checkpoint": str(args.checkpoint),
+        **measure(detector, files, args.batch, args.repeats),
+        **machine(),
+    }
+    print(as_text(record), flush=True)
+    if args.out is not None:
+        text = json.dumps(record, indent=1) + "\n"
+        atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def measure(
+    detector: CloudDetector, files: tuple[Path, ...], batch: tuple[int, ...], repeats: int
+) -> dict[str, Any]:
+    """Times of the stages, of the whole, and of several clouds at once.
+
+    Args:
+        detector: from a checkpoint or an exported file.
+        files: point files; none for simulated clouds, which are not read.
+        batch: clouds at once; none for what is usual.
+        repeats: turns.
+
+    Raises:
+        ValueError: a file that cannot be read, or a batch that an exported detector does not take.
+    """
+    sensor = detector.sensor
+    read = functools.partial(read_points, sensor=sensor)
+    arrays = [read(file) for file in files] or [make_frame(seed, sensor).points for seed in range(_SIMULATED)]
+    clean = functools.partial(make_cloud, config=detector.config, sensor=sensor)
+    clouds = [clean(points) for points in arrays]
+    takes = detector.record["batch"] if isinstance(detector, ExportedDetector) else "any"
+    sizes = batch or ((1, 2, 4) if takes == "any" else (takes,))
+    mesh = make_mesh(jax.local_devices()[:1])
+    programs = {size: detector.program(mesh, size) for size in sizes}
+
+    def detect(size: int, several: Iterable[Cloud]) -> Any:
+        points, valid = (np.stack(parts) for parts in zip(*((c.points, c.valid) for c in several), strict=True))
+        return jax.device_get(programs[size](*shard_batch((points, valid), mesh)))
+
+    calls: dict[str, Call] = {"read": _in_turn(read, files)} if files else {}
+    calls["clean"] = _in_turn(clean, arrays)
+    if isinstance(detector, TrainedDetector):
+        calls |= _stages(detector, clouds)
+    if 1 in sizes:
+        calls["detect"] = _in_turn(lambda cloud: detect(1, [cloud]), clouds)
+        start: Callable[[Any], Cloud] = (lambda file: clean(read(file))) if files else clean
+        calls["whole"] = _in_turn(lambda given: detect(1, [start(given)]), files or arrays)
+    stages = interleaved(calls, repeats, percentile=95)
+    together = {
+        size: functools.partial(detect, size, list(itertools.islice(itertools.cycle(clouds), size)))
+        for size in sizes
+    }
+    throughput = {
+        str(size): {**times, "clouds_per_s": round(1e3 * size / times["median_ms"], 2)}
+        for size, times in interleaved(together, repeats, percentile=95).items()
+    }
+    number = {"clouds": len(clouds), "points": round(float(np.mean([len(points) for points in arrays])))}
+    return {**number, "repeats": repeats, "stages": stages, "throughput": throughput}
+
+
+def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
+    """Calls of a function with one value after the other."""
+    turns = itertools.cycle(values)
+    return lambda: function(next(turns))
+
+
+def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
+    stages = Stages(detector.config, detector.sensor)
+    variables = jax.device_put(detector.variables)
+    on_device = [jax.device_put((cloud.points, cloud.valid)) for cloud in clouds]
+    images = [stages.project(*cloud) for cloud in on_device]
+    outputs = [stages.network(variables, image) for image in images]
+    return {
+        "projection": _in_turn(lambda cloud: stages.project(*cloud), on_device),
+        "network": _in_turn(lambda image: stages.network(variables, image), images),
+        "postprocess": _in_turn(lambda pair: stages.postprocess(*pair), list(zip(outputs, images, strict=True))),
+    }
+
+
+def as_text(record: dict[str, Any]) -> str:
+    """The figures as a table."""
+
+    def line(name: str, times: Times) -> str:
+        return f"{name:<12}{times['median_ms']:>12.2f}{times['p95_ms']:>12.2f}"
+
+    return "\n".join(
+        [
+            f"{record['checkpoint']}: {record['clouds']} clouds of {record['points']} points, {record['repeats']} "
+            f"turns, {record['device']} ({record['processor']}, {record['cores']} cores), jax {record['jax']}",
+            f"{'stage':<12}{'median ms':>12}{'95 % ms':>12}",
+            *(line(name, times) for name, times in record["stages"].items()),
+            f"{'batch':<12}{'median ms':>12}{'95 % ms':>12}{'clouds/s':>12}",
+            *(f"{line(size, t)}{t['clouds_per_s']:>12.2f}" for size, t in record["throughput"].items()),
+        ]
+    )

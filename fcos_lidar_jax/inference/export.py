@@ -1,0 +1,214 @@
+"""A detector as one file: a program of ``jax.export`` from points to boxes, with the weights inside.
+
+The file is a line with its format and the checksum of what follows, a line of JSON that says what the detector is,
+and the serialised program. docs/export.md shows how to run it without this package.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export, lax
+from jax.sharding import Mesh
+
+from fcos_lidar_jax import __version__
+from fcos_lidar_jax.config import config_from_json, config_to_json
+from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.inference.cloud import usable_rows
+from fcos_lidar_jax.inference.detect import make_detect
+from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, jit_split
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.projection import remove_close as without_close
+from fcos_lidar_jax.sensors import sensor_from_json, sensor_to_json
+from fcos_lidar_jax.training.checkpoint import CheckpointError
+from fcos_lidar_jax.types import Detections
+
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+Size = int | Literal["any"]
+
+_MAGIC, _FORMAT = "fcos-lidar-detector", 1
+_MAX_FIRST_LINE, _MAX_RECORD, _MAX_BYTES = 100, 2**20, 2**31
+_EXPECTED = "expected a checkpoint folder or a file that `fcos-lidar export` has written"
+_WITHOUT_SOURCE_PATHS = {"jax_hlo_source_file_canonicalization_regex": ".*", "jax_traceback_in_locations_limit": 0}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExportedDetector(CloudDetector):
+    """A detector of a file that ``fcos-lidar export`` has written, see :func:`load_exported`."""
+
+    record: dict[str, Any]  # What the file says of itself.
+    exported: export.Exported
+
+    @property
+    def fingerprint(self) -> str:
+        return self.record["weights"]["blake2b"] + " exported"
+
+    def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
+        if self.record["batch"] not in (batch_size, "any"):
+            raise ValueError(
+                f"batch size: got {batch_size}, expected {self.record['batch']}: the detector was exported for it"
+            )
+        return _split_program(self, mesh)
+
+
+@functools.lru_cache(maxsize=8)
+def _split_program(detector: ExportedDetector, mesh: Mesh) -> Callable[..., Any]:
+    def on_one_device(points: jax.Array, valid: jax.Array) -> Detections:
+        # Clouds of this package have been cleaned, each sweep in its own frame.
+        found: Any = detector.exported.call(points, valid, np.False_)
+        return Detections(**found)
+
+    return jit_split(on_one_device, mesh)
+
+
+def export_detector(detector: TrainedDetector, *, num_points: Size | None = None, batch: Size = 1) -> bytes:
+    """The bytes of a file that detects without this package, the same for the same detector and versions.
+
+    Its program takes points f32[b, n, c], valid bool[b, n] and remove_close bool[], and returns a dictionary of
+    the arrays of :class:`~fcos_lidar_jax.types.Detections`. It drops rows that are not finite or beyond physical
+    limits and, with ``remove_close``, those on the ego vehicle, as the configuration says.
+
+    Args:
+        detector: network with its weights.
+        num_points: n, rows of a cloud with its padding; ``"any"`` compiles anew for each number. Default:
+            ``config.max_points``.
+        batch: b, clouds at once, or ``"any"``. With more than one, boxes and scores differ by rounding.
+
+    Raises:
+        ValueError: a size below 1.
+    """
+    config, sensor = detector.config, detector.sensor
+    rows = config.max_points if num_points is None else num_points
+    for name, size in (("points", rows), ("batch", batch)):
+        if isinstance(size, int) and size < 1:
+            raise ValueError(f"{name}: got {size}, expected at least 1, or any")
+    if rows != "any":
+        config = dataclasses.replace(config, max_points=rows)
+    scope = export.SymbolicScope()
+    b, n = (
+        export.symbolic_shape(name, scope=scope)[0] if size == "any" else size
+        for name, size in (("b", batch), ("n", rows))
+    )
+    arguments = (
+        jax.ShapeDtypeStruct((b, n, sensor.point_columns), jnp.float32),
+        jax.ShapeDtypeStruct((b, n), jnp.bool_),
+        jax.ShapeDtypeStruct((), jnp.bool_),
+    )
+    with _settings(_WITHOUT_SOURCE_PATHS):
+        exported = export.export(jax.jit(_whole_path(detector, batch)), platforms=PLATFORMS)(*arguments)
+        program = bytes(exported.serialize())
+    weights = [np.asarray(leaf) for leaf in jax.tree.leaves(detector.variables)]
+    record = {
+        "written_by": f"fcos_lidar_jax {__version__}, jax {jax.__version__}",
+        "name": config.name,
+        "classes": list(detector.classes),
+        "batch": batch,
+        "num_points": rows,
+        "num_columns": sensor.point_columns,
+        "columns": ["x", "y", "z", "intensity", "time_lag", "laser"][: sensor.point_columns],
+        "box": ["x", "y", "z", "l", "w", "h", "yaw", "vx", "vy"],
+        "platforms": PLATFORMS,
+        "calling_convention": exported.calling_convention_version,
+        "weights": {
+            "parameters": sum(leaf.size for leaf in jax.tree.leaves(detector.variables["params"])),
+            "blake2b": checksum(b"".join(leaf.tobytes() for leaf in weights)),
+        },
+        "program": {"bytes": len(program), "blake2b": checksum(program)},
+        "sensor": sensor_to_json(sensor),
+        "config": config_to_json(config),
+    }
+    content = json.dumps(record).encode() + b"\n" + program
+    return f"{_MAGIC} {_FORMAT} {checksum(content)}\n".encode() + content
+
+
+def _whole_path(detector: TrainedDetector, batch: Size) -> Callable[..., dict[str, jax.Array]]:
+    detect, config, sensor = make_detect(detector.model), detector.config.projection, detector.sensor
+    weights = jax.tree.map(np.asarray, detector.variables)
+
+    def one(variables: Any, points: jax.Array, valid: jax.Array, remove_close: jax.Array) -> Detections:
+        usable = valid & usable_rows(points)
+        far = without_close(points, usable, sensor, mode=config.remove_close, close_m=config.close_m)
+        return detect(variables, points, jnp.where(remove_close, far, usable))
+
+    def whole(points: jax.Array, valid: jax.Array, remove_close: jax.Array) -> dict[str, jax.Array]:
+        # As constants that are not folded, so that they are computed with as if they were arguments.
+        variables = lax.optimization_barrier(jax.tree.map(jnp.asarray, weights))
+        if batch == 1:
+            found = jax.tree.map(lambda leaf: leaf[None], one(variables, points[0], valid[0], remove_close))
+        else:
+            found = jax.vmap(one, (None, 0, 0, None))(variables, points, valid, remove_close)
+        return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+
+    return whole
+
+
+@contextlib.contextmanager
+def _settings(values: dict[str, Any]) -> Iterator[None]:
+    """Settings of JAX for a while."""
+    before = {name: getattr(jax.config, name) for name in values}
+    try:
+        for name, value in values.items():
+            jax.config.update(name, value)
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+
+
+def read_record(file: Path) -> dict[str, Any]:
+    """What an exported detector says of itself; nothing of its program is deserialised.
+
+    Raises:
+        CheckpointError: another file, another format, or not as it was written.
+    """
+    return _read(file)[0]
+
+
+def load_exported(file: Path) -> ExportedDetector:
+    """Read a file of :func:`export_detector`; compiled at the first cloud.
+
+    Raises:
+        CheckpointError: as :func:`read_record`, or written for a newer JAX.
+    """
+    record, program = _read(file)
+    config = config_from_json(record["config"], f"{file}: config")
+    sensor = sensor_from_json(record["sensor"], f"{file}: sensor")
+    try:
+        exported = export.deserialize(bytearray(program))
+    except Exception as error:  # a version that this JAX does not read
+        raise CheckpointError(
+            f"{file}: not readable by jax {jax.__version__}: found the program of {record['written_by']}: "
+            f"{' '.join(str(error).split())[:200]}"
+        ) from error
+    return ExportedDetector(build_detector(config, sensor), record, exported)
+
+
+def _read(file: Path) -> tuple[dict[str, Any], bytes]:
+    try:
+        with file.open("rb") as stream:
+            first = stream.readline(_MAX_FIRST_LINE)
+            if not first.startswith(_MAGIC.encode() + b" "):
+                raise CheckpointError(f"{file}: found a file, {_EXPECTED}")
+            content = stream.read(_MAX_BYTES)
+    except OSError as error:
+        raise CheckpointError(f"{file}: cannot be read: {error.strerror}") from None
+    version, _, expected = first.decode("ascii", "replace").removeprefix(_MAGIC).strip().partition(" ")
+    if version != str(_FORMAT):
+        raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
+    if (found := checksum(content)) != expected:
+        raise CheckpointError(f"{file}: checksum {found}, expected {expected}: damaged")
+    line, _, program = content.partition(b"\n")
+    try:
+        record = json.loads(line[:_MAX_RECORD])
+        if all(isinstance(record[name], dict) for name in ("config", "sensor", "weights")) and "batch" in record:
+            return record, program
+    except (ValueError, RecursionError, KeyError, TypeError):
+        pass
+    raise CheckpointError(f"{file}: found a forged record, {_EXPECTED}")

@@ -1,0 +1,91 @@
+"""Identities of boxes over time, by the distance between their centres."""
+
+import dataclasses
+
+import numpy as np
+
+MAX_DISTANCE_M = 2.0  # Between a box and where its track is expected.
+MAX_UNSEEN_S = 1.5  # After which a track ends.
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracks:
+    """Objects that have been seen, in a frame that does not move; by default none yet."""
+
+    ids: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))  # i64[t]
+    labels: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int32))  # i32[t]
+    centres: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))  # f64[t, 2]: x, y, metres
+    velocities: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))  # f64[t, 2]: m/s
+    unseen_s: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))  # f64[t]: since the last box
+    next_id: int = 0
+
+
+def track(
+    tracks: Tracks,
+    boxes: np.ndarray,
+    labels: np.ndarray,
+    scores: np.ndarray,
+    dt: float,
+    *,
+    max_distance_m: float = MAX_DISTANCE_M,
+    max_unseen_s: float = MAX_UNSEEN_S,
+) -> tuple[Tracks, np.ndarray]:
+    """Greedy matching of boxes to tracks of their class, the nearest pair first.
+
+    A track is expected where its velocity has brought it. Boxes without a track begin one, the best score first.
+    The order of the boxes does not matter.
+
+    Args:
+        tracks: of the time before.
+        boxes: f32[m, 9], ``x, y, z, l, w, h, yaw, vx, vy`` in a frame that does not move, see :func:`to_world`;
+            unknown (NaN) velocities count as 0.
+        labels, scores: i32[m], f32[m].
+        dt: seconds since the time before.
+
+    Returns:
+        the tracks from now on, and the identity of every box, i64[m], 0 and up.
+
+    >>> car = np.array([[10.0, 0, 0, 4, 2, 1.5, 0, 8, 0]])
+    >>> tracks, ids = track(Tracks(), car, np.zeros(1, int), np.ones(1), 0.0)
+    >>> moved = car + [[4.0, 0, 0, 0, 0, 0, 0, 0, 0]]
+    >>> ids.tolist(), track(tracks, moved, np.zeros(1, int), np.ones(1), 0.5)[1].tolist()
+    ([0], [0])
+    """
+    order = np.lexsort((*boxes.T, labels, -scores))
+    boxes, labels = np.asarray(boxes, np.float64)[order], labels[order]
+    expected = tracks.centres + dt * tracks.velocities
+    distance = np.linalg.norm(boxes[:, None, :2] - expected, axis=-1)
+    distance[labels[:, None] != tracks.labels] = np.inf
+    ids, free = np.full(len(boxes), -1), np.ones(len(expected), bool)
+    near = np.flatnonzero(distance <= max_distance_m)
+    for pair in near[np.argsort(distance.flat[near], kind="stable")]:
+        box, old = divmod(int(pair), len(expected))
+        if ids[box] < 0 and free[old]:
+            ids[box], free[old] = tracks.ids[old], False
+    new = ids < 0
+    ids[new] = tracks.next_id + np.arange(new.sum())
+    kept = free & (tracks.unseen_s + dt <= max_unseen_s)
+    after = Tracks(
+        np.concatenate([ids, tracks.ids[kept]]),
+        np.concatenate([labels, tracks.labels[kept]]),
+        np.concatenate([boxes[:, :2], expected[kept]]),
+        np.concatenate([np.nan_to_num(boxes[:, 7:9]), tracks.velocities[kept]]),
+        np.concatenate([np.zeros(len(boxes)), tracks.unseen_s[kept] + dt]),
+        tracks.next_id + int(new.sum()),
+    )
+    return after, ids[np.argsort(order)]
+
+
+def to_world(boxes: np.ndarray, sensor_to_world: np.ndarray) -> np.ndarray:
+    """Boxes f32[m, 9] of a sensor's frame in the world's, f64[m, 9]; the sensor's tilt is lost.
+
+    >>> quarter = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    >>> to_world(np.array([[10.0, 0, 0, 4, 2, 1, 0, 8, 0]]), quarter).round(4).tolist()
+    [[5.0, 10.0, 0.0, 4.0, 2.0, 1.0, 1.5708, 0.0, 8.0]]
+    """
+    world, turn = np.array(boxes, np.float64), sensor_to_world[:3, :3]
+    world[:, :3] = world[:, :3] @ turn.T + sensor_to_world[:3, 3]
+    heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=-1) @ turn[:2, :2].T
+    world[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
+    world[:, 7:9] = world[:, 7:9] @ turn[:2, :2].T
+    return world

@@ -1,0 +1,105 @@
+"""A drive as an animation: range image and bird's-eye view of one keyframe after another."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.types import CHANNELS
+from fcos_lidar_jax.visualization.bev import bev_on, class_legend
+from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
+
+_SIZE_IN = (8.0, 9.6)
+_DPI = 90
+_COLORS = 96  # Of the GIF; more make it larger and hardly better.
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A keyframe to draw, in its sensor's frame."""
+
+    points: np.ndarray  # f32[n, >= 3]
+    detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f32[d, 9], labels, scores
+    truth: tuple[np.ndarray, np.ndarray]  # boxes f32[m, 9], labels
+
+
+def draw_drive(
+    path: str | Path,
+    scenes: Sequence[Scene],
+    *,
+    sensor: Sensor,
+    classes: Sequence[str],
+    title: str,
+    limit_m: float,
+    seconds_a_scene: float = 0.5,
+    report: Callable[[int], object] = lambda done: None,
+) -> list[Path]:
+    """Draw an animated GIF, and every scene as a PNG beside it.
+
+    Above the range image from behind over the left, ahead in the middle, and the right to behind; below it the
+    view from above with detections, and the truth dashed.
+
+    Args:
+        path: of the GIF; the PNG files are named ``NAME_00.png`` and so on.
+        scenes: in their order.
+        sensor: of the range image.
+        classes: names that the labels index.
+        title: of all pictures.
+        limit_m: half the side of the square that is shown from above.
+        seconds_a_scene: how long each stays.
+        report: called with the number of scenes that are drawn.
+
+    Returns:
+        the PNG files.
+    """
+    from PIL import Image
+
+    path = Path(path)
+    files = [path.with_name(f"{path.stem}_{number:02d}.png") for number in range(len(scenes))]
+    labels = {int(k) for scene in scenes for k in (*scene.detections[1], *scene.truth[1])}
+    most = max(len(scene.points) for scene in scenes)  # of one size, so that the projection is compiled once
+    pictures = []
+    for number, (scene, file) in enumerate(zip(scenes, files, strict=True)):
+        figure = new_figure(*_SIZE_IN)
+        strip, view = figure.subplots(2, 1, height_ratios=(1, 7.4))
+        _draw_ranges(strip, scene.points, most, sensor)
+        bev_on(view, scene.points, limit_m=limit_m, detections=scene.detections, truth=scene.truth, scores=False)
+        class_legend(figure, sorted(labels), classes, detections=True, truth=True)
+        strip.set_title(f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
+        save_png(figure, file, dpi=_DPI)
+        with Image.open(file) as picture:
+            pictures.append(picture.convert("RGB").quantize(_COLORS))
+        report(number + 1)
+    options: Any = {"save_all": True, "append_images": pictures[1:], "loop": 0, "duration": 1e3 * seconds_a_scene}
+    atomic_write(path, lambda out: pictures[0].save(out, "GIF", **options))
+    return files
+
+
+def _draw_ranges(axis: Any, points: np.ndarray, size: int, sensor: Sensor) -> None:
+    """The first round of the range image, the direction of travel in the middle."""
+    import matplotlib as mpl
+    from matplotlib.colors import LogNorm
+
+    padded = np.pad(points, ((0, size - len(points)), (0, 0)))
+    image = np.asarray(project_points(padded, np.arange(size) < len(points), sensor, num_rounds=1).features)[
+        ..., 0
+    ]
+    range_m, exists = (image[..., CHANNELS.index(name)] for name in ("range", "existence"))
+    # Columns run clockwise from azimuth 180 degrees; ahead, +y, is at 90.
+    shown = np.roll(np.ma.masked_where(exists == 0, range_m), sensor.num_columns // 4, axis=1)
+    axis.imshow(
+        shown,
+        cmap=mpl.colormaps["viridis_r"].with_extremes(bad=EMPTY),
+        norm=LogNorm(2, sensor.limit_xy_m),
+        aspect="auto",
+        interpolation="nearest",
+        extent=(-180, 180, sensor.num_rows, 0),
+    )
+    axis.set_xticks((-180, -90, 0, 90, 180), ("behind", "left", "ahead", "right", "behind"), fontsize=9)
+    axis.set_yticks(())
+    axis.set_ylabel(f"{sensor.num_rows} beams", fontsize=9)

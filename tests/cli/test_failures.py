@@ -1,0 +1,168 @@
+"""Every failure of a command ends in one line and an exit code: expected ones, defects, signals, closed pipes."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from commands import assert_one_line_error, child_environment, run_python
+
+from fcos_lidar_jax.cli import exit_code
+
+
+def fail_with(error):
+    def work():
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (ValueError("a.npy: two\n  lines"), "a.npy: two lines"),
+        (FileNotFoundError(2, "No such file", "a"), "[Errno 2] No such file: 'a'"),
+        (OverflowError(), "OverflowError without a message"),
+        (RecursionError("maximum recursion depth"), "nested too deeply: expected a file or an option with fewer"),
+        (MemoryError(), "out of memory: in training --optimizer.accumulate"),
+        (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: in training --optimizer.accumulate"),
+        (RuntimeError("Unable to initialize backend 'x': no"), "expected a platform of this machine: Unable to"),
+        (ValueError("x" * 120_000), "x" * 900),
+    ],
+)
+def test_an_expected_failure_is_one_line(capsys, error, told):
+    assert exit_code("program", fail_with(error)) == 1
+    shown = capsys.readouterr()
+    assert shown.err.startswith("program: error: ")
+    assert told in shown.err
+    assert (shown.err.count("\n"), shown.out) == (1, "")
+    assert len(shown.err) < 1100
+
+
+def test_a_defect_is_one_line_that_names_its_report(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert exit_code("program", fail_with(KeyError("lost"))) == 1
+    (report,) = tmp_path.iterdir()
+    line = (
+        f"program: error: unexpected KeyError: a defect: the full report is {report}, please attach it to an issue"
+    )
+    assert capsys.readouterr().err == f"{line} of the project: 'lost'\n"
+    text = report.read_text()
+    assert "Traceback (most recent call last)" in text
+    assert "arguments: [" in text
+    assert f"jax {__import__('jax').__version__}" in text
+
+
+def test_an_unknown_platform_is_one_line(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((9, 4)))
+    words = ["project", tmp_path / "a.npy", "--out", tmp_path / "a.npz"]
+    done = run_python("-m", "fcos_lidar_jax", *words, JAX_PLATFORMS="abacus")
+    assert done.returncode == 1
+    assert done.stderr.startswith(
+        "fcos-lidar: error: JAX_PLATFORMS: got 'abacus', expected a platform of this mach"
+    )
+    assert done.stderr.count("\n") == 1
+
+
+def test_absurd_numbers_and_deep_files_are_one_line(tmp_path, capsys):
+    np.save(tmp_path / "a.npy", np.ones((9, 4)))
+    project = ["project", str(tmp_path / "a.npy"), "--out", str(tmp_path / "a.npz")]
+    assert_one_line_error(capsys, [*project, "--rounds", "100000"], "--rounds: got 100000, expected at most 100")
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    deep = str(tmp_path / "deep.json")
+    assert_one_line_error(capsys, [*project, "--sensor", deep], "deep.json: not JSON")
+    data = ["evaluate", "--checkpoint", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out")]
+    assert_one_line_error(capsys, [*data, "--class-map", deep], "deep.json: not JSON")
+
+
+INTERRUPTED = """
+import os, signal, sys
+class Interrupt:
+    def find_spec(self, name, path, target=None):
+        if name == "numpy":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+from fcos_lidar_jax.cli import main
+sys.exit(main(["--help"]))
+"""
+
+
+def test_an_interruption_of_the_imports_is_one_line():
+    done = run_python("-c", INTERRUPTED)
+    assert (done.returncode, done.stderr) == (130, "fcos-lidar: interrupted\n")
+
+
+TERMINATED = """
+import os, signal, sys, time
+from pathlib import Path
+from fcos_lidar_jax.cli import exit_code
+from fcos_lidar_jax.files import atomic_write
+def write(path):
+    path.write_text("half")
+    os.kill(os.getpid(), int(sys.argv[2]))
+    time.sleep(60)
+sys.exit(exit_code("program", lambda: atomic_write(Path(sys.argv[1]), write)))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_temporary_file(tmp_path, number):
+    done = run_python("-c", TERMINATED, tmp_path / "a.json", int(number))
+    assert (done.returncode, done.stderr) == (128 + number, "")
+    assert list(tmp_path.iterdir()) == []
+
+
+IN_A_CALLBACK = """
+import os, signal, sys, time, weakref
+from pathlib import Path
+from fcos_lidar_jax.cli import exit_code
+from fcos_lidar_jax.files import atomic_write
+class Object:
+    pass
+def signal_in_a_callback():
+    thing = Object()
+    weakref.finalize(thing, lambda: None)
+    watch = weakref.ref(thing, lambda _: os.kill(os.getpid(), int(sys.argv[2])))
+    del thing
+def work():
+    def write(path):
+        path.write_text("half")
+        signal_in_a_callback()
+        time.sleep(float(sys.argv[3]))
+    atomic_write(Path(sys.argv[1]), write)
+sys.exit(exit_code("program", work))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("rest_s", [60, 0])
+def test_a_signal_in_a_weak_reference_s_callback_is_not_lost(tmp_path, number, rest_s):
+    """Python drops what the callback raises: the work that follows is stopped, and what is done is whole."""
+    (tmp_path / "a.json").write_text("before")
+    done = run_python("-c", IN_A_CALLBACK, tmp_path / "a.json", int(number), rest_s)
+    told = "program: interrupted\n" if number == signal.SIGINT else ""
+    assert (done.returncode, done.stderr) == (128 + number, told)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+    assert (tmp_path / "a.json").read_text() == ("before" if rest_s else "half")
+
+
+def test_a_library_that_takes_a_signal_for_a_failure_does_not_hide_it():
+    def work():
+        try:
+            raise KeyboardInterrupt
+        except BaseException as error:
+            raise ValueError("cannot be read") from error
+
+    assert exit_code("program", work) == 130
+
+
+def test_nobody_reads_the_help_any_more():
+    read, write = os.pipe()
+    os.close(read)
+    words = [sys.executable, "-m", "fcos_lidar_jax", "--help"]
+    streams = {"stdout": write, "stderr": subprocess.PIPE, "text": True}
+    done = subprocess.run(words, env=child_environment(), check=False, **streams)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")

@@ -1,0 +1,70 @@
+"""Drives: poses of lines, and the scenes of nuScenes."""
+
+import numpy as np
+import pytest
+from made_nuscenes import BETWEEN, KEYFRAMES, VERSION, make_tables, write
+from refusal import refused
+from scipy.spatial.transform import Rotation
+
+from fcos_lidar_jax.data.drives import folder_drive, read_tum
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.data.sweeps import fuse_sweeps
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
+
+CLOUD = np.array([[5, 0, 0, 1, 0]], np.float32)
+
+
+@pytest.fixture
+def poses(tmp_path):
+    """Poses at 0 and 0.4 s: two metres on, and a quarter of a turn."""
+    half = float(np.sqrt(0.5))
+    (tmp_path / "poses.txt").write_text(f"0 1 0 0 0 0 0 1\n\n0.4 3 0 0 0 0 {half} {half}\n")
+    (tmp_path / "clouds").mkdir()
+    return tmp_path
+
+
+def test_poses_are_interpolated_where_names_are_times(poses):
+    for name in ("0.0", "0.1", "0.4"):
+        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
+    drive = folder_drive(poses / "clouds", TINY, poses / "poses.txt")
+    for sweep, share in zip(drive.sweeps, (0, 0.25, 1), strict=True):
+        assert sweep.time_us == 400_000 * share
+        expected = Rotation.from_euler("z", 90 * share, degrees=True).as_matrix()
+        np.testing.assert_allclose(sweep.sensor_to_world[:3, :3], expected, atol=1e-12)
+        np.testing.assert_allclose(sweep.sensor_to_world[:3, 3], (1 + 2 * share, 0, 0), atol=1e-12)
+
+
+def test_other_names_have_a_line_each(poses):
+    for name in ("b", "a"):
+        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
+    sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
+    assert [(sweep.name[-5:], sweep.time_us) for sweep in sweeps] == [("a.npy", 0), ("b.npy", 400_000)]
+    assert sweeps[1].sensor_to_world[0, 3] == 3
+    np.save(poses / "clouds" / "c.npy", CLOUD)
+    with refused("poses.txt: got 2 poses for 3 clouds, expected one a cloud"):
+        folder_drive(poses / "clouds", TINY, poses / "poses.txt")
+
+
+@pytest.mark.parametrize(
+    "line", ["x 0 0 0 0 0 0 1", "1 0 0 0 0 0 1", "1 0 0 nan 0 0 0 1", "nan 0 0 0 0 0 0 1", "1e999 0 0 0 0 0 0 1"]
+)
+def test_lines_that_are_no_pose_are_refused(tmp_path, line):
+    (tmp_path / "poses.txt").write_text(f"# t\n0 0 0 0 0 0 0 1\n{line}\n")
+    with refused("poses.txt: line 3: "):
+        read_tum(tmp_path / "poses.txt")
+
+
+def test_a_scene_is_all_its_sweeps_or_its_keyframes(tmp_path):
+    data = NuScenes(write(tmp_path, *make_tables()), VERSION)
+    sweeps, keyframes = list(data.drive("scene-1")), list(data.drive("scene-1", keyframes=True))
+    assert len(sweeps) == KEYFRAMES * BETWEEN
+    assert len(keyframes) == KEYFRAMES
+    assert np.diff([sweep.time_us for sweep in sweeps]).min() > 0
+    how = {"remove_close": "all", "close_m": 1.0}
+    for number, token in enumerate(data.split("scene-1")):
+        assert keyframes[number].name == sweeps[number * BETWEEN].name
+        window = sweeps[max(0, number * BETWEEN - 2) : number * BETWEEN + 1][::-1]
+        fused, _ = fuse_sweeps(window, NUSCENES_HDL32E, **how)
+        np.testing.assert_array_equal(fused, data.sweeps(token, 3))
+    with refused("scene: got 'scene-7', expected"):
+        data.drive("scene-7")

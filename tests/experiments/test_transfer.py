@@ -1,0 +1,165 @@
+"""Figures of shipped weights: by distance, as float16, and in their model card."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+from tiny_run import TINY_CONFIG, untrained
+
+from experiments.real_frames import SPANS_M, scores_by_range, within
+from experiments.studies import model_card, shipped_weights
+from experiments.studies.shipped_weights import earlier_trainings, half_precision
+from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.training.checkpoint import CheckpointError
+from fcos_lidar_jax.types import Detections
+
+CONFIG = dataclasses.replace(TINY_CONFIG, sensor="tiny")
+
+
+def random_frames(seed: int, number: int = 6):
+    """Frames with detections a little off their boxes, some at whole distances, some without a point."""
+    rng = np.random.default_rng(seed)
+    frames, found = [], []
+    for _ in range(number):
+        boxes = np.pad(rng.uniform(1, 4, (30, 6)), ((0, 0), (0, 3))).astype(np.float32)
+        distance, angle = rng.uniform(0, 45, 30), rng.uniform(-math.pi, math.pi, 30)
+        boxes[:, :2] = np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1)
+        boxes[:3, :2] = [[20, 0], [0, -40], [12, 16]]
+        labels, counts = rng.integers(0, 10, 30), rng.integers(0, 3, 30)
+        frames.append(Frame(np.zeros((0, 5), np.float32), boxes, labels, counts))
+        moved = boxes + np.pad(rng.normal(0, 0.7, (30, 2)), ((0, 0), (0, 7))).astype(np.float32)
+        scores = rng.uniform(0.05, 1, 30).astype(np.float32)
+        found.append(Detections(moved, scores, labels, rng.random(30) < 0.8, np.zeros((), np.int32)))
+    return found, frames
+
+
+@pytest.mark.parametrize(("near", "far"), SPANS_M)
+def test_a_span_holds_the_boxes_of_its_distances(near, far):
+    found, frames = random_frames(0)
+    chosen, rest = within(found, frames, near, far)
+    for before, after, d, e in zip(frames, rest, found, chosen, strict=True):
+        distances = [math.sqrt(float(x) ** 2 + float(y) ** 2) for x, y in before.boxes[:, :2]]
+        kept = [i for i, distance in enumerate(distances) if near <= distance < far]
+        np.testing.assert_array_equal(after.boxes, before.boxes[kept])
+        np.testing.assert_array_equal(after.labels, before.labels[kept])
+        np.testing.assert_array_equal(after.num_points, before.num_points[kept])
+        for i, box in enumerate(d.boxes):
+            inside = near <= math.sqrt(float(box[0]) ** 2 + float(box[1]) ** 2) < far
+            assert e.valid[i] == (d.valid[i] and inside)
+
+
+def average_precision(pairs, num_truths):
+    """nuScenes' average precision of one distance by its definition; pairs of (score, hit)."""
+    hits, points = 0, []
+    for rank, (_, hit) in enumerate(sorted(pairs, key=lambda p: -p[0]), 1):
+        hits += hit
+        points.append((hits / num_truths, hits / rank))
+    recalls, precisions = zip(*points, strict=True)
+    curve = np.interp(np.linspace(0, 1, 101), recalls, precisions, right=0)[11:]
+    return float(np.mean(np.maximum(curve - 0.1, 0)) / 0.9)
+
+
+def test_scores_of_a_span_are_those_of_its_boxes_alone():
+    found, frames = random_frames(1)
+    near, far = SPANS_M[1]
+    record = scores_by_range(found, frames, repeats=20)[f"{near}-{far} m"]
+
+    def there(box):
+        return near <= math.hypot(float(box[0]), float(box[1])) < far
+
+    truths = [
+        [b for b, label, n in zip(f.boxes, f.labels, f.num_points, strict=True) if label == 0 and n and there(b)]
+        for f in frames
+    ]
+    rows = [
+        (float(s), i, b)
+        for i, d in enumerate(found)
+        for b, s, label, v in zip(d.boxes, d.scores, d.labels, d.valid, strict=True)
+        if v and label == 0 and there(b)
+    ]
+    aps = []
+    for limit in (0.5, 1, 2, 4):
+        free, pairs = [list(t) for t in truths], []
+        for score, i, box in sorted(rows, key=lambda r: -r[0]):
+            gaps = [math.hypot(*(np.float64(box[:2]) - np.float64(t[:2]))) for t in free[i]]
+            hit = bool(gaps) and min(gaps) < limit
+            if hit:
+                free[i].pop(int(np.argmin(gaps)))
+            pairs.append((score, hit))
+        aps.append(average_precision(pairs, sum(map(len, truths))))
+    assert record["truths"]["car"] == sum(map(len, truths))
+    assert record["AP"]["car"] == pytest.approx(np.mean(aps), abs=1e-4)
+    assert record["interval"][0] <= record["mAP"] <= record["interval"][1]
+
+
+@pytest.fixture
+def shipped(tmp_path, monkeypatch):
+    """A run of three steps whose weights are exported into a package elsewhere; returns the package's folder."""
+    run, package = tmp_path / "run", tmp_path / "weights"
+    (run / "checkpoints").mkdir(parents=True)
+    package.mkdir()
+    for module in (shipped_weights, model_card):
+        monkeypatch.setattr(module, "SHIPPED", package)
+    weights = jax.tree.map(lambda leaf: leaf + np.float32(1e-4), untrained(CONFIG, TINY))
+    save_checkpoint(run / "checkpoints" / "00000003", Checkpoint(CONFIG, TINY, weights, 3))
+    (run / "run.json").write_text(json.dumps({"seed": 4, "weights": None, "steps": 9}))
+    lines = ({"step": s, "loss/total": 1.0, "seconds": 2.0} for s in (1, 2, 3))
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    args = shipped_weights.Args(name="hdl32e", work=run, export=True, test_frames=2)
+    return package, shipped_weights.measure(args)
+
+
+def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
+    package, record = shipped
+    exported, run = (load_checkpoint(p) for p in (package / "hdl32e", tmp_path / "run/checkpoints/00000003"))
+    for a, b in zip(*(jax.tree.leaves(c.variables) for c in (exported, run)), strict=True):
+        assert a.dtype == np.float32
+        np.testing.assert_array_equal(a, np.asarray(b).astype(np.float16).astype(np.float32))
+    training = record["training"]
+    assert (training["steps"], training["steps_planned"], training["frames_seen"]) == (3, 9, 6)
+    assert training["seconds_of_steps"] == 6
+
+
+def test_a_warm_start_remembers_the_trainings_before_it(tmp_path):
+    legs = [{"begun_with": b, "seed": s, "steps": 5} for b, s in (("random weights", 1), ("w", 2), ("w", 3))]
+    assert earlier_trainings("w", legs[1], tmp_path) == []
+    (tmp_path / "w.json").write_text(json.dumps({"earlier": legs[:1], "training": legs[1]}))
+    assert earlier_trainings("w", legs[2], tmp_path) == legs[:2]
+    assert earlier_trainings("w", {**legs[1], "steps": 6}, tmp_path) == legs[:1]  # the same run, exported again
+    assert earlier_trainings("w", legs[0], tmp_path) == []
+
+
+def test_weights_beyond_float16_are_not_exported(tmp_path):
+    large = jax.tree.map(lambda leaf: leaf + np.float32(1e5), untrained(CONFIG, TINY))
+    with np.errstate(over="ignore"), pytest.raises(ArithmeticError, match="not finite"):
+        save_checkpoint(tmp_path / "c", half_precision(Checkpoint(CONFIG, TINY, large, 1)))
+
+
+def test_a_card_has_the_figures_of_its_own_weights_alone(shipped, tmp_path):
+    package, record = shipped
+    card = package / "hdl32e" / "README.md"
+    assert "Not measured yet" in card.read_text()
+    assert f"mAP {record['mAP']:.3f}" in card.read_text()
+    written = json.loads((package / "hdl32e" / "checkpoint.json").read_text())["hash"]
+    found, frames = random_frames(2)
+    part = {"keyframes": 6, **scores_by_range(found, frames, repeats=20)}
+    (tmp_path / "hdl32e.json").write_text(json.dumps(record))
+    for own in (True, False):
+        transfer = {"checkpoint": {"hash": written if own else "other"}, "scene-0523, odd": part}
+        (tmp_path / "transfer.json").write_text(json.dumps(transfer))
+        text = model_card.write_card("hdl32e", tmp_path).read_text()
+        car = part["all"]["AP"]["car"], part["all"]["truths"]["car"]
+        assert (f"| car | {car[0]:.3f} ({car[1]}) |" in text) is own
+    load_checkpoint(package / "hdl32e")  # the card is no part of the checkpoint
+
+
+def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
+    package, _ = shipped
+    (package / "hdl32e" / "notes.md").write_text("more")
+    with pytest.raises(CheckpointError, match=r"notes\.md: found a file that is not of the checkpoint"):
+        load_checkpoint(package / "hdl32e")

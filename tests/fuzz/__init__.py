@@ -1,0 +1,1 @@
+"""Seeded fuzzing of everything that reads a file: ``python -m tests.fuzz``."""

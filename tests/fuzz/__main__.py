@@ -1,0 +1,92 @@
+"""Do all readers of files refuse what is wrong in one line, and return sound data else?
+
+    python -m tests.fuzz --inputs 1000000
+
+Files of every kind that is read are mutated by their structure, by a seed, and read in processes of a thousand
+inputs each, with Python's debugging allocator, a limit on memory and one on time. Expected of each input: sound
+data, or a ``ValueError`` of one line that names the file; no warning, no other exception, nothing that takes long,
+no process that ends. Ten minutes for a million on a core.
+"""
+
+import dataclasses
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path += [str(Path(__file__).parents[1] / "support")]
+
+from experiments.script import run_script, save
+
+from .engine import Limits, fuzz, summed
+from .targets import make_targets
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """How much, of what, and where to."""
+
+    inputs: int = 1_000_000
+    """Of all targets together."""
+    seed: int = 0
+    """Another seed gives other inputs."""
+    only: tuple[str, ...] = ()
+    """Names of targets; default: all."""
+    workers: int = os.cpu_count() or 1
+    """Processes at once."""
+    memory_mib: int = 2048
+    """Address space of a process beyond what it began with."""
+    seconds: float = 10.0
+    """The longest that an input may take."""
+    out: Path = Path("experiments/results/fuzz.json")
+    """Where the figures go."""
+
+
+def main(args: Args) -> None:
+    """Fuzz, print and write."""
+    targets = [target for target in make_targets() if not args.only or target.name in args.only]
+    if len(targets) < len(args.only):
+        raise ValueError(f"--only: got {args.only}, expected some of {', '.join(t.name for t in make_targets())}")
+    began = shown = time.monotonic()
+
+    def report(done: int) -> None:
+        nonlocal shown
+        now = time.monotonic()
+        if now - shown > 10:
+            shown = now
+            print(f"{done} inputs, {done / (now - began):.0f} a second", file=sys.stderr, flush=True)
+
+    limits = Limits(args.memory_mib, args.seconds)
+    counts, failures = fuzz(
+        targets, args.inputs, seed=args.seed, workers=args.workers, limits=limits, report=report
+    )
+    seconds, total = time.monotonic() - began, sum(count.inputs for count in counts.values())
+    causes = [(failure, number) for failure, number in summed(failures)]
+    record = {
+        **{"inputs": total, "seed": args.seed, "failures": len(failures), "seconds": round(seconds, 1)},
+        **{"limits": dataclasses.asdict(limits), "python_malloc": os.environ.get("PYTHONMALLOC")},
+        "targets": {name: _rounded(dataclasses.asdict(count)) for name, count in counts.items()},
+        "causes": [{**dataclasses.asdict(failure), "times": number} for failure, number in causes],
+    }
+    lines = [f"{'target':22} inputs accepted refused failed slowest ms peak MiB a second"]
+    for name, c in counts.items():
+        rate = c.inputs / max(c.cpu_s, 1e-9)
+        lines.append(
+            f"{name:22} {c.inputs:6} {c.accepted:8} {c.refused:7} {c.failed:6} {c.slowest_ms:10.0f} "
+            f"{c.peak_mib:8.0f} {rate:8.0f}"
+        )
+    lines += [f"{f.target} {f.number} {f.file}: {f.problem} ({times} times)" for f, times in causes]
+    save(record, args.out, "\n".join([*lines, f"{total} inputs in {seconds:.0f} s, {len(failures)} failures"]))
+    if failures:
+        raise ValueError(f"got {len(failures)} failures of {len(causes)} causes, expected none")
+
+
+def _rounded(record: dict[str, float]) -> dict[str, float]:
+    return {name: round(value, 1) if isinstance(value, float) else value for name, value in record.items()}
+
+
+if __name__ == "__main__":
+    if os.environ.get("PYTHONMALLOC") != "debug":  # which Python reads once
+        os.execve(sys.executable, sys.orig_argv, {**os.environ, "PYTHONMALLOC": "debug"})
+    run_script(main, Args, __doc__)

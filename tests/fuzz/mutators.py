@@ -1,0 +1,285 @@
+"""Files changed at random, by their structure: bytes, words, JSON values, headers of point files, columns."""
+
+import copy
+import io
+import json
+import re
+import struct
+import zipfile
+from collections.abc import Callable
+from random import Random
+from typing import Any
+
+INTEGERS = (-1, 0, 1, 2, 3, 5, 127, 255, 65_536, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**62, 2**63, 2**64, 10**30)
+WORDS = (
+    *(str(number).encode() for number in INTEGERS),
+    *(b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e999", b"1e-320", b"0.5", b"-0", b"0x10", b"1_0", b"+3"),
+    *(
+        b"",
+        b"a",
+        b"\0",
+        b"\xff\xfe",
+        b"\xd9\xa3",
+        b"a" * 300,
+        b"9" * 5000,
+        b"%s",
+        b"$a$",
+        b"../..",
+        b"/",
+        b"#",
+        b"\r",
+    ),
+)
+VALUES = (
+    *(None, True, False, *INTEGERS, 10**400, 0.5, -1.5, -0.0, 1e308, -1e308, 1e-320),
+    *(float("nan"), float("inf"), float("-inf")),
+    *("", "a", "\0", "\ud800", "é" * 300, "a" * 5000, "../x", "/", "$a$", "0", "car", "nan"),
+    *([], {}, [[]], [0], [None], {"": None}, {"a": 1}, [[[[[[[[]]]]]]]]),
+)
+DEEP = (b"[" * 100_000, b'{"a":' * 100_000, b"[" * 5000 + b"]" * 5000)
+NUMBER = struct.Struct("<Q")
+LARGEST = 1 << 16  # bytes of a file, beyond which it is not made larger
+
+
+def mutate(name: str, content: bytes, rng: Random) -> bytes:
+    """The content of a file of this name, changed in at least one place."""
+    ending = name.rpartition(".")[2]
+    if rng.random() < 0.2:
+        return mutate_bytes(content, rng)
+    return _BY_ENDING.get(ending, mutate_bytes)(content, rng)
+
+
+def mutate_bytes(content: bytes, rng: Random) -> bytes:
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
+        place, end = sorted((rng.randrange(len(data) + 1), rng.randrange(len(data) + 1)))
+        end = min(end, place + rng.choice((1, 2, 4, 8, 64, 1 << 20)))
+        match rng.randrange(8):
+            case 0 | 1 if place < len(data):
+                data[place] ^= 1 << rng.randrange(8)
+            case 2 if place < len(data):
+                data[place] = rng.choice((0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)))
+            case 3:
+                number = NUMBER.pack(rng.choice(INTEGERS) % 2**64)
+                width = rng.choice((1, 2, 4, 8))
+                data[place : place + width] = number[:width]
+            case 4:
+                del data[place:end]
+            case 5 if len(data) < LARGEST:
+                data[place:place] = rng.choice((bytes(data[place:end]), rng.randbytes(rng.choice((1, 4, 40)))))
+            case 6:
+                del data[place:]
+            case 7 if len(data) < LARGEST:
+                data += rng.choice((bytes(4), bytes(400), rng.randbytes(7)))
+    return bytes(data)
+
+
+_WORD = re.compile(rb"[\w.+-]+")
+
+
+def mutate_words(content: bytes, rng: Random) -> bytes:
+    """Words replaced, removed and repeated; lines likewise."""
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        if rng.random() < 0.7:
+            words = [match.span() for match in _WORD.finditer(content)] or [(0, 0)]
+            start, end = rng.choice(words)
+            content = content[:start] + rng.choice((*WORDS, content[start:end] * 2)) + content[end:]
+        else:
+            lines = content.split(b"\n")
+            i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
+            match rng.randrange(4):
+                case 0:
+                    del lines[i]
+                case 1:
+                    lines[i], lines[j] = lines[j], lines[i]
+                case 2 if len(content) < LARGEST:
+                    lines.insert(i, lines[j])
+                case 3:
+                    lines[i] = b""
+            content = b"\n".join(lines)
+    return content
+
+
+def mutate_json(content: bytes, rng: Random) -> bytes:
+    kind = rng.random()
+    if kind < 0.1:
+        return mutate_words(content, rng)
+    if kind < 0.105:
+        return rng.choice(DEEP)
+    root = {"": json.loads(content)}
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        mutate_value(root, rng)
+    text = json.dumps(root.get(""))
+    if kind < 0.15:  # a key that occurs twice, or a value that is too deep
+        text = text.replace(",", rng.choice((',"a":0,"a":1,', "," + DEEP[2].decode() + ",")), 1)
+    return text.encode()
+
+
+def mutate_value(root: dict[str, Any], rng: Random) -> None:
+    """Change a value somewhere below the only one of ``root``."""
+    parent: Any = root
+    key: Any = ""
+    while parent and isinstance(value := parent[key], dict | list) and value and rng.random() < 0.9:
+        parent, key = value, rng.choice(list(value)) if isinstance(value, dict) else rng.randrange(len(value))
+    if not parent or (isinstance(parent, dict) and key not in parent):
+        return
+    value = parent[key]
+    match rng.randrange(8):
+        case 0 if parent is not root:
+            del parent[key]
+        case 1 if parent is not root and isinstance(parent, list) and len(parent) < 2000:
+            parent.insert(key, value)
+        case 1 if parent is not root and isinstance(parent, dict):
+            parent[rng.choice(("", "a", "token", "x" * 300, key + " "))] = parent.pop(key)
+        case 2 if isinstance(parent, list):
+            other = rng.randrange(len(parent))
+            parent[key], parent[other] = parent[other], value
+        case 2 if isinstance(parent, dict):
+            parent[key] = parent[rng.choice(list(parent))]
+        case 3 if isinstance(value, int | float):
+            half = value // 2 if isinstance(value, int) else value / 2
+            parent[key] = rng.choice((-value, value * 1_000_003, value + 1, half, str(value)[:99]))
+        case 4:
+            parent[key] = [value]
+        case _:
+            parent[key] = copy.deepcopy(rng.choice(VALUES))
+
+
+def mutate_lines(content: bytes, rng: Random) -> bytes:
+    """A line of JSON, or the order of the lines."""
+    lines = content.splitlines()
+    if rng.random() < 0.3:
+        return mutate_words(content, rng)
+    i = rng.randrange(len(lines))
+    try:
+        lines[i] = mutate_json(lines[i], rng)
+    except ValueError:
+        lines[i] = mutate_bytes(lines[i], rng)
+    return b"\n".join(lines) + b"\n"
+
+
+_DTYPES = (
+    "<f4",
+    "<f8",
+    "<f2",
+    ">f4",
+    "<i8",
+    "<u1",
+    "|b1",
+    "|O",
+    "<c8",
+    "<U3",
+    "|V4",
+    "<M8[s]",
+    "f4,(2,3)i4",
+    "<f16",
+)
+_SHAPES = ("()", "(0,)", "(-1, 5)", "(3,)", "(0, 5)", "(5, 0)", "(2, 5)", "(4611686018427387904, 4)", "(1, 1, 10)")
+
+
+def mutate_npy(content: bytes, rng: Random) -> bytes:
+    """The text of the header, with the length that fits it or another, and the values."""
+    size = int.from_bytes(content[8:10], "little")
+    magic, header, values = content[:8], content[10 : 10 + size], content[10 + size :]
+    match rng.randrange(5):
+        case 0:
+            header = mutate_words(header, rng)
+        case 1:
+            header = re.sub(rb"'descr': [^,]*", f"'descr': {rng.choice(_DTYPES)!r}".encode(), header)
+        case 2:
+            header = re.sub(rb"\([^)]*\)", rng.choice(_SHAPES).encode(), header)
+        case 3:
+            header = header.replace(b"False", rng.choice((b"True", b"None", b"0", b"[]")))
+        case 4:
+            values = mutate_bytes(values, rng)
+    if rng.random() < 0.2:
+        values = values[: rng.randrange(len(values) + 1)] + values * rng.randrange(3)
+    length = rng.choice((len(header),) * 6 + (0, 1, 65_535))
+    return magic + length.to_bytes(2, "little") + header + values
+
+
+def mutate_npz(content: bytes, rng: Random) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = rng.choice(list(members))
+    match rng.randrange(6):
+        case 0:
+            members[rng.choice(("points.npy", "points", "a.npy", "../a.npy", " ", "a" * 300))] = members.pop(name)
+        case 1:
+            members["more.npy"] = members[name]
+        case 2:
+            members.pop(name)
+        case _:
+            members[name] = mutate_npy(members[name], rng)
+    file = io.BytesIO()
+    compression = rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2))
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    made = bytearray(file.getvalue())
+    if rng.random() < 0.2:  # the sizes in the directory
+        place = made.rfind(b"PK\1\2") + rng.choice((8, 10, 16, 20, 24, 28, 42))
+        made[place : place + 4] = NUMBER.pack(rng.choice(INTEGERS) % 2**64)[:4]
+    return bytes(made)
+
+
+def mutate_pcd(content: bytes, rng: Random) -> bytes:
+    cut = content.find(b"\n", content.find(b"DATA")) + 1
+    header, body = content[:cut], content[cut:]
+    match rng.randrange(4):
+        case 0:
+            body = mutate_bytes(body, rng)
+        case 1:  # points that are as many as the header says
+            line = rng.choice((b"SIZE", b"TYPE", b"COUNT", b"FIELDS", b"POINTS", b"WIDTH", b"HEIGHT"))
+            words = rng.choice(
+                (b"1 2 4 8", b"F F F F", b"I U F F", b"x y z t", b"x x y z", b"1 1 1 1000000", *WORDS)
+            )
+            header = re.sub(line + rb" .*", lambda _: line + b" " + words, header)
+        case _:
+            header = mutate_words(header, rng)
+    if rng.random() < 0.2:  # the packed and the plain size
+        body = NUMBER.pack(rng.choice(INTEGERS) % 2**64)[:4] + body[4:]
+    return header + body
+
+
+def mutate_feather(content: bytes, rng: Random) -> bytes:
+    import pyarrow as pa
+
+    table = pa.ipc.open_file(content).read_all()
+    i = rng.randrange(table.num_columns)
+    name, column = table.column_names[i], table.column(i)
+    rows = len(column)
+    match rng.randrange(5):
+        case 0:
+            table = table.remove_column(i)
+        case 1:
+            table = table.append_column(rng.choice((name, "a")), column)
+        case 2:
+            others = [
+                [value] * rows for value in (None, True, "a", b"a", 0.5, [1], {"a": 1}, 2**63 - 1, float("nan"))
+            ]
+            table = table.set_column(i, name, pa.array(rng.choice((*others, [None, *column.to_pylist()[1:]]))))
+        case 3:
+            values = column.to_pylist()
+            values[rng.randrange(rows)] = rng.choice((None, type(values[0])(), values[-1], values[0] * 2))
+            table = table.set_column(i, name, pa.array(values))
+        case 4:
+            table = table.slice(rng.randrange(rows), rng.choice((0, 1, rows)))
+    sink = pa.BufferOutputStream()
+    compression = rng.choice((None, None, "lz4", "zstd"))
+    with pa.ipc.new_file(sink, table.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
+        writer.write_table(table)
+    made = sink.getvalue().to_pybytes()
+    return mutate_bytes(made, rng) if rng.random() < 0.3 else made
+
+
+_BY_ENDING: dict[str, Callable[[bytes, Random], bytes]] = {
+    "json": mutate_json,
+    "jsonl": mutate_lines,
+    "resume_log": mutate_lines,
+    "txt": mutate_words,
+    "npy": mutate_npy,
+    "npz": mutate_npz,
+    "pcd": mutate_pcd,
+    "feather": mutate_feather,
+}

@@ -1,0 +1,505 @@
+"""What is fuzzed: sound files, and the reader of each with what its result must be."""
+
+import contextlib
+import dataclasses
+import functools
+import io
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from random import Random
+
+import numpy as np
+from made_argoverse2 import START_NS, STEP_NS, write_boxes, write_poses, write_sweep
+from made_kitti import calibration_text, label_text
+from made_nuscenes import VERSION, make_tables
+from made_nuscenes import write as write_nuscenes
+
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.cli.data import read_class_map
+from fcos_lidar_jax.config import config_from_json, config_to_json
+from fcos_lidar_jax.data import argoverse2
+from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
+from fcos_lidar_jax.data.cached import CachedFrames
+from fcos_lidar_jax.data.drives import read_tum
+from fcos_lidar_jax.data.folder import FolderFrames
+from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.data.keyframe import read_keyframe
+from fcos_lidar_jax.data.kitti import KittiFrames
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.sweeps import read_sweeps
+from fcos_lidar_jax.evaluation.boxes import BoxColumns
+from fcos_lidar_jax.evaluation.frames import read_detections
+from fcos_lidar_jax.evaluation.results import LIDAR_META, read_results
+from fcos_lidar_jax.evaluation.resume_log import ResumeLog
+from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
+from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.geometry import pose_matrix
+from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.input_pipeline.batching import check_boxes
+from fcos_lidar_jax.input_pipeline.database import open_database, prepare_database
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.sensors import (
+    ARGOVERSE2,
+    KITTI_HDL64E,
+    NUSCENES_HDL32E,
+    TINY,
+    Sensor,
+    load_sensor,
+    sensor_from_json,
+    sensor_to_json,
+)
+from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
+from fcos_lidar_jax.simulation.render import DatasetSpec
+from fcos_lidar_jax.trainer.run import check_run
+from fcos_lidar_jax.training.checkpoint import read_description
+from fcos_lidar_jax.training.metrics_log import read_metrics
+
+from .mutators import mutate, mutate_bytes
+
+CONFIG = dataclasses.replace(QUICKSTART, max_points=64)
+_RNG = np.random.default_rng(0)
+POINTS = np.column_stack([_RNG.uniform(-20, 20, (60, 2)), _RNG.uniform(-2, 1, 60), _RNG.uniform(0, 90, 60)])
+POSE = np.eye(4).tolist()
+SPEC = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=False, version="v")
+
+Files = Mapping[str, bytes]
+Read = Callable[[Path, str], None]
+"""Called with a folder and the name of the file in it that was changed. Raises InvalidError for a wrong result."""
+
+
+class InvalidError(Exception):
+    """What was read is not what the reader promises."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A kind of file."""
+
+    name: str
+    files: Files  # below a folder
+    read: Read
+    changed: tuple[str, ...] = ()  # those of the files that are mutated; none stands for all
+    mutate: Callable[[str, bytes, Random], bytes] = mutate
+    seal: Callable[[Path, str], None] | None = None  # makes checksums fit, for half of the inputs
+    share: float = 1.0  # of the inputs, relative to the others
+    alone: bool = False  # messages name the file itself, not only the folder
+
+    @property
+    def mutable(self) -> tuple[str, ...]:
+        return self.changed or tuple(self.files)
+
+
+def expect(condition: object, what: str) -> None:
+    if not condition:
+        raise InvalidError(what)
+
+
+def check_points(points: np.ndarray, sensor: Sensor) -> None:
+    shape = (len(points), sensor.point_columns)
+    expect(points.dtype == np.float32 and points.shape == shape and len(points), f"{points.dtype} {points.shape}")
+    cloud = make_cloud(points, CONFIG, sensor=sensor)
+    expect(np.isfinite(cloud.points[cloud.valid]).all(), "points that are not finite")
+    expect(cloud.valid.sum() + cloud.num_removed == len(points), "points that are not counted")
+
+
+def check_frame(frame: Frame, frames: FrameSet) -> None:
+    if len(frame.points):
+        check_points(frame.points, frames.sensor)
+    check_boxes(frame.boxes, "frame")
+    expect(frame.boxes.dtype == np.float32, "boxes that are not float32")
+    for column in (frame.labels, frame.num_points):
+        expect(column.shape == (len(frame.boxes),) and column.dtype == np.int32, "a column of another shape")
+    expect((frame.labels >= 0).all() and (frame.labels < len(frames.classes)).all(), "a label that is no class")
+    expect((frame.num_points >= 0).all(), "a negative number of points")
+
+
+def check_columns(boxes: BoxColumns) -> None:
+    for name in ("translation", "size", "yaw", "score"):
+        expect(np.isfinite(getattr(boxes, name)).all(), f"{name} that is not finite")
+    expect((boxes.size > 0).all(), "sizes that are not positive")
+    expect(not np.isinf(boxes.velocity).any(), "infinite velocities")
+    expect(((boxes.label >= 0) & (boxes.label < len(NUSCENES_CLASSES))).all(), "a label that is no class")
+
+
+def _cloud(sensor: Sensor, **options: dict) -> Read:
+    def read(folder: Path, name: str) -> None:
+        check_points(read_points(folder / name, sensor, **options.get(name.partition(".")[0], {})), sensor)
+
+    return read
+
+
+def _raw(dtype: str, *columns: np.ndarray) -> bytes:
+    return np.column_stack([POINTS[:, :3], *columns]).astype(dtype).tobytes()
+
+
+def _saved(save: Callable, *arrays: np.ndarray, **named: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    save(stream, *arrays, **named)
+    return stream.getvalue()
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value).encode()
+
+
+def _files(write: Callable[[Path], object]) -> dict[str, bytes]:
+    """What a function writes into a folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder))
+        found = sorted(file for file in Path(folder).rglob("*") if file.is_file())
+        return {file.relative_to(folder).as_posix(): file.read_bytes() for file in found}
+
+
+def _pcd_files() -> dict[str, bytes]:
+    rows = POINTS[:12].astype("<f4")
+
+    def header(form: str, fields: str = "x y z intensity") -> bytes:
+        words = fields.split()
+        lines = f"SIZE{' 4' * len(words)}\nTYPE{' F' * len(words)}\nCOUNT{' 1' * len(words)}\nWIDTH 12\nHEIGHT 1\n"
+        return f"# .PCD v0.7\nFIELDS {fields}\n{lines}POINTS 12\nDATA {form}\n".encode()
+
+    plain = rows.T.tobytes() + bytes(48)
+    packed = b"".join(bytes([31]) + plain[i : i + 32] for i in range(0, 192, 32)) + bytes([0, 0, 0xE0, 38, 0])
+    sizes = np.array([len(packed), len(plain)], "<u4").tobytes()
+    return {
+        "ascii.pcd": header("ascii") + "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode(),
+        "binary.pcd": header("binary") + rows.tobytes(),
+        "packed.pcd": header("binary_compressed", "x y z intensity time_lag") + sizes + packed,
+    }
+
+
+def _argoverse2_files(folder: Path) -> None:
+    times = (START_NS, START_NS + STEP_NS)
+    for time in times:
+        write_sweep(folder, time, np.column_stack([POINTS, np.arange(60) % 64]))
+    write_poses(folder, np.array(times), np.tile(np.eye(4), (2, 1, 1)))
+    box = {"box": [8, 1, 0, 4, 2, 2, 0.3], "category": "BUS", "count": 3}
+    write_boxes(folder, [{**box, "time_ns": time, "track": track} for time in times for track in "ab"])
+
+
+def _read_argoverse2(folder: Path, name: str) -> None:
+    argoverse2._cached_log.cache_clear()  # files change faster than their times
+    frames = Argoverse2Frames(folder, num_sweeps=2)
+    check_frame(frames.frame(len(frames) - 1), frames)
+
+
+def _kitti_files() -> dict[str, bytes]:
+    box = label_text([12, 1, -0.5, 4, 1.6, 1.5, 0.3]) + label_text([15, -4, -0.5, 4, 1.6, 1.5, -3], "Pedestrian")
+    return {
+        "training/velodyne/000000.bin": _raw("f4", POINTS[:, 3] / 100),
+        "training/label_2/000000.txt": (
+            box + "DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"
+        ).encode(),
+        "training/calib/000000.txt": calibration_text().encode(),
+        "ImageSets/train.txt": b"000000\n",
+    }
+
+
+def _read_kitti(folder: Path, name: str) -> None:
+    frames = KittiFrames(folder, "train")
+    check_frame(frames.frame(0), frames)
+
+
+def _folder_files() -> dict[str, bytes]:
+    box = {"label": "car", "box": [8, 1, -1, 4, 2, 1.5, 0.3, None, None]}
+    listed = [
+        {"file": f"../clouds/{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("b", 5))
+    ]
+    clouds = {f"clouds/{name}.npy": _saved(np.save, POINTS.astype("f4")) for name in "ab"}
+    return clouds | {
+        "boxes/a.json": _json({"boxes": [box, {**box, "label": "sign", "score": 0.5}]}),
+        "boxes/b.json": _json({"boxes": []}),
+        "sweeps/a.json": _json(listed),
+        "sensor.json": _json(sensor_to_json(TINY)),
+        "classes.json": _json({"car": "car", "sign": None, "lorry": "truck"}),
+        "splits.json": _json({"train": ["a"], "val": ["b"]}),
+    }
+
+
+def _read_folder(folder: Path, name: str) -> None:
+    frames = FolderFrames(folder, split="train", num_sweeps=2)
+    check_frame(frames.frame(0), frames)
+    frames.fingerprint()
+
+
+def _read_poses(folder: Path, name: str) -> None:
+    times_us, rotations, translations = read_tum(folder / name)
+    expect(bool((np.diff(times_us) > 0).all()), "times that do not increase")
+    expect(bool(np.isfinite(pose_matrix(rotations, translations)).all()), "a pose that is not finite")
+
+
+def _read_nuscenes(folder: Path, name: str) -> None:
+    data = NuScenes(folder, VERSION)
+    tokens = data.split("all")
+    check_points(data.sweeps(tokens[0], 2, remove_close="none"), NUSCENES_HDL32E)
+    boxes = data.boxes(tokens[0])
+    check_boxes(boxes.boxes, "frame")
+    truth = split_truth(data, tokens)
+    check_columns(truth.boxes)
+
+
+def _index_files(folder: Path) -> None:
+    tables, clouds = make_tables(1)
+    write_nuscenes(folder, tables, clouds)
+    save_index(NuScenes(folder, VERSION).index, folder / "index", tables=folder / VERSION)
+
+
+def _read_index(folder: Path, name: str) -> None:
+    column = name.removeprefix("index/").removesuffix(".npy")
+    index = open_index(folder / "index", tables=folder / VERSION)
+    if name.endswith(".npy"):
+        expect(checksum(getattr(index, column).tobytes()) == _column_checksums()[column], "another column")
+
+
+@functools.cache
+def _column_checksums() -> dict[str, str]:
+    with tempfile.TemporaryDirectory() as folder:
+        _index_files(Path(folder))
+        index = open_index(Path(folder, "index"), tables=Path(folder, VERSION))
+    return {name: checksum(column.tobytes()) for name, column in vars(index).items()}
+
+
+def _box(**more: object) -> dict[str, object]:
+    plain = {"translation": [1.0, 2, 3], "size": [2.0, 4, 1.5], "rotation": [1.0, 0, 0, 0], "velocity": [0.5, 0]}
+    return {**plain, "detection_name": "car", "attribute_name": "vehicle.moving", **more}
+
+
+def _read_results(folder: Path, name: str) -> None:
+    results = read_results(folder / name, ("a", "b"))
+    check_columns(results.boxes)
+
+
+def _read_truth(folder: Path, name: str) -> None:
+    truth = read_truth(folder / name)
+    check_columns(truth.boxes)
+    expect(np.isfinite(truth.ego_translation).all() and np.isfinite(truth.rack_axes).all(), "not finite")
+
+
+def _read_detections(folder: Path, name: str) -> None:
+    for found in read_detections(folder / name, ("a", "b"), ("car", "sign")):
+        boxes = np.asarray(found.boxes)
+        expect(np.isfinite(boxes[:, :7]).all() and not np.isinf(boxes).any(), "boxes that are not finite")
+        expect((boxes[:, 3:6] > 0).all(), "sizes that are not positive")
+        expect(np.isfinite(found.scores).all() and (found.scores >= 0).all(), "a score that is none")
+
+
+def _read_keyframe(folder: Path, name: str) -> None:
+    frame = read_keyframe(folder, NUSCENES_HDL32E)
+    check_boxes(frame.boxes, "frame")
+
+
+def _read_sweeps(folder: Path, name: str) -> None:
+    points, _ = read_sweeps(folder / name, TINY, remove_close="all", close_m=1.0)
+    if len(points):
+        check_points(points, TINY)
+
+
+def _read_sensor(folder: Path, name: str) -> None:
+    sensor = load_sensor(folder / name)
+    expect(sensor_from_json(json.loads(json.dumps(sensor_to_json(sensor)))) == sensor, "another sensor")
+    expect(len(sensor.row_edges_rad) == sensor.num_rows + 1 and sensor.point_columns in (5, 6), "no rows")
+
+
+def _read_class_map(folder: Path, name: str) -> None:
+    found = read_class_map(folder / name)
+    expect(isinstance(found, dict) and all(v is None or isinstance(v, str) for v in found.values()), "no map")
+
+
+RUN_SPEC = {"config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY), "steps": 4, "seed": 0, "data": "x"}
+RUN_SPEC["ground_truth_database"] = None
+
+
+def _read_run(folder: Path, name: str) -> None:
+    check_run(folder, RUN_SPEC, resume=True)
+    found = {"ground_truth_database": None} | json.loads((folder / name).read_bytes())  # added later, as is remat
+    found["config"]["model"].setdefault("remat", False)
+    expect(found == json.loads(json.dumps(RUN_SPEC)), "another run")
+
+
+def _read_metrics(folder: Path, name: str) -> None:
+    for line in read_metrics(folder):
+        expect(isinstance(line, dict) and isinstance(line.get("step"), int), "a line without a step")
+
+
+def _read_resume_log(folder: Path, name: str) -> None:
+    with ResumeLog(folder / name, "this detector") as log:
+        log.add("new", [])
+        expect(dict(log.entries(list(log.places)))["new"] == b"[]", "other entries")
+    with ResumeLog(folder / name, "this detector") as log:
+        expect("new" in log, "an entry that was lost")
+
+
+def _resume_log(folder: Path) -> None:
+    with ResumeLog(folder / "a.resume_log", "this detector") as log:
+        for token in "abc":
+            log.add(token, [_box()])
+
+
+def _read_description(folder: Path, name: str) -> None:
+    description = read_description(folder)
+    for part, from_json in (("config", config_from_json), ("sensor", sensor_from_json)):
+        from_json(description[part], f"{folder / name}: {part}")
+
+
+def _description() -> dict[str, object]:
+    description = {"format": 3, "step": 4, "files": {"a": "0"}, "data": "", "score": None}
+    return {**description, "config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY)}
+
+
+def _seal_description(folder: Path, name: str) -> None:
+    description = json.loads((folder / name).read_bytes())
+    if isinstance(description, dict):
+        description.pop("hash", None)
+        description["hash"] = checksum(json.dumps(description, sort_keys=True).encode())
+        (folder / name).write_text(json.dumps(description))
+
+
+@dataclasses.dataclass(frozen=True)
+class OneFrame(FrameSet):
+    """A single frame, made from numbers."""
+
+    points: int = 60
+    classes = ("car",)
+    sensor = TINY
+
+    def __len__(self) -> int:
+        return 1
+
+    def frame(self, index: int) -> Frame:
+        points = np.column_stack([POINTS, np.zeros(60)]).astype(np.float32)
+        boxes = np.array([[0, 0, 0, 30, 30, 9, 0, 0, 0], [5, 5, 0, 20, 20, 9, 1, 0, 0]], np.float32)
+        return Frame(points, boxes, np.zeros(2, np.int32), np.full(2, 9, np.int32))
+
+    def name(self, index: int) -> str:
+        return "a"
+
+    def fingerprint(self) -> str:
+        return "one"
+
+
+def _read_database(folder: Path, name: str) -> None:
+    database = open_database(folder)
+    for i in range(min(len(database), 9)):
+        points = database.points(i)
+        expect(points.shape == (database.table["count"][i], database.manifest.columns), "points of another shape")
+    labels = database.table["label"]
+    expect(((labels >= 0) & (labels < len(database.manifest.classes))).all(), "a label that is no class")
+
+
+def _read_cached(folder: Path, name: str) -> None:
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
+        frames = CachedFrames(OneFrame(), folder)
+        found, wanted = frames.frame(0), OneFrame().frame(0)
+    expect(all(np.array_equal(getattr(found, f), v) for f, v in vars(wanted).items()), "another frame")
+
+
+def _read_order(folder: Path, name: str) -> None:
+    write_dataset(SPEC, folder, workers=1, report=lambda done: None)
+
+
+def make_targets() -> list[Target]:
+    """All targets, with files that their readers accept."""
+    lag, ring = np.zeros(60), np.arange(60) % 32
+    raw = {
+        "a.pcd.bin": _raw("f4", POINTS[:, 3], ring),
+        "three.bin": _raw("f8"),
+        "five.bin": _raw("f4", POINTS[:, 3], lag),
+        "half.pcd.bin": _raw("f2", POINTS[:, 3], ring, lag),
+    }
+    layouts = {"three": {"columns": 3, "dtype": "float64"}, "five": {"columns": 5}}
+    layouts["half"] = {"columns": 6, "dtype": "float16"}
+    arrays = {
+        "a.npy": _saved(np.save, POINTS[:12].astype("f4")),
+        "b.npy": _saved(np.save, np.column_stack([POINTS, lag, ring])[:12]),
+    }
+    archives = {
+        "a.npz": _saved(np.savez_compressed, POINTS[:12].astype("f4")),
+        "b.npz": _saved(np.savez, points=POINTS[:12].astype("f4"), other=ring),
+    }
+    sweep = _files(lambda folder: write_sweep(folder, 0, np.column_stack([POINTS, np.arange(60) % 64])))
+    drive = _files(_argoverse2_files)
+    tables = _files(lambda folder: write_nuscenes(folder, *make_tables(1)))
+    index = _files(_index_files)
+    _column_checksums()  # once for all processes
+    synthesized = _files(lambda folder: write_dataset(SPEC, folder, workers=1, report=lambda done: None))
+    listed = [{"file": f"{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("a", 5))]
+    boxes = [
+        {"class": "car", **dict(zip(("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy"), range(1, 10), strict=True))}
+    ]
+    boxes = [{**box, "num_lidar_pts": 3} for box in (*boxes, {**boxes[0], "vx": None, "vy": None})]
+    found = {"a": [], "b": [{**_box(), "sample_token": "b", "detection_score": 0.5}] * 2}
+    truth = {t: {"ego_translation": [0.0, 0, 0], "boxes": [_box(num_pts=3)] * 2} for t in "ab"}
+    truth["b"]["boxes"] = [_box(detection_name="static_object.bicycle_rack", attribute_name="", num_pts=-1)]
+    detection = {"label": "car", "score": 0.5, "box": [1, 2, 3, 4, 2, 1.5, 0, None, None]}
+    frames = [{"name": "a", "boxes": [detection] * 2}, {"name": "b", "boxes": []}]
+    lines = [{"step": step, "seconds": 0.1, "loss": [0.5, float("nan")]} for step in range(1, 5)]
+    sensors = {"a.json": sensor_to_json(TINY)}
+    sensors["b.json"] = {
+        "name": "b",
+        "num_columns": 9,
+        "inclinations_deg": {"lowest": -9, "highest": 3, "rows": 4},
+    }
+    records = tuple(name for name in synthesized if name.startswith(".synthesize/"))
+    is_column = [name for name in index if name.startswith("index/")]
+    return [
+        Target("raw points", raw, _cloud(NUSCENES_HDL32E, **layouts), alone=True),
+        Target("raw points of KITTI", {"a.bin": _raw("f4", POINTS[:, 3] / 100)}, _cloud(KITTI_HDL64E), alone=True),
+        Target("npy", arrays, _cloud(NUSCENES_HDL32E), alone=True, share=2),
+        Target("npz", archives, _cloud(NUSCENES_HDL32E), alone=True, share=2),
+        Target("pcd", _pcd_files(), _cloud(NUSCENES_HDL32E), alone=True, share=4),
+        Target("feather", {"a.feather": next(iter(sweep.values()))}, _cloud(ARGOVERSE2), alone=True, share=2),
+        Target("Argoverse 2", drive, _read_argoverse2, share=0.5),
+        Target("KITTI", _kitti_files(), _read_kitti),
+        Target("folder", _folder_files(), _read_folder),
+        Target("nuScenes", tables, _read_nuscenes, share=0.5),
+        Target("nuScenes index", index, _read_index, tuple(is_column), share=0.5),
+        Target("list of sweeps", {"a.json": _json(listed), "a.npy": arrays["a.npy"]}, _read_sweeps, ("a.json",)),
+        Target(
+            "keyframe",
+            {"boxes.json": _json({"lidar_file": "a.npy", "boxes": boxes}), "a.npy": arrays["a.npy"]},
+            _read_keyframe,
+        ),
+        Target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor, alone=True),
+        Target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses, alone=True),
+        Target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map, alone=True),
+        Target("results", {"a.json": _json({"meta": LIDAR_META, "results": found})}, _read_results, alone=True),
+        Target("ground truth", {"a.json": _json(truth)}, _read_truth, alone=True),
+        Target(
+            "detections",
+            {"a.json": _json({"classes": ["car", "sign"], "frames": frames})},
+            _read_detections,
+            alone=True,
+        ),
+        Target("run.json", {"run.json": _json(RUN_SPEC)}, _read_run, alone=True),
+        Target(
+            "metrics.jsonl",
+            {"metrics.jsonl": b"".join(_json(line) + b"\n" for line in lines)},
+            _read_metrics,
+            alone=True,
+        ),
+        Target("resume log", _files(_resume_log), _read_resume_log, alone=True),
+        Target(
+            "checkpoint.json",
+            {"checkpoint.json": _json(_description())},
+            _read_description,
+            seal=_seal_description,
+        ),
+        Target(
+            "ground-truth database",
+            _files(lambda folder: prepare_database(OneFrame(), folder)),
+            _read_database,
+        ),
+        Target(
+            "cached frames",
+            _files(lambda folder: CachedFrames(OneFrame(), folder).frame(0)),
+            _read_cached,
+            mutate=lambda _, content, rng: mutate_bytes(content, rng),
+            share=0.5,
+        ),
+        Target("records of synthesize", synthesized, _read_order, records),
+    ]

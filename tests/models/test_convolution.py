@@ -1,0 +1,162 @@
+"""Weight gradients on CPU are those of the library, however they are transformed, and absent elsewhere."""
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import run_python
+from jax import export, lax
+from tiny_run import CONFIG, SENSOR, host_batch, weights
+
+from fcos_lidar_jax.models import build_detector, convolution
+from fcos_lidar_jax.models.convolution import convolve
+from fcos_lidar_jax.training.step import make_gradient
+
+CASES = {
+    "3x3": ((3, 3, 6, 5), {}),
+    "7x7": ((7, 7, 3, 4), {}),
+    "3x5": ((3, 5, 3, 4), {}),
+    "dilated": ((3, 3, 4, 7), {"dilation": 3}),
+    "circular": ((3, 3, 4, 5), {"dilation": 2, "circular": True}),
+    "strided": ((3, 3, 4, 5), {"stride": 2}),
+    "1x1": ((1, 1, 7, 5), {}),
+    "1x1 strided": ((1, 1, 5, 7), {"stride": 2}),
+}
+TOLERANCES = {"float32": 1e-5, "bfloat16": 1e-2}
+
+
+@pytest.fixture(autouse=True)
+def _every_image_is_large(monkeypatch):
+    monkeypatch.setattr(convolution, "LARGE", 0)
+
+
+def library(x, kernel, stride=1, dilation=1, circular=False):
+    """The library's convolution of the image padded beforehand."""
+    high, wide = (size // 2 * dilation for size in kernel.shape[:2])
+    x = jnp.pad(x, ((0, 0), (0, 0), (wide, wide), (0, 0)), mode="wrap" if circular else "constant")
+    x = jnp.pad(x, ((0, 0), (high, high), (0, 0), (0, 0)))
+    layout = ("NHWC", "HWIO", "NHWC")
+    return lax.conv_general_dilated(
+        x, kernel, (stride, stride), "VALID", rhs_dilation=(dilation, dilation), dimension_numbers=layout
+    )
+
+
+def gradients(function):
+    """Of a weighted sum over the results: the weights that make them are an argument."""
+    return jax.grad(lambda x, kernel, weights: (function(x, kernel) * weights).sum(), argnums=(0, 1))
+
+
+def example(case: str, dtype: str = "float32", batch: int = 3):
+    """Image of odd sizes, kernel, weights of the results, and the expected results and gradients."""
+    shape, options = CASES[case]
+    rng = np.random.default_rng(0)
+    x, kernel = (jnp.asarray(rng.normal(size=size), dtype) for size in ((batch, 9, 13, shape[2]), shape))
+    full = [leaf.astype(jnp.float32) for leaf in (x, kernel)]
+    values = library(*full, **options)
+    weights = jnp.asarray(rng.normal(size=values.shape), dtype)
+    expected = gradients(functools.partial(library, **options))(*full, weights.astype(jnp.float32))
+    return functools.partial(convolve, **options), (x, kernel, weights), values, expected
+
+
+def assert_close(found, expected, tolerance):
+    for a, b in zip(found, expected, strict=True):
+        a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
+
+
+@pytest.mark.parametrize("dtype", TOLERANCES)
+@pytest.mark.parametrize("case", CASES)
+def test_values_and_gradients_are_the_librarys(case, dtype):
+    function, (x, kernel, weights), values, expected = example(case, dtype)
+    found = jax.jit(gradients(function))(x, kernel, weights)
+    assert [leaf.dtype for leaf in found] == [dtype, dtype]
+    assert_close([function(x, kernel), *found], [values, *expected], TOLERANCES[dtype])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_batches_of_gradients_and_gradients_of_batches(case):
+    """Per-sample gradients add up to the batch's; so does the gradient of a mapped function, recomputed or not."""
+    function, (x, kernel, weights), _, (to_x, to_kernel) = example(case)
+    one = jax.vmap(gradients(function), (0, None, 0))
+    found_x, found_kernel = jax.jit(one)(x[:, None], kernel, weights[:, None])
+    assert_close([found_x[:, 0], found_kernel.sum(0)], [to_x, to_kernel], 1e-5)
+    mapped = gradients(jax.vmap(jax.checkpoint(function), (0, None)))
+    found_x, found_kernel = jax.jit(mapped)(x[:, None], kernel, weights[:, None])
+    assert_close([found_x[:, 0], found_kernel], [to_x, to_kernel], 1e-5)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCES)
+def test_pointwise_sums_in_the_type_asked_for(dtype):
+    _, (x, kernel, weights), values, (to_x, to_kernel) = example("1x1", dtype)
+    wide = functools.partial(convolution.pointwise, dtype=jnp.float32)
+    assert wide(x, kernel[0, 0]).dtype == jnp.float32
+    found = jax.jit(gradients(wide))(x, kernel[0, 0], weights.astype(jnp.float32))
+    assert_close([wide(x, kernel[0, 0]), *found], [values, to_x, to_kernel[0, 0]], TOLERANCES[dtype])
+
+
+def test_only_cpu_has_rows_also_in_exported_programs():
+    function, arguments, _, expected = example("3x3")
+    platforms = [("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda")]
+    programs = {p: export.export(jax.jit(gradients(function)), platforms=p)(*arguments) for p in platforms}
+    loops = {p: program.mlir_module().count("stablehlo.while") for p, program in programs.items()}
+    assert loops == {("cpu",): 1, ("cuda",): 0, ("tpu",): 0, ("cpu", "cuda"): 1}
+    assert_close(programs["cpu", "cuda"].call(*arguments), expected, 1e-5)
+
+
+def test_small_images_have_no_rows(monkeypatch):
+    function, arguments, *_ = example("3x3")
+    work = 9 * 13 * 3 * 3 * 6 * 5
+    for large, loops in ((work, 1), (work + 1, 0)):
+        monkeypatch.setattr(convolution, "LARGE", large)
+        program = jax.jit(lambda *given: gradients(function)(*given)).lower(*arguments)
+        assert program.as_text().count("stablehlo.while") == loops
+
+
+@pytest.mark.parametrize("precision", TOLERANCES)
+def test_a_networks_losses_and_gradients_are_those_with_the_librarys(precision, monkeypatch):
+    model = dataclasses.replace(CONFIG.model, precision=precision)
+    detector = build_detector(dataclasses.replace(CONFIG, model=model), SENSOR)
+    given = weights()["params"], weights()["batch_stats"], host_batch()
+    runs = []
+    for large in (0, math.inf):
+        monkeypatch.setattr(convolution, "LARGE", large)
+        gradient = make_gradient(detector)
+        runs.append(jax.device_get(jax.jit(lambda *given, gradient=gradient: gradient(*given))(*given)))
+    (found, _, metrics), (expected, _, expected_metrics) = runs
+    assert int(metrics["positives"]) > 0
+    assert_close(*(jax.tree.leaves(tree) for tree in (metrics, expected_metrics)), TOLERANCES[precision])
+    largest = max(np.abs(leaf).max() for leaf in jax.tree.leaves(expected))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCES[precision] * largest)
+
+
+SHARDED = """
+import jax, re
+from jax.sharding import NamedSharding, PartitionSpec
+from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
+from test_convolution import CASES, TOLERANCES, assert_close, convolution, example, gradients
+convolution.LARGE = 0
+mesh = make_mesh()
+assert mesh.size == 2
+for case in CASES:
+    for dtype, tolerance in TOLERANCES.items():
+        function, (x, kernel, weights), _, expected = example(case, dtype, batch=4)
+        places = NamedSharding(mesh, PartitionSpec("data")), NamedSharding(mesh, PartitionSpec())
+        gradient = jax.jit(gradients(function), out_shardings=places)
+        arguments = shard_batch(x, mesh), replicate(kernel, mesh), shard_batch(weights, mesh)
+        assert_close(gradient(*arguments), expected, tolerance)
+        text = gradient.lower(*arguments).compile().as_text()
+        # The sums over samples are exchanged, once, and no image.
+        assert "all-gather" not in text and "all-to-all" not in text, case
+        assert len(re.findall(r" all-reduce(?:-start)?[(]", text)) == 1, case
+        assert not re.search(r"all-reduce.*while/body", text), case
+"""
+
+
+def test_two_devices_exchange_the_sums_alone():
+    done = run_python("-c", "import sys; sys.path.insert(0, 'tests/models')\n" + SHARDED, JAX_NUM_CPU_DEVICES="2")
+    assert done.returncode == 0, done.stderr

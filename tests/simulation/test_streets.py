@@ -1,0 +1,317 @@
+"""Varied streets: each randomisation against a closed form or a count, and plain streets as they were."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.random import default_rng
+
+from fcos_lidar_jax.data.cached import CachedFrames
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, city_frames
+from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.simulation.ground import Ground
+from fcos_lidar_jax.simulation.lidar import SWEEP_S, Scan, sample_mount, scan
+from fcos_lidar_jax.simulation.motion import MOTION, make_motion
+from fcos_lidar_jax.simulation.objects import CLUTTER_MODELS, OBJECT_MODELS, object_solids, sample_size, vary_shape
+from fcos_lidar_jax.simulation.relief import Relief, sample_relief
+from fcos_lidar_jax.simulation.solids import BOX, SOLID, WHEEL, corners, make_solids
+from fcos_lidar_jax.simulation.streets import CITY, PLAIN
+from fcos_lidar_jax.simulation.surroundings import Side, sample_surroundings
+from fcos_lidar_jax.simulation.traffic import Traffic
+from fcos_lidar_jax.simulation.world import World, class_shares, sample_labels, sample_world
+
+SENSOR = NUSCENES_HDL32E
+PLAIN_FRAMES = {  # seed -> points, labels, mean x, y, z and intensity
+    0: (3294, [3, 3, 2, 4, 1, 0, 9, 5, 5], (0.92492, -0.79278, -1.12002, 18.78081)),
+    3: (3592, [3, 2, 2, 4, 1, 0, 6, 6, 9, 5], (-0.20851, -0.18856, -0.9564, 14.11192)),
+}
+WAVE_M, HEIGHT_M, CROWN_M = 32.0, 0.08, 0.12
+PLANE = np.array([[0.01, -0.02, -1.8]])
+STREET = Ground(np.zeros((1, 3)), 7, 900, 7, 0.13, 3, (0.3, 0.3, 0.3))
+
+
+def wave(x):
+    return HEIGHT_M * np.sin(2 * np.pi * x / WAVE_M)
+
+
+def wavy_ground() -> Ground:
+    """One plane with waves along x, a crowned street, kerbs."""
+    grid = np.arange(256) * 0.5
+    relief = Relief(np.tile(wave(grid)[:, None], (1, 256)).astype(np.float32))
+    return Ground(PLANE, 6, 900, 5, 0.13, 3, (0.1, 0.2, 0.3), crown=CROWN_M, relief=relief)
+
+
+def wavy_height(x, y):
+    """What :func:`wavy_ground` is meant to be, in float64."""
+    side = np.minimum(np.abs(y) / 6, 1)
+    return 0.01 * x - 0.02 * y - 1.8 + wave(x) - CROWN_M * side**2 + 0.13 * (np.abs(y) >= 6)
+
+
+def test_heights_of_uneven_ground_are_the_sum_of_its_parts():
+    x, y = default_rng(0).uniform(-150, 150, (2, 2000))
+    np.testing.assert_allclose(wavy_ground().height(x, y), wavy_height(x, y), atol=2e-4)
+
+
+def test_rays_meet_uneven_ground_where_marching_first_finds_it():
+    rng, eye = default_rng(1), np.array([0.3, -0.4, 0.2])
+    azimuth, falling = rng.uniform(-np.pi, np.pi, 400), np.radians(rng.uniform(-30, 3, 400))
+    d = np.stack([np.cos(falling) * np.cos(azimuth), np.cos(falling) * np.sin(azimuth), np.sin(falling)])
+    found, cosine = wavy_ground().first_hits(d.astype(np.float32), eye)
+    steps = np.linspace(1.2, 118, 40_000)
+    for ray in range(400):
+        path = eye[:, None] + d[:, ray : ray + 1] * steps / np.cos(falling[ray])
+        under = np.flatnonzero(wavy_height(path[0], path[1]) > path[2])
+        if not len(under):
+            assert found[ray] > 100
+            continue
+        # A ray that only just passes a crest or not may end on either side of it.
+        end = eye + d[:, ray].astype(float) * found[ray]
+        clear = (path[2] - wavy_height(path[0], path[1]))[: under[0]]
+        assert abs(end[2] - wavy_height(*end[:2])) < 0.02 or abs(abs(end[1]) - 6) < 0.05
+        if len(clear) and clear[: int(0.9 * len(clear))].min(initial=1) > 0.05:
+            assert found[ray] == pytest.approx(steps[under[0]] / np.cos(falling[ray]), rel=0.02, abs=0.05)
+    assert np.isfinite(found).mean() > 0.6
+    assert ((cosine >= 0) & (cosine <= 1)).all()
+
+
+def test_relief_has_its_deviation_repeats_itself_and_falls_with_frequency():
+    field = sample_relief(default_rng(3), 0.05, 2.0)
+    x, y = default_rng(0).uniform(-60, 60, (2, 500))
+    np.testing.assert_allclose(field.at(x, y), field.at(x + 128, y - 256), atol=1e-4)
+    assert field.values.std() == pytest.approx(0.05, rel=1e-3)
+    power = np.abs(np.fft.fft(field.values, axis=0)).mean(axis=1)
+    assert power[3:8].mean() > 10 * power[40:80].mean()
+
+
+def empty_world(streets, *, seed=0, ground=STREET, scenery=None, speed=0.0) -> World:
+    nothing = np.zeros(0, SOLID)
+    traffic = Traffic(np.zeros(0, np.int32), (), np.zeros((0, 3)), np.zeros(0, MOTION), np.zeros(0, bool))
+    there = nothing if scenery is None else scenery
+    return World(ground, there, traffic, nothing, make_motion(speed=speed), streets, seed)
+
+
+def scan_of(world, seed=0, level_mount=True, **options) -> Scan:
+    mount = sample_mount(default_rng(seed), SENSOR, level=level_mount, streets=world.streets)
+    return scan(world, SENSOR, mount, 0.0, default_rng(seed), **options)
+
+
+def changed(**fields):
+    return dataclasses.replace(PLAIN, **fields)
+
+
+def by_laser(values: np.ndarray) -> np.ndarray:
+    """Of a scan's rays: columns, lasers (the lowest first), whatever there is of each."""
+    return values.reshape(-1, SENSOR.num_rows, *values.shape[1:])
+
+
+def test_the_mount_looks_down_ahead_and_has_another_height_each_time():
+    streets = changed(pitch_rad=0.03, mount_m=0.05)
+    mounts = [sample_mount(default_rng(s), SENSOR, streets=streets) for s in range(300)]
+    ahead, heights = np.array([m[2, 1] for m in mounts]), np.array([m[2, 3] for m in mounts])
+    assert ahead.mean() == pytest.approx(-0.03, abs=0.003)
+    assert (heights.mean(), heights.std()) == pytest.approx((1.84, 0.05), abs=0.01)
+    level_mounts = [sample_mount(default_rng(s), SENSOR, level=True, streets=CITY) for s in range(3)]
+    assert all((m[:3, 2] == [0, 0, 1]).all() for m in level_mounts)
+
+
+def test_the_ego_vehicle_hides_what_it_hides_in_nuscenes():
+    """To the right the lowest beam is free, behind the eleventh is the lowest, ahead the eighth."""
+    sweep = scan_of(empty_world(changed(ego_outline=True)))
+    points, returned = sweep.points.reshape(-1, 32, 5), by_laser(sweep.returned)
+    azimuth = np.degrees(np.arctan2(points[:, 13, 0], points[:, 13, 1]))  # clockwise from ahead, of a free beam
+    for towards, lowest in ((90, 0), (-104, 0), (0, 7), (176, 9.5)):
+        there = np.abs((azimuth - towards + 180) % 360 - 180) < 2
+        free = returned[there].any(axis=0)
+        assert np.argmax(free) == pytest.approx(lowest, abs=1.01), towards
+        assert not free[: int(lowest)].any()
+
+
+def test_the_edges_of_bonnet_and_roof_return_some_rays():
+    """As in nuScenes: about 70 points ahead and 60 to 130 behind, in a line across, low and dark."""
+    without, found = (
+        scan_of(empty_world(changed(ego_outline=True, ego_edges=edges))).points[:, :4] for edges in (False, True)
+    )
+    near = [p[(np.hypot(p[:, 0], p[:, 1]) < 2.2) & (np.abs(p[:, 1]) > 0.9)] for p in (without, found)]
+    assert len(near[0]) == 0
+    ahead, behind = near[1][near[1][:, 1] > 0], near[1][near[1][:, 1] < 0]
+    for edge, distance, half in ((ahead, (1.4, 1.75), 0.62), (behind, (1.0, 1.15), 0.35)):
+        assert 30 < len(edge) < 140
+        assert np.ptp(edge[:, 1]) < 0.1
+        assert distance[0] - 0.05 < np.abs(edge[:, 1]).mean() < distance[1] + 0.05
+        assert np.abs(edge[:, 0]).max() < half + 0.05
+        assert edge[:, 2].max() < -0.2
+
+
+def of_rings(streets, unit, seed) -> np.ndarray:
+    """Mean intensity and range offset of the lasers that rise to walls at 19 m on both sides."""
+    walls = make_solids(BOX, [[0, 20, 3], [0, -20, 3]], [30, 1, 9], albedo=0.3)
+    points = by_laser(scan_of(empty_world(streets, seed=unit, scenery=walls), seed).points.astype(float))
+    across = np.abs(points[..., 0])
+    face = (across > 18) & (np.abs(points[..., 1]) < 8)
+    range_m = np.linalg.norm(points[..., :3], axis=2)
+    offset = range_m - 19 * range_m / np.maximum(across, 1e-3)
+    rows = range(24, 30)
+    return np.array([[v[:, k][face[:, k]].mean() for k in rows] for v in (points[..., 3], offset)])
+
+
+def test_gains_and_offsets_are_those_of_rings_and_stay_through_a_drive():
+    plain = changed(speckle=0.0, range_noise_m=0.0)
+    ringed = dataclasses.replace(plain, ring_gain=0.4, ring_range_m=0.05)
+    even = of_rings(plain, 5, 0)
+    units = np.array([of_rings(ringed, unit, 0) for unit in range(5, 11)])
+    assert np.ptp(even[0]) < 0.1 * even[0].mean()
+    assert np.abs(even[1]).max() < 0.002
+    assert np.log(units[:, 0] / even[0]).std() == pytest.approx(0.4, rel=0.4)
+    assert units[:, 1].std() == pytest.approx(0.05, rel=0.4)
+    again = of_rings(ringed, 5, 1)
+    np.testing.assert_allclose(again[0], units[0, 0], rtol=0.05)
+    np.testing.assert_allclose(again[1], units[0, 1], atol=0.002)
+
+
+@pytest.mark.parametrize("name", OBJECT_MODELS)
+def test_varied_shapes_differ_and_keep_the_box_as_tight(name):
+    rng = default_rng(1)
+    for model in OBJECT_MODELS[name]:
+        size = sample_size(rng, model, CITY.sizes)
+        usual = object_solids(model, size, 0.2)
+        straight = (usual["lean"] == 0) & (usual["taper"] <= 1).all(axis=1)
+        varied = usual.copy()
+        vary_shape(rng, varied, size, CITY.shape)
+        before, after = corners(usual[straight]), corners(varied[straight])
+        for end in (np.min, np.max):
+            slack = 0.05 + 0.02 * size.max()
+            np.testing.assert_allclose(end(after, axis=(0, 1)), end(before, axis=(0, 1)), atol=slack)
+        assert (varied["half"] > 0).all()
+        wheels = usual["kind"] == WHEEL
+        for field in ("center", "half"):
+            np.testing.assert_allclose(varied[field][wheels], usual[field][wheels])
+        assert (wheels.all() or (varied["half"] != usual["half"]).any()) or len(usual) == 2
+
+
+@pytest.mark.parametrize("place", CLUTTER_MODELS)
+def test_clutter_stands_on_the_ground_within_its_size(place):
+    for model in CLUTTER_MODELS[place]:
+        size = np.array(model.size_m)
+        solids = object_solids(model, size, 0.2)
+        ends = corners(solids)
+        assert ends[..., 2].min() < 0.1 * size[2], model.category
+        assert 0.8 * size[2] < ends[..., 2].max() < 1.02 * size[2], model.category
+        assert (np.abs(ends[..., :2]).max(axis=(0, 1)) <= 0.75 * size[:2] + 0.3).all(), model.category
+
+
+@pytest.mark.parametrize(("along", "side"), [(0, -1), (0, 1), (1, -1), (1, 1)])
+def test_surroundings_stand_beside_their_street_and_on_neither_carriageway(along, side):
+    ground = Ground(np.zeros((1, 3)), 7, 30, 6, 0.13, 3, (0.1, 0.1, 0.1))
+    here = Side(ground, along, side, (-60.0, 80.0))
+    found = np.concatenate([sample_surroundings(default_rng(s), here, CITY, "city") for s in range(4)])
+    assert len(found) > 200
+    assert (found["owner"] == -1).all()
+    low = found[(found["center"][:, 2] - found["half"][:, 2] < 2) & (found["density"] > 5)]
+    inside = np.abs(low["center"][:, 1]) < 6.5 if along == 0 else np.abs(low["center"][:, 0] - 30) < 5.5
+    assert not inside.any()
+    beside = low["center"][:, 1] if along == 0 else low["center"][:, 0] - 30
+    assert (np.sign(beside) == side).all()
+
+
+def test_fronts_of_buildings_have_depth():
+    """Parts stand out of the plane of a front by decimetres to metres."""
+    ground = Ground(np.zeros((1, 3)), 7, 900, 6, 0.13, 3, (0.1, 0.1, 0.1))
+    streets = changed(facades=True)
+    depths = []
+    for seed in range(12):
+        found = sample_surroundings(default_rng(seed), Side(ground, 0, 1, (-60.0, 60.0)), streets, "city")
+        fronts = np.abs(found["center"][:, 1]) - found["half"][:, 0]  # turned by a right angle
+        bodies = found["half"][:, 0] > 3
+        if not bodies.all():
+            depths += [float(fronts[bodies].min() - fronts[~bodies].min())]
+    assert np.median(depths) > 0.3
+    assert max(depths) < 4
+
+
+@pytest.fixture(scope="module")
+def frames() -> list:
+    return [city_frames(SENSOR, 10_000).frame(i) for i in range(16)]
+
+
+def test_city_frames_are_the_same_in_any_order(frames):
+    again = city_frames(SENSOR, 10_000).frame(3)
+    for field in ("points", "boxes", "labels", "num_points"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(frames[3], field))
+
+
+def test_every_annotated_object_of_a_city_shows_a_point(frames):
+    for frame in frames:
+        assert (frame.num_points >= 1).all()
+        assert np.isfinite(frame.points).all()
+        assert (frame.points[:, 3] <= 255).all()
+
+
+def test_cities_are_crowded_and_empty_and_mostly_no_objects(frames):
+    numbers = [len(frame.labels) for frame in frames]
+    assert max(numbers) > 2 * min(numbers)
+    shares = [frame.num_points.sum() / len(frame.points) for frame in frames]
+    assert np.mean(shares) < 0.2  # in nuScenes three to ten in a hundred
+
+
+def test_classes_are_as_frequent_as_the_streets_say():
+    shares = class_shares(1.0)
+    drawn = np.bincount(sample_labels(default_rng(0), 20_010), minlength=10) - 1
+    np.testing.assert_allclose(drawn / drawn.sum(), shares, atol=0.02)
+    flat = class_shares(0.5)
+    np.testing.assert_allclose(flat[0] / flat[2], np.sqrt(shares[0] / shares[2]))
+
+
+def test_the_power_of_distances_moves_objects_away():
+    options = {"reach_m": 50, "beyond_m": 20, "duration_s": 0.0, "labels": np.full(40, 5), "level": True}
+    medians = []
+    for streets in (changed(spread=0.5), PLAIN):
+        worlds = [sample_world(default_rng(s), **options, streets=streets) for s in range(8)]
+        away = np.concatenate([w.object_poses(0.0)[:, :2] - [w.ego["x"][0], w.ego["y"][0]] for w in worlds])
+        medians.append(np.median(np.hypot(*away.T)))
+    assert medians[0] == pytest.approx(50 * np.sqrt(0.525), rel=0.1)
+    assert medians[1] == pytest.approx(50 * 0.525, rel=0.15)
+
+
+def test_a_frame_of_a_moving_ego_vehicle_takes_the_time_of_a_turn():
+    """Compensated rings: the first and the last column are from places that lie apart as far as it drove."""
+    still, moving = (
+        by_laser(
+            scan(
+                empty_world(changed(range_noise_m=0.0), speed=speed),
+                SENSOR,
+                sample_mount(default_rng(0), SENSOR, level=True),
+                SWEEP_S,
+                default_rng(0),
+                rolling_shutter=True,
+            ).points.astype(float)
+        )[..., :2]
+        for speed in (0.0, 12.0)
+    )
+    shift = (moving - still)[:, 12:16].mean(axis=1)  # beams that meet the road
+    assert shift[5, 1] == pytest.approx(-12 * 0.95 * SWEEP_S, abs=0.02)
+    assert shift[-8, 1] == pytest.approx(-12 * 0.05 * SWEEP_S, abs=0.02)
+    frames = [make_frame(seed, SENSOR, streets=streets) for seed in (1, 2) for streets in (CITY, still_city())]
+    assert any((a.points.shape != b.points.shape) for a, b in zip(frames[::2], frames[1::2], strict=True))
+
+
+def still_city():
+    return dataclasses.replace(CITY, rolling_shutter=False)
+
+
+def test_streets_enter_fingerprints_caches_and_data_sets(tmp_path):
+    plain, city = SimulatedFrames(TINY, 3), SimulatedFrames(TINY, 3, streets=CITY)
+    finer = SimulatedFrames(TINY, 3, streets=dataclasses.replace(CITY, clutter=0.2))
+    assert len({frames.fingerprint() for frames in (plain, city, finer)}) == 3
+    CachedFrames(plain, tmp_path / "cache")
+    with pytest.raises(ValueError, match="streets"):
+        CachedFrames(city, tmp_path / "cache")
+
+
+def test_plain_streets_are_those_of_the_shipped_quickstart():
+    """Frames that the weights in the package were trained on, as they were before there were others."""
+    for seed, (number, labels, mean) in PLAIN_FRAMES.items():
+        frame = make_frame(seed, TINY)
+        assert len(frame.points) == number
+        assert frame.labels.tolist() == labels
+        np.testing.assert_allclose(frame.points[:, :4].mean(axis=0), mean, atol=1e-3)

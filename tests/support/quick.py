@@ -1,0 +1,58 @@
+"""Programs compiled in a third of the time, for tests whose question is what a run does and not how it rounds."""
+
+import functools
+import os
+from typing import Any
+
+import jax
+from jax._src import compiler
+
+_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+_compile_options = compiler.get_compile_options
+
+
+def compile_quickly(quick: bool) -> None:
+    """Choose for all programs that this process compiles from now on."""
+    if is_quick() == quick:
+        return
+    jax.config.update("jax_disable_most_optimizations", quick)
+    # JAX offers options for all programs only in the environment, which a process reads once.
+    compiler.get_compile_options = _quick_compile_options if quick else _compile_options
+    jax.clear_caches()
+
+
+def is_quick() -> bool:
+    """What was chosen last."""
+    return jax.config.read("jax_disable_most_optimizations")
+
+
+def environment(quick: bool) -> dict[str, str]:
+    """Variables with which another process compiles one way or the other."""
+    flags = [f"--{name}={str(value).lower()}" for name, value in _known_options().items()] if quick else []
+    return {
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": str(int(quick)),
+        "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]),
+    }
+
+
+def _quick_compile_options(*args, env_options_overrides=None, **kwargs):
+    options = _known_options() | (env_options_overrides or {})
+    return _compile_options(*args, env_options_overrides=options, **kwargs)
+
+
+@functools.cache
+def _known_options() -> dict[str, Any]:
+    """Those that this XLA has; in the environment an unknown one would end the process."""
+
+    def known(option: dict[str, Any]) -> bool:
+        lowered = jax.jit(lambda x: x + 1).lower(0.0)
+        try:
+            lowered.compile(compiler_options=option)
+        except jax.errors.JaxRuntimeError:
+            return False
+        return True
+
+    compiler.get_compile_options, chosen = _compile_options, compiler.get_compile_options
+    options = {name: value for name, value in _OPTIONS.items() if known({name: value})}
+    compiler.get_compile_options = chosen
+    return options
