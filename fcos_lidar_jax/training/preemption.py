@@ -6,6 +6,8 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
+import jax
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -43,9 +45,11 @@ def after_the_block() -> Iterator[None]:
     """Let the first Ctrl-C or SIGTERM act only when the block has ended.
 
     In a library's event loop it would be reported as a failure of the library. Outside the main thread, which no
-    signal interrupts, nothing changes.
+    signal interrupts, nothing changes; nor in a cluster, where JAX's preemption service has taken SIGTERM by a
+    handler that Python cannot see and could not restore.
     """
-    with stop_requests(active=threading.current_thread() is threading.main_thread()) as request:
+    own = threading.current_thread() is threading.main_thread() and not jax.distributed.is_initialized()
+    with stop_requests(active=own) as request:
         yield
     if request.signal is not None:
         signal.raise_signal(request.signal)
