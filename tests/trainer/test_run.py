@@ -197,6 +197,10 @@ def test_killed_in_a_save_and_resumed_it_ends_in_the_same_bits(finished, tmp_pat
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000004"]
 
 
+def test_killed_before_its_first_checkpoint_it_begins_with_the_given_weights(finished, begun):
+    assert bits(train_tiny(begun, resume=True, weights=weights())) == bits(finished[1])
+
+
 FULL = """
 import resource, sys
 from tiny_run import train_tiny, weights
