@@ -48,7 +48,12 @@ _FRESH = change(copy_paste=None, class_balanced=False)  # What makes more of few
 CONFIGS = {
     "quickstart": change(augment=None, optimizer__ema_decay=0.999)(_FRESH(QUICKSTART)),
     # No street is shown twice. A mirrored or turned one would look down behind, and have its blind arcs elsewhere.
-    "hdl32e": change(augment__flip_y_probability=0.0, augment__max_rotation_rad=math.radians(3))(_FRESH(COMPACT)),
+    # Most trainings begin with the weights of an earlier one, which need less of a warm-up.
+    "hdl32e": change(
+        augment__flip_y_probability=0.0,
+        augment__max_rotation_rad=math.radians(3),
+        optimizer__warmup_fraction=0.15,
+    )(_FRESH(COMPACT)),
 }
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
@@ -82,7 +87,7 @@ def train(args: Args) -> dict[str, Any]:
     os.nice(_NICE)
     config = CONFIGS[args.name]
     frames, unseen = streets(config, steps=args.steps, seed=args.seed)
-    schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 20))
+    schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
     tests = ChosenFrames(unseen, tuple(range(_TESTS_ALONG)))
     length = {"steps": args.steps, "seed": args.seed}
     trained(args.work, config, frames, **length, tests=tests, schedule=schedule, weights=args.warm_start)
