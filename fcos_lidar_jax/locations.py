@@ -26,12 +26,15 @@ class ImageLayout:
         rows, columns: of the sensor's image.
         row_upscale: row i of the network's image is row ``i // row_upscale`` of the sensor's.
         height: rows of the network's image, padded with empty rows to a multiple of 32.
-        width: columns, padded on the right with copies of the first ones to a multiple of 32.
+        width: columns, padded on the right to a multiple of 32.
+        full_turn: the first column follows the last one, so that copies of the first columns pad the image; else
+            empty columns do.
     """
 
     rows: int
     columns: int
     row_upscale: int
+    full_turn: bool = True
 
     @property
     def height(self) -> int:
@@ -59,12 +62,17 @@ def _up_to_stride(size: int) -> int:
 def image_sensor(sensor: Sensor, model: ModelConfig) -> Sensor:
     """The sensor as binned for a model: with ``circular_width``, columns divisible by the largest stride.
 
+    Raises:
+        ValueError: ``circular_width`` for a sensor that covers only a part of the turn.
+
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
     >>> image_sensor(NUSCENES_HDL32E, ModelConfig(circular_width=True)).num_columns
     1088
     """
     if not model.circular_width:
         return sensor
+    if sensor.azimuth_limits_rad is not None:
+        raise ValueError(f"circular_width: got True for sensor {sensor.name!r}, which covers a part of the turn")
     return dataclasses.replace(sensor, num_columns=_up_to_stride(sensor.num_columns))
 
 
@@ -77,7 +85,8 @@ def image_layout(sensor: Sensor, model: ModelConfig) -> ImageLayout:
     (64, 1088, 92820)
     """
     binned = image_sensor(sensor, model)
-    return ImageLayout(binned.num_rows, binned.num_columns, model.row_upscale)
+    full_turn = sensor.azimuth_limits_rad is None
+    return ImageLayout(binned.num_rows, binned.num_columns, model.row_upscale, full_turn)
 
 
 def pad_image(features: Float32[Array, "*b h w c r"], layout: ImageLayout) -> Float32[Array, "*b i j c r"]:
@@ -88,8 +97,11 @@ def pad_image(features: Float32[Array, "*b h w c r"], layout: ImageLayout) -> Fl
     """
     image = jnp.repeat(features, layout.row_upscale, axis=-4)
     extra = layout.width - layout.columns
-    image = jnp.concatenate([image, image[..., :extra, :, :]], axis=-3) if extra else image
     below = [(0, 0)] * image.ndim
+    if layout.full_turn:
+        image = jnp.concatenate([image, image[..., :extra, :, :]], axis=-3) if extra else image
+    else:
+        below[-3] = (0, extra)
     below[-4] = (0, layout.height - layout.rows * layout.row_upscale)
     return jnp.pad(image, below)
 

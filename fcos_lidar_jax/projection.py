@@ -69,9 +69,9 @@ def image_cells(
 ) -> tuple[Int32[Array, "n"], tuple[Float32[Array, "n"], ...]]:
     """The image cell of every point.
 
-    Rows are bin centres (the beams), the top row the highest beam; columns run clockwise from azimuth pi.
-    Points that are invalid, non-finite, outside the limits or more than half a row outside the field of view
-    get the sentinel cell ``num_rows * num_columns``.
+    Rows are bin centres (the beams), the top row the highest beam; columns run clockwise from azimuth pi, or from
+    the left end of the sensor's sector. Points that are invalid, non-finite, outside the limits, beside the sector
+    or more than half a row outside the field of view get the sentinel cell ``num_rows * num_columns``.
 
     Returns:
         row-major cells, and (range, azimuth, inclination) as seen from the sensor, finite everywhere.
@@ -88,8 +88,14 @@ def image_cells(
     low, high = sensor.limit_z_m
     usable &= (jnp.abs(x) < sensor.limit_xy_m) & (jnp.abs(y) < sensor.limit_xy_m) & (z > low) & (z < high)
     range_m, azimuth, inclination = spherical(points[:, :3] - np.asarray(sensor.origin_m, np.float32))
-    turn = np.float32(sensor.num_columns / (2 * np.pi))
-    column = jnp.floor((np.float32(np.pi) - azimuth) * turn).astype(jnp.int32) % sensor.num_columns
+    behind = np.float32(sensor.first_azimuth_rad) - azimuth
+    if sensor.azimuth_limits_rad is not None:
+        behind = jnp.mod(behind, np.float32(2 * np.pi))
+    column = jnp.floor(behind * np.float32(1 / sensor.column_rad)).astype(jnp.int32)
+    if sensor.azimuth_limits_rad is None:
+        column %= sensor.num_columns
+    else:
+        usable &= column < sensor.num_columns
     row = points[:, 5].astype(jnp.int32) if sensor.row_source == "laser" else _row(inclination, sensor)
     usable &= (row >= 0) & (row < sensor.num_rows)
     cell = jnp.where(usable, row * sensor.num_columns + column, sensor.num_rows * sensor.num_columns)

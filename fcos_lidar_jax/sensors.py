@@ -17,13 +17,16 @@ class Sensor:
         name: for messages and pictures.
         inclinations_rad: the beams' inclinations in radians, one per image row, strictly falling: row 0 is
             the highest beam. For a sensor whose rows come from the laser number the table is nominal.
-        num_columns: azimuth bins of one turn. Columns run clockwise, column 0 starts at azimuth pi.
+        num_columns: azimuth bins of one turn, or of the sector that is covered. Columns run clockwise, column 0
+            starts at azimuth pi, or at the left end of the sector.
         origin_m: the sensor's position in the frame of the points; subtracted before equation 1.
         limit_xy_m: points with ``|x|`` or ``|y|`` at or beyond it are dropped (point frame, metres).
         limit_z_m: points with z outside this open interval are dropped (point frame, metres).
         intensity_scale: a file's intensity times this is on the scale 0-255.
         row_source: ``"inclination"`` bins the angle of each point; ``"laser"`` reads the row from a sixth
             point column, for stacked sensors whose inclinations overlap.
+        azimuth_limits_rad: right and left end of the sector that is covered, counter-clockwise and at most a turn
+            apart, the right one within [-pi, pi]; None for a full turn. Points beside it are dropped.
 
     Raises:
         ValueError: at construction, naming the field, what was found and what was expected.
@@ -40,6 +43,7 @@ class Sensor:
     limit_z_m: tuple[float, float] = (-5.0, 3.0)
     intensity_scale: float = 1.0
     row_source: Literal["inclination", "laser"] = "inclination"
+    azimuth_limits_rad: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         table = np.asarray(self.inclinations_rad, np.float64)
@@ -61,6 +65,22 @@ class Sensor:
             raise ValueError(f"intensity_scale: got {self.intensity_scale!r}, expected a positive number")
         if self.row_source not in ("inclination", "laser"):
             raise ValueError(f"row_source: got {self.row_source!r}, expected 'inclination' or 'laser'")
+        if self.azimuth_limits_rad is not None:
+            ends = self.azimuth_limits_rad
+            if len(ends) != 2 or not (abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi):
+                expected = "(right, left) with right within [-pi, pi] and left at most a turn beyond it"
+                raise ValueError(f"azimuth_limits_rad: got {ends!r}, expected {expected}")
+
+    @property
+    def first_azimuth_rad(self) -> float:
+        """Azimuth at which column 0 starts."""
+        return math.pi if self.azimuth_limits_rad is None else self.azimuth_limits_rad[1]
+
+    @property
+    def column_rad(self) -> float:
+        """Width of a column."""
+        right, left = self.azimuth_limits_rad or (-math.pi, math.pi)
+        return (left - right) / self.num_columns
 
     @property
     def num_rows(self) -> int:
@@ -95,6 +115,25 @@ def even_inclinations(lowest_deg: float, highest_deg: float, num_rows: int) -> t
     [10.67, -10.0, -30.67]
     """
     return tuple(float(v) for v in np.radians(np.linspace(highest_deg, lowest_deg, num_rows)))
+
+
+def sector(sensor: Sensor, middle_rad: float, num_columns: int) -> Sensor:
+    """A part of a sensor's turn, of columns as wide as they were.
+
+    Args:
+        sensor: of a full turn.
+        middle_rad: azimuth of the sector's middle.
+        num_columns: of the sector.
+
+    >>> ahead = sector(NUSCENES_HDL32E, math.pi / 2, 272)
+    >>> ahead.num_columns, [round(math.degrees(v), 2) for v in ahead.azimuth_limits_rad]
+    (272, [44.92, 135.08])
+    """
+    half = sensor.column_rad * num_columns / 2
+    right = math.remainder(middle_rad - half, 2 * math.pi)
+    limits = (right, right + 2 * half)
+    name = f"{sensor.name}_{num_columns}_columns"
+    return dataclasses.replace(sensor, name=name, num_columns=num_columns, azimuth_limits_rad=limits)
 
 
 NUSCENES_HDL32E = Sensor("nuscenes_hdl32e", even_inclinations(-30.67, 10.67, 32), 1086)
@@ -151,7 +190,10 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     >>> sensor_from_json(sensor_to_json(TINY)) == TINY
     True
     """
-    return dataclasses.asdict(sensor)
+    record = dataclasses.asdict(sensor)
+    if sensor.azimuth_limits_rad is None:  # a full turn is described as it was before there were sectors
+        del record["azimuth_limits_rad"]
+    return record
 
 
 _MAX_ROWS = 4096  # far more than any LiDAR has: a damaged number must not exhaust the memory
@@ -195,7 +237,9 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
                 raise ValueError(f"{where}: {name}: missing")
             continue
         value = record[name]
-        if name in ("inclinations_rad", "origin_m", "limit_z_m"):
+        if name == "azimuth_limits_rad" and value is None:
+            continue
+        if name in ("inclinations_rad", "origin_m", "limit_z_m", "azimuth_limits_rad"):
             if not isinstance(value, list | tuple):
                 raise ValueError(f"{where}: {name}: got {value!r}, expected a list of numbers")
             record[name] = tuple(_number(v, f"{where}: {name}") for v in value)

@@ -16,10 +16,15 @@ from fcos_lidar_jax.locations import (
     location_cells,
     pad_image,
 )
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 from fcos_lidar_jax.types import RangeImage
 
-LAYOUTS = [ImageLayout(16, 256, 2), ImageLayout(32, 1086, 2), ImageLayout(10, 70, 3)]
+LAYOUTS = [
+    ImageLayout(16, 256, 2),
+    ImageLayout(32, 1086, 2),
+    ImageLayout(10, 70, 3),
+    ImageLayout(16, 70, 1, full_turn=False),
+]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=str)
@@ -38,7 +43,7 @@ def test_pixel_of_a_location_is_index_times_stride(layout):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=str)
-def test_padding_repeats_rows_and_copies_the_first_columns(layout):
+def test_padding_repeats_rows_and_copies_the_first_columns_of_a_turn(layout):
     image = np.random.default_rng(0).random((1, layout.rows, layout.columns, 9, 2), np.float32)
     padded = np.asarray(pad_image(jnp.asarray(image), layout))
     assert padded.shape == (1, layout.height, layout.width, 9, 2)
@@ -47,6 +52,8 @@ def test_padding_repeats_rows_and_copies_the_first_columns(layout):
     source = np.minimum(row // layout.row_upscale, layout.rows - 1)
     expected = image[0][source][:, column % layout.columns]
     expected[row >= layout.rows * layout.row_upscale] = 0
+    if not layout.full_turn:
+        expected[:, layout.columns :] = 0
     np.testing.assert_array_equal(padded[0], expected)
 
 
@@ -73,3 +80,13 @@ def test_circular_width_bins_into_whole_strides_and_pads_nothing():
     layout = image_layout(NUSCENES_HDL32E, circular)
     assert layout.columns == layout.width == 1088
     assert (location_cells(layout) >= 0).all()
+
+
+def test_a_sector_does_not_wrap():
+    part = sector(NUSCENES_HDL32E, np.pi / 2, 272)
+    layout = image_layout(part, ModelConfig())
+    assert (layout.columns, layout.width, layout.full_turn) == (272, 288, False)
+    with pytest.raises(
+        ValueError, match="circular_width: got True for sensor 'nuscenes_hdl32e_272_columns', which"
+    ):
+        image_layout(part, ModelConfig(circular_width=True))

@@ -17,10 +17,14 @@ from fcos_lidar_jax.sensors import (
     WAYMO_TOP,
     Sensor,
     even_inclinations,
+    sector,
 )
 
 SMALL = Sensor("small", even_inclinations(-20, 10, 4), 12)
 LASER = dataclasses.replace(SMALL, name="laser", row_source="laser", origin_m=(1.0, -2.0, 0.5))
+
+
+AHEAD, BEHIND = sector(NUSCENES_HDL32E, np.pi / 2, 272), sector(WAYMO_TOP, -np.pi, 300)  # one across the seam
 
 
 def cloud(seed: int, number: int = 400, columns: int = 5) -> np.ndarray:
@@ -42,7 +46,8 @@ def reference_cells(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.
     p = points.astype(np.float64)
     x, y, z = (p[:, i] - sensor.origin_m[i] for i in range(3))
     theta, phi = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
-    u = (np.pi - theta) / (2 * np.pi) * sensor.num_columns
+    right, left = sensor.azimuth_limits_rad or (-np.pi, np.pi)
+    u = (left - theta) % (2 * np.pi) / (left - right) * sensor.num_columns
     table = np.array(sensor.inclinations_rad)
     if sensor.row_source == "laser":
         row = p[:, 5].astype(int)
@@ -54,16 +59,18 @@ def reference_cells(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.
         row = np.where((phi > top) | (phi < bottom), -1, row)
         middles = np.array([top, *(table[1:] + table[:-1]) / 2, bottom])
         edge = np.abs(phi[:, None] - middles).min(1)
-    edge = np.minimum(edge, np.abs(u - np.round(u)) * 2 * np.pi / sensor.num_columns)
+    edge = np.minimum(edge, np.abs(u - np.round(u)) * (left - right) / sensor.num_columns)
     good = (np.abs(p[:, 0]) < sensor.limit_xy_m) & (np.abs(p[:, 1]) < sensor.limit_xy_m)
     good &= (p[:, 2] > sensor.limit_z_m[0]) & (p[:, 2] < sensor.limit_z_m[1])
-    good &= (row >= 0) & (row < sensor.num_rows)
+    good &= (row >= 0) & (row < sensor.num_rows) & (u < sensor.num_columns)
     cells = sensor.num_rows * sensor.num_columns
     return np.where(good, row * sensor.num_columns + np.floor(u).astype(int) % sensor.num_columns, cells), edge
 
 
 @pytest.mark.parametrize(
-    "sensor", [SMALL, LASER, TINY, NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP], ids=lambda s: s.name
+    "sensor",
+    [SMALL, LASER, TINY, NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, AHEAD, BEHIND],
+    ids=lambda s: s.name,
 )
 def test_cells_follow_the_definitions(sensor):
     points = cloud(0, 5000, sensor.point_columns)
@@ -76,6 +83,23 @@ def test_cells_follow_the_definitions(sensor):
     np.testing.assert_allclose(range_m, np.linalg.norm(xyz, axis=1), rtol=1e-6)
     np.testing.assert_allclose(azimuth, np.arctan2(xyz[:, 1], xyz[:, 0]), atol=4e-7)
     np.testing.assert_allclose(inclination, np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])), atol=4e-7)
+
+
+def test_a_sector_is_a_part_of_the_turn():
+    """Of points in the middle of the columns, so that no rounding decides."""
+    turn, first = NUSCENES_HDL32E, 150
+    part = sector(turn, np.pi - (first + 272 / 2) * turn.column_rad, 272)
+    column, row = np.divmod(np.arange(turn.num_columns * turn.num_rows), turn.num_rows)
+    azimuth = np.pi - (column + 0.5) * turn.column_rad
+    inclination = np.array(turn.inclinations_rad)[row]
+    points = np.zeros((len(column), 5), np.float32)
+    points[:, :3] = 3 * np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(inclination)], axis=1)
+    valid = np.random.default_rng(0).random(len(points)) < 0.7
+    whole, seen = (project_points(points, valid, sensor, num_rounds=1) for sensor in (turn, part))
+    columns = slice(first, first + 272)
+    np.testing.assert_array_equal(seen.features, whole.features[:, columns])
+    np.testing.assert_array_equal(seen.point_index, whole.point_index[:, columns])
+    assert int(seen.num_dropped) == valid.sum() - (np.asarray(seen.point_index) >= 0).sum()
 
 
 @pytest.mark.parametrize("num_rounds", range(1, 8))

@@ -6,7 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.sensors import PRESETS, TINY, Sensor, load_sensor, sensor_from_json, sensor_to_json
+from fcos_lidar_jax.sensors import (
+    PRESETS,
+    TINY,
+    Sensor,
+    load_sensor,
+    sector,
+    sensor_from_json,
+    sensor_to_json,
+)
 
 
 def test_presets_are_the_papers_and_the_makers():
@@ -34,6 +42,20 @@ def test_files_give_back_the_sensor(tmp_path, name):
     assert load_sensor(path) == PRESETS[name] == load_sensor(name)
 
 
+@pytest.mark.parametrize("middle", [math.pi / 2, -math.pi, 3.0, 7.0])
+def test_a_sector_has_columns_as_wide_as_the_turn_s_and_goes_through_files(tmp_path, middle):
+    part = sector(TINY, middle, 64)
+    right, left = part.azimuth_limits_rad
+    assert math.remainder((left + right) / 2 - middle, 2 * math.pi) == pytest.approx(0, abs=1e-12)
+    assert left - right == pytest.approx(math.pi / 2)
+    assert part.column_rad == pytest.approx(TINY.column_rad) == pytest.approx(2 * math.pi / 256)
+    assert (part.first_azimuth_rad, TINY.first_azimuth_rad) == (left, math.pi)
+    path = tmp_path / "sensor.json"
+    path.write_text(json.dumps(sensor_to_json(part)))
+    assert load_sensor(path) == part
+    assert "azimuth_limits_rad" not in sensor_to_json(TINY)  # described as before there were sectors
+
+
 def test_even_beams_may_be_given_in_degrees():
     beams = {"lowest": -25, "highest": 3, "rows": 64}
     sensor = sensor_from_json({"name": "a", "num_columns": 1024, "inclinations_deg": beams})
@@ -57,6 +79,14 @@ BAD = [
     ({**GOOD, "inclinations_deg": {"lowest": 1}}, "lowest, highest and rows"),
     ({**GOOD, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 1}}, "rows: got 1"),
     ({**GOOD, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 2**32}}, "rows: got 4294967296"),
+    ({**GOOD, "azimuth_limits_rad": 1}, "azimuth_limits_rad: got 1, expected a list of numbers"),
+    ({**GOOD, "azimuth_limits_rad": [1]}, r"azimuth_limits_rad: got \(1\.0,\), expected \(right, left\)"),
+    ({**GOOD, "azimuth_limits_rad": [1, 1]}, r"azimuth_limits_rad: got \(1\.0, 1\.0\), expected \(right, left\)"),
+    ({**GOOD, "azimuth_limits_rad": [4, 5]}, r"azimuth_limits_rad: got \(4\.0, 5\.0\), expected \(right, left\)"),
+    (
+        {**GOOD, "azimuth_limits_rad": [-3, 4]},
+        r"azimuth_limits_rad: got \(-3\.0, 4\.0\), expected \(right, ",
+    ),
     ({**GOOD, "limit_xy_m": 10**400}, "limit_xy_m: got 10000"),
     ({**GOOD, "origin_m": [1, 2]}, "origin_m"),
     ({**GOOD, "limit_xy_m": -1}, "limit_xy_m: got -1"),

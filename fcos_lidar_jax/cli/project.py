@@ -71,5 +71,6 @@ def run(args: Project) -> None:
     if args.png is not None:
         from fcos_lidar_jax.visualization.range_image import draw_range_image
 
-        draw_range_image(image, args.png, title=f"{args.file.name}, {sensor.name}")
+        limits = sensor.azimuth_limits_rad
+        draw_range_image(image, args.png, title=f"{args.file.name}, {sensor.name}", azimuth_limits_rad=limits)
     print(json.dumps({"file": str(args.file), **counts}))

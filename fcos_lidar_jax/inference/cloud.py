@@ -187,6 +187,10 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
     far = without_close(points, np.ones(len(points), bool), sensor, mode="all", close_m=_NEAR_M)
     points = points[np.asarray(far)]
+    if sensor.azimuth_limits_rad is not None:
+        x, y = points[:, 0] - sensor.origin_m[0], points[:, 1] - sensor.origin_m[1]
+        behind = (sensor.first_azimuth_rad - np.arctan2(y, x)) % (2 * np.pi)
+        points = points[behind < sensor.num_columns * sensor.column_rad]
     if len(points) < _MIN_ROWS:
         return None
     finding = _mismatch(points, sensor)

@@ -93,9 +93,14 @@ def scan(
     begin = rng.uniform(-1, 1)
     rings = _sample_rings(world, sensor)
     edges = np.linspace(0, sensor.num_columns, (_SECTORS if rolling_shutter else 1) + 1).astype(int)
+    # Columns of a whole turn, and of its part before the first one.
+    turn, before = float(sensor.num_columns), 0.0
+    if sensor.azimuth_limits_rad is not None:
+        turn = 2 * np.pi / sensor.column_rad
+        before = (np.pi - sensor.first_azimuth_rad) / sensor.column_rad % turn
     sectors = []
     for first, last in itertools.pairwise(edges.tolist()):
-        age = SWEEP_S * (1 - (first + last) / 2 / sensor.num_columns) if rolling_shutter else 0.0
+        age = SWEEP_S * (1 - (before + (first + last) / 2) / turn % 1) if rolling_shutter else 0.0
         fan = _make_fan(sensor, rings, begin, first, last)
         sectors.append(_scan_sector(world, sensor, rings, fan, mount, max(time_s - age, 0.0), now, rng))
     points, returned, towards, seen = zip(*sectors, strict=True)
@@ -209,11 +214,11 @@ def _measure(
 
 def _make_fan(sensor: Sensor, rings: _Rings, begin: float, first: int, last: int) -> Fan:
     rows = sensor.num_rows
-    step = 2 * np.pi / sensor.num_columns * _SURPLUS
+    step = sensor.column_rad * _SURPLUS
     # The lasers fire in turn, one of the lower half and one of the upper half alternately.
     rising = np.arange(rows)
     slot = np.where(rising < rows // 2, 2 * rising, 2 * (rising - rows // 2) + 1)
-    start = np.pi - step * (0.1 + begin + first)
+    start = sensor.first_azimuth_rad - step * (0.1 + begin + first)
     inclinations = np.sort(np.array(sensor.inclinations_rad) + rings.elevation_rad)[::-1]
     return Fan(inclinations, last - first, start, step, delay=0.83 * slot[::-1] / rows)
 

@@ -91,15 +91,21 @@ def _draw_ranges(axis: Any, points: np.ndarray, size: int, sensor: Sensor) -> No
     ]
     range_m, exists = (image[..., CHANNELS.index(name)] for name in ("range", "existence"))
     # Columns run clockwise from azimuth 180 degrees; ahead, +y, is at 90.
-    shown = np.roll(np.ma.masked_where(exists == 0, range_m), sensor.num_columns // 4, axis=1)
+    shown, left, right = np.ma.masked_where(exists == 0, range_m), -180.0, 180.0
+    if sensor.azimuth_limits_rad is None:
+        shown = np.roll(shown, sensor.num_columns // 4, axis=1)
+    else:
+        right, left = 90 - np.degrees(sensor.azimuth_limits_rad)
     axis.imshow(
         shown,
         cmap=mpl.colormaps["viridis_r"].with_extremes(bad=EMPTY),
         norm=LogNorm(2, sensor.limit_xy_m),
         aspect="auto",
         interpolation="nearest",
-        extent=(-180, 180, sensor.num_rows, 0),
+        extent=(left, right, sensor.num_rows, 0),
     )
-    axis.set_xticks((-180, -90, 0, 90, 180), ("behind", "left", "ahead", "right", "behind"), fontsize=9)
+    names = {-180: "behind", -90: "left", 0: "ahead", 90: "right", 180: "behind"}
+    ticks = [degrees for degrees in names if left <= degrees <= right]
+    axis.set_xticks(ticks, [names[degrees] for degrees in ticks], fontsize=9)
     axis.set_yticks(())
     axis.set_ylabel(f"{sensor.num_rows} beams", fontsize=9)

@@ -1,5 +1,7 @@
 """Pictures of multi-round range images."""
 
+import dataclasses
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,18 +25,21 @@ def draw_range_image(
     title: str | None = None,
     boxes: np.ndarray | None = None,
     detections: np.ndarray | None = None,
+    azimuth_limits_rad: tuple[float, float] | None = None,
 ) -> None:
     """Draw the range of every round, and below the first round its intensity and time lag.
 
-    Columns run clockwise from azimuth +180 degrees, the highest beam is on top, empty cells are grey. Ranges are
-    coloured by their logarithm, since most cells are near. The time lag is left out where all points are
-    current.
+    Columns run clockwise, in a full turn from azimuth +180 degrees, the highest beam is on top, empty cells are
+    grey. Ranges are coloured by their logarithm, since most cells are near. The time lag is left out where all
+    points are current.
 
     Args:
         boxes: f32[m, >= 7], metres, in the frame of the points; each is outlined in round 1 around the cells
             whose point lies in it, so a box without such a cell does not show.
         detections: likewise, on a panel of their own below.
+        azimuth_limits_rad: of the sensor.
     """
+    view = _View.of(azimuth_limits_rad)
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
     lags = features[:, :, _LAG].any()
@@ -49,21 +54,41 @@ def draw_range_image(
     ticks = np.unique(np.linspace(0, rows - 1, 5).round().astype(int))
     degrees = np.degrees(_row_inclinations(features))[ticks]
     for axis, (channel, r, pair) in zip(axes, panels, strict=True):
-        name = _draw_channel(figure, axis, features, channel, r)
+        name = _draw_channel(figure, axis, features, channel, r, view)
         if pair is not None:
             kind, those = pair
-            name += f"; {_outline(axis, features, those)} of {len(those)} {kind} have a cell"
+            name += f"; {_outline(axis, features, those, view)} of {len(those)} {kind} have a cell"
         axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
         axis.set_ylabel("inclination", fontsize=9)
-        axis.set(xlim=(180, -180), ylim=(rows, 0))
-        axis.set_xticks(range(180, -181, -45), [f"{v}°" for v in range(180, -181, -45)])
+        axis.set(xlim=(view.left, view.right), ylim=(rows, 0))
+        axis.set_xticks(view.ticks, [f"{v - 360 if v > 180 else v}°" for v in view.ticks])
         axis.set_yticks(ticks + 0.5, [f"{round(v)}°" for v in degrees])
         axis.tick_params(labelsize=9)
     axes[-1].set_xlabel(f"azimuth (0° along +x, 90° along +y), {columns} columns clockwise", fontsize=9)
     save_png(figure, path)
 
 
-def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r: int) -> str:
+@dataclasses.dataclass(frozen=True)
+class _View:
+    """The azimuths that a picture spans, degrees."""
+
+    left: float
+    right: float
+    full_turn: bool
+
+    @staticmethod
+    def of(azimuth_limits_rad: tuple[float, float] | None) -> "_View":
+        right, left = np.degrees(azimuth_limits_rad or (-np.pi, np.pi)).round(6).tolist()
+        return _View(left, right, azimuth_limits_rad is None)
+
+    @property
+    def ticks(self) -> range:
+        """Whole degrees, from left to right."""
+        step = 45 if self.left - self.right > 180 else 15
+        return range(math.floor(self.left / step) * step, math.ceil(self.right / step) * step - 1, -step)
+
+
+def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r: int, view: _View) -> str:
     """One channel of one round with its colour bar; returns what it shows."""
     import matplotlib as mpl
     from matplotlib.colors import LogNorm, Normalize
@@ -80,7 +105,7 @@ def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r:
         norm=norm,
         aspect="auto",
         interpolation="nearest",
-        extent=(180, -180, filled.shape[0], 0),
+        extent=(view.left, view.right, filled.shape[0], 0),
     )
     beyond = {_RANGE: "both", _INTENSITY: "max", _LAG: "neither"}[channel]
     bar = figure.colorbar(picture, ax=axis, pad=0.01, aspect=10, extend=beyond)
@@ -106,7 +131,7 @@ def _row_inclinations(features: np.ndarray) -> np.ndarray:
     return np.interp(rows, known, medians) + beyond * step
 
 
-def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray) -> int:
+def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray, view: _View) -> int:
     """Rectangles around the first-round cells of each box; returns how many boxes have any."""
     from matplotlib.patches import Rectangle
 
@@ -117,9 +142,10 @@ def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray) -> int:
     for cells in found:
         rows_in, columns_in = np.divmod(cells, columns)
         top, bottom = rows_in.min(), rows_in.max() + 1
-        for first, last in _spans(columns_in, columns):
-            left = 180 - 360 * first / columns
-            width = -360 * (last + 1 - first) / columns
+        spans = _spans(columns_in, columns) if view.full_turn else [(columns_in.min(), columns_in.max())]
+        degrees = (view.left - view.right) / columns
+        for first, last in spans:
+            left, width = view.left - degrees * first, -degrees * (last + 1 - first)
             axis.add_patch(Rectangle((left, top), width, bottom - top, fill=False, edgecolor=_BOX, linewidth=1.2))
     return len(found)
 

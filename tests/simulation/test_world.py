@@ -10,7 +10,7 @@ from numpy.random import default_rng
 from scipy.integrate import cumulative_trapezoid
 from shapely import STRtree
 
-from fcos_lidar_jax.sensors import TINY, Sensor, even_inclinations
+from fcos_lidar_jax.sensors import TINY, Sensor, even_inclinations, sector
 from fcos_lidar_jax.simulation.frames import scan_sweeps
 from fcos_lidar_jax.simulation.ground import Ground
 from fcos_lidar_jax.simulation.lidar import SWEEP_S, Scan, sample_mount, scan, sensor_pose
@@ -276,3 +276,18 @@ def test_rays_without_return_lie_about_the_sensor_and_points_tell_their_laser():
     slope = np.arctan2(back[:, 2], np.hypot(back[:, 0], back[:, 1]))
     expected = np.array(TINY.inclinations_rad)[::-1][back[:, 4].astype(int)]
     np.testing.assert_allclose(slope, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("middle", [np.pi / 2, -3.0])
+def test_a_sector_is_scanned_alone_and_in_its_part_of_the_turn(middle):
+    part = sector(TINY, middle, 64)
+    world, mount = made_by_hand(make_motion()), sample_mount(default_rng(0), TINY, level=True)
+    found, whole = (
+        scan(world, sensor, mount, 0.0, default_rng(0), rolling_shutter=True) for sensor in (part, TINY)
+    )
+    assert found.points.shape == (TINY.num_rows * 64, 5)
+    back = found.points[found.returned]
+    behind = (part.first_azimuth_rad - np.arctan2(back[:, 1], back[:, 0]) + 0.1) % (2 * np.pi)
+    assert behind.max() < 0.1 + (64 + 3) * part.column_rad
+    assert len(back) > 400
+    assert len(whole.points) == 4 * len(found.points)

@@ -177,6 +177,15 @@ def test_a_box_across_the_seam_is_outlined_at_both_ends(tmp_path):
     assert not ((columns > 1.2) & (columns < 14.8)).any()
 
 
+def test_in_a_sector_nothing_lies_across_a_seam(tmp_path):
+    """One outline from the first column to the last."""
+    box = np.array([[10, 0, 0, 1, 1, 1, 0]], np.float32)
+    image = small_image([(2, 0), (2, 15)])
+    picture, [(_, _, left, right), _] = draw(tmp_path, image, boxes=box, azimuth_limits_rad=(3.0, 4.5))
+    reddish = (picture[..., 0].astype(int) - picture[..., 1:].max(-1) > 50).any(axis=0)
+    assert reddish[left + 2 : right - 2].all()
+
+
 def test_rows_are_labelled_by_their_points_inclination():
     table = _row_inclinations(small_image([(2, 0), (2, 9), (6, 1)]).features)
     np.testing.assert_allclose(table, -np.arange(8) / 10, atol=1e-6)  # between and beyond rows with points, too
