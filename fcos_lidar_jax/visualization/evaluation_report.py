@@ -202,8 +202,13 @@ def _draw_examples(
         views.append((caption, view))
         if len(points):
             projected = project_points(points, np.ones(len(points), bool), sensor, num_rounds=1)
-            boxes = {"boxes": example.truth[0], "detections": example.detections[0]}
-            draw_range_image(projected, image, **boxes, azimuth_limits_rad=sensor.azimuth_limits_rad)
+            draw_range_image(
+                projected,
+                image,
+                boxes=example.truth[0],
+                detections=example.detections[0],
+                azimuth_limits_rad=sensor.azimuth_limits_rad,
+            )
             images.append((f"The {kind} sample's range image: truth above, detections below.", image))
     return views, images
 
