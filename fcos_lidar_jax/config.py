@@ -146,11 +146,18 @@ class InferenceConfig:
     max_detections: int = 500  # Boxes kept.
     candidates_per_level: int = 1000  # Reading: (location, class) pairs that enter NMS from each level.
     nms_overlap: Literal["bev", "3d"] = "bev"  # Reading: rotated IoU in the ground plane, or of the boxes.
+    merge_iou: float | None = None
+    """Not in the paper: weighted NMS, by which a kept box becomes the mean of those that overlap it by more than
+    this, see ``nms.merge_boxes``; None: it stays as it is."""
+    flips: Literal["none", "x", "y", "xy"] = "none"
+    """Not in the paper: mirrored views of the cloud that are detected beside it, their boxes mirrored back; "xy"
+    all three. Only flips of the training."""
 
     def __post_init__(self) -> None:
         _check(0 <= self.min_probability < 1, "min_probability", self.min_probability, "within [0, 1)")
         _check(0 <= self.iou_threshold <= 1, "iou_threshold", self.iou_threshold, "within [0, 1]")
         _check_least(self, 1, "max_detections", "candidates_per_level")
+        _check(self.merge_iou is None or 0 <= self.merge_iou <= 1, "merge_iou", self.merge_iou, "within [0, 1]")
         _check_choices(self)
 
 
@@ -254,6 +261,9 @@ class Config:
         for field, values in (("class_ranges_m", self.class_ranges_m), ("copy_paste.targets", targets)):
             _check(len(values) in (0, len(names)), field, values, f"{len(names)} values, one a class, or none")
         _check(all(v > 0 for v in self.class_ranges_m), "class_ranges_m", self.class_ranges_m, "values above 0")
+        for axis in self.inference.flips if self.inference.flips != "none" else "":
+            seen = self.augment is not None and getattr(self.augment, f"flip_{axis}_probability") > 0
+            _check(seen, "inference.flips", self.inference.flips, f"augment.flip_{axis}_probability above 0")
 
     @property
     def ranges_m(self) -> dict[str, float]:

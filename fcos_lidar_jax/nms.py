@@ -8,7 +8,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
+
+_MAX_TURN_RAD = np.pi / 3  # Boxes that point elsewhere are no estimates of the same heading.
 
 
 def rotated_nms(
@@ -57,6 +60,55 @@ def rotated_nms(
     if form is not None:
         return (rows if form == "rows" else matrix)(*candidates)
     return lax.platform_dependent(*candidates, cpu=rows, default=matrix)
+
+
+def merge_boxes(
+    boxes: Float32[Array | np.ndarray, "n c"],
+    scores: Float32[Array | np.ndarray, "n"],
+    valid: Bool[Array | np.ndarray, "n"],
+    kept: Int32[Array, "d"],
+    used: Bool[Array, "d"],
+    *,
+    labels: Int32[Array | np.ndarray, "n"] | None = None,
+    iou_threshold: float,
+    overlap: Literal["bev", "3d"] = "bev",
+) -> Float32[Array, "d c"]:
+    """Weighted NMS (RangeDet: Fan et al., ICCV 2021): what suppression keeps, improved by what it suppressed.
+
+    Each kept box becomes the mean of itself and of the valid boxes of its label that overlap it by more than the
+    threshold and point within 60 degrees of it, weighted by their squared scores; angles as differences.
+
+    Args:
+        boxes, scores, valid, labels, overlap: as given to :func:`rotated_nms`; columns after the seventh are
+            averaged, too.
+        kept, used: what it returned.
+        iou_threshold: a box takes part if IoU > threshold (static).
+
+    Returns:
+        the merged boxes, zero in unused slots.
+
+    >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0]])
+    >>> valid, best = jnp.ones(2, bool), (jnp.array([0]), jnp.array([True]))
+    >>> merge_boxes(boxes, jnp.array([0.8, 0.4]), valid, *best, iou_threshold=0.3)[0, 0].round(3).tolist()
+    0.10000000149011612
+    """
+    candidates, turned = jnp.asarray(boxes), oriented(boxes)
+    usable = jnp.asarray(valid) & ~jnp.isnan(scores)
+    weights = jnp.where(usable, scores, 0.0) ** 2
+    kinds = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
+
+    def merged(slot: Array, result: Array) -> Array:
+        index = kept[slot]
+        offsets = candidates - candidates[index]
+        offsets = offsets.at[:, 6].set(wrap_angle(offsets[:, 6]))
+        member = _overlaps(turned[index], turned, iou_threshold, overlap == "3d") & (kinds == kinds[index])
+        weight = jnp.where(member & (jnp.abs(offsets[:, 6]) <= _MAX_TURN_RAD), weights, 0.0)
+        shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
+        total = weight.sum()
+        mean = candidates[index] + shift / jnp.where(total > 0, total, 1.0)
+        return result.at[slot].set(mean.at[6].set(wrap_angle(mean[6])))
+
+    return lax.fori_loop(0, used.sum(), merged, jnp.zeros((kept.shape[0], candidates.shape[1]), jnp.float32))
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:

@@ -7,7 +7,7 @@ import oracles
 import pytest
 from jax import export
 
-from fcos_lidar_jax.nms import rotated_nms
+from fcos_lidar_jax.nms import merge_boxes, rotated_nms
 
 FORMS = pytest.mark.parametrize("form", ["rows", "matrix"])
 OPTIONS = {"iou_threshold": 0.2, "max_outputs": 50}
@@ -107,3 +107,58 @@ def test_unknown_options_are_refused():
     empty = jnp.zeros((1, 7)), jnp.zeros(1), jnp.ones(1, bool)
     with pytest.raises((ValueError, TypeError), match="form"):
         rotated_nms(*empty, iou_threshold=0.2, max_outputs=1, form="fast")
+
+
+def merged_by_loops(boxes, scores, valid, labels, kept, threshold, *, vertical):
+    result = []
+    for i in kept:
+        mean, total = np.zeros(boxes.shape[1]), 0.0
+        for j in np.flatnonzero(valid & (labels == labels[i])):
+            turn = (float(boxes[j, 6]) - float(boxes[i, 6]) + np.pi) % (2 * np.pi) - np.pi
+            overlap = oracles.iou(boxes[i : i + 1, :7], boxes[j : j + 1, :7], vertical=vertical)[0]
+            if overlap > threshold and abs(turn) <= np.pi / 3:
+                offset = boxes[j].astype(np.float64) - boxes[i]
+                offset[6] = turn
+                mean, total = mean + float(scores[j]) ** 2 * offset, total + float(scores[j]) ** 2
+        result.append(boxes[i] + mean / total)
+    return np.array(result)
+
+
+@pytest.mark.parametrize("overlap", ["bev", "3d"])
+def test_merged_boxes_are_the_weighted_means_of_those_that_overlap(overlap):
+    """Some of them turned by half a turn, and some across the seam of the angle."""
+    options = {"iou_threshold": 0.3, "overlap": overlap}
+    merge = jax.jit(merge_boxes, static_argnames=tuple(options))
+    for seed in range(3):
+        boxes, scores, valid, labels = clusters(seed)
+        rng = np.random.default_rng(seed)
+        boxes[:, 6] += np.where(rng.random(len(boxes)) < 0.3, np.pi, 0)
+        boxes = np.concatenate([boxes, rng.normal(0, 5, (len(boxes), 2)).astype(np.float32)], axis=1)
+        scores = np.maximum(scores, np.float32(0.01))
+        kept, used = compute(boxes, scores, valid, labels=labels, **OPTIONS)
+        found = np.asarray(merge(boxes, scores, valid, kept, used, labels=labels, **options))
+        assert not found[~np.asarray(used)].any()
+        chosen = np.asarray(kept)[np.asarray(used)]
+        expected = merged_by_loops(boxes, scores, valid, labels, chosen, 0.3, vertical=overlap == "3d")
+        difference = found[np.asarray(used)] - expected
+        difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
+        np.testing.assert_allclose(difference, 0, atol=2e-4)
+        assert np.abs(expected - boxes[chosen]).max() > 0.05
+
+
+def test_boxes_without_size_or_score_stay_as_they_are_and_gradients_are_finite():
+    boxes = np.zeros((4, 9), np.float32)
+    boxes[:, 0] = [0, 5, 5, 9]
+    boxes[1:3, 3:6] = 1
+    scores, valid = np.array([0.9, 0.0, 0.0, np.nan], np.float32), np.array([True, True, True, False])
+    kept, used = jnp.array([0, 1, 0, 0]), jnp.array([True, True, False, False])
+    found = np.asarray(merge_boxes(boxes, scores, valid, kept, used, iou_threshold=0.3))
+    np.testing.assert_array_equal(found[:2], boxes[:2])
+    assert not found[2:].any()
+
+    def loss(boxes, scores):
+        return jax.vmap(lambda b, s: merge_boxes(b, s, valid, kept, used, iou_threshold=0.3))(boxes, scores).sum()
+
+    tangents = jnp.ones((2, 4, 9)), jnp.ones((2, 4))
+    _, slope = jax.jvp(loss, (np.stack([boxes] * 2), np.stack([np.nan_to_num(scores)] * 2)), tangents)
+    assert bool(jnp.isfinite(slope))

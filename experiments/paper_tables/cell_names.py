@@ -40,7 +40,12 @@ FIELDS = frozenset(f"{part}.{name}".strip(".") for part, names in _SECTIONS.item
 """Fields that name a cell; ``copy_paste`` and ``augment`` themselves where they are null."""
 CONSTANTS = {"name": "", "model.stem.form": "split", "inference.nms_form": "rows"}
 """First fields that never changed a result."""
-ADDED: dict[str, Any] = {"classes": NUSCENES_CLASSES, "class_ranges_m": ()}
+ADDED: dict[str, Any] = {
+    "classes": NUSCENES_CLASSES,
+    "class_ranges_m": (),
+    "inference.merge_iou": None,
+    "inference.flips": "none",
+}
 """Later fields, and their values in older cells."""
 IGNORED = frozenset({*CONSTANTS, "model.remat"})  # Fields that cannot change a result.
 _SENSOR = "name inclinations_rad num_columns origin_m limit_xy_m limit_z_m intensity_scale row_source"

@@ -9,15 +9,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from fcos_lidar_jax.augment import flip_x, flip_y
 from fcos_lidar_jax.coding import decode
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
 from fcos_lidar_jax.models import Detector
-from fcos_lidar_jax.nms import rotated_nms
+from fcos_lidar_jax.nms import merge_boxes, rotated_nms
 from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections, Locations, Outputs
 
 Detect = Callable[[Any, Array, Array], Detections]
+_MIRRORS = {"none": ("",), "x": ("", "x"), "y": ("", "y"), "xy": ("", "x", "y", "xy")}
 
 
 def select_candidates(
@@ -61,18 +64,28 @@ def postprocess(
     Returns:
         boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d]; zero where invalid.
     """
-    boxes, scores, labels, valid = select_candidates(outputs, locations, config=config, layout=layout)
+    return _suppress(select_candidates(outputs, locations, config=config, layout=layout), config)
+
+
+def _suppress(
+    candidates: tuple[Array, Array, Array, Array], config: InferenceConfig
+) -> tuple[Array, Array, Array, Array]:
+    """The best boxes of the candidates; in and out as of :func:`postprocess`."""
+    boxes, scores, labels, valid = candidates
+    options: dict[str, Any] = {"labels": labels, "overlap": config.nms_overlap}
     with jax.named_scope("nms"):
         index, used = rotated_nms(
             boxes,
             scores,
             valid,
-            labels=labels,
+            **options,
             iou_threshold=config.iou_threshold,
             max_outputs=config.max_detections,
-            overlap=config.nms_overlap,
         )
-    best_boxes = jnp.where(used[:, None], boxes[index], 0.0)
+    if config.merge_iou is None:
+        best_boxes = jnp.where(used[:, None], boxes[index], 0.0)
+    else:
+        best_boxes = merge_boxes(boxes, scores, valid, index, used, **options, iou_threshold=config.merge_iou)
     return best_boxes, jnp.where(used, scores[index], 0.0), jnp.where(used, labels[index], 0), used
 
 
@@ -87,15 +100,33 @@ def make_detect(detector: Detector) -> Detect:
     config, sensor = detector.config, detector.sensor
     binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
 
+    rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
+    views = _MIRRORS[config.inference.flips]
+    no_points, no_boxes = jnp.zeros((0, 5)), jnp.zeros((0, 9))
+
     def detect(variables: Any, points: Array | np.ndarray, valid: Array | np.ndarray) -> Detections:
         with jax.named_scope("mrv"):
-            rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
-            image = project_points(points, valid, binned, num_rounds=rounds, prioritize_current=current_first)
-        outputs, _ = detector.apply(variables, image.features[None], train=False)
-        outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
-        boxes, scores, labels, used = postprocess(
-            outputs, locate(image, layout), config=config.inference, layout=layout
-        )
-        return Detections(boxes, scores, labels, used, image.num_dropped)
+            images = [
+                project_points(cloud, valid, binned, num_rounds=rounds, prioritize_current=current_first)
+                for cloud in (_mirror(view, sensor, jnp.asarray(points), no_boxes)[0] for view in views)
+            ]
+        outputs, _ = detector.apply(variables, jnp.stack([image.features for image in images]), train=False)
+        found = []
+        for i, (view, image) in enumerate(zip(views, images, strict=True)):
+            seen = jax.tree.map(lambda leaf, i=i: leaf[i], outputs)
+            boxes, *rest = select_candidates(seen, locate(image, layout), config=config.inference, layout=layout)
+            found.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
+        candidates = tuple(jnp.concatenate(parts) for parts in zip(*found, strict=True))
+        return Detections(*_suppress(candidates, config.inference), images[0].num_dropped)  # type: ignore[arg-type]
 
     return detect
+
+
+def _mirror(view: str, sensor: Sensor, points: Array, boxes: Array) -> tuple[Array, Array]:
+    """Points and boxes in a view that is mirrored at the sensor, or back from there."""
+    origin = jnp.asarray(sensor.origin_m[:2], jnp.float32)
+    for axis in view:
+        points, boxes = points.at[:, :2].add(-origin), boxes.at[:, :2].add(-origin)
+        points, boxes = (flip_x if axis == "x" else flip_y)(points, boxes)
+        points, boxes = points.at[:, :2].add(origin), boxes.at[:, :2].add(origin)
+    return points, boxes

@@ -28,7 +28,7 @@ from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
 _OLD_FORMAT = 2
-_LATER_FIELDS = {"model": {"remat": False}}
+_LATER_FIELDS = {"model": {"remat": False}, "inference": {"merge_iou": None, "flips": "none"}}
 """Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
 _DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
 _CARD = "README.md"
@@ -269,8 +269,8 @@ def _converted(config: dict[str, Any], written: int) -> dict[str, Any]:
 def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     """A configuration's JSON object with the fields that older ones do not have.
 
-    >>> with_later_fields({"model": {}})
-    {'model': {'remat': False}}
+    >>> with_later_fields({"model": {}})["model"]
+    {'remat': False}
     """
     later = dict[str, Any]()
     for section, fields in _LATER_FIELDS.items():

@@ -1,14 +1,16 @@
 """Candidates and detection against loops."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from tiny_run import TINY_CONFIG, bits, untrained
+from tiny_run import CONFIG, SENSOR, TINY_CONFIG, bits, untrained, weights
 
 from fcos_lidar_jax.coding import decode
-from fcos_lidar_jax.config import InferenceConfig
+from fcos_lidar_jax.config import AugmentConfig, InferenceConfig
 from fcos_lidar_jax.inference import TrainedDetector, make_detect, postprocess, select_candidates
 from fcos_lidar_jax.locations import ImageLayout, locate
 from fcos_lidar_jax.models import build_detector
@@ -114,3 +116,38 @@ def test_a_trained_detector_takes_a_file_as_its_points_and_tells_another_sensors
     assert bits(detector(tmp_path / "cloud.npy")) == bits(detector(str(tmp_path / "cloud.npy"))) == bits(found)
     with pytest.warns(UserWarning, match=r"^points hardly of sensor 'tiny' .*; expect poor detections$"):
         detector(make_frame(0, NUSCENES_HDL32E).points)
+
+
+@pytest.mark.parametrize("flips", ["x", "xy"])
+def test_mirrored_views_are_detected_too_and_their_boxes_mirrored_back(flips):
+    """A mirrored cloud has the mirrored boxes, and without further views the candidates of one view are left."""
+    sensor = dataclasses.replace(SENSOR, origin_m=(0.5, -0.25, 0.0))
+    inference = dataclasses.replace(CONFIG.inference, flips=flips, merge_iou=0.3)
+    config, variables = dataclasses.replace(CONFIG, inference=inference, augment=AugmentConfig()), weights()
+    detect = jax.jit(make_detect(build_detector(config, sensor)))
+    points = make_frame(0, SENSOR).points
+    mirrored = points * np.array([-1, 1, 1, 1, 1], np.float32) + np.array([1, 0, 0, 0, 0], np.float32)
+    valid = np.ones(len(points), bool)
+    found, back = detect(variables, points, valid), detect(variables, mirrored, valid)
+    assert found.valid.sum() > 10
+    np.testing.assert_allclose(back.scores, found.scores, atol=1e-5)
+    expected = np.asarray(found.boxes)[np.asarray(found.valid)]
+    expected[:, 0] = 1 - expected[:, 0]
+    expected[:, 6], expected[:, 7] = np.pi - expected[:, 6], -expected[:, 7]
+    difference = np.asarray(back.boxes)[np.asarray(found.valid)] - expected
+    difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    # Boxes of nearly equal scores may change places.
+    assert (np.abs(difference).max(axis=1) < 1e-3).mean() > 0.9
+
+
+def test_flips_that_the_training_did_not_have_are_refused():
+    augment = dataclasses.replace(TINY_CONFIG.augment or AugmentConfig(), flip_y_probability=0.0)
+    inference = dataclasses.replace(TINY_CONFIG.inference, flips="xy")
+    with pytest.raises(
+        ValueError, match=r"inference.flips: got 'xy', expected augment.flip_y_probability above 0"
+    ):
+        dataclasses.replace(TINY_CONFIG, augment=augment, inference=inference)
+    with pytest.raises(
+        ValueError, match=r"inference.flips: got 'xy', expected augment.flip_x_probability above 0"
+    ):
+        dataclasses.replace(TINY_CONFIG, augment=None, inference=inference)
