@@ -74,7 +74,9 @@ def page_frame(
 
 def _numbers(values: np.ndarray) -> list[Any]:
     """Nested lists; None for NaN, which JSON has not."""
-    return np.where(np.isfinite(values), values, None).tolist()
+    plain = np.array(values, object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
 
 
 def encode_points(points: np.ndarray) -> tuple[int, float, str]:
@@ -105,7 +107,7 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
     planes = places.view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)
     intensity = np.clip(np.nan_to_num(points[first, 3]), 0, 255).astype(np.uint8)
     data = planes.tobytes() + intensity.tobytes() + age[first].astype(np.uint8).tobytes()
-    return len(first), longest, base64.b64encode(gzip.compress(data, 9, mtime=0)).decode()
+    return len(first), longest, base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
 
 
 def write_page(
