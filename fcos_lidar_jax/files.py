@@ -35,6 +35,13 @@ def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
     >>> file.read_text(), [f.name for f in file.parent.iterdir()]
     ('whole', ['a.txt'])
     """
+    with atomic_path(path) as temporary:
+        write(temporary)
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """As :func:`atomic_write`, for what is written bit by bit: the temporary file's name, within the context."""
     path = Path(path)
     _check_kind(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,7 +49,7 @@ def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
     temporary = path.with_name(f".{secrets.token_hex(6)}{path.suffix}")
     try:
         with naming(path):
-            write(temporary)
+            yield temporary
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -27,11 +27,13 @@ from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.trainer import Prediction, predict
 from fcos_lidar_jax.visualization.drive import Scene, draw_drive
 from fcos_lidar_jax.visualization.evaluation_report import write_evaluation_report
+from fcos_lidar_jax.visualization.page import page_frame, write_page
 
 WEIGHTS = "quickstart"  # That are shown.
 _SETS = 200  # Of keyframes, drawn for the intervals.
 _CAPTION = """The drive, a keyframe every half a second: the range image, and the view from above, where higher
 points are darker, detections have the colour of their class, and the truth is dashed."""
+_PAGE = "drive.html"
 _SHOWN_M = 50.0  # Half the side of the square that pictures show, at most.
 
 
@@ -40,9 +42,9 @@ class Demo:
     """Look at the shipped detector on a simulated drive that it has never seen: needs no data and no GPU.
 
     Simulates a street, writes it as a data set in the nuScenes layout, detects in its keyframes, evaluates as the
-    benchmark does, and writes report.html, metrics_summary.json, an animation and pictures. With --train it then
-    trains the quickstart preset from scratch, in the folder training; Ctrl-C ends that early and evaluates what
-    there is; the same command resumes.
+    benchmark does, and writes report.html, metrics_summary.json, an animation, pictures, and drive.html, which
+    plays the drive. With --train it then trains the quickstart preset from scratch, in the folder training; Ctrl-C
+    ends that early and evaluates what there is; the same command resumes.
     """
 
     out: Path = Path("demo_output")  # Folder for the results.
@@ -102,8 +104,10 @@ def _report(args: Demo, detector: CloudDetector, frames: NuScenesFrames, predict
         args.out, evaluation, LIDAR_META, repeats=_SETS, report=Progress("sets", _SETS).show
     )
     # Drawn from the score on at which precision and recall are balanced best.
-    least = choose_examples(evaluation).min_score
+    chosen = choose_examples(evaluation)
+    least = chosen.min_score
     scenes = [_scene(prediction, least) for prediction in predictions]
+    _write_page(args.out / _PAGE, detector, frames, predictions, least)
     limit_m = min(sensor.limit_xy_m, _SHOWN_M)
     title = f"{WEIGHTS} on an unseen simulated drive: score {least:.2f} and more, truth dashed"
     options = {"sensor": sensor, "classes": classes, "title": title, "limit_m": limit_m}
@@ -113,11 +117,25 @@ def _report(args: Demo, detector: CloudDetector, frames: NuScenesFrames, predict
         args.out,
         title=f"{WEIGHTS} on an unseen simulated drive",
         num_samples=len(scenes),
-        examples=examples(evaluation, frames, np.zeros((len(scenes), 3))),
+        examples=examples(evaluation, frames, np.zeros((len(scenes), 3)), chosen.rows, min_score=least),
         sensor=sensor,
         pictures=[(_CAPTION, args.out / "drive.gif")],
+        links=[("Look at the drive: play, turn, zoom", _PAGE)],
     )
     return describe(evaluation, intervals)
+
+
+def _write_page(
+    path: Path, detector: CloudDetector, frames: NuScenesFrames, predictions: list[Prediction], min_score: float
+) -> None:
+    """The drive to look at: all detections, of which those from ``min_score`` on show at first."""
+    shown = []
+    for prediction in predictions:
+        scene, index = _scene(prediction, 0.0), prediction.index
+        at = {"time_us": frames.time_us(index), "pose": frames.pose(index), "name": frames.name(index)}
+        shown.append(page_frame(scene.points, scene.detections, truth=scene.truth, **at))
+    title = f"{WEIGHTS} on a simulated drive"
+    write_page(path, shown, classes=detector.classes, title=title, min_score=min_score)
 
 
 def _scene(prediction: Prediction, min_score: float) -> Scene:

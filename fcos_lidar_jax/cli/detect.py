@@ -18,6 +18,7 @@ from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.trainer import predict
 from fcos_lidar_jax.training.checkpoints import find_checkpoint
+from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +44,8 @@ class Detect:
     as the detector was trained."""
     pictures: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also draw every cloud with its boxes, from above."""
+    page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
+    """Also write a page that shows the clouds: one file for any browser, which asks for nothing else."""
     columns: int | None = None
     """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
     dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
@@ -60,10 +63,13 @@ def run(args: Detect) -> None:
     files = find_clouds(args.files) if args.sweeps is None else (args.sweeps,)
     sweeps = () if args.sweeps is None else (args.sweeps.parent / each.file for each in read_list(args.sweeps))
     check_out_file("--out", args.out, keep=(*files, *sweeps))
+    if args.page is not None:
+        check_out_file("--page", args.page, keep=(*files, *sweeps, args.out))
     if args.pictures is not None:
         check_out_folder(args.pictures, "--pictures")
-    if find_checkpoint(args.checkpoint).resolve() in args.out.resolve().parents:
-        raise ValueError(f"--out: {args.out}: found a place in the checkpoint, expected one elsewhere")
+    for option, out in (("--out", args.out), ("--page", args.page or args.out)):
+        if find_checkpoint(args.checkpoint).resolve() in out.resolve().parents:
+            raise ValueError(f"{option}: {out}: found a place in the checkpoint, expected one elsewhere")
     detector = load_detector(args.checkpoint)
     projection = detector.config.projection
     clouds = CloudFiles(
@@ -76,7 +82,7 @@ def run(args: Detect) -> None:
         max_points=args.max_file_points,
     )
     progress = Progress("files", len(clouds))
-    results: list[dict[str, Any]] = []
+    results, frames = list[dict[str, Any]](), list[PageFrame]()
     for prediction in predict(detector, clouds, batch_size=args.batch_size):
         file, found, cloud = clouds.files[prediction.index], prediction.detections, prediction.cloud
         assert prediction.frame is not None
@@ -87,6 +93,9 @@ def run(args: Detect) -> None:
         record = {"file": str(file), "num_points": cloud.num_points, "num_dropped": dropped}
         record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
         results.append(record | {"boxes": boxes})
+        if args.page is not None:
+            shown = confident(found, args.min_score)
+            frames.append(page_frame(prediction.frame.points, shown, name=file.name))
         if args.pictures is not None:
             from fcos_lidar_jax.visualization.bev import draw_bev
 
@@ -99,3 +108,5 @@ def run(args: Detect) -> None:
         progress.show(len(results), f"{file}: {len(boxes)} boxes")
     text = json.dumps({"files": results}, indent=1)
     atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))
+    if args.page is not None:
+        write_page(args.page, frames, classes=detector.classes, title=f"Boxes of {args.checkpoint.name}")

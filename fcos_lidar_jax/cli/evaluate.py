@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,8 @@ from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.trainer.results import write_predictions
 from fcos_lidar_jax.types import Detections
-from fcos_lidar_jax.visualization.evaluation_report import Example, clear_report, write_evaluation_report
+from fcos_lidar_jax.visualization.evaluation_report import PAGE, Example, clear_report, write_evaluation_report
+from fcos_lidar_jax.visualization.page import page_frame, write_page
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +45,9 @@ class Evaluate:
 
     Either a detector is run over a split (--checkpoint), or a results file is read (--results), against the
     annotations of a data set (--data-root) or, for an official results file, a file of ground truth
-    (--ground-truth). Writes metrics_summary.json, curves.json, report.html with its pictures, and the detections:
-    results_nusc.json for nuScenes, else detections.json. Ctrl-C, or a kill, loses one batch of a detector's work:
-    the same command resumes.
+    (--ground-truth). Writes metrics_summary.json, curves.json, report.html with its pictures, frames.html, which
+    shows the worst and the best frames with their truth, and the detections: results_nusc.json for nuScenes, else
+    detections.json. Ctrl-C, or a kill, loses one batch of a detector's work: the same command resumes.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
@@ -63,7 +64,7 @@ class Evaluate:
     """Truth as JSON, instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
     batch_size: int = 1  # Frames that a device takes at once; more than one changes boxes and scores by rounding.
     bootstrap: int = 0  # Sets of samples to draw for the 95 % intervals of mAP and NDS; a few hundred will do.
-    report: bool = True  # Write report.html and its pictures.
+    report: bool = True  # Write report.html with its pictures, and frames.html.
     sensor: str = "nuscenes_hdl32e"
     """Sensor of the range images of a results file: preset or file; a checkpoint knows its own."""
 
@@ -90,14 +91,7 @@ def run(args: Evaluate) -> None:
             args.out, evaluation, compared.meta, repeats=args.bootstrap, report=progress.show
         )
         if args.report:
-            write_evaluation_report(
-                args.out,
-                title=f"{(args.checkpoint or args.results or Path()).name} on {compared.name}",
-                num_samples=len(compared.truth.tokens),
-                examples=examples(evaluation, compared.frames, compared.truth.ego_translation),
-                sensor=sensor,
-                global_axes=compared.frames is None,
-            )
+            _report(args, compared, evaluation, sensor)
     for line in warnings(evaluation, len(compared.predictions)):
         print(line, file=sys.stderr)
     print(describe(evaluation, intervals))
@@ -120,7 +114,7 @@ def _check(args: Evaluate) -> None:
     check_out_folder(args.out)
     given = [] if args.results is None else [args.results]
     truth = [] if args.ground_truth is None else [args.ground_truth]
-    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html"):
+    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE):
         check_out_file("--out", args.out / name, keep=[*given, *truth])
     for name in ("results_nusc.json", "detections.json"):  # may be evaluated again where they are
         check_out_file("--out", args.out / name, keep=truth)
@@ -208,19 +202,49 @@ def _detect(
         print(f"{removed['invalid']} points dropped: not finite, or beyond physical limits", file=sys.stderr)
 
 
-def examples(evaluation: Evaluation, frames: FrameSet | None, centres: np.ndarray) -> Iterator[Example]:
-    """The best, a typical and the worst sample.
+def _report(args: Evaluate, compared: _Compared, evaluation: Evaluation, sensor: Sensor) -> None:
+    """The report, and the page that it links to."""
+    title = f"{(args.checkpoint or args.results or Path()).name} on {compared.name}"
+    chosen = choose_examples(evaluation)
+    place = evaluation, compared.frames, compared.truth.ego_translation
+    frames = [
+        page_frame(each.points, each.detections, name=f"{each.kind}: {each.name}", truth=each.truth)
+        for each in examples(*place, chosen.extremes, min_score=0, all_sweeps=True)
+    ]
+    if frames:
+        options = {"classes": evaluation.metric.classes, "min_score": chosen.min_score}
+        write_page(args.out / PAGE, frames, title=title, **options)
+    write_evaluation_report(
+        args.out,
+        title=title,
+        num_samples=len(compared.truth.tokens),
+        examples=examples(*place, chosen.rows, min_score=chosen.min_score),
+        sensor=sensor,
+        global_axes=compared.frames is None,
+        links=[("Look at the worst and the best frames", PAGE)] if frames else [],
+    )
+
+
+def examples(
+    evaluation: Evaluation,
+    frames: FrameSet | None,
+    centres: np.ndarray,
+    rows: Mapping[str, int],
+    *,
+    min_score: float,
+    all_sweeps: bool = False,
+) -> Iterator[Example]:
+    """Samples by what they are called, with the boxes that reach a score, and the current sweep or all of them.
 
     Without frames they are in the global frame, around their ``centres`` f64[samples, 3], and without points.
     """
-    chosen = choose_examples(evaluation)
-    for kind, row in chosen.rows.items():
+    for kind, row in rows.items():
         pose, points = np.eye(4), np.zeros((0, 5), np.float32)
         pose[:3, 3] = centres[row]
         if frames is not None:
             points = frames.frame(row).points
-            points = points[points[:, 4] == 0]
+            points = points if all_sweeps else points[points[:, 4] == 0]
             own_pose = frames.pose(row) if evaluation.metric is NUSCENES_METRIC else None
             pose = np.eye(4) if own_pose is None else own_pose
-        found, true = sensor_boxes(evaluation, row, pose, min_score=chosen.min_score)
+        found, true = sensor_boxes(evaluation, row, pose, min_score=min_score)
         yield Example(kind, evaluation.tokens[row], points, found, true)

@@ -22,6 +22,7 @@ from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open import find_layout
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
+from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +47,8 @@ class Stream:
     keyframes: bool = False  # Only the scene's keyframes.
     page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
     """Also write a page that shows the drive: one file for any browser, which asks for nothing else."""
+    rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Also write a recording for the viewer rerun, with `pip install 'fcos-lidar-jax[viz]'`."""
     track: bool = False  # Give every box the identity of its object over time; needs poses.
     min_score: float = 0.0  # Leave out boxes below this score.
     columns: int | None = None
@@ -65,7 +68,10 @@ def run(args: Stream) -> None:
         print("no poses: every sweep is detected on its own, without those before it", file=sys.stderr)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
-    with args.out.open("wb", buffering=0) as lines:  # a line is one write, so that interruptions leave whole ones
+    with (
+        rerun_recording(args.rrd, detector.classes) as record_rerun,
+        args.out.open("wb", buffering=0) as lines,  # a line is one write, so that interruptions leave whole ones
+    ):
         for found in detect_stream(drive.sweeps, detector, num_sweeps=None if drive.posed else 1):
             points = found.cloud.points[found.cloud.valid]
             if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
@@ -78,8 +84,13 @@ def run(args: Stream) -> None:
                 tracks, ids = track(tracks, to_world(boxes, found.sweep.sensor_to_world), labels, scores, dt)
                 record["boxes"] = [b | {"track": int(i)} for b, i in zip(record["boxes"], ids, strict=True)]
             lines.write(json.dumps(record).encode() + b"\n")
+            look = {"name": Path(found.sweep.name).name, "ids": ids}
+            if drive.posed:
+                look |= {"time_us": found.sweep.time_us, "pose": found.sweep.sensor_to_world}
+            points = found.sweep.points[:, :4]
+            record_rerun(points, (boxes, labels, scores), **look)
             if args.page is not None:
-                frames.append(page_frame(found.sweep, boxes, labels, scores, ids, posed=drive.posed))
+                frames.append(page_frame(points, (boxes, labels, scores), **look))
             before_us = found.sweep.time_us
     if args.page is not None:
         write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source))
@@ -101,6 +112,9 @@ def _check(args: Stream) -> None:
     check_out_file("--out", args.out, keep=keep)
     if args.page is not None:
         check_out_file("--page", args.page, keep=[*keep, args.out])
+    if args.rrd is not None:
+        check_rerun()
+        check_out_file("--rrd", args.rrd, keep=[*keep, args.out, *filter(None, [args.page])])
     args.out.parent.mkdir(parents=True, exist_ok=True)
 
 

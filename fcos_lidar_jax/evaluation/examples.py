@@ -7,12 +7,15 @@ import numpy as np
 from fcos_lidar_jax.evaluation.boxes import BoxColumns
 from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation
 
+_EXTREMES = 3  # Of the worst and of the best.
+
 
 @dataclasses.dataclass(frozen=True)
 class Examples:
     """Samples to draw, and the detections to draw in them."""
 
     rows: dict[str, int]  # best, typical and worst -> row of the sample; fewer where there are fewer samples
+    extremes: dict[str, int]  # worst 1 to 3 and best 1 to 3, likewise; none twice
     min_score: float  # the score from which on the predictions of all samples together have the highest F1
 
 
@@ -34,12 +37,15 @@ def choose_examples(evaluation: Evaluation) -> Examples:
     quality = 2 * hits / np.maximum(np.bincount(sample[shown], minlength=num_samples) + truth, 1)
     candidates = np.flatnonzero(truth)
     if not len(candidates):
-        return Examples({}, min_score)
+        return Examples({}, {}, min_score)
     most = -truth[candidates]
     falling, rising = (candidates[np.lexsort((most, q[candidates]))].tolist() for q in (-quality, quality))
     # One name a sample, of several the last.
     names = {falling[len(falling) // 2]: "typical", rising[0]: "worst", falling[0]: "best"}
-    return Examples(dict(sorted((name, row) for row, name in names.items())), min_score)
+    worst = rising[:_EXTREMES]
+    ranked = {"worst": worst, "best": [row for row in falling[:_EXTREMES] if row not in worst]}
+    extremes = {f"{kind} {place}": row for kind, rows in ranked.items() for place, row in enumerate(rows, 1)}
+    return Examples(dict(sorted((name, row) for row, name in names.items())), extremes, min_score)
 
 
 def sensor_boxes(

@@ -24,6 +24,7 @@ ERROR_NAMES = {
     "attr_err": ("AAE", "attribute [1 - accuracy]"),
 }
 """Errors of the hits: abbreviation, name and unit."""
+PAGE = "frames.html"  # The worst and the best frames, to look at.
 _MARGIN_M = 2.0  # shown beyond the largest class range
 
 
@@ -47,6 +48,7 @@ def write_evaluation_report(
     sensor: Sensor,
     global_axes: bool = False,
     pictures: Sequence[Picture] = (),
+    links: Sequence[tuple[str, str]] = (),
 ) -> None:
     """Write ``report.html``, one file that needs nothing else, and its pictures into ``pictures/``.
 
@@ -58,6 +60,7 @@ def write_evaluation_report(
         sensor: of their range images.
         global_axes: x and y of the examples are the directions of the global frame.
         pictures: more of them, which stand first.
+        links: text and name of files beside the report.
     """
     summary, curves = (json.loads((out / f"{name}.json").read_text()) for name in ("metrics_summary", "curves"))
     file, folder = out / "bootstrap.json", out / "pictures"
@@ -80,6 +83,7 @@ def write_evaluation_report(
         out / "report.html",
         title=title,
         lead=_lead(summary, num_samples, defined),
+        links=links,
         summary=_scores(summary, intervals, defined),
         tables=[("By class", ("class", "AP", *(f"AP {float(d):g} m" for d in distances), *short), rows)],
         galleries=[("Precision over recall", precisions), ("Mean errors of the hits, up to each recall", errors)],
@@ -89,8 +93,9 @@ def write_evaluation_report(
 
 
 def clear_report(out: Path) -> None:
-    """Remove the report and the pictures of an earlier evaluation."""
-    (out / "report.html").unlink(missing_ok=True)
+    """Remove the report, its page and the pictures of an earlier evaluation."""
+    for name in ("report.html", PAGE):
+        (out / name).unlink(missing_ok=True)
     for file in (out / "pictures").glob("*.png"):
         if re.fullmatch(r"(precision|errors)_\d+_.*|(best|typical|worst)_(bev|range)\.png", file.name):
             file.unlink()

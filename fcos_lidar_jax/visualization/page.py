@@ -1,4 +1,4 @@
-"""A drive as one HTML file that asks for nothing else: points, boxes and the way of the ego vehicle."""
+"""Frames as one HTML file that asks for nothing else: points, boxes, truth and the way of the ego vehicle."""
 
 import base64
 import dataclasses
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.inference.cloud import MAX_TIME_LAG_S
 from fcos_lidar_jax.visualization.figure import class_color
 
 STEP_M = 0.02  # Points are rounded to multiples of it.
@@ -21,80 +21,111 @@ _LIMIT = 2**15 - 1  # int16: points up to 655 m away.
 
 @dataclasses.dataclass(frozen=True)
 class PageFrame:
-    """A sweep with its boxes, as the page holds it."""
+    """A cloud with its boxes, as the page holds it."""
 
     name: str
     time_us: int | None  # None where it is not known.
     pose: list[float] | None  # 16 numbers, row by row, from the sensor to the world; likewise.
-    num_points: int  # Finite ones within reach, each cell of the size STEP_M counted once.
+    num_points: int  # Finite ones within reach, each cell of the size STEP_M of a sweep counted once.
+    max_lag_s: float  # Of the points; 0 for those of one sweep.
     points: str  # See encode_points.
-    boxes: list[list[float]]  # x, y, z, l, w, h, yaw, vx, vy
+    boxes: list[list[float | None]]  # x, y, z, l, w, h, yaw, vx, vy; None for what is not finite.
     labels: list[int]
     scores: list[float]
     ids: list[int] | None  # Over time, None where they are not known.
+    truth: list[list[float | None]] | None  # As the boxes, None where it is not known.
+    truth_labels: list[int] | None
 
 
 def page_frame(
-    sweep: Sweep,
-    boxes: np.ndarray,
-    labels: np.ndarray,
-    scores: np.ndarray,
-    ids: np.ndarray | None = None,
+    points: np.ndarray,
+    found: tuple[np.ndarray, np.ndarray, np.ndarray],
     *,
-    posed: bool = True,
+    name: str,
+    time_us: int | None = None,
+    pose: np.ndarray | None = None,
+    ids: np.ndarray | None = None,
+    truth: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> PageFrame:
-    """A sweep and the boxes f32[m, 9] in its frame, encoded, so that a long drive fits into memory."""
-    num_points, points = encode_points(sweep.points)
+    """A cloud and its boxes, encoded, so that many fit into memory.
+
+    Args:
+        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), time lag in seconds (else 0).
+        found: boxes f32[m, 9] in the frame of the points, labels i32[m], scores f32[m].
+        name: of the frame.
+        time_us, pose: when, and f64[4, 4] to the world; for the frames of one drive alone.
+        ids: i32[m], identities over time.
+        truth: boxes f32[k, 9], labels i32[k].
+    """
+    boxes, labels, scores = found
     return PageFrame(
-        Path(sweep.name).name,
-        sweep.time_us if posed else None,
-        np.ravel(sweep.sensor_to_world).tolist() if posed else None,
-        num_points,
-        points,
-        np.asarray(boxes).tolist(),
+        name,
+        time_us,
+        None if pose is None else np.ravel(pose).tolist(),
+        *encode_points(points),
+        _numbers(boxes),
         np.asarray(labels).tolist(),
-        np.asarray(scores).tolist(),
+        _numbers(scores),
         None if ids is None else ids.tolist(),
+        None if truth is None else _numbers(truth[0]),
+        None if truth is None else np.asarray(truth[1]).tolist(),
     )
 
 
-def encode_points(points: np.ndarray) -> tuple[int, str]:
-    """Points in few bytes: rounded, each place once, sorted by x, compressed.
+def _numbers(values: np.ndarray) -> list[Any]:
+    """Nested lists; None for NaN, which JSON has not."""
+    plain = np.array(values, object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
+
+
+def encode_points(points: np.ndarray) -> tuple[int, float, str]:
+    """Points in few bytes: rounded, each place of a sweep once, sorted by time lag and x, compressed.
 
     The bytes are planes, one behind another: x as int16 differences, y and z as int16, the low bytes of each
-    before its high bytes, then the intensity as uint8; compressed by gzip, written in base64.
+    before its high bytes, then as uint8 the intensity and the time lag, 255 for the largest; compressed by gzip,
+    written in base64.
 
     Args:
-        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255).
+        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), time lag in seconds (else 0).
 
     Returns:
-        how many points are left, and the text.
+        how many points are left, their largest time lag in seconds, and the text.
 
-    >>> encode_points(np.array([[1, 2, 3, 9], [1, 2, 3.001, 9], [np.nan, 0, 0, 0]], np.float32))[0]
-    1
+    >>> encode_points(np.array([[1, 2, 3, 9], [1, 2, 3.001, 9], [np.nan, 0, 0, 0]], np.float32))[:2]
+    (1, 0.0)
     """
-    near = (np.abs(points[:, :3]) < STEP_M * _LIMIT).all(axis=1)
-    places = np.round(points[near, :3] / STEP_M).astype("<i2")
-    places, first = np.unique(places, axis=0, return_index=True)  # sorted by x first
-    places[:, 0] = np.diff(places[:, 0], prepend=places.dtype.type(0))
-    planes = places.T.copy().view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)
-    intensity = np.clip(np.nan_to_num(points[near, 3][first]), 0, 255).astype(np.uint8)
-    data = gzip.compress(planes.tobytes() + intensity.tobytes(), 9, mtime=0)
-    return len(places), base64.b64encode(data).decode()
+    points = points[(np.abs(points[:, :3]) < STEP_M * _LIMIT).all(axis=1)]
+    lags = points[:, 4] if points.shape[1] > 4 else np.zeros(len(points))
+    lags = np.clip(np.nan_to_num(lags), 0, MAX_TIME_LAG_S)
+    longest = float(lags.max(initial=0))
+    age = np.round(lags * (255 / longest if longest else 0)).astype(np.int64)
+    # Sorted as one integer each: many times faster than as rows.
+    x, y, z = np.round(points[:, :3].T / STEP_M).astype(np.int64) - np.iinfo(np.int16).min
+    _, first = np.unique(age << 48 | x << 32 | y << 16 | z, return_index=True)
+    places = np.stack([np.diff(x[first], prepend=2**15), y[first] - 2**15, z[first] - 2**15]).astype("<i2")
+    planes = places.view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)
+    intensity = np.clip(np.nan_to_num(points[first, 3]), 0, 255).astype(np.uint8)
+    data = planes.tobytes() + intensity.tobytes() + age[first].astype(np.uint8).tobytes()
+    return len(first), longest, base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
 
 
-def write_page(path: str | Path, frames: Sequence[PageFrame], *, classes: Sequence[str], title: str) -> None:
+def write_page(
+    path: str | Path, frames: Sequence[PageFrame], *, classes: Sequence[str], title: str, min_score: float = 0.3
+) -> None:
     """Write the page.
 
     Args:
         path: of the HTML file.
-        frames: in the order of time.
+        frames: in their order.
         classes: names that the labels index.
         title: of the page.
+        min_score: of the boxes that show at first.
     """
-    content: dict[str, Any] = {"title": title, "step_m": STEP_M, "classes": list(classes)}
+    content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}
     content |= {"colors": [class_color(label) for label in range(len(classes))]}
     content |= {"frames": [dataclasses.asdict(frame) for frame in frames]}
-    text = json.dumps(content).replace("<", "\\u003c")  # names may hold anything, even the end of a script
+    # Names may hold anything, even the end of a script.
+    text = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
     template = files("fcos_lidar_jax.visualization").joinpath("page.html").read_text(encoding="utf-8")
     atomic_write(path, lambda file: file.write_text(template.replace("{{drive}}", text), encoding="utf-8"))

@@ -39,6 +39,7 @@ def write_report(
     title: str,
     summary: Mapping[str, Cell],
     lead: str = "",
+    links: Sequence[tuple[str, str]] = (),
     tables: Sequence[Table] = (),
     galleries: Sequence[tuple[str, Sequence[Picture]]] = (),
     pictures: Sequence[Picture] = (),
@@ -49,6 +50,7 @@ def write_report(
     Args:
         summary: named values; of all numbers, those with a point are shown with three decimals, NaN as a dash.
         lead: one paragraph below the heading.
+        links: text and name of files that lie beside the report.
         tables: caption, header and rows each; the first column names the row.
         galleries: heading and small pictures each, as many side by side as there is room for.
         pictures: caption and PNG or GIF each, curves too; the files are embedded.
@@ -63,6 +65,7 @@ def write_report(
     parts = [f"<h1>{_text(title)}</h1>"]
     if lead:
         parts.append(f"<p>{_text(lead)}</p>")
+    parts += [f'<p><a href="{_text(file)}">{_text(text)}</a></p>' for text, file in links]
     parts.append(_table("Summary", ("", "value"), list(summary.items())))
     parts += [_table(*table) for table in tables]
     for heading, shown in galleries:

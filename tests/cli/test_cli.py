@@ -4,11 +4,12 @@ import dataclasses
 import json
 import os
 import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command
+from commands import assert_one_line_error, command, page_content
 from PIL import Image
 from tiny_run import TINY_CONFIG, bits, untrained
 
@@ -58,7 +59,8 @@ def home(tmp_path_factory):
 
 def test_detect_writes_the_contract(home, tmp_path, capsys):
     out, files = tmp_path / "boxes.json", [home / "good.npy", home / "nan.npy"]
-    command("detect", *files, "--checkpoint", home / "checkpoint", "--out", out, "--pictures", tmp_path)
+    look = "--pictures", tmp_path, "--page", tmp_path / "page.html"
+    command("detect", *files, "--checkpoint", home / "checkpoint", "--out", out, *look)
     progress = capsys.readouterr().err.strip().splitlines()
     assert len(progress) == 2
     assert "2/2" in progress[1]
@@ -76,6 +78,10 @@ def test_detect_writes_the_contract(home, tmp_path, capsys):
     assert len(scores) > 0
     assert scores == sorted(scores, reverse=True)
     assert len(list(tmp_path.glob("*.png"))) == 2
+    for file, frame in zip((good, bad), page_content(tmp_path / "page.html")["frames"], strict=True):
+        assert frame["name"] == Path(file["file"]).name
+        assert frame["boxes"] == [box["box"] for box in file["boxes"]]
+        assert [frame["pose"], frame["truth"]] == [None, None]
 
 
 def test_a_file_name_is_no_formula(home, tmp_path):
@@ -261,6 +267,11 @@ def test_demo_draws_an_animation_and_reports(drive):
     report = (drive / "report.html").read_text()
     assert report.count("data:image/gif;base64,") == 1
     assert "NDS" in report
+    assert 'href="drive.html"' in report
+    frames = page_content(drive / "drive.html")["frames"]
+    assert [frame["time_us"] - frames[0]["time_us"] for frame in frames] == pytest.approx([0, 5e5, 1e6], abs=1e5)
+    assert all(frame["pose"] and frame["num_points"] > 500 for frame in frames)
+    assert sum(len(frame["truth"]) for frame in frames) > 0
     assert "://" not in report  # no outside address; base64 has no colon
 
 

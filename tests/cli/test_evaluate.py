@@ -8,7 +8,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, in_use
+from commands import assert_one_line_error, in_use, page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
@@ -91,6 +91,17 @@ def test_the_official_keys_in_the_official_order(by_tables):
     precision = np.array(curves["classes"]["car"]["precision"]["2.0"])
     ap = np.maximum(precision[11:] - 0.1, 0).mean() / 0.9
     assert summary["label_aps"]["car"]["2.0"] == pytest.approx(ap)
+
+
+def test_a_page_shows_the_worst_and_the_best_frames(by_tables):
+    page, summary = page_content(by_tables / "frames.html"), read(by_tables / "metrics_summary.json")
+    assert page["classes"] == list(summary["label_aps"])
+    assert page["frames"][0]["name"].startswith("worst 1: ")
+    assert {frame["name"].split()[0] for frame in page["frames"]} == {"worst", "best"}
+    for frame in page["frames"]:
+        assert frame["num_points"] > 100
+        assert len(frame["truth"]) == len(frame["truth_labels"]) > 0
+    assert 'href="frames.html"' in (by_tables / "report.html").read_text()
 
 
 def test_the_report_shows_the_numbers_of_the_summary(by_tables):

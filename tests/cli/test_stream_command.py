@@ -2,11 +2,10 @@
 
 import dataclasses
 import json
-import re
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command
+from commands import assert_one_line_error, command, page_content
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
@@ -98,10 +97,7 @@ def test_tracks_and_page(home, tmp_path):
     page = tmp_path / "page.html"
     lines = stream(home, tmp_path / "b.jsonl", "--poses", home / "poses.json", "--track --page", page)
     plain = stream(home, tmp_path / "c.jsonl", "--poses", home / "poses.json")
-    text = re.search(r'id="drive">(.*?)</script>', page.read_text(), re.DOTALL)
-    assert text is not None
-    frames = json.loads(text[1])["frames"]
-    for line, bare, frame in zip(lines, plain, frames, strict=True):
+    for line, bare, frame in zip(lines, plain, page_content(page)["frames"], strict=True):
         ids = [box.pop("track") for box in line["boxes"]]
         assert len(set(ids)) == len(ids) > 0
         assert line == bare
@@ -135,6 +131,14 @@ def test_an_interruption_leaves_whole_lines(home, tmp_path, monkeypatch):
         main(["stream", str(home / "drive"), "--checkpoint", str(home / "checkpoint"), "--out", str(out)]) == 130
     )
     assert [set(json.loads(line)) >= {"file", "boxes"} for line in out.read_text().splitlines()] == [True, True]
+
+
+def test_a_recording_for_rerun(home, tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    file = tmp_path / "drive.rrd"
+    lines = stream(home, tmp_path / "b.jsonl", "--poses", home / "poses.json", "--rrd", file)
+    assert file.read_bytes()[:3] == b"RRF"
+    assert len(lines) == SWEEPS
 
 
 MISTAKES = {

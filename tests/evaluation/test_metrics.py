@@ -218,6 +218,13 @@ def test_examples_run_from_best_to_worst():
             boxes += confident.sum() + (ranking.truth_sample == row).sum()
         shown[name] = 2 * hits / boxes
     assert shown["best"] > shown["typical"] > shown["worst"]
+    assert chosen.extremes["worst 1"] == chosen.rows["worst"]
+    assert chosen.extremes["best 1"] == chosen.rows["best"]
+    assert [*chosen.extremes] == [f"{kind} {place}" for kind in ("worst", "best") for place in (1, 2, 3)]
+    assert len(set(chosen.extremes.values())) == 6
+    results, truth = task(1)
+    few = {token: sample if i < 4 else {**sample, "boxes": []} for i, (token, sample) in enumerate(truth.items())}
+    assert [*choose_examples(evaluated(results, few)).extremes] == ["worst 1", "worst 2", "worst 3", "best 1"]
     results, truth = task()
     nothing = {token: {**sample, "boxes": []} for token, sample in truth.items()}
     assert choose_examples(evaluated(results, nothing)).rows == {}

@@ -1,6 +1,7 @@
 """Commands of ``fcos-lidar``, in this process and in others."""
 
 import contextlib
+import json
 import os
 import re
 import subprocess
@@ -8,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import jax
 import quick
@@ -19,6 +21,13 @@ from fcos_lidar_jax.files import folder_lock
 def command(*args: object) -> None:
     """Run a command that must succeed; each argument a word, or several with spaces between."""
     assert main([word for arg in args for word in (arg.split() if isinstance(arg, str) else [str(arg)])]) == 0
+
+
+def page_content(path: Path) -> dict[str, Any]:
+    """What a page of ``visualization/page.py`` holds."""
+    found = re.search(r'<script type="application/json" id="drive">(.*?)</script>', path.read_text(), re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
 
 
 def assert_one_line_error(capsys, args: list[str], message: str) -> None:

@@ -1,0 +1,94 @@
+"""A drive as a recording for the viewer rerun (extra ``viz``)."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.files import atomic_path
+from fcos_lidar_jax.visualization.figure import class_color
+
+_HIGH_M = 4.0  # Above the ground, where the colours of the points end.
+
+
+def check_rerun() -> None:
+    """Refuse, in one line, to go on without rerun.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    try:
+        import rerun  # noqa: F401
+    except ImportError:
+        line = "rerun is not installed, which writes it: pip install 'fcos-lidar-jax[viz]'"
+        raise ValueError(f"--rrd: {line}") from None
+
+
+@contextlib.contextmanager
+def rerun_recording(path: Path | None, classes: Sequence[str]) -> Iterator[Callable[..., None]]:
+    """A function that records frames, with the arguments of :func:`fcos_lidar_jax.visualization.page.page_frame`.
+
+    What it records is written as it comes; the file is there when the context ends, and only if nothing failed.
+
+    Args:
+        path: of the recording (.rrd); with None nothing is recorded.
+        classes: names that the labels index.
+
+    >>> with rerun_recording(None, ("car",)) as record:
+    ...     record(np.zeros((0, 4)), (np.zeros((0, 9)), np.zeros(0), np.zeros(0)), name="a")
+    """
+    if path is None:
+        yield lambda *_, **__: None
+        return
+    import rerun as rr
+
+    with atomic_path(path) as temporary:
+        recording = rr.RecordingStream("fcos_lidar_jax")
+        recording.save(temporary)
+        number = iter(range(2**63))
+        with recording:
+            yield lambda *given, **named: _record(recording, next(number), classes, *given, **named)
+        recording.disconnect()
+
+
+def _record(
+    recording: Any,
+    number: int,
+    classes: Sequence[str],
+    points: np.ndarray,
+    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+    *,
+    name: str,
+    time_us: int | None = None,
+    pose: np.ndarray | None = None,
+    ids: np.ndarray | None = None,
+) -> None:
+    """Points by height, boxes with class, score and identity, in the frame of the sensor, which has its pose."""
+    import matplotlib as mpl
+    import rerun as rr
+
+    recording.set_time("frame", sequence=number)
+    if time_us is not None:
+        recording.set_time("time", timestamp=np.datetime64(time_us, "us"))
+    if pose is not None:
+        recording.log("sensor", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+    points = points[np.isfinite(points[:, :3]).all(axis=1)]
+    height = points[:, 2] - (np.quantile(points[:, 2], 0.1) if len(points) else 0)
+    colors = mpl.colormaps["viridis"](height / _HIGH_M, bytes=True)
+    recording.log("sensor/points", rr.Points3D(points[:, :3], colors=colors))
+    boxes, labels, scores = found
+    texts = [f"{classes[k]} {score:.2f}" for k, score in zip(labels, scores, strict=True)]
+    if ids is not None:
+        texts = [f"{text} #{i}" for text, i in zip(texts, ids, strict=True)]
+    half, zero = boxes[:, 6] / 2, np.zeros(len(boxes))
+    shapes = rr.Boxes3D(
+        centers=boxes[:, :3],
+        half_sizes=boxes[:, 3:6] / 2,
+        quaternions=np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1),
+        labels=texts,
+        colors=[int(class_color(k)[1:] + "ff", 16) for k in labels],
+    )
+    recording.log("sensor/boxes", shapes)
+    recording.log("name", rr.TextLog(name))

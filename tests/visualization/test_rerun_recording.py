@@ -1,0 +1,57 @@
+"""The recording for rerun, read back by rerun itself."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
+
+POINTS = np.array([[1, 2, 3, 9], [4, 5, 6, 9], [np.nan, 0, 0, 0]], np.float32)
+BOXES = np.array([[8, 5, 0, 6, 3, 2, 0.4, 0, 0], [-10, -6, -1, 8, 3, 3, 2, 1, 0]], np.float32)
+FOUND = BOXES, np.array([1, 0]), np.array([0.5, 0.25], np.float32)
+
+
+def test_what_was_recorded_comes_back(tmp_path):
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    path, pose = tmp_path / "drive.rrd", np.eye(4)
+    pose[:3, 3] = 1, 2, 3
+    with rerun_recording(path, ("car", "bus")) as record:
+        record(POINTS, FOUND, name="first", time_us=5, pose=pose, ids=np.array([7, 9]))
+        record(POINTS[:0], tuple(a[:0] for a in FOUND), name="second", time_us=10)
+        assert not path.exists()
+    assert [file.name for file in tmp_path.iterdir()] == ["drive.rrd"]
+    columns = {}
+    for each in chunk.RrdReader(path).stream():
+        batch = each.to_record_batch()
+        for name, values in zip(batch.schema.names, batch.columns, strict=True):
+            if name != "log_time":
+                columns.setdefault((each.entity_path, name.split(":")[-1]), []).extend(values.to_pylist())
+
+    def array(entity, name, row):
+        return np.array(columns[entity, name][row])
+
+    np.testing.assert_array_equal(array("/sensor/points", "positions", 0), POINTS[:2, :3])
+    assert columns["/sensor/points", "positions"][1] == []
+    np.testing.assert_array_equal(array("/sensor/boxes", "centers", 0), BOXES[:, :3])
+    np.testing.assert_array_equal(array("/sensor/boxes", "half_sizes", 0), BOXES[:, 3:6] / 2)
+    turned = Rotation.from_quat(array("/sensor/boxes", "quaternions", 0)).as_euler("zyx")
+    np.testing.assert_allclose(turned, [[0.4, 0, 0], [2, 0, 0]], atol=1e-6)
+    assert columns["/sensor/boxes", "labels"][0] == ["bus 0.50 #7", "car 0.25 #9"]
+    np.testing.assert_array_equal(array("/sensor", "translation", 0), [[1, 2, 3]])
+    assert columns["/sensor/boxes", "frame"] == [0, 1]
+    assert [time.microsecond for time in columns["/sensor/boxes", "time"]] == [5, 10]
+
+
+def test_nothing_is_left_of_a_recording_that_fails(tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    with pytest.raises(KeyboardInterrupt), rerun_recording(tmp_path / "drive.rrd", ("car",)):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_rerun_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(ValueError, match=r"^--rrd: rerun is not installed.*pip install 'fcos-lidar-jax\[viz\]'$"):
+        check_rerun()
