@@ -5,11 +5,14 @@
 - ``simulated``: the quickstart's network on ten sweeps of simulated streets with fast traffic: the ego vehicle at
   10 to 20 m/s, nearly all objects that can move in motion. One GPU, or a long CPU run.
 - ``calm``: the same in light traffic, to tell what the motion does.
+- ``sector``: the compact network on ten sweeps of a quarter of nuScenes' sensor's turn, at its own resolution and
+  reach, of varied streets in ordinary traffic. One GPU, or hours of two CPU cores a cell.
 - ``nuscenes``: the paper's detector on a data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
 """
 
 import dataclasses
 import functools
+import math
 import operator
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +25,7 @@ from experiments.paper_tables.cell_names import describe_sensor
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.data.cached import CachedFrames
-from fcos_lidar_jax.data.frame import Frame, FramesOf
+from fcos_lidar_jax.data.frame import ChosenFrames, Frame, FramesOf
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames, default_index
@@ -34,12 +37,16 @@ from fcos_lidar_jax.inference import CloudDetector
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
-from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
-from fcos_lidar_jax.sensors import SHORT_RANGE, TINY, Sensor
+from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE, TINY, Sensor, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.lidar import SWEEP_S
+from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
+from fcos_lidar_jax.trainer import Schedule
 from fcos_lidar_jax.trainer.results import write_predictions
+from fcos_lidar_jax.training.metrics_log import read_metrics
 
+_LOOKED_AT = 100
 _BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, which would leave a trail when sweeps are fused.
 
 
@@ -69,10 +76,18 @@ class Simulated:
     test_frames: int
     cache: Path  # Frames are simulated once and kept here.
     fast_traffic: bool = True  # The ego vehicle drives at 10 to 20 m/s, and nearly all objects that can move do.
+    streets: Streets = PLAIN
+    num_objects: int = 14  # This and the others as of make_frame.
+    reach_m: float = 10.0
+    min_points: int = 5
+    looks: int = 0  # Evaluations during a cell's training, on the first test frames: its curve.
 
     def describe(self) -> dict[str, Any]:
-        """What of the scale decides a cell's result, as JSON; the streets are plain ones in all of them."""
+        """What of the scale decides a cell's result, as JSON; in older cells the streets are plain ones."""
+        extent = {name: getattr(self, name) for name in ("num_objects", "reach_m", "min_points")}
+        varied = {} if self.streets == PLAIN else {"streets": dataclasses.asdict(self.streets), **extent}
         return {
+            **varied,
             "scale": self.name,
             "sensor": describe_sensor(self.sensor),
             "train_frames": self.train_frames,
@@ -97,7 +112,16 @@ class Simulated:
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, UNSEEN_SEED)}[split]
         sweeps = self.base.num_sweeps
         made = SimulatedFrames(
-            self.sensor, number, first, num_sweeps=sweeps, fast_traffic=self.fast_traffic, close_m=_BONNET_M
+            self.sensor,
+            number,
+            first,
+            self.num_objects,
+            self.reach_m,
+            self.min_points,
+            _BONNET_M,
+            sweeps,
+            self.fast_traffic,
+            self.streets,
         )
         return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
 
@@ -117,12 +141,18 @@ class Simulated:
             return database.prepare_database(self.frames("train", num_sweeps), folder)
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``."""
+        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``, ``curve: [[samples, mAP]]``."""
         frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
-        steps = config.optimizer.epochs * steps_per_epoch(frames, config)
-        detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects)
-        return _scores(benchmark(*detections(detector, tests)).summary)
+        steps, options = config.optimizer.epochs * steps_per_epoch(frames, config), dict[str, Any]()
+        if self.looks:
+            along = ChosenFrames(tests, tuple(range(min(_LOOKED_AT, len(tests)))))
+            options = {"tests": along, "schedule": Schedule(-(-steps // 20), -(-steps // self.looks))}
+        detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
+        scores = _scores(benchmark(*detections(detector, tests)).summary)
+        batch, records = config.optimizer.batch_size, read_metrics(folder)
+        curve = [[r["step"] * batch, round(r["test/mAP"], 5)] for r in records if "test/mAP" in r]
+        return scores | ({"curve": curve} if curve else {})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,3 +334,31 @@ def simulated(cache: Path) -> Simulated:
 def calm(cache: Path) -> Simulated:
     """As simulated, in light traffic: the ego vehicle slower, fewer objects in motion."""
     return dataclasses.replace(simulated(cache), name="calm", fast_traffic=False)
+
+
+_SECTOR = change(
+    name="sector",
+    num_sweeps=10,
+    max_points=81_920,
+    max_boxes=64,
+    copy_paste=None,
+    class_balanced=False,
+    projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
+    model__circular_width=False,
+    # Wide enough for the 45 inputs of five rounds.
+    model__stem__channels_per_type=8,
+    model__stem__out_channels=24,
+    # What is turned leaves the sector, and a mirrored street would look down behind.
+    augment__flip_y_probability=0.0,
+    augment__max_rotation_rad=math.radians(5),
+    optimizer__ema_decay=0.998,
+    optimizer__epochs=2,
+)(COMPACT)
+
+
+def quarter(cache: Path) -> Simulated:
+    """The compact network on ten sweeps of the quarter of a turn ahead: what the paper's claims are about."""
+    extent = {"num_objects": 60, "reach_m": NUSCENES_HDL32E.limit_xy_m, "min_points": 1}
+    ahead = sector(NUSCENES_HDL32E, math.pi / 2, 272)
+    sizes = {"train_frames": 4000, "test_frames": 400, "cache": cache, "looks": 8}
+    return Simulated("sector", _SECTOR, ahead, **sizes, fast_traffic=False, streets=CITY, **extent)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import tyro
 
 from experiments.benchmarks import module_latency
@@ -15,7 +16,16 @@ from experiments.changes import Change
 from experiments.hardware import hardware
 from experiments.paper import PAPER
 from experiments.paper_tables.grid import run_cells
-from experiments.paper_tables.scales import Layout, NuScenesLayout, Scale, Simulated, calm, simulated, smoke
+from experiments.paper_tables.scales import (
+    Layout,
+    NuScenesLayout,
+    Scale,
+    Simulated,
+    calm,
+    quarter,
+    simulated,
+    smoke,
+)
 from experiments.statistics import interval
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
@@ -27,8 +37,10 @@ SCORES = ("mAP", "NDS")
 class Args:
     """At which scale, and where the results go."""
 
-    scale: Literal["smoke", "simulated", "calm", "nuscenes"] = "smoke"
-    """Minutes on a toy; the quickstart on simulated streets in fast or in light traffic; the real thing."""
+    scale: Literal["smoke", "simulated", "calm", "sector", "nuscenes"] = "smoke"
+    """Minutes on a toy; the quickstart on simulated streets in fast or in light traffic; the compact network on a
+    quarter of nuScenes' sensor's turn; the real thing."""
+    rows: tuple[str, ...] = ()  # Labels of the rows to train, beside the reference; default: all.
     seeds: tuple[int, ...] = ()  # Of every cell; default: 0 for smoke, else 0, 1 and 2.
     out: Path = Path("outputs/tables")  # Folder of tables and cells; a folder of the scale's name below it.
     runs: Path = Path("outputs/runs")  # Folder of the training runs and of the simulated frames.
@@ -76,6 +88,16 @@ class Table:
                 if key is not None and key not in known:
                     raise ValueError(f"row {row.label!r}: {field}: got {key!r}, expected one of {list(known)}")
 
+    def only(self, labels: tuple[str, ...]) -> "Table":
+        """The table with the rows of these labels and their references; with all where there are none."""
+        if unknown := [label for label in labels if label not in [row.label for row in self.rows]]:
+            known = ", ".join(row.label for row in self.rows)
+            raise ValueError(f"--rows: got {unknown[0]!r}, expected some of: {known}")
+        if not labels:
+            return self
+        needed = {self.reference, *labels, *(r.reference for r in self.rows if r.label in labels)}
+        return dataclasses.replace(self, rows=tuple(row for row in self.rows if row.label in needed))
+
     @property
     def paper_rows(self) -> dict[Any, Any]:
         """The paper's rows, none where the table is not the paper's."""
@@ -84,7 +106,7 @@ class Table:
 
 def simulated_scale(args: Args) -> Simulated | None:
     """The scale that is asked for, if its frames are simulated."""
-    make = {"smoke": smoke, "simulated": simulated, "calm": calm}.get(args.scale)
+    make = {"smoke": smoke, "simulated": simulated, "calm": calm, "sector": quarter}.get(args.scale)
     return make(args.runs / "frames") if make else None
 
 
@@ -104,6 +126,7 @@ def stem_times(variants: dict[str, str], args: Args) -> dict[str, Any]:
 def run_table(table: Table, args: Args) -> dict[str, Any]:
     """Train what is missing, measure, print, write; the record."""
     _check(args)
+    table = table.only(args.rows)
     here, folder = hardware(), args.out / args.scale
     seeds = args.seeds or ((0,) if args.scale == "smoke" else (0, 1, 2))
     scale = None if args.only_figures else make_scale(args)
@@ -131,6 +154,8 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
             draw(table, record, picture)
         else:
             picture.unlink(missing_ok=True)  # of other seeds
+        if any(cell and "curve" in cell for row in record["rows"] for cell in row.get("scores", ())):
+            draw_learning(table, record, file.with_name(f"{file.name}_curves.png"))
     return record
 
 
@@ -265,5 +290,24 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     handles, labels = axis.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
     axis.legend(kinds.values(), kinds.keys(), fontsize=9, frameon=False)
+    axis.spines[["top", "right"]].set_visible(False)
+    save_png(figure, path)
+
+
+def draw_learning(table: Table, record: dict[str, Any], path: Path) -> None:
+    """The mAP of each row over the samples that its training had seen: thin by seed, thick their mean."""
+    from fcos_lidar_jax.visualization.figure import new_figure, save_png
+
+    figure = new_figure(7.5, 4)
+    axis = figure.add_subplot()
+    for i, row in enumerate(record["rows"]):
+        curves = [np.array(cell["curve"]) for cell in row["scores"] if cell]
+        for curve in curves:
+            axis.plot(curve[:, 0], 100 * curve[:, 1], color=f"C{i}", linewidth=0.5)
+        mean = np.mean(curves, axis=0)
+        axis.plot(mean[:, 0], 100 * mean[:, 1], color=f"C{i}", linewidth=2, label=row["label"])
+    axis.set(xlabel="samples seen", ylabel="mAP", ylim=(0, None))
+    axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds)", fontsize=11)
+    axis.legend(fontsize=9, frameon=False)
     axis.spines[["top", "right"]].set_visible(False)
     save_png(figure, path)

@@ -21,7 +21,7 @@ from experiments.paper_tables import table8_test_submission as table8
 from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cell_names import cell_name
 from experiments.paper_tables.grid import run_cell, run_cells
-from experiments.paper_tables.scales import Layout, NuScenesLayout, smoke
+from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, simulated, smoke
 from experiments.paper_tables.tables import Args, Row, run_table
 from experiments.script import run_script
 from experiments.statistics import interval
@@ -31,7 +31,7 @@ from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.evaluation.results import write_results
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.training import NonFiniteLossError
@@ -167,6 +167,45 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_
     assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+40.00, +40.00] | 57.08 | +2.06 |" in text
     assert "| multi, 1 round | 10.50 [4.15, 16.85] | - | 55.02 | - |" in text, "no difference to itself"
     assert (tmp_path / "smoke" / "table1.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_chosen_rows_come_with_their_references():
+    chosen = table1_mrv_rounds.TABLE.only(("single, 5 rounds",))
+    assert [row.label for row in chosen.rows] == ["single, 1 round", "single, 5 rounds", "multi, 1 round"]
+    assert table1_mrv_rounds.TABLE.only(()) == table1_mrv_rounds.TABLE
+    with pytest.raises(ValueError, match="--rows: got 'nine', expected some of: tied, untied"):
+        table6_untied_heads.TABLE.only(("untied", "nine"))
+
+
+def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
+    @dataclasses.dataclass
+    class Looked(Pretended):
+        def score(self, config, seed, folder):
+            return {**super().score(config, seed, folder), "curve": [[10, 0.1], [20, 0.2 + 0.1 * seed]]}
+
+    for scale in (Pretended(), Looked(name="looked")):
+        train_table(table6_untied_heads.TABLE, scale=scale, seeds=(0, 1))
+        drawn = tmp_path / "smoke" / "table6_curves.png"
+        assert drawn.exists() == isinstance(scale, Looked)
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_sector_is_a_quarter_of_the_sensor_at_its_resolution(tmp_path):
+    scale = quarter(tmp_path)
+    assert scale.sensor.column_rad == pytest.approx(NUSCENES_HDL32E.column_rad)
+    assert (scale.sensor.num_rows, scale.sensor.num_columns) == (32, 272)
+    # The streets are said where they are not plain: cells of the other scales keep their names.
+    assert scale.describe()["streets"]["name"] == "city"
+    assert "streets" not in simulated(tmp_path).describe()
+    for table in TABLES[:6]:
+        for row in table.rows:
+            scale.check(row.change(scale.base))
+    frame = scale.frames("test", 10).frame(0)
+    azimuth = np.arctan2(frame.points[:, 1], frame.points[:, 0])
+    current = frame.points[:, 4] == 0
+    right, left = scale.sensor.azimuth_limits_rad
+    assert ((azimuth > right - 0.1) & (azimuth < left + 0.1))[current].mean() > 0.97
+    assert len(np.unique(frame.points[:, 4])) == 10
 
 
 def test_more_rounds_changes_the_traffic_or_the_epochs_alone(tmp_path, monkeypatch):
@@ -361,7 +400,8 @@ def tiny_smoke(cache):
         change(optimizer__epochs=1)(tiny_run.CONFIG),
         tiny_run.STEPS * tiny_run.CONFIG.optimizer.batch_size,
     )
-    return dataclasses.replace(smoke(cache), base=base, sensor=tiny_run.SENSOR, train_frames=frames, test_frames=1)
+    sizes = {"train_frames": frames, "test_frames": 1, "looks": 2}
+    return dataclasses.replace(smoke(cache), base=base, sensor=tiny_run.SENSOR, **sizes)
 
 
 def test_the_variant_of_the_readme_runs(tmp_path, monkeypatch, capsys):
