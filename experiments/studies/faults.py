@@ -12,7 +12,8 @@
 
 and ``train`` resumed after its newest checkpoint was damaged. Expected: in the end the same bytes as without any
 of it (of ``train`` the same state, of ``evaluate`` the same but for the time it took), no traceback, and one line
-from whoever gives up. About an hour on two cores.
+from whoever gives up. About an hour on two cores; ``--only train`` and the like does a part, and leaves what the
+file of figures says of the others.
 """
 
 import collections
@@ -43,6 +44,7 @@ from experiments.script import Options, run_script, save
 from experiments.studies.device_equivalence import CONFIG, SENSOR, draw_variables
 from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.cli import main as command
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.trainer import Schedule, train
@@ -330,7 +332,9 @@ def make_works(home: Path) -> list[Work]:
 
 def main(args: Args) -> None:
     """Every fault for every command."""
-    chance, record, failures = random.Random(args.seed), dict[str, Any](), list[str]()
+    chance, failures = random.Random(args.seed), list[str]()
+    earlier = args.out is not None and args.out.is_file() and args.only
+    record = read_json(args.out, dict[str, Any])["faults"] if earlier else {}
     warnings.simplefilter("ignore", RuntimeWarning)  # JAX warns of forks; its threads are not begun
     with tempfile.TemporaryDirectory() as name:
         home = Path(name)
@@ -355,14 +359,9 @@ def main(args: Args) -> None:
                     shutil.rmtree(folder, ignore_errors=True)
                 record[what] = {"times": times, "same": sum(one["same"] for one in each), "each": each}
                 print(f"{what}: {record[what]['same']} of {times} as they should be", flush=True)
-    signals = collections.Counter(
-        s for done in record.values() for one in done["each"] for s in one.get("killed", ())
-    )
-    save(
-        {"seed": args.seed, "signals": signals, "faults": record},
-        args.out,
-        f"{len(failures)} failures; {dict(signals)}",
-    )
+            killed = (s for done in record.values() for one in done["each"] for s in one.get("killed", ()))
+            figures = {"seed": args.seed, "signals": collections.Counter(killed), "faults": record}
+            save(figures, args.out, f"{len(failures)} failures; {dict(figures['signals'])}")
     if failures:
         raise ValueError(f"got {len(failures)} failures, expected none")
 
