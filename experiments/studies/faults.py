@@ -370,9 +370,7 @@ def _earlier(args: Args) -> dict[str, Any]:
 
 
 def _save(args: Args, record: dict[str, Any], line: str) -> None:
-    signals = collections.Counter(
-        s for done in record.values() for one in done["each"] for s in one.get("killed", ())
-    )
+    killed = (s for done in record.values() for one in done["each"] for s in one.get("killed", ()))
     save({"seed": args.seed, "signals": collections.Counter(killed), "faults": record}, args.out, line)
 
 
