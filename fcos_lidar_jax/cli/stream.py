@@ -42,8 +42,8 @@ class Stream:
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")]  # Trained detector, as for `fcos-lidar detect`.
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.jsonl")]  # Where the lines go.
     source: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="SOURCE")]] = None
-    """Folder of point files, one sweep each; a recording of ROS 1 (.bag) or ROS 2 (its folder, .mcap, .db3); or one
-    of KITTI raw or a log of Argoverse 2, which have their poses."""
+    """Folder of point files, one sweep each; a recording of ROS 1 (.bag) or ROS 2 (its folder, .mcap, .db3); or
+    one of KITTI raw or a log of Argoverse 2, which have their poses."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Poses of the sweeps, from the sensor to the world: FILE.json, a list [{"file", "timestamp_us",
     "sensor_to_world": 4x4}] in the order of time, for a folder; or lines `t x y z qx qy qz qw` (TUM), for a folder
@@ -161,7 +161,9 @@ def _check(args: Stream) -> None:
     if (args.data_root is None) != (args.scene is None):
         raise ValueError("stream: expected --data-root and --scene together")
     is_ros = args.source is not None and is_ros_bag(args.source)
-    foreign = dict.fromkeys(("version", "keyframes"), "--data-root") if args.source is not None else {}
+    foreign: dict[str, str] = {}  # an option, and what alone it is for
+    if args.source is not None:
+        foreign |= dict.fromkeys(("version", "keyframes"), "--data-root")
     if args.source is None or is_ros:
         foreign |= dict.fromkeys(("columns", "dtype"), "a folder of point files")
     if not is_ros:

@@ -60,8 +60,8 @@ class PoseTrack(NamedTuple):
         outside = not 0 < last < len(known_us)
         if outside or known_us[last] - known_us[last - 1] > MAX_POSE_GAP_US:
             raise (OutsidePosesError if outside else ValueError)(
-                f"{where}: at {time_us / 1e6} s: a gap in the poses, expected one before and one after it, at most "
-                f"{MAX_POSE_GAP_US / 1e6:g} s apart"
+                f"{where}: at {time_us / 1e6} s: a gap in the poses, expected one before and one after it, at "
+                f"most {MAX_POSE_GAP_US / 1e6:g} s apart"
             )
         ends = slice(last - 1, last + 1)
         share = (time_us - known_us[last - 1]) / (known_us[last] - known_us[last - 1])
@@ -128,8 +128,8 @@ def _posed(files: Sequence[Path], path: Path) -> tuple[list[int], list[np.ndarra
     if any(time is None for time in times):
         if len(files) != len(track.times_us):
             raise ValueError(
-                f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one a cloud, or clouds "
-                f"whose names are times (seconds with a decimal point, or nanoseconds)"
+                f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one a cloud, or "
+                f"clouds whose names are times (seconds with a decimal point, or nanoseconds)"
             )
         return track.times_us.tolist(), list(pose_matrix(track.rotations, track.translations))
     clouds = zip(files, times, strict=True)
@@ -185,4 +185,3 @@ def read_tum(path: Path) -> PoseTrack:
         raise ValueError(f"{path}: no pose in it, expected lines t x y z qx qy qz qw")
     poses = np.array(rows)
     return PoseTrack(np.array(times), poses[:, [6, 3, 4, 5]], poses[:, :3])
-

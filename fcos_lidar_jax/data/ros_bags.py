@@ -7,27 +7,22 @@ translate into Python, are left alone.
 import contextlib
 import functools
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fcos_lidar_jax.data.drives import Drive, OutsidePosesError, PoseTrack, read_tum
-from fcos_lidar_jax.data.point_files import MAX_POINTS, assemble_points
-from fcos_lidar_jax.data.sweeps import Sweep, find_bad_pose
+from fcos_lidar_jax.data.frame_tree import FrameTree, PoseRow, make_track, printable
+from fcos_lidar_jax.data.point_cloud2 import parse_point_cloud2
+from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.sensors import Sensor
 
 _CLOUD = ("sensor_msgs/msg/PointCloud2",)
 _POSE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in "xyz"}
-_COLUMNS["intensity"] = ("intensity", "reflectivity")
-_COLUMNS["laser"] = ("ring", "laser_number", "laser", "line", "channel")
-"""Column -> the field names it goes by among drivers, the most telling first. Other fields are skipped."""
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Datatype of a field -> NumPy's name."""
-_ODOM = "odom"  # the frame that does not jump, by ROS's REP 105; others above it may
 _MAX_LISTED = 20  # topics in a message
 
 _PoseAt = Callable[[str, int, str], np.ndarray]
@@ -71,22 +66,23 @@ def ros_bag_drive(
         ValueError: here or on reading a cloud, naming recording, topic, what was found and what was expected.
     """
     with _Bag(path) as bag:
-        topic = bag.choose(topic, _CLOUD, "topic")
+        clouds = bag.choose(topic, _CLOUD, "topic")
         pose_at, notes = _poses(bag, odometry, poses)
 
     def read() -> Iterator[Sweep]:
         number, outside = 0, list[OutsidePosesError]()
         with _Bag(path) as bag:
-            for number, (where, cloud) in enumerate(bag.messages(topic, _CLOUD), 1):
-                time_us = _time_us(cloud.header)
+            for where, cloud in bag.messages(clouds, _CLOUD):
+                number, time_us = number + 1, _time_us(cloud.header)
                 try:
                     pose = np.eye(4) if pose_at is None else pose_at(_frame(cloud.header.frame_id), time_us, where)
                 except OutsidePosesError as error:
                     outside.append(error)
                     continue
-                yield Sweep(_decode(cloud, where, sensor, max_points), pose, time_us, where)
+                points = parse_point_cloud2(cloud, where, sensor, max_points=max_points)
+                yield Sweep(points, pose, time_us, where)
         if number == 0:
-            raise ValueError(f"{path}: {_shown(topic)}: no cloud in it, expected at least one")
+            raise ValueError(f"{path}: {printable(clouds)}: no cloud in it, expected at least one")
         if len(outside) == number:
             raise outside[0]
         if outside:
@@ -109,7 +105,7 @@ class _Bag(contextlib.AbstractContextManager):
         self.path, self._is_ros1 = path, path.suffix == ".bag"
         files = [path, *path.iterdir()] if path.is_dir() else [path]
         if odd := [file for file in files if file.suffix == ".db3" and set("%?#") & set(str(file))]:
-            raise ValueError(f"{_shown(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")
+            raise ValueError(f"{printable(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")
         with _refusing(str(path)):
             self._reader: Any = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()
@@ -127,13 +123,13 @@ class _Bag(contextlib.AbstractContextManager):
     def choose(self, wanted: str | None, types: tuple[str, ...], what: str) -> str:
         """The topic of these types that is wanted, or the only one."""
         fitting = self.topics(types)
-        if wanted in fitting:
+        if wanted is not None and wanted in fitting:
             return wanted
         if wanted is None and len(fitting) == 1:
             return fitting[0]
         names = " or ".join(kind.rpartition("/")[2] for kind in types)
         listed = [
-            f"{_shown(topic)} ({_shown(kind)}, {count} messages)"
+            f"{printable(topic)} ({printable(kind)}, {count} messages)"
             for (topic, kind), count in sorted(self.counts.items())
             if not fitting or kind in types
         ]
@@ -147,7 +143,7 @@ class _Bag(contextlib.AbstractContextManager):
         connections = [one for one in self._reader.connections if one.topic == topic and one.msgtype in types]
         raw, number = self._reader.messages(connections=connections), 0
         while True:
-            where = f"{self.path}: {_shown(topic)}: message {number}"
+            where = f"{self.path}: {printable(topic)}: message {number}"
             with _refusing(where):
                 if (record := next(raw, None)) is None:
                     return
@@ -179,13 +175,7 @@ def _refusing(where: str) -> Iterator[None]:
         yield
     except Exception as error:  # damaged recordings raise what rosbags, SQLite, the unpackers and YAML like
         kind = "" if type(error).__module__.startswith("rosbags") else f"{type(error).__name__}: "
-        raise ValueError(f"{where}: cannot be read: {kind}{_shown(' '.join(str(error).split()))}") from None
-
-
-def _shown(text: str) -> str:
-    """A text of a recording, for messages."""
-    text = text if text.isprintable() else repr(text)
-    return text if len(text) <= 500 else text[:500] + "..."
+        raise ValueError(f"{where}: cannot be read: {kind}{printable(' '.join(str(error).split()))}") from None
 
 
 def _frame(name: str) -> str:
@@ -194,42 +184,6 @@ def _frame(name: str) -> str:
 
 def _time_us(header: Any) -> int:
     return header.stamp.sec * 1_000_000 + header.stamp.nanosec // 1000
-
-
-def _decode(cloud: Any, where: str, sensor: Sensor, max_points: int) -> np.ndarray:
-    """The points of a PointCloud2, in the columns of :func:`~fcos_lidar_jax.data.point_files.read_points`."""
-    width, height, step, pitch = cloud.width, cloud.height, cloud.point_step, cloud.row_step
-    if width * height > max_points:
-        raise ValueError(f"{where}: got {width} x {height} points, expected at most {max_points}")
-    pitch = max(pitch, width * step) if height <= 1 else pitch  # some drivers leave it out in a single row
-    if pitch < width * step:
-        raise ValueError(f"{where}: row_step: got {pitch}, expected {width * step}, width x point_step, or more")
-    if height and width and len(cloud.data) < (needed := (height - 1) * pitch + width * step):
-        found = f"got {len(cloud.data)} bytes, expected at least {needed}"
-        raise ValueError(f"{where}: data: {found} for {height} rows of {width} points of {step}")
-    table = {}
-    names = [field.name for field in cloud.fields]
-    for column, aliases in _COLUMNS.items():
-        name = next((alias for alias in aliases if alias in names), None)
-        if name is None:
-            if column in "xyz":
-                found = ", ".join(map(_shown, names[:_MAX_LISTED])) or "none"
-                raise ValueError(f"{where}: fields: got {found}, expected one named {column}")
-            continue
-        field = cloud.fields[names.index(name)]
-        if field.datatype not in _NUMBERS or field.count > 1:
-            found = f"{field.count} of datatype {field.datatype}"
-            raise ValueError(f"{where}: field {name}: got {found}, expected one number of datatype 1 to 8")
-        dtype = np.dtype((">" if cloud.is_bigendian else "<") + _NUMBERS[field.datatype])
-        if field.offset + dtype.itemsize > step:
-            found = f"{dtype.itemsize} bytes at offset {field.offset}"
-            raise ValueError(f"{where}: field {name}: got {found}, expected a place within point_step {step}")
-        if width and height:
-            values = np.ndarray((height, width), dtype, cloud.data.data, field.offset, (pitch, step))
-        else:
-            values = np.zeros(0, dtype)
-        table[column] = values.reshape(-1)
-    return assemble_points(where, sensor, table)
 
 
 def _poses(bag: _Bag, odometry: str | None, poses: Path | None) -> tuple[_PoseAt | None, list[str]]:
@@ -242,20 +196,17 @@ def _poses(bag: _Bag, odometry: str | None, poses: Path | None) -> tuple[_PoseAt
     if odometry == "tf":
         if not bag.topics(_TRANSFORMS):
             bag.choose("tf", _TRANSFORMS, "odometry")
-        return _Transforms(bag).to_world, []
+        return _read_transforms(bag).to_world, []
     odometry = bag.choose(odometry, _POSE, "odometry")
     track, child = _read_odometry(bag, odometry)
-    if not child:
-        note = "does not say of which frame its poses are: taken for those of the clouds' frame"
-        at = lambda frame, time_us, where: track.at(time_us, f"{where}: {_shown(odometry)}")  # noqa: E731
-        return at, [f"{_shown(odometry)} {note}"]
-    transforms = _Transforms(bag)
+    name, tree = printable(odometry), _read_transforms(bag)
 
     def to_world(frame: str, time_us: int, where: str) -> np.ndarray:
-        pose = track.at(time_us, f"{where}: {_shown(odometry)}")
-        return pose @ transforms.between(child, frame, time_us, where)
+        pose = track.at(time_us, f"{where}: {name}")
+        return pose @ tree.between(child, frame, time_us, where) if child else pose
 
-    return to_world, []
+    assumed = f"{name} does not say of which frame its poses are: taken for those of the clouds' frame"
+    return to_world, [] if child else [assumed]
 
 
 def _read_odometry(bag: _Bag, topic: str) -> tuple[PoseTrack, str]:
@@ -268,90 +219,24 @@ def _read_odometry(bag: _Bag, topic: str) -> tuple[PoseTrack, str]:
         of = _frame(getattr(message, "child_frame_id", ""))
         child = of if child is None else child
         if of != child:
-            raise ValueError(f"{where}: child_frame_id: got {_shown(of)!r}, expected {_shown(child)!r} as before")
+            got, expected = printable(of), printable(child)
+            raise ValueError(f"{where}: child_frame_id: got {got!r}, expected {expected!r} as before")
         pose = getattr(message.pose, "pose", message.pose)  # within one with covariance, as in odometry
         rows.append(_numbers(pose.orientation, pose.position))
         times.append(time_us)
-    return _track(times, rows, f"{bag.path}: {_shown(topic)}"), child or ""
+    return make_track(times, rows, f"{bag.path}: {printable(topic)}"), child or ""
 
 
-def _numbers(rotation: Any, translation: Any) -> tuple[float, ...]:
+def _read_transforms(bag: _Bag) -> FrameTree:
+    tree = FrameTree(str(bag.path))
+    for topic in bag.topics(_TRANSFORMS):
+        for _, message in bag.messages(topic, _TRANSFORMS):
+            for each in message.transforms:
+                time_us = None if topic.endswith("tf_static") else _time_us(each.header)
+                pose = _numbers(each.transform.rotation, each.transform.translation)
+                tree.add(_frame(each.child_frame_id), _frame(each.header.frame_id), time_us, pose)
+    return tree
+
+
+def _numbers(rotation: Any, translation: Any) -> PoseRow:
     return rotation.w, rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z
-
-
-def _track(times: Iterable[int], rows: Iterable[tuple[float, ...]], where: str) -> PoseTrack:
-    values = np.array(list(rows), np.float64).reshape(-1, 7)
-    if bad := find_bad_pose(values[:, :4], values[:, 4:]):
-        raise ValueError(f"{where}: pose {bad[0]}: {bad[1]}")
-    return PoseTrack(np.array(list(times), np.int64), values[:, :4], values[:, 4:])
-
-
-class _Transforms:
-    """The tree of frames of ``/tf_static`` and ``/tf``."""
-
-    def __init__(self, bag: _Bag) -> None:
-        self.path = bag.path
-        self._static = dict[tuple[str, str], tuple[float, ...]]()
-        self._moving = defaultdict[tuple[str, str], dict[int, tuple[float, ...]]](dict)
-        self._parents = defaultdict[str, set[str]](set)
-        self._tracks = dict[tuple[str, str], PoseTrack]()
-        for topic in bag.topics(_TRANSFORMS):
-            for _, message in bag.messages(topic, _TRANSFORMS):
-                for each in message.transforms:
-                    edge = _frame(each.child_frame_id), _frame(each.header.frame_id)
-                    values = _numbers(each.transform.rotation, each.transform.translation)
-                    self._parents[edge[0]].add(edge[1])
-                    if topic.endswith("tf_static"):
-                        self._static[edge] = values
-                    else:  # some are sent twice
-                        self._moving[edge].setdefault(_time_us(each.header), values)
-
-    def between(self, to: str, frame: str, time_us: int, where: str) -> np.ndarray:
-        """The pose of a frame in another one, f64[4, 4]."""
-        up, down = self._ancestors(frame), self._ancestors(to)
-        meet = next((name for name in up if name in down), None)
-        if meet is None:
-            known = ", ".join(_shown(name) for name in sorted(self._parents)[:_MAX_LISTED]) or "none"
-            raise ValueError(
-                f"{where}: no transform from {_shown(frame)!r} to {_shown(to)!r} in the recording, expected one in "
-                f"/tf_static or /tf, which have those of: {known}"
-            )
-        pose = self._climb(up[: up.index(meet) + 1], time_us, where)
-        return np.linalg.inv(self._climb(down[: down.index(meet) + 1], time_us, where)) @ pose
-
-    def to_world(self, frame: str, time_us: int, where: str) -> np.ndarray:
-        """The pose of a frame in ``odom``, or in its last ancestor, f64[4, 4]."""
-        up = self._ancestors(frame)
-        up = up[: up.index(_ODOM) + 1] if _ODOM in up else up
-        if not any(edge in self._moving for edge in zip(up, up[1:], strict=False)):
-            found = " -> ".join(map(_shown, up))
-            raise ValueError(f"{where}: got the frames {found}, expected one that moves, by /tf")
-        return self._climb(up, time_us, where)
-
-    def _ancestors(self, frame: str) -> list[str]:
-        """A frame, what it is in, and so on."""
-        found = [frame]
-        while parents := self._parents.get(found[-1]):
-            parent, *others = sorted(parents)
-            if others or parent in found:
-                what = f"{len(parents)} parents" if others else "itself among those that it is in"
-                raise ValueError(f"{self.path}: tf: frame {_shown(found[-1])!r} has {what}, expected a tree")
-            found.append(parent)
-        return found
-
-    def _climb(self, frames: list[str], time_us: int, where: str) -> np.ndarray:
-        """The pose of the first of a chain of frames in the last."""
-        pose = np.eye(4)
-        for edge in zip(frames, frames[1:], strict=False):
-            if edge not in self._tracks:
-                self._tracks[edge] = self._edge_track(edge)
-            track, fixed = self._tracks[edge], len(self._tracks[edge].times_us) == 1
-            at = int(track.times_us[0]) if fixed else time_us
-            pose = track.at(at, f"{where}: tf of {_shown(edge[0])} in {_shown(edge[1])}") @ pose
-        return pose
-
-    def _edge_track(self, edge: tuple[str, str]) -> PoseTrack:
-        """Poses of a frame in its parent; one where they never change, which needs no neighbours in time."""
-        known = {0: self._static[edge]} if edge in self._static else self._moving[edge]
-        known = known if len(set(known.values())) > 1 else dict([next(iter(known.items()))])
-        return _track(sorted(known), (known[time] for time in sorted(known)), f"{self.path}: tf of {_shown(edge[0])}")

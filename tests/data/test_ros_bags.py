@@ -218,7 +218,9 @@ def test_clouds_outside_of_the_poses_are_left_out_and_told(tmp_path):
     drive = ros_bag_drive(bag, TINY, odometry="/odom")
     assert [sweep.name[-1] for sweep in drive.sweeps] == ["1", "2"]
     assert drive.notes == ["2 clouds before the first or after the last pose were left out"]
-    bag = write_recording(tmp_path / "b", "mcap", lambda make: drive_content(make, lambda make: list(poses(make))[:1]))
+    bag = write_recording(
+        tmp_path / "b", "mcap", lambda make: drive_content(make, lambda make: list(poses(make))[:1])
+    )
     with refused("/points: message 0: /odom: at 1700000000.173456 s: a gap in the poses"):
         list(ros_bag_drive(bag, TINY, odometry="/odom").sweeps)
 
@@ -228,6 +230,16 @@ def test_names_are_no_addresses_for_sqlite(tmp_path, name):
     with refused(f"{name}.db3: %, ? or # in the name"):
         (tmp_path / f"{name}.db3").touch()
         ros_bag_drive(tmp_path / f"{name}.db3", TINY)
+
+
+def test_other_branches_of_the_tree_may_be_wrong(tmp_path):
+    def poses(make):
+        for name in ("odom", "map"):
+            yield "/tf", make.transform(START_NS, name, "base_link", (0, 0, 0), NO_TURN)
+        yield from (("/odom", make.odometry(t, *motion(seconds))) for seconds, t in times_ns())
+
+    bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
+    expect_poses(ros_bag_drive(bag, TINY, odometry="/odom"), lambda s: matrix(*motion(s)) @ TO_LIDAR)
 
 
 def moving(*names):
@@ -253,7 +265,11 @@ WRONG_DRIVES = {
         odometry((0, (0, 0, 0), NO_TURN)),
         ("odometry: got '/odm', expected", "there are: /odom (nav_msgs/msg/Odometry, 1 messages)"),
     ),
-    "a cloud's topic": ({"topic": "/tf_static"}, lambda make: (), ("topic: got '/tf_static', expected a topic of P",)),
+    "a cloud's topic": (
+        {"topic": "/tf_static"},
+        lambda make: (),
+        ("topic: got '/tf_static', expected a topic of P",),
+    ),
     "a gap": (
         {"odometry": "/odom"},
         odometry((0, (0, 0, 0), NO_TURN), (6 * 10**8, (0, 0, 0), NO_TURN)),
@@ -269,7 +285,11 @@ WRONG_DRIVES = {
         odometry((0, (0, 0, 0), NO_TURN), (4000, (0, 0, 0), (0, 0, 0, 0))),
         ("/odom: pose 1: rotation: got [0.0, 0.0, 0.0, 0.0], expected a unit quaternion",),
     ),
-    "far away": ({"odometry": "/odom"}, odometry((0, (0, np.nan, 0), NO_TURN)), ("/odom: pose 0: translation: got",)),
+    "far away": (
+        {"odometry": "/odom"},
+        odometry((0, (0, np.nan, 0), NO_TURN)),
+        ("/odom: pose 0: translation: got",),
+    ),
     "other frames": (
         {"odometry": "/odom"},
         odometry((0, (0, 0, 0), NO_TURN), (4000, (0, 0, 0), NO_TURN, "imu")),
@@ -278,7 +298,10 @@ WRONG_DRIVES = {
     "no transform": (
         {"odometry": "/odom"},
         odometry(*((round(s * 1e9), (0, 0, 0), NO_TURN, "chassis") for s in POSES_S)),
-        ("/points: message 0: no transform from 'lidar' to 'chassis' in the recording", "those of: imu, lidar, mount"),
+        (
+            "/points: message 0: no transform from 'lidar' to 'chassis' in the recording",
+            "those of: imu, lidar, mount",
+        ),
     ),
     "nothing that moves": (
         {"odometry": "tf"},
@@ -330,7 +353,10 @@ def test_several_topics_of_clouds_are_listed(tmp_path):
 
 NAMES = ("x", "y", "z", "intensity")
 WRONG_CLOUDS = {
-    "too short": ({"data": np.zeros(191, np.uint8)}, "data: got 191 bytes, expected at least 192 for 1 rows of 12"),
+    "too short": (
+        {"data": np.zeros(191, np.uint8)},
+        "data: got 191 bytes, expected at least 192 for 1 rows of 12",
+    ),
     "huge": ({"width": 2**32 - 1, "height": 2**32 - 1}, "x 4294967295 points, expected at most 10000000"),
     "wide rows": ({"row_step": 2**32 - 1, "height": 2}, "data: got 192 bytes, expected at least 4294967487"),
     "narrow rows": ({"row_step": 100, "width": 7, "height": 2}, "row_step: got 100, expected 112, width x"),
@@ -354,7 +380,10 @@ def test_wrong_clouds_are_one_line(tmp_path, case):
     [
         (("x", 0, 9, 1), "field x: got 1 of datatype 9, expected one number of datatype 1 to 8"),
         (("x", 0, 7, 3), "field x: got 3 of datatype 7"),
-        (("x", 2**32 - 1, 7, 1), "field x: got 4 bytes at offset 4294967295, expected a place within point_step 16"),
+        (
+            ("x", 2**32 - 1, 7, 1),
+            "field x: got 4 bytes at offset 4294967295, expected a place within point_step 16",
+        ),
     ],
 )
 def test_wrong_fields_are_one_line(tmp_path, field, message):

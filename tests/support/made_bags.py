@@ -78,9 +78,7 @@ class Messages:
         vector = self.make("geometry_msgs/Vector3", *map(float, place))
         quaternion = self.make("geometry_msgs/Quaternion", *map(float, turn))
         transform = self.make("geometry_msgs/Transform", vector, quaternion)
-        stamped = self.make(
-            "geometry_msgs/TransformStamped", self.header(stamp_ns, parent), child, transform
-        )
+        stamped = self.make("geometry_msgs/TransformStamped", self.header(stamp_ns, parent), child, transform)
         return self.make("tf2_msgs/TFMessage", [stamped])
 
     def text(self, words: str) -> Any:
