@@ -45,9 +45,9 @@ class Stream:
     """Folder of point files, one sweep each; a recording of ROS 1 (.bag) or ROS 2 (its folder, .mcap, .db3); or
     one of KITTI raw or a log of Argoverse 2, which have their poses."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Poses of the sweeps, from the sensor to the world: FILE.json, a list [{"file", "timestamp_us",
-    "sensor_to_world": 4x4}] in the order of time, for a folder; or lines `t x y z qx qy qz qw` (TUM), for a folder
-    or a recording of ROS. Without poses every sweep is on its own."""
+    """Poses of the sweeps, from the sensor to the world: lines `t x y z qx qy qz qw` (TUM); or, for a folder alone,
+    FILE.json, a list [{"file", "timestamp_us", "sensor_to_world": 4x4}] in the order of time. Without poses each
+    sweep is on its own."""
     topic: str | None = None  # Clouds (PointCloud2) of a recording of ROS; may be left out where there is one.
     odometry: Annotated[str | None, tyro.conf.arg(metavar="T|tf")] = None
     """Poses of a recording of ROS: a topic of Odometry, PoseStamped or PoseWithCovarianceStamped; or tf."""
@@ -75,6 +75,7 @@ def run(args: Stream) -> None:
     if not drive.posed:
         print("no poses: every sweep is detected on its own, without those before it", file=sys.stderr)
     _tell(drive.notes)
+    print("compiling the detector", file=sys.stderr, flush=True)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
     with args.out.open("wb", buffering=0) as lines, _Timing() as timing:

@@ -405,6 +405,16 @@ def test_too_many_points_and_missing_lasers_are_one_line(tmp_path):
         list(ros_bag_drive(bag, ARGOVERSE2).sweeps)
 
 
+@pytest.mark.parametrize(
+    ("form", "how"),
+    [("ros1", "LZ4"), ("ros1", "BZ2"), ("sqlite", "FILE"), ("sqlite", "MESSAGE"), ("mcap file", "STORAGE")],
+)
+def test_compressed_recordings_are_read(tmp_path, form, how):
+    bag = write_recording(tmp_path / "a", form, lambda make: [("/p", make.cloud(1, POINTS))], compression=how)
+    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    np.testing.assert_array_equal(sweep.points[:, 2], POINTS["z"])
+
+
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("share", [0, 0.3, 0.97])
 def test_truncated_recordings_are_one_line(tmp_path, form, share):

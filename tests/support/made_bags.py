@@ -85,8 +85,14 @@ class Messages:
         return self.make("std_msgs/String", words)
 
 
-def write_recording(place: Path, form: str, content: Callable[[Messages], Iterable[Recorded]]) -> Path:
+def write_recording(
+    place: Path, form: str, content: Callable[[Messages], Iterable[Recorded]], *, compression: str = ""
+) -> Path:
     """Write a recording of one of the :data:`FORMS`; a message was recorded a microsecond after the one before.
+
+    Args:
+        compression: of ROS 1: ``LZ4`` or ``BZ2``; of ROS 2: what zstd compresses, ``FILE``, ``MESSAGE`` or, in
+            MCAP, ``STORAGE``.
 
     Returns:
         what to read: the place with an ending, or the file in its folder.
@@ -99,6 +105,10 @@ def write_recording(place: Path, form: str, content: Callable[[Messages], Iterab
     else:
         plugin = plugins.SQLITE3 if form == "sqlite" else plugins.MCAP
         writer = rosbag2.Writer(place, version=9, storage_plugin=plugin)
+    if compression and is_ros1:
+        writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    elif compression:
+        writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
     with writer:
         connections: dict[tuple[str, str], Any] = {}
         for number, (topic, message) in enumerate(content(Messages(is_ros1))):
