@@ -45,9 +45,9 @@ class Stream:
     """Folder of point files, one sweep each; a recording of ROS 1 (.bag) or ROS 2 (its folder, .mcap, .db3); or
     one of KITTI raw or a log of Argoverse 2, which have their poses."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Poses of the sweeps, from the sensor to the world: lines `t x y z qx qy qz qw` (TUM); or, for a folder alone,
-    FILE.json, a list [{"file", "timestamp_us", "sensor_to_world": 4x4}] in the order of time. Without poses each
-    sweep is on its own."""
+    """Poses of the sweeps, from the sensor to the world: lines `t x y z qx qy qz qw` (TUM); or, for a folder
+    alone, FILE.json, a list [{"file", "timestamp_us", "sensor_to_world": 4x4}] in the order of time. Without poses
+    each sweep is on its own."""
     topic: str | None = None  # Clouds (PointCloud2) of a recording of ROS; may be left out where there is one.
     odometry: Annotated[str | None, tyro.conf.arg(metavar="T|tf")] = None
     """Poses of a recording of ROS: a topic of Odometry, PoseStamped or PoseWithCovarianceStamped; or tf."""
