@@ -1,19 +1,26 @@
 """``fcos-lidar stream``: the boxes of a drive, sweep by sweep."""
 
+import contextlib
 import dataclasses
 import json
 import sys
+import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax
 import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
+from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
 from fcos_lidar_jax.data.drives import Drive, folder_drive
 from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
 from fcos_lidar_jax.data.nuscenes.reader import NuScenes
 from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
+from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.inference.cloud import sensor_mismatch
 from fcos_lidar_jax.inference.records import as_records, confident
@@ -36,11 +43,15 @@ class Stream:
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")]  # Trained detector, as for `fcos-lidar detect`.
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.jsonl")]  # Where the lines go.
     source: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="SOURCE")]] = None
-    """Folder of point files, one sweep each; or a recording of KITTI raw, which has its poses."""
+    """Folder of point files, one sweep each; a recording of ROS 1 (.bag) or ROS 2 (its folder, .mcap, .db3); or
+    one of KITTI raw or a log of Argoverse 2, which have their poses."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Poses of a folder's sweeps, from the sensor to the world: FILE.json, a list [{"file", "timestamp_us",
-    "sensor_to_world": 4x4}] in the order of time; or lines `t x y z qx qy qz qw` (TUM). Without poses every sweep
-    is on its own."""
+    """Poses of the sweeps, from the sensor to the world: lines `t x y z qx qy qz qw` (TUM); or, for a folder
+    alone, FILE.json, a list [{"file", "timestamp_us", "sensor_to_world": 4x4}] in the order of time. Without poses
+    each sweep is on its own."""
+    topic: str | None = None  # Clouds (PointCloud2) of a recording of ROS; may be left out where there is one.
+    odometry: Annotated[str | None, tyro.conf.arg(metavar="T|tf")] = None
+    """Poses of a recording of ROS: a topic of Odometry, PoseStamped or PoseWithCovarianceStamped; or tf."""
     data_root: Path | None = None  # Instead of a folder: a data set in the layout of nuScenes.
     scene: str | None = None  # Its scene.
     version: str | None = None  # Its folder of tables; may be left out where there is one.
@@ -63,20 +74,24 @@ def run(args: Stream) -> None:
     detector = load_detector(args.checkpoint)
     drive = _open(args, detector.sensor)
     if args.track and not drive.posed:
-        raise ValueError("--track: found no poses, expected --poses FILE")
+        raise ValueError("--track: found no poses, expected --poses FILE, or --odometry of a recording of ROS")
     if not drive.posed:
         print("no poses: every sweep is detected on its own, without those before it", file=sys.stderr)
+    _tell(drive.notes)
+    print("compiling the detector", file=sys.stderr, flush=True)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
     with (
         rerun_recording(args.rrd, detector.classes) as record_rerun,
         args.out.open("wb", buffering=0) as lines,  # a line is one write, so that interruptions leave whole ones
+        _Timing() as timing,
     ):
-        for found in detect_stream(drive.sweeps, detector, num_sweeps=None if drive.posed else 1):
+        sweeps = timing.read(drive.sweeps)
+        for found in timing.detect(detect_stream(sweeps, detector, num_sweeps=None if drive.posed else 1)):
             points = found.cloud.points[found.cloud.valid]
             if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
                 print(f"warning: {line}", file=sys.stderr)
-            record = _record(found, detector.classes, args.min_score, posed=drive.posed)
+            record = _record(found, detector.classes, args.min_score, drive)
             boxes, labels, scores = confident(found.detections, args.min_score)
             ids = None
             if args.track:
@@ -92,8 +107,62 @@ def run(args: Stream) -> None:
             if args.page is not None:
                 frames.append(page_frame(points, (boxes, labels, scores), **look))
             before_us = found.sweep.time_us
+    _tell(drive.notes)
+    print(timing.summary(), file=sys.stderr)
     if args.page is not None:
         write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source))
+
+
+def _tell(notes: list[str]) -> None:
+    """Each once."""
+    while notes:
+        print(f"note: {notes.pop(0)}", file=sys.stderr)
+
+
+class _Timing(contextlib.AbstractContextManager):
+    """Seconds of each sweep by stage, and how many programs were compiled until its end."""
+
+    def __init__(self) -> None:
+        self._reading, self._to_boxes, self._writing = list[float](), list[float](), list[float]()
+        self._programs, self._until = 0, list[int]()
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def __exit__(self, *error: object) -> None:
+        jax.monitoring.unregister_event_duration_listener(self._listen)
+
+    def _listen(self, event: str, *_: object, **__: object) -> None:
+        self._programs += event.endswith("/backend_compile_duration")
+
+    def read(self, sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
+        return _timed(sweeps, self._reading, [])
+
+    def detect(self, stream: Iterable[Found]) -> Iterator[Found]:
+        for found in _timed(stream, self._to_boxes, self._writing):
+            yield found
+            self._until.append(self._programs)
+
+    def summary(self) -> str:
+        """A line with the medians; the first sweep, for which the detector is compiled, stands apart."""
+        number = len(self._until)
+        if number < 2:
+            return f"{number} sweeps"
+        reading, to_boxes, writing = map(np.array, (self._reading, self._to_boxes, self._writing))
+        stages = {"reading": reading, "detection": to_boxes - reading, "writing": writing}
+        later = ", ".join(f"{np.median(s[1:]) * 1e3:.1f} ms {name}" for name, s in stages.items())
+        compilations = f"{self._until[-1] - self._until[0]} compilations"
+        first = f"the first, which compiles, {to_boxes[0] + writing[0]:.1f} s"
+        return f"{number} sweeps: {first}; the others {later} (medians), {compilations}"
+
+
+def _timed(items: Iterable[Any], within: list[float], between: list[float]) -> Iterator[Any]:
+    """The items; how long each took to come is added to one list, and how long it was in use to the other."""
+    began = time.perf_counter()
+    for item in items:
+        ready = time.perf_counter()
+        within.append(ready - began)
+        yield item
+        began = time.perf_counter()
+        between.append(began - ready)
 
 
 def _check(args: Stream) -> None:
@@ -101,13 +170,21 @@ def _check(args: Stream) -> None:
     if not 0 <= args.min_score <= 1:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
     if (args.source is None) == (args.data_root is None):
-        raise ValueError("stream: expected a folder of point files or --data-root, one of the two")
+        raise ValueError("stream: expected a folder of point files or --data-root, or a recording, one of them")
     if (args.data_root is None) != (args.scene is None):
         raise ValueError("stream: expected --data-root and --scene together")
-    own = ("poses", "columns", "dtype") if args.source is None else ("version", "keyframes")
-    if given := [name for name in own if getattr(args, name)]:
-        where = "a folder of point files" if args.source is None else "--data-root"
-        raise ValueError(f"--{given[0]}: expected with {where} alone")
+    is_ros = args.source is not None and is_ros_bag(args.source)
+    foreign: dict[str, str] = {}  # an option, and what alone it is for
+    if args.source is not None:
+        foreign |= dict.fromkeys(("version", "keyframes"), "--data-root")
+    if args.source is None or is_ros:
+        foreign |= dict.fromkeys(("columns", "dtype"), "a folder of point files")
+    if not is_ros:
+        foreign |= dict.fromkeys(("topic", "odometry"), "a recording of ROS (.bag, .mcap, .db3, metadata.yaml)")
+    if args.source is None or args.odometry is not None:
+        foreign["poses"] = "a folder of point files, or a recording of ROS without --odometry,"
+    if given := [name for name in foreign if getattr(args, name)]:
+        raise ValueError(f"--{given[0]}: expected with {foreign[given[0]]} alone")
     keep = [path for path in (args.source, args.poses) if path is not None and path.is_file()]
     check_out_file("--out", args.out, keep=keep)
     if args.page is not None:
@@ -120,8 +197,13 @@ def _check(args: Stream) -> None:
 
 def _open(args: Stream, sensor: Sensor) -> Drive:
     if args.source is not None:
+        if is_ros_bag(args.source):
+            how = {"topic": args.topic, "odometry": args.odometry, "poses": args.poses}
+            return ros_bag_drive(args.source, sensor, **how, max_points=args.max_file_points)
         if args.poses is None and is_kitti_raw(args.source):
             return kitti_raw_drive(args.source, sensor, max_points=args.max_file_points)
+        if args.poses is None and is_argoverse2_log(args.source):
+            return argoverse2_drive(args.source, sensor, max_points=args.max_file_points)
         layout: dict[str, Any] = {"columns": args.columns, "dtype": args.dtype}
         return folder_drive(args.source, sensor, args.poses, max_points=args.max_file_points, **layout)
     assert args.data_root is not None
@@ -131,12 +213,12 @@ def _open(args: Stream, sensor: Sensor) -> Drive:
     return Drive(NuScenes(args.data_root, version).drive(args.scene, keyframes=args.keyframes))
 
 
-def _record(found: Found, classes: tuple[str, ...], min_score: float, *, posed: bool) -> dict[str, Any]:
+def _record(found: Found, classes: tuple[str, ...], min_score: float, drive: Drive) -> dict[str, Any]:
     """A line's content, in the words of ``fcos-lidar detect``; null where it is not known."""
     cloud, sweep = found.cloud, found.sweep
     dropped = int(found.detections.num_dropped) + cloud.num_removed
-    record: dict[str, Any] = {"file": sweep.name, "timestamp_us": sweep.time_us if posed else None}
-    record |= {"sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if posed else None}
+    record: dict[str, Any] = {"file": sweep.name, "timestamp_us": sweep.time_us if drive.timed else None}
+    record |= {"sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if drive.posed else None}
     record |= {"num_points": cloud.num_points, "num_dropped": dropped}
     record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
     return record | {"boxes": as_records(found.detections, classes, min_score=min_score)}

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -11,9 +11,10 @@ import numpy as np
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES
 from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
 from fcos_lidar_jax.data.classes import map_labels, unknown_name
+from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint
 from fcos_lidar_jax.data.nuscenes.build import velocities
-from fcos_lidar_jax.data.point_files import read_feather, read_points
+from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, find_bad_pose, fuse_sweeps
 from fcos_lidar_jax.geometry import pose_matrix, wrap_angle
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
@@ -121,6 +122,28 @@ class Argoverse2Frames(FrameSet):
         return boxes, labels, num_points
 
 
+def is_argoverse2_log(folder: Path) -> bool:
+    """Whether a folder is a log, such as ``sensor/val/LOG``."""
+    return (folder / _SWEEPS).is_dir()
+
+
+def argoverse2_drive(log: Path, sensor: Sensor, *, max_points: int = MAX_POINTS) -> Drive:
+    """The sweeps of a log in the order of time, in the frame of the ego vehicle, with its poses in the city.
+
+    Raises:
+        ValueError: here or on reading a sweep, naming the file, the row, the field, found and expected.
+    """
+    poses, stamps = _read_poses(log / _POSES), _stamps(log)
+
+    def read() -> Iterator[Sweep]:
+        for stamp in stamps:
+            file = log / _SWEEPS / f"{stamp}.feather"
+            points = read_points(file, sensor, max_points=max_points)
+            yield Sweep(points, poses.at(stamp), stamp // 1000, str(file))
+
+    return Drive(read())
+
+
 def find_splits(root: Path) -> list[str]:
     """Folders of logs in a folder."""
     return sorted(
@@ -180,15 +203,19 @@ def _read_log(log: Path) -> tuple[_Poses, _Boxes]:
 
 @functools.lru_cache(maxsize=32)
 def _cached_log(pose_file: Path, box_file: Path, *states: object) -> tuple[_Poses, _Boxes]:
-    table, matrices = _read_table(pose_file, _POSE)
-    time_ns, first = np.unique(table["timestamp_ns"], return_index=True)
-    if not len(time_ns):
-        raise ValueError(f"{pose_file}: no row in it, expected the poses of the ego vehicle")
-    poses = _Poses(pose_file, time_ns, matrices[first])
+    poses = _read_poses(pose_file)
     if box_file.exists():
         return poses, _read_boxes(box_file, poses)
     none = np.zeros(0, np.int32)
     return poses, _Boxes(np.zeros(0, np.int64), np.zeros((0, 9), np.float32), none, none)
+
+
+def _read_poses(file: Path) -> _Poses:
+    table, matrices = _read_table(file, _POSE)
+    time_ns, first = np.unique(table["timestamp_ns"], return_index=True)
+    if not len(time_ns):
+        raise ValueError(f"{file}: no row in it, expected the poses of the ego vehicle")
+    return _Poses(file, time_ns, matrices[first])
 
 
 def _read_boxes(file: Path, poses: _Poses) -> _Boxes:

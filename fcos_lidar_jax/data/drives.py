@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -24,7 +25,49 @@ class Drive:
     """Sweeps as they come. A new kind of recording is a function that returns this."""
 
     sweeps: Iterable[Sweep]  # read as they are asked for, in the order of time
-    posed: bool = True  # False: poses and times are not known; the identity and 0, 1, ... stand for them
+    posed: bool = True  # False: poses are not known; the identity stands for them
+    timed: bool = True  # False: times are not known; 0, 1, ... stand for them
+    notes: list[str] = dataclasses.field(default_factory=list)
+    """Lines on what was assumed and what was left out, the latter when the last sweep has been read."""
+
+
+class OutsidePosesError(ValueError):
+    """A time before the first or after the last pose."""
+
+
+class PoseTrack(NamedTuple):
+    """Poses of one thing over time."""
+
+    times_us: np.ndarray  # i64[n], increasing
+    rotations: np.ndarray  # f64[n, 4], quaternions w, x, y, z
+    translations: np.ndarray  # f64[n, 3], metres
+
+    def at(self, time_us: int, where: str) -> np.ndarray:
+        """The pose f64[4, 4] at a time: translation and rotation interpolated between the neighbours.
+
+        Raises:
+            OutsidePosesError: naming ``where``: there is no pose before the time, or none after it.
+            ValueError: the neighbours are more than :data:`MAX_POSE_GAP_US` apart.
+
+        >>> track = PoseTrack(np.array([0, 400_000]), np.eye(4)[[0, 0]], np.array([[0.0, 0, 0], [2.0, 0, 0]]))
+        >>> track.at(100_000, "poses")[0].tolist()
+        [1.0, 0.0, 0.0, 0.5]
+        """
+        known_us, rotations, translations = self
+        last = int(np.searchsorted(known_us, time_us))
+        if last < len(known_us) and known_us[last] == time_us:
+            return pose_matrix(rotations[last], translations[last])
+        outside = not 0 < last < len(known_us)
+        if outside or known_us[last] - known_us[last - 1] > MAX_POSE_GAP_US:
+            raise (OutsidePosesError if outside else ValueError)(
+                f"{where}: at {time_us / 1e6} s: a gap in the poses, expected one before and one after it, at "
+                f"most {MAX_POSE_GAP_US / 1e6:g} s apart"
+            )
+        ends = slice(last - 1, last + 1)
+        share = (time_us - known_us[last - 1]) / (known_us[last] - known_us[last - 1])
+        turn = Slerp([0, 1], Rotation.from_quat(rotations[ends], scalar_first=True))(share)
+        place = (1 - share) * translations[last - 1] + share * translations[last]
+        return pose_matrix(turn.as_quat(scalar_first=True), place)
 
 
 def folder_drive(
@@ -63,7 +106,7 @@ def folder_drive(
             points = read_points(file, sensor, columns=columns, dtype=dtype, max_points=max_points)
             yield Sweep(points, matrix, time_us, str(file))
 
-    return Drive(read(), posed=poses is not None)
+    return Drive(read(), posed=poses is not None, timed=poses is not None)
 
 
 def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list[np.ndarray]]:
@@ -80,17 +123,17 @@ def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list
 
 def _posed(files: Sequence[Path], path: Path) -> tuple[list[int], list[np.ndarray]]:
     """Times and poses of clouds from a file of lines."""
-    known_us, rotations, translations = read_tum(path)
+    track = read_tum(path)
     times = [_time_of(file) for file in files]
     if any(time is None for time in times):
-        if len(files) != len(known_us):
+        if len(files) != len(track.times_us):
             raise ValueError(
-                f"{path}: got {len(known_us)} poses for {len(files)} clouds, expected one a cloud, or clouds "
-                f"whose names are times (seconds with a decimal point, or nanoseconds)"
+                f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one a cloud, or "
+                f"clouds whose names are times (seconds with a decimal point, or nanoseconds)"
             )
-        return known_us.tolist(), list(pose_matrix(rotations, translations))
+        return track.times_us.tolist(), list(pose_matrix(track.rotations, track.translations))
     clouds = zip(files, times, strict=True)
-    return times, [_pose_at(t, known_us, rotations, translations, f"{path}: {f}") for f, t in clouds]  # type: ignore
+    return times, [track.at(t, f"{path}: {f}") for f, t in clouds]  # type: ignore
 
 
 def _time_of(file: Path) -> int | None:
@@ -108,11 +151,8 @@ def _time_of(file: Path) -> int | None:
     return int(stem) // 1000 if len(stem) in _NANOSECOND_DIGITS else None
 
 
-def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def read_tum(path: Path) -> PoseTrack:
     """Poses of a file of lines ``t x y z qx qy qz qw``; those that begin with # are left out.
-
-    Returns:
-        times i64[n] in microseconds, increasing; quaternions w, x, y, z f64[n, 4]; translations f64[n, 3], metres.
 
     Raises:
         ValueError: naming the file, the line, what was found and what was expected.
@@ -144,23 +184,4 @@ def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not rows:
         raise ValueError(f"{path}: no pose in it, expected lines t x y z qx qy qz qw")
     poses = np.array(rows)
-    return np.array(times), poses[:, [6, 3, 4, 5]], poses[:, :3]
-
-
-def _pose_at(
-    time_us: int, known_us: np.ndarray, rotations: np.ndarray, translations: np.ndarray, where: str
-) -> np.ndarray:
-    """The pose f64[4, 4] at a time: translation and rotation interpolated between the neighbours."""
-    last = int(np.searchsorted(known_us, time_us))
-    if last < len(known_us) and known_us[last] == time_us:
-        return pose_matrix(rotations[last], translations[last])
-    if not 0 < last < len(known_us) or known_us[last] - known_us[last - 1] > MAX_POSE_GAP_US:
-        raise ValueError(
-            f"{where}: at {time_us / 1e6} s: a gap in the poses, expected one before and one after it, at most "
-            f"{MAX_POSE_GAP_US / 1e6:g} s apart"
-        )
-    ends = slice(last - 1, last + 1)
-    share = (time_us - known_us[last - 1]) / (known_us[last] - known_us[last - 1])
-    turn = Slerp([0, 1], Rotation.from_quat(rotations[ends], scalar_first=True))(share)
-    place = (1 - share) * translations[last - 1] + share * translations[last]
-    return pose_matrix(turn.as_quat(scalar_first=True), place)
+    return PoseTrack(np.array(times), poses[:, [6, 3, 4, 5]], poses[:, :3])

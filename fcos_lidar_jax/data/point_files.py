@@ -77,14 +77,14 @@ def read_points(
     if kind == ".feather":
         names = ("x", "y", "z", "intensity", "laser_number")
         table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)
-        return _assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
+        return assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
     content = _read_whole(path, max_points)
     if kind == ".pcd":
         try:
             table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_A_POINT)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        return _assemble_points(path, sensor, table)
+        return assemble_points(path, sensor, table)
     if not kind.endswith(".bin"):
         return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
     columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
@@ -93,7 +93,7 @@ def read_points(
     rows = _read_raw(path, content, columns, dtype)
     if kind != ".pcd.bin":
         return points_from_array(rows, sensor, str(path))
-    return _assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
+    return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
 def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") -> np.ndarray:
@@ -122,7 +122,7 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
             "time lag in seconds: leave the column out"
         )
     names = ("x", "y", "z", "intensity", "time_lag", "laser")
-    return _assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
+    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
 
 
 def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_POINTS) -> dict[str, np.ndarray]:
@@ -285,11 +285,15 @@ def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.nd
         raise ValueError(f"{path}: not a readable {kind} file: {error}") from None
 
 
-def _assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
-    """The contract's columns from named ones."""
+def assemble_points(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The columns that :func:`read_points` returns from named ones: x, y, z, intensity, time_lag, laser.
+
+    Raises:
+        ValueError: naming ``where``: no points, a negative lag, laser numbers that are missing or none.
+    """
     number = len(table["x"])
     if number == 0:
-        raise ValueError(f"{path}: no points in it, expected at least one")
+        raise ValueError(f"{where}: no points in it, expected at least one")
     points = np.zeros((number, sensor.point_columns), np.float32)
     # What is too large becomes infinite, and is dropped with the other non-finite values.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -301,19 +305,19 @@ def _assemble_points(path: Path | str, sensor: Sensor, table: dict[str, np.ndarr
     negative = np.flatnonzero(points[:, 4] < 0)
     if len(negative):
         found = f"{points[negative[0], 4]:g} in row {negative[0]}"
-        raise ValueError(f"{path}: time_lag: got {found}, expected seconds of at least 0")
+        raise ValueError(f"{where}: time_lag: got {found}, expected seconds of at least 0")
     if sensor.row_source == "laser":
-        points[:, 5] = _laser_numbers(path, sensor, table)
+        points[:, 5] = _laser_numbers(where, sensor, table)
     return points
 
 
-def _laser_numbers(path: Path | str, sensor: Sensor, table: dict[str, np.ndarray]) -> np.ndarray:
+def _laser_numbers(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
     if "laser" not in table:
         expected = f"one for every point, since sensor {sensor.name} needs it"
-        raise ValueError(f"{path}: no laser number in it, expected {expected}")
+        raise ValueError(f"{where}: no laser number in it, expected {expected}")
     laser = table["laser"].astype(np.float64)
     bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
     if len(bad):
         found, expected = f"{laser[bad[0]]:g} in row {bad[0]}", f"whole numbers of 0 to {sensor.num_rows - 1}"
-        raise ValueError(f"{path}: laser number: got {found}, expected {expected}")
+        raise ValueError(f"{where}: laser number: got {found}, expected {expected}")
     return laser

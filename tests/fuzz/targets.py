@@ -7,12 +7,13 @@ import io
 import json
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from random import Random
 
 import numpy as np
 from made_argoverse2 import START_NS, STEP_NS, write_boxes, write_poses, write_sweep
+from made_bags import Messages, structured, write_recording
 from made_kitti import calibration_text, label_text
 from made_nuscenes import VERSION, make_tables
 from made_nuscenes import write as write_nuscenes
@@ -31,6 +32,7 @@ from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
 from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.ros_bags import ros_bag_drive
 from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.evaluation.boxes import BoxColumns
 from fcos_lidar_jax.evaluation.frames import read_detections
@@ -231,6 +233,26 @@ def _read_poses(folder: Path, name: str) -> None:
     times_us, rotations, translations = read_tum(folder / name)
     expect(bool((np.diff(times_us) > 0).all()), "times that do not increase")
     expect(bool(np.isfinite(pose_matrix(rotations, translations)).all()), "a pose that is not finite")
+
+
+def _recordings(folder: Path) -> None:
+    def content(make: Messages) -> Iterator[tuple[str, object]]:
+        yield "/tf_static", make.transform(0, "base_link", "lidar", (0, 0, 1), (0, 0, 0, 1))
+        for time_ns in (0, 10**8):
+            yield "/odom", make.odometry(time_ns, (time_ns / 1e8, 0, 0), (0, 0, 0, 1))
+        yield "/points", make.cloud(5 * 10**7, structured(POINTS[:12].astype("f4")))
+
+    for form in ("ros1", "sqlite", "mcap"):
+        write_recording(folder / form, form, content)
+    (folder / "mcap" / "mcap.mcap").rename(folder / "a.mcap")
+    (folder / "mcap" / "metadata.yaml").unlink()
+
+
+def _read_recording(folder: Path, name: str) -> None:
+    path = folder / name
+    for sweep in ros_bag_drive(path.parent if path.parent != folder else path, TINY, odometry="/odom").sweeps:
+        check_points(sweep.points, TINY)
+        expect(bool(np.isfinite(sweep.sensor_to_world).all()), "a pose that is not finite")
 
 
 def _read_nuscenes(folder: Path, name: str) -> None:
@@ -466,6 +488,7 @@ def make_targets() -> list[Target]:
         ),
         Target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor, alone=True),
         Target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses, alone=True),
+        Target("recordings of ROS", _files(_recordings), _read_recording),
         Target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map, alone=True),
         Target("results", {"a.json": _json({"meta": LIDAR_META, "results": found})}, _read_results, alone=True),
         Target("ground truth", {"a.json": _json(truth)}, _read_truth, alone=True),

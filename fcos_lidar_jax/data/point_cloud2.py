@@ -1,0 +1,68 @@
+"""The points of ROS's message PointCloud2, in the layouts of all drivers."""
+
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.data.point_files import assemble_points
+from fcos_lidar_jax.sensors import Sensor
+
+_COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in "xyz"}
+_COLUMNS["intensity"] = ("intensity", "reflectivity")
+_COLUMNS["laser"] = ("ring", "laser_number", "laser", "line", "channel")
+"""Column -> the field names it goes by among drivers, the most telling first. Other fields are skipped."""
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Datatype of a field -> NumPy's name."""
+
+
+def parse_point_cloud2(cloud: Any, where: str, sensor: Sensor, *, max_points: int) -> np.ndarray:
+    """The points of a message, in the columns of :func:`~fcos_lidar_jax.data.point_files.read_points`.
+
+    Args:
+        cloud: anything with the message's fields; ``data`` is u8[n].
+        where: what to call it in messages.
+        sensor: scales the intensity and says whether a laser number is needed.
+        max_points: of a cloud; a larger one is refused before it takes memory.
+
+    Raises:
+        ValueError: naming ``where``, the field, what was found and what was expected.
+    """
+    width, height, step, pitch = cloud.width, cloud.height, cloud.point_step, cloud.row_step
+    if width * height > max_points:
+        raise ValueError(f"{where}: got {width} x {height} points, expected at most {max_points}")
+    pitch = max(pitch, width * step) if height <= 1 else pitch  # some drivers leave it out in a single row
+    if pitch < width * step:
+        raise ValueError(f"{where}: row_step: got {pitch}, expected {width * step}, width x point_step, or more")
+    if height and width and len(cloud.data) < (needed := (height - 1) * pitch + width * step):
+        found = f"got {len(cloud.data)} bytes, expected at least {needed}"
+        raise ValueError(f"{where}: data: {found} for {height} rows of {width} points of {step}")
+    columns = {}
+    for column, dtype, offset in _find_columns(cloud, where):
+        if width and height:
+            values = np.ndarray((height, width), dtype, cloud.data.data, offset, (pitch, step))
+        else:
+            values = np.zeros(0, dtype)
+        columns[column] = values.reshape(-1)
+    return assemble_points(where, sensor, columns)
+
+
+def _find_columns(cloud: Any, where: str) -> list[tuple[str, np.dtype, int]]:
+    """The columns that there are, with type and offset within a point."""
+    found, names = [], [field.name for field in cloud.fields]
+    for column, aliases in _COLUMNS.items():
+        name = next((alias for alias in aliases if alias in names), None)
+        if name is None:
+            if column in "xyz":
+                there = ", ".join(map(repr, names))[:500] or "none"
+                raise ValueError(f"{where}: fields: got {there}, expected one named {column}")
+            continue
+        field = cloud.fields[names.index(name)]
+        if field.datatype not in _NUMBERS or field.count > 1:
+            got = f"{field.count} of datatype {field.datatype}"
+            raise ValueError(f"{where}: field {name}: got {got}, expected one number of datatype 1 to 8")
+        dtype = np.dtype((">" if cloud.is_bigendian else "<") + _NUMBERS[field.datatype])
+        if field.offset + dtype.itemsize > cloud.point_step:
+            got, expected = f"{dtype.itemsize} bytes at offset {field.offset}", "a place within point_step"
+            raise ValueError(f"{where}: field {name}: got {got}, expected {expected} {cloud.point_step}")
+        found.append((column, dtype, field.offset))
+    return found

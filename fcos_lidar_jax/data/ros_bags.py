@@ -1,0 +1,242 @@
+"""Recordings of ROS 1, ROS 2 and MCAP: the clouds of a topic, with poses of odometry or transforms.
+
+Messages are read with the definitions that rosbags brings along; those that a recording holds, which it would
+translate into Python, are left alone.
+"""
+
+import contextlib
+import functools
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.data.drives import Drive, OutsidePosesError, PoseTrack, read_tum
+from fcos_lidar_jax.data.frame_tree import FrameTree, PoseRow, make_track, printable
+from fcos_lidar_jax.data.point_cloud2 import parse_point_cloud2
+from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.sweeps import Sweep
+from fcos_lidar_jax.sensors import Sensor
+
+_CLOUD = ("sensor_msgs/msg/PointCloud2",)
+_POSE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_MAX_LISTED = 20  # topics in a message
+
+_PoseAt = Callable[[str, int, str], np.ndarray]
+"""(frame of a cloud, microseconds, what to call the cloud) -> sensor to world, f64[4, 4]."""
+
+
+def is_ros_bag(path: Path) -> bool:
+    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder with ``metadata.yaml``.
+
+    >>> is_ros_bag(Path("street.bag")), is_ros_bag(Path("street"))
+    (True, False)
+    """
+    return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+def ros_bag_drive(
+    path: Path,
+    sensor: Sensor,
+    *,
+    topic: str | None = None,
+    odometry: str | None = None,
+    poses: Path | None = None,
+    max_points: int = MAX_POINTS,
+) -> Drive:
+    """The clouds of a recording, in the order in which they were recorded; needs the extra ``ros``.
+
+    The time of a sweep is its header's stamp, rounded down to whole microseconds, as are those of poses. Poses are
+    interpolated by the rule of :class:`~fcos_lidar_jax.data.drives.PoseTrack`. Sweeps are not corrected for the
+    ego vehicle's motion within them: the times of their points are not read. Clouds before the first and after the
+    last pose are left out, which a note of the drive tells.
+
+    Args:
+        topic: of the clouds (``PointCloud2``); may be left out where there is one.
+        odometry: topic of ``Odometry``, ``PoseStamped`` or ``PoseWithCovarianceStamped``; or ``"tf"``: the
+            transforms from the frame of the cloud up to ``odom``, or to the last one. Odometry of another frame
+            than the cloud's, as its child frame says, is completed by the transforms between the two.
+        poses: instead, a file of lines for :func:`~fcos_lidar_jax.data.drives.read_tum`, of the cloud's frame.
+        max_points: a larger cloud is refused.
+
+    Raises:
+        ValueError: here or on reading a cloud, naming recording, topic, what was found and what was expected.
+    """
+    with _Bag(path) as bag:
+        clouds = bag.choose(topic, _CLOUD, "topic")
+        pose_at, notes = _poses(bag, odometry, poses)
+
+    def read() -> Iterator[Sweep]:
+        number, outside = 0, list[OutsidePosesError]()
+        with _Bag(path) as bag:
+            for where, cloud in bag.messages(clouds, _CLOUD):
+                number, time_us = number + 1, _time_us(cloud.header)
+                try:
+                    pose = np.eye(4) if pose_at is None else pose_at(_frame(cloud.header.frame_id), time_us, where)
+                except OutsidePosesError as error:
+                    outside.append(error)
+                    continue
+                points = parse_point_cloud2(cloud, where, sensor, max_points=max_points)
+                yield Sweep(points, pose, time_us, where)
+        if number == 0:
+            raise ValueError(f"{path}: {printable(clouds)}: no cloud in it, expected at least one")
+        if len(outside) == number:
+            raise outside[0]
+        if outside:
+            notes.append(f"{len(outside)} clouds before the first or after the last pose were left out")
+
+    return Drive(read(), posed=pose_at is not None, notes=notes)
+
+
+class _Bag(contextlib.AbstractContextManager):
+    """An open recording. Whatever the library raises of a damaged one becomes a line."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags import rosbag1, rosbag2
+        except ImportError:
+            how = "pip install 'fcos-lidar-jax[ros]'"
+            raise ValueError(f"{path}: rosbags is not installed, which reads recordings: {how}") from None
+        if not path.exists():
+            raise ValueError(f"{path}: no such file or folder, expected a recording")
+        self.path, self._is_ros1 = path, path.suffix == ".bag"
+        files = [path, *path.iterdir()] if path.is_dir() else [path]
+        if odd := [file for file in files if file.suffix == ".db3" and set("%?#") & set(str(file))]:
+            raise ValueError(f"{printable(str(odd[0]))}: %, ? or # in the name, which SQLite takes for an address")
+        with _refusing(str(path)):
+            self._reader: Any = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
+            self._reader.open()
+            self.counts = defaultdict[tuple[str, str], int](int)  # (topic, type) -> messages
+            for one in self._reader.connections:
+                self.counts[str(one.topic), str(one.msgtype)] += int(one.msgcount)
+
+    def __exit__(self, *error: object) -> None:
+        with contextlib.suppress(Exception):
+            self._reader.close()
+
+    def topics(self, types: tuple[str, ...]) -> list[str]:
+        return sorted({topic for topic, kind in self.counts if kind in types})
+
+    def choose(self, wanted: str | None, types: tuple[str, ...], what: str) -> str:
+        """The topic of these types that is wanted, or the only one."""
+        fitting = self.topics(types)
+        if wanted is not None and wanted in fitting:
+            return wanted
+        if wanted is None and len(fitting) == 1:
+            return fitting[0]
+        names = " or ".join(kind.rpartition("/")[2] for kind in types)
+        listed = [
+            f"{printable(topic)} ({printable(kind)}, {count} messages)"
+            for (topic, kind), count in sorted(self.counts.items())
+            if not fitting or kind in types
+        ]
+        more = [f"{len(listed) - _MAX_LISTED} more"] if len(listed) > _MAX_LISTED else []
+        there = ", ".join(listed[:_MAX_LISTED] + more) or "none"
+        found = f"{len(fitting)} of them and none named" if wanted is None else repr(wanted)
+        raise ValueError(f"{self.path}: {what}: got {found}, expected a topic of {names}; there are: {there}")
+
+    def messages(self, topic: str, types: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+        """What to call each message of a topic, and the message."""
+        connections = [one for one in self._reader.connections if one.topic == topic and one.msgtype in types]
+        raw, number = self._reader.messages(connections=connections), 0
+        while True:
+            where = f"{self.path}: {printable(topic)}: message {number}"
+            with _refusing(where):
+                if (record := next(raw, None)) is None:
+                    return
+                connection, _, content = record
+                message = self._deserialize(content, connection.msgtype)
+            yield where, message
+            number += 1
+
+    def _deserialize(self, content: bytes, kind: str) -> Any:
+        types = _typestore(self._is_ros1)
+        return types.deserialize_ros1(content, kind) if self._is_ros1 else types.deserialize_cdr(content, kind)
+
+
+@functools.cache
+def _typestore(is_ros1: bool) -> Any:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if not is_ros1:
+        return get_typestore(Stores.LATEST)
+    types = get_typestore(Stores.ROS1_NOETIC)
+    for kind in _TRANSFORMS:  # which rosbags does not bring along
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+    return types
+
+
+@contextlib.contextmanager
+def _refusing(where: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # damaged recordings raise what rosbags, SQLite, the unpackers and YAML like
+        kind = "" if type(error).__module__.startswith("rosbags") else f"{type(error).__name__}: "
+        raise ValueError(f"{where}: cannot be read: {kind}{printable(' '.join(str(error).split()))}") from None
+
+
+def _frame(name: str) -> str:
+    return name.removeprefix("/")  # ROS 1 wrote both
+
+
+def _time_us(header: Any) -> int:
+    return header.stamp.sec * 1_000_000 + header.stamp.nanosec // 1000
+
+
+def _poses(bag: _Bag, odometry: str | None, poses: Path | None) -> tuple[_PoseAt | None, list[str]]:
+    """Where the sensor was, None where nobody asked, and lines on what was assumed."""
+    if poses is not None:
+        track = read_tum(poses)
+        return lambda frame, time_us, where: track.at(time_us, f"{poses}: {where}"), []
+    if odometry is None:
+        return None, []
+    if odometry == "tf":
+        if not bag.topics(_TRANSFORMS):
+            bag.choose("tf", _TRANSFORMS, "odometry")
+        return _read_transforms(bag).to_world, []
+    odometry = bag.choose(odometry, _POSE, "odometry")
+    track, child = _read_odometry(bag, odometry)
+    name, tree = printable(odometry), _read_transforms(bag)
+
+    def to_world(frame: str, time_us: int, where: str) -> np.ndarray:
+        pose = track.at(time_us, f"{where}: {name}")
+        return pose @ tree.between(child, frame, time_us, where) if child else pose
+
+    assumed = f"{name} does not say of which frame its poses are: taken for those of the clouds' frame"
+    return to_world, [] if child else [assumed]
+
+
+def _read_odometry(bag: _Bag, topic: str) -> tuple[PoseTrack, str]:
+    """Poses of a topic, and of which frame they are: "" where the messages do not say."""
+    rows, times, child = [], [], None
+    for where, message in bag.messages(topic, _POSE):
+        time_us = _time_us(message.header)
+        if times and time_us <= times[-1]:
+            raise ValueError(f"{where}: time: got {time_us} us after {times[-1]} us, expected a later one")
+        of = _frame(getattr(message, "child_frame_id", ""))
+        child = of if child is None else child
+        if of != child:
+            got, expected = printable(of), printable(child)
+            raise ValueError(f"{where}: child_frame_id: got {got!r}, expected {expected!r} as before")
+        pose = getattr(message.pose, "pose", message.pose)  # within one with covariance, as in odometry
+        rows.append(_numbers(pose.orientation, pose.position))
+        times.append(time_us)
+    return make_track(times, rows, f"{bag.path}: {printable(topic)}"), child or ""
+
+
+def _read_transforms(bag: _Bag) -> FrameTree:
+    tree = FrameTree(str(bag.path))
+    for topic in bag.topics(_TRANSFORMS):
+        for _, message in bag.messages(topic, _TRANSFORMS):
+            for each in message.transforms:
+                time_us = None if topic.endswith("tf_static") else _time_us(each.header)
+                pose = _numbers(each.transform.rotation, each.transform.translation)
+                tree.add(_frame(each.child_frame_id), _frame(each.header.frame_id), time_us, pose)
+    return tree
+
+
+def _numbers(rotation: Any, translation: Any) -> PoseRow:
+    return rotation.w, rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z

@@ -1,0 +1,444 @@
+"""Recordings of ROS: layouts of drivers, poses against closed forms, and one line for everything that is wrong."""
+
+import sys
+
+import numpy as np
+import pytest
+from made_bags import FORMS, structured, write_recording
+from refusal import refused
+from scipy.spatial.transform import Rotation
+
+from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, TINY
+
+START_NS = 1_700_000_000_123_456_789
+POINTS = structured(np.random.default_rng(0).uniform(1, 20, (12, 4)).astype(np.float32))
+NO_TURN = (0, 0, 0, 1)
+VELOCITY, YAW_RATE = np.array([8.0, -3.0, 0.5]), 0.7
+
+
+def layout(itemsize, **fields):
+    """name=(type, offset)"""
+    kinds, places = zip(*fields.values(), strict=True)
+    return np.dtype({"names": list(fields), "formats": kinds, "offsets": places, "itemsize": itemsize})
+
+
+XYZ = {"x": ("f4", 0), "y": ("f4", 4), "z": ("f4", 8)}
+DRIVERS = {
+    "velodyne": layout(22, **XYZ, intensity=("f4", 12), ring=("u2", 16), time=("f4", 18)),
+    "ouster": layout(
+        48,
+        **XYZ,
+        **{"intensity": ("f4", 16), "t": ("u4", 20), "reflectivity": ("u2", 24), "ring": ("u1", 26)},
+        **{"ambient": ("u2", 28), "range": ("u4", 32)},
+    ),
+    "hesai": layout(26, **XYZ, intensity=("f4", 12), timestamp=("f8", 16), ring=("u2", 24)),
+    "livox": layout(26, **XYZ, intensity=("f4", 12), tag=("u1", 16), line=("u1", 17), timestamp=("f8", 18)),
+    "big-endian": layout(18, z=(">f4", 0), y=(">f4", 4), x=(">f4", 8), intensity=(">f4", 12), ring=(">u2", 16)),
+    "doubles": layout(29, ring=("i4", 25), x=("f8", 1), y=("f8", 9), z=("f8", 17), reflectivity=("u1", 0)),
+}
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("form", ["ros1", "mcap"])
+def test_clouds_of_the_usual_drivers(tmp_path, driver, form):
+    rng, dtype = np.random.default_rng(1), DRIVERS[driver]
+    points = np.frombuffer(rng.bytes(dtype.itemsize * 20), dtype).copy()  # noise in the gaps and in other fields
+    values = rng.integers(1, 60, (20, 4))
+    laser = next(name for name in ("ring", "line") if name in dtype.names)
+    light = "intensity" if "intensity" in dtype.names else "reflectivity"
+    for name, column in zip(("x", "y", "z", light), values.T, strict=True):
+        points[name] = column
+    points[laser] = np.arange(20)
+    bag = write_recording(tmp_path / "a", form, lambda make: [("/points", make.cloud(START_NS, points))])
+    [sweep] = ros_bag_drive(bag, ARGOVERSE2).sweeps
+    expected = np.column_stack([values, np.zeros(20), np.arange(20)])
+    np.testing.assert_array_equal(sweep.points, expected.astype(np.float32))
+    assert sweep.points.dtype == np.float32
+    assert sweep.time_us == START_NS // 1000
+    [sweep] = ros_bag_drive(bag, KITTI_HDL64E).sweeps
+    np.testing.assert_array_equal(sweep.points[:, 3], values[:, 3] * 255)  # the sensor's scale
+    assert sweep.points.shape == (20, 5)
+
+
+def test_rows_of_organised_clouds_may_be_padded_and_hold_nan(tmp_path):
+    rows = np.stack([POINTS[:6], POINTS[6:]])
+    rows["z"][1, 2] = np.nan
+    padded = np.zeros((2, 6 * 16 + 10), np.uint8)
+    padded[:, : 6 * 16] = np.frombuffer(rows.tobytes(), np.uint8).reshape(2, -1)
+    changed = {"row_step": 6 * 16 + 10, "data": padded.ravel()[:-10]}
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, rows, **changed))])
+    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    np.testing.assert_array_equal(sweep.points[:, 2], rows["z"].ravel())
+    np.testing.assert_array_equal(sweep.points[:, 0], rows["x"].ravel())
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_without_odometry_sweeps_have_times_alone(tmp_path, form):
+    bag = write_recording(
+        tmp_path / "a",
+        form,
+        lambda make: [
+            ("/chatter", make.text("hello")),
+            *(("/p", make.cloud(START_NS + i * 10**8, POINTS)) for i in range(3)),
+        ],
+    )
+    assert is_ros_bag(bag)
+    drive = ros_bag_drive(bag, TINY)
+    assert (drive.posed, drive.timed) == (False, True)
+    sweeps = list(drive.sweeps)
+    assert [sweep.name for sweep in sweeps] == [f"{bag}: /p: message {i}" for i in range(3)]
+    assert [sweep.time_us for sweep in sweeps] == [START_NS // 1000 + i * 10**5 for i in range(3)]
+
+
+def turn(yaw):
+    return Rotation.from_euler("z", yaw).as_quat()
+
+
+def matrix(place, quaternion):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), place
+    return pose
+
+
+def motion(seconds):
+    """A constant velocity and a constant rate of rotation."""
+    return VELOCITY * seconds, turn(0.3 + YAW_RATE * seconds)
+
+
+MOUNT = (0.9, 0.1, 1.7), Rotation.from_euler("zyx", [0.2, -0.1, 0.05]).as_quat()
+HEAD = (0.0, 0.02, 0.3), turn(1.5)
+IMU = (-0.4, 0.3, 0.6), Rotation.from_euler("x", 3.0).as_quat()
+POSES_S = np.arange(9) * 0.1
+CLOUDS_S = np.array([0.05, 0.2, 0.333, 0.7999])
+
+
+def drive_content(make, poses):
+    """Clouds between poses; the LiDAR is on a mount on the vehicle."""
+    yield "/tf_static", make.transform(0, "base_link", "mount", *MOUNT)
+    yield "/tf_static", make.transform(0, "/mount", "lidar", *HEAD)
+    yield "/tf_static", make.transform(0, "base_link", "imu", *IMU)
+    yield from poses(make)
+    for seconds in CLOUDS_S:
+        yield "/points", make.cloud(START_NS + round(seconds * 1e9), POINTS, "/lidar")
+
+
+def expect_poses(drive, expected, atol=1e-5):
+    assert drive.posed
+    for sweep, seconds in zip(drive.sweeps, CLOUDS_S, strict=True):
+        # Whole microseconds: at 9 m/s up to a hundredth of a millimetre beside the stamp.
+        np.testing.assert_allclose(sweep.sensor_to_world, expected(seconds), atol=atol)
+
+
+def times_ns():
+    return [(seconds, START_NS + round(seconds * 1e9)) for seconds in POSES_S]
+
+
+TO_LIDAR = matrix(*MOUNT) @ matrix(*HEAD)
+
+
+@pytest.mark.parametrize(
+    ("child", "to_lidar"),
+    [("lidar", np.eye(4)), ("/base_link", TO_LIDAR), ("imu", np.linalg.inv(matrix(*IMU)) @ TO_LIDAR)],
+)
+@pytest.mark.parametrize("form", ["ros1", "sqlite"])
+def test_odometry_is_interpolated_and_completed_by_transforms(tmp_path, form, child, to_lidar):
+    def poses(make):
+        return (("/odom", make.odometry(t, *motion(seconds), child)) for seconds, t in times_ns())
+
+    bag = write_recording(tmp_path / "a", form, lambda make: drive_content(make, poses))
+    expect_poses(ros_bag_drive(bag, TINY, odometry="/odom"), lambda s: matrix(*motion(s)) @ to_lidar)
+
+
+@pytest.mark.parametrize("kind", ["pose_stamped", "pose_with_covariance"])
+def test_poses_without_a_child_frame_are_the_sensors_own(tmp_path, kind):
+    def poses(make):
+        return (("/pose", getattr(make, kind)(t, *motion(seconds))) for seconds, t in times_ns())
+
+    bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
+    drive = ros_bag_drive(bag, TINY, odometry="/pose")
+    [note] = drive.notes
+    assert note.startswith("/pose does not say of which frame its poses are")
+    expect_poses(drive, lambda s: matrix(*motion(s)))
+
+
+@pytest.mark.parametrize("form", ["ros1", "mcap file"])
+def test_transforms_lead_to_odom_which_does_not_jump(tmp_path, form):
+    def poses(make):
+        for number, (seconds, t) in enumerate(times_ns()):
+            yield "/tf", make.transform(t, "map", "odom", (number**2, 0, 0), NO_TURN)  # corrections that jump
+            for _ in range(2):  # some are sent twice
+                yield "/tf", make.transform(t, "odom", "base_link", *motion(seconds))
+
+    bag = write_recording(tmp_path / "a", form, lambda make: drive_content(make, poses))
+    expect_poses(ros_bag_drive(bag, TINY, odometry="tf"), lambda s: matrix(*motion(s)) @ TO_LIDAR)
+
+
+def test_moving_transforms_are_multiplied_up_to_the_last_frame(tmp_path):
+    def poses(make):
+        yield "/tf", make.transform(0, "earth", "world", (5, 6, 7), turn(1))  # once: it stays there
+        for seconds, t in times_ns():
+            yield "/tf", make.transform(t, "world", "lift", (0, 0, seconds), NO_TURN)
+            yield "/tf", make.transform(t + 5 * 10**7, "lift", "base_link", *motion(seconds + 0.05))
+        yield "/tf", make.transform(START_NS - 10**8, "lift", "base_link", *motion(-0.1))
+
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, poses))
+
+    def expected(seconds):
+        lift = matrix((0, 0, seconds), NO_TURN)
+        return matrix((5, 6, 7), turn(1)) @ lift @ matrix(*motion(seconds)) @ TO_LIDAR
+
+    expect_poses(ros_bag_drive(bag, TINY, odometry="tf"), expected)
+
+
+def test_lines_of_poses_are_of_the_sensor(tmp_path):
+    lines = [
+        " ".join(map(str, [f"{t // 10**9}.{t % 10**9:09d}", *place, *quaternion]))
+        for t, (place, quaternion) in ((t, motion(seconds)) for seconds, t in times_ns())
+    ]
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, lambda _: ()))
+    expect_poses(ros_bag_drive(bag, TINY, poses=tmp_path / "poses.txt"), lambda s: matrix(*motion(s)))
+
+
+def test_messages_need_no_definitions_of_the_recording(tmp_path):
+    bag = write_recording(tmp_path / "a", "ros1", lambda make: [("/points", make.cloud(1, POINTS))])
+    content = bag.read_bytes()
+    assert content.count(b"uint32 height") > 0
+    bag.write_bytes(content.replace(b"uint32 height", b"string heigh!"))
+    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    np.testing.assert_array_equal(sweep.points[:, 0], POINTS["x"])
+
+
+def test_clouds_outside_of_the_poses_are_left_out_and_told(tmp_path):
+    def poses(make):
+        return (("/odom", make.odometry(t, *motion(seconds), "lidar")) for seconds, t in times_ns()[1:6])
+
+    bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
+    drive = ros_bag_drive(bag, TINY, odometry="/odom")
+    assert [sweep.name[-1] for sweep in drive.sweeps] == ["1", "2"]
+    assert drive.notes == ["2 clouds before the first or after the last pose were left out"]
+    bag = write_recording(
+        tmp_path / "b", "mcap", lambda make: drive_content(make, lambda make: list(poses(make))[:1])
+    )
+    with refused("/points: message 0: /odom: at 1700000000.173456 s: a gap in the poses"):
+        list(ros_bag_drive(bag, TINY, odometry="/odom").sweeps)
+
+
+@pytest.mark.parametrize("name", ["a%20b", "a?mode=rw", "a#b"])
+def test_names_are_no_addresses_for_sqlite(tmp_path, name):
+    with refused(f"{name}.db3: %, ? or # in the name"):
+        (tmp_path / f"{name}.db3").touch()
+        ros_bag_drive(tmp_path / f"{name}.db3", TINY)
+
+
+def test_other_branches_of_the_tree_may_be_wrong(tmp_path):
+    def poses(make):
+        for name in ("odom", "map"):
+            yield "/tf", make.transform(START_NS, name, "base_link", (0, 0, 0), NO_TURN)
+        yield from (("/odom", make.odometry(t, *motion(seconds))) for seconds, t in times_ns())
+
+    bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
+    expect_poses(ros_bag_drive(bag, TINY, odometry="/odom"), lambda s: matrix(*motion(s)) @ TO_LIDAR)
+
+
+def moving(*names):
+    return lambda make: (
+        ("/tf", make.transform(t, parent, child, *motion(seconds)))
+        for seconds, t in times_ns()
+        for parent, child in names
+    )
+
+
+def odometry(*rows):
+    return lambda make: (("/odom", make.odometry(START_NS + t, *pose)) for t, *pose in rows)
+
+
+WRONG_DRIVES = {
+    "no odometry": (
+        {"odometry": "/odom"},
+        lambda make: (),
+        ("odometry: got '/odom', expected a topic of Odometry or PoseStamped or", "/points (sensor_msgs/msg/P"),
+    ),
+    "another topic of odometry": (
+        {"odometry": "/odm"},
+        odometry((0, (0, 0, 0), NO_TURN)),
+        ("odometry: got '/odm', expected", "there are: /odom (nav_msgs/msg/Odometry, 1 messages)"),
+    ),
+    "a cloud's topic": (
+        {"topic": "/tf_static"},
+        lambda make: (),
+        ("topic: got '/tf_static', expected a topic of P",),
+    ),
+    "a gap": (
+        {"odometry": "/odom"},
+        odometry((0, (0, 0, 0), NO_TURN), (6 * 10**8, (0, 0, 0), NO_TURN)),
+        ("/points: message 0: /odom: at 1700000000.173456 s: a gap in the poses",),
+    ),
+    "time going back": (
+        {"odometry": "/odom"},
+        odometry((5000, (0, 0, 0), NO_TURN), (4000, (0, 0, 0), NO_TURN)),
+        ("/odom: message 1: time: got 1700000000123460 us after 1700000000123461 us, expected a later one",),
+    ),
+    "no unit quaternion": (
+        {"odometry": "/odom"},
+        odometry((0, (0, 0, 0), NO_TURN), (4000, (0, 0, 0), (0, 0, 0, 0))),
+        ("/odom: pose 1: rotation: got [0.0, 0.0, 0.0, 0.0], expected a unit quaternion",),
+    ),
+    "far away": (
+        {"odometry": "/odom"},
+        odometry((0, (0, np.nan, 0), NO_TURN)),
+        ("/odom: pose 0: translation: got",),
+    ),
+    "other frames": (
+        {"odometry": "/odom"},
+        odometry((0, (0, 0, 0), NO_TURN), (4000, (0, 0, 0), NO_TURN, "imu")),
+        ("/odom: message 1: child_frame_id: got 'imu', expected 'base_link' as before",),
+    ),
+    "no transform": (
+        {"odometry": "/odom"},
+        odometry(*((round(s * 1e9), (0, 0, 0), NO_TURN, "chassis") for s in POSES_S)),
+        (
+            "/points: message 0: no transform from 'lidar' to 'chassis' in the recording",
+            "those of: imu, lidar, mount",
+        ),
+    ),
+    "nothing that moves": (
+        {"odometry": "tf"},
+        lambda make: (),
+        ("/points: message 0: got the frames lidar -> mount -> base_link, expected one that moves, by /tf",),
+    ),
+    "a gap in transforms": (
+        {"odometry": "tf"},
+        lambda make: np.delete(list(moving(("odom", "base_link"))(make)), range(2, 8), axis=0),
+        ("/points: message 1: tf of base_link in odom: at 1700000000.323456 s: a gap in the poses",),
+    ),
+    "two parents": (
+        {"odometry": "tf"},
+        moving(("odom", "base_link"), ("map", "base_link")),
+        ("a: tf: frame 'base_link' has 2 parents, expected a tree",),
+    ),
+    "a circle": (
+        {"odometry": "tf"},
+        moving(("lidar", "base_link")),
+        ("a: tf: frame 'base_link' has itself among those that it is in, expected a tree",),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_DRIVES)
+def test_wrong_drives_are_one_line(tmp_path, case):
+    options, poses, fragments = WRONG_DRIVES[case]
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, poses))
+    with refused(f"{bag}: ", *fragments):
+        list(ros_bag_drive(bag, TINY, **options).sweeps)
+
+
+def test_several_topics_of_clouds_are_listed(tmp_path):
+    bag = write_recording(
+        tmp_path / "a",
+        "mcap",
+        lambda make: [("/front", make.cloud(1, POINTS)), ("/rear", make.cloud(1, POINTS)), ("/a", make.text(""))],
+    )
+    kind = "sensor_msgs/msg/PointCloud2, 1 messages"
+    with refused("topic: got 2 of them and none named, expected", f"there are: /front ({kind}), /rear ({kind})"):
+        ros_bag_drive(bag, TINY)
+    assert len(list(ros_bag_drive(bag, TINY, topic="/rear").sweeps)) == 1
+    bag = write_recording(tmp_path / "b", "sqlite", lambda make: [("/a", make.text(""))])
+    with refused("topic: got 0 of them and none named", "there are: /a (std_msgs/msg/String, 1 messages)"):
+        ros_bag_drive(bag, TINY)
+    with refused("odometry: got 'tf', expected a topic of TFMessage"):
+        ros_bag_drive(tmp_path / "a", TINY, topic="/rear", odometry="tf")
+
+
+NAMES = ("x", "y", "z", "intensity")
+WRONG_CLOUDS = {
+    "too short": (
+        {"data": np.zeros(191, np.uint8)},
+        "data: got 191 bytes, expected at least 192 for 1 rows of 12",
+    ),
+    "huge": ({"width": 2**32 - 1, "height": 2**32 - 1}, "x 4294967295 points, expected at most 10000000"),
+    "wide rows": ({"row_step": 2**32 - 1, "height": 2}, "data: got 192 bytes, expected at least 4294967487"),
+    "narrow rows": ({"row_step": 100, "width": 7, "height": 2}, "row_step: got 100, expected 112, width x"),
+    "no step": ({"point_step": 0}, "field x: got 4 bytes at offset 0, expected a place within point_step 0"),
+    "narrow step": ({"point_step": 10}, "field z: got 4 bytes at offset 8, expected a place within point_step 10"),
+    "no points": ({"width": 0}, "no points in it, expected at least one"),
+    "no fields": ({"fields": []}, "fields: got none, expected one named x"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_CLOUDS)
+def test_wrong_clouds_are_one_line(tmp_path, case):
+    changed, message = WRONG_CLOUDS[case]
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS, **changed))])
+    with refused(f"{bag}: /p: message 0: ", message):
+        list(ros_bag_drive(bag, TINY).sweeps)
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        (("x", 0, 9, 1), "field x: got 1 of datatype 9, expected one number of datatype 1 to 8"),
+        (("x", 0, 7, 3), "field x: got 3 of datatype 7"),
+        (
+            ("x", 2**32 - 1, 7, 1),
+            "field x: got 4 bytes at offset 4294967295, expected a place within point_step 16",
+        ),
+    ],
+)
+def test_wrong_fields_are_one_line(tmp_path, field, message):
+    def content(make):
+        cloud = make.cloud(1, POINTS)
+        cloud.fields[0] = make.make("sensor_msgs/PointField", *field)
+        return [("/p", cloud)]
+
+    bag = write_recording(tmp_path / "a", "sqlite", content)
+    with refused(f"{bag}: /p: message 0: ", message):
+        list(ros_bag_drive(bag, TINY).sweeps)
+
+
+def test_too_many_points_and_missing_lasers_are_one_line(tmp_path):
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS))])
+    with refused("/p: message 0: got 12 x 1 points, expected at most 11"):
+        list(ros_bag_drive(bag, NUSCENES_HDL32E, max_points=11).sweeps)
+    with refused("/p: message 0: no laser number in it"):
+        list(ros_bag_drive(bag, ARGOVERSE2).sweeps)
+
+
+@pytest.mark.parametrize(
+    ("form", "how"),
+    [("ros1", "LZ4"), ("ros1", "BZ2"), ("sqlite", "FILE"), ("sqlite", "MESSAGE"), ("mcap file", "STORAGE")],
+)
+def test_compressed_recordings_are_read(tmp_path, form, how):
+    bag = write_recording(tmp_path / "a", form, lambda make: [("/p", make.cloud(1, POINTS))], compression=how)
+    [sweep] = ros_bag_drive(bag, TINY).sweeps
+    np.testing.assert_array_equal(sweep.points[:, 2], POINTS["z"])
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("share", [0, 0.3, 0.97])
+def test_truncated_recordings_are_one_line(tmp_path, form, share):
+    clouds = [structured(np.random.default_rng(i).normal(0, 5, (5000, 4)).astype(np.float32)) for i in range(3)]
+    bag = write_recording(
+        tmp_path / "a", form, lambda make: [("/p", make.cloud(i, cloud)) for i, cloud in enumerate(clouds)]
+    )
+    file = bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
+    content = file.read_bytes()
+    file.write_bytes(content[: round(share * len(content))])
+    with refused(f"{bag}: ", "cannot be read: "):
+        list(ros_bag_drive(bag, TINY).sweeps)
+
+
+@pytest.mark.parametrize("text", ["", "{", "rosbag2_bagfile_information: 3", "a: &a [*a]", "\0"])
+def test_broken_metadata_are_one_line(tmp_path, text):
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS))])
+    (bag / "metadata.yaml").write_text(text)
+    with refused(f"{bag}: cannot be read: "):
+        ros_bag_drive(bag, TINY)
+
+
+def test_a_missing_library_names_the_extra(tmp_path, monkeypatch):
+    (tmp_path / "a.bag").touch()
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with refused("a.bag: rosbags is not installed", "pip install 'fcos-lidar-jax[ros]'"):
+        ros_bag_drive(tmp_path / "a.bag", TINY)
