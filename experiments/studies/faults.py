@@ -12,8 +12,8 @@
 
 and ``train`` resumed after its newest checkpoint was damaged. Expected: in the end the same bytes as without any
 of it (of ``train`` the same state, of ``evaluate`` the same but for the time it took), no traceback, and one line
-from whoever gives up. About an hour and a half on two cores. The same command goes on where it was stopped, by the
-file of figures that ``--out`` names.
+from whoever gives up. About an hour and a half on two cores. The same command goes on where it was stopped, by its
+file of figures.
 """
 
 import collections
@@ -44,7 +44,7 @@ from experiments.script import Options, run_script, save
 from experiments.studies.device_equivalence import CONFIG, SENSOR, draw_variables
 from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.cli import main as command
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.trainer import Schedule, train
@@ -355,23 +355,28 @@ def main(args: Args) -> None:
                         each.append({"same": False, "problem": str(error)})
                     shutil.rmtree(folder, ignore_errors=True)
                     record[what] |= {"times": len(each), "same": sum(one["same"] for one in each)}
-                    _save(args, record, f"{what}: {record[what]['same']} of {len(each)} as they should be")
+                    print(f"{what}: {record[what]['same']} of {len(each)} as they should be", flush=True)
+                    # Without the hardware's description: it would begin JAX's threads, which forks do not survive.
+                    text = json.dumps({"seed": args.seed, "faults": record})
+                    atomic_write(_file(args), lambda path, text=text: path.write_text(text, encoding="utf-8"))
+    killed = (s for done in record.values() for one in done["each"] for s in one.get("killed", ()))
+    figures = {"seed": args.seed, "signals": collections.Counter(killed), "faults": record}
+    save(figures, _file(args), f"{dict(figures['signals'])}")
     problems = [one["problem"] for done in record.values() for one in done["each"] if not one["same"]]
     if problems:
         raise ValueError(f"got {len(problems)} failures, expected none: {problems[0]}")
 
 
+def _file(args: Args) -> Path:
+    return args.out or Path("outputs", "faults.json")
+
+
 def _earlier(args: Args) -> dict[str, Any]:
     """What a run that was stopped has found with the same seed."""
-    if args.out is None or not args.out.is_file():
+    if not _file(args).is_file():
         return {}
-    found = read_json(args.out, dict[str, Any])
+    found = read_json(_file(args), dict[str, Any])
     return found["faults"] if found["seed"] == args.seed else {}
-
-
-def _save(args: Args, record: dict[str, Any], line: str) -> None:
-    killed = (s for done in record.values() for one in done["each"] for s in one.get("killed", ()))
-    save({"seed": args.seed, "signals": collections.Counter(killed), "faults": record}, args.out, line)
 
 
 if __name__ == "__main__":
