@@ -1,0 +1,36 @@
+"""Check that a wheel and a source archive hold what they should, and nothing else.
+
+python look_into_wheel.py WHEEL SDIST
+"""
+
+import sys
+import tarfile
+import zipfile
+from pathlib import PurePosixPath
+
+NEEDED = (
+    "py.typed",
+    "weights/quickstart/checkpoint.json",
+    "weights/hdl32e/checkpoint.json",
+    "weights/hdl32e/README.md",
+    "simulation/objects.toml",
+    "simulation/clutter.toml",
+    "visualization/page.html",
+)
+KINDS = {".py", ".typed", ".toml", ".html"}  # and whatever Orbax calls its arrays
+
+wheel, source = sys.argv[1:]
+names = zipfile.ZipFile(wheel).namelist()
+inside = [PurePosixPath(n) for n in names if not n.split("/")[0].endswith(".dist-info")]
+if missing := [name for name in NEEDED if f"fcos_lidar_jax/{name}" not in names]:
+    sys.exit(f"{wheel}: no {missing[0]} in it")
+if not any(name.endswith("LICENSE") for name in names):
+    sys.exit(f"{wheel}: no licence in it")
+own = [p for p in inside if p.parts[0] == "fcos_lidar_jax" and (p.suffix in KINDS or "weights" in p.parts)]
+if strangers := sorted(set(inside) - set(own)):
+    sys.exit(f"{wheel}: holds {strangers[0]}, expected the package alone")
+with tarfile.open(source) as archive:
+    packed = archive.getnames()
+if not any(name.endswith("/pyproject.toml") for name in packed):
+    sys.exit(f"{source}: no pyproject.toml in it")
+print(f"{wheel}: {len(names)} files; {source}: {len(packed)} files")

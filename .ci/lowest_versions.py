@@ -1,0 +1,13 @@
+"""Print the lowest versions that pyproject.toml allows, as constraints for pip; of all but the tools that read code."""
+
+import re
+import tomllib
+from pathlib import Path
+
+TOOLS = ("ruff", "pyright", "import-linter")
+
+project = tomllib.loads(Path(__file__).parent.with_name("pyproject.toml").read_text(encoding="utf-8"))["project"]
+for requirement in sorted({*project["dependencies"], *project["optional-dependencies"]["test"]}):
+    name, lowest = re.fullmatch(r"([\w.-]+)>=([\d.]+)(?:,.*)?", requirement).groups()
+    if name not in TOOLS:
+        print(f"{name}=={lowest}")
