@@ -1,4 +1,4 @@
-"""Print the lowest versions that pyproject.toml allows, as constraints for pip; of all but the tools that read code."""
+"""Print the lowest versions that pyproject.toml allows, as constraints for pip, but for tools that read code."""
 
 import re
 import tomllib
