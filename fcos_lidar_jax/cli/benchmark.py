@@ -16,9 +16,10 @@ from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference import CloudDetector, TrainedDetector, load_detector
+from fcos_lidar_jax.inference import Backend, CloudDetector, TrainedDetector, load_detector
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
 from fcos_lidar_jax.inference.export import ExportedDetector
+from fcos_lidar_jax.inference.openvino import OpenVinoDetector
 from fcos_lidar_jax.inference.stages import Stages
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -44,6 +45,7 @@ class Benchmark:
     batch: tuple[int, ...] = ()
     """Clouds at once. Default: 1, 2 and 4, or what the file was exported for."""
     repeats: int = 20  # Turns.
+    backend: Backend = "xla"  # What the network runs in, as for `fcos-lidar detect`.
 
 
 def run(args: Benchmark) -> None:
@@ -54,9 +56,10 @@ def run(args: Benchmark) -> None:
     files = find_clouds(args.files)
     if args.out is not None:
         check_out_file("--out", args.out, keep=files)
-    detector = load_detector(args.checkpoint)
+    detector = load_detector(args.checkpoint, backend=args.backend)
     record = {
         "checkpoint": str(args.checkpoint),
+        "backend": f"openvino {detector.precision}" if isinstance(detector, OpenVinoDetector) else "xla",
         **measure(detector, files, args.batch, args.repeats),
         **machine(),
     }
@@ -123,13 +126,14 @@ def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
 
 def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
     stages = Stages(detector.config, detector.sensor)
-    variables = jax.device_put(detector.variables)
+    of_xla = functools.partial(stages.network, jax.device_put(detector.variables))
+    network = detector.network if isinstance(detector, OpenVinoDetector) else of_xla
     on_device = [jax.device_put((cloud.points, cloud.valid)) for cloud in clouds]
     images = [stages.project(*cloud) for cloud in on_device]
-    outputs = [stages.network(variables, image) for image in images]
+    outputs = [network(image) for image in images]
     return {
         "projection": _in_turn(lambda cloud: stages.project(*cloud), on_device),
-        "network": _in_turn(lambda image: stages.network(variables, image), images),
+        "network": _in_turn(network, images),
         "postprocess": _in_turn(lambda pair: stages.postprocess(*pair), list(zip(outputs, images, strict=True))),
     }
 
@@ -143,7 +147,8 @@ def as_text(record: dict[str, Any]) -> str:
     return "\n".join(
         [
             f"{record['checkpoint']}: {record['clouds']} clouds of {record['points']} points, {record['repeats']} "
-            f"turns, {record['device']} ({record['processor']}, {record['cores']} cores), jax {record['jax']}",
+            f"turns, {record['backend']}, {record['device']} ({record['processor']}, {record['cores']} cores), "
+            f"jax {record['jax']}",
             f"{'stage':<12}{'median ms':>12}{'95 % ms':>12}",
             *(line(name, times) for name, times in record["stages"].items()),
             f"{'batch':<12}{'median ms':>12}{'95 % ms':>12}{'clouds/s':>12}",

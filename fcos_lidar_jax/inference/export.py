@@ -10,10 +10,11 @@ import functools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypedDict
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jax import export, lax
 from jax.sharding import Mesh
@@ -37,6 +38,23 @@ _MAGIC, _FORMAT = "fcos-lidar-detector", 1
 _MAX_FIRST_LINE, _MAX_RECORD, _MAX_BYTES = 100, 2**20, 2**31
 _EXPECTED = "expected a checkpoint folder or a file that `fcos-lidar export` has written"
 _WITHOUT_SOURCE_PATHS = {"jax_hlo_source_file_canonicalization_regex": ".*", "jax_traceback_in_locations_limit": 0}
+
+
+class _Weights(TypedDict):
+    parameters: int
+    blake2b: str
+
+
+class _Record(TypedDict):
+    """What the package itself needs of the record of a file."""
+
+    written_by: str
+    name: str
+    num_points: Annotated[int, msgspec.Meta(ge=1)] | Literal["any"]
+    batch: Annotated[int, msgspec.Meta(ge=1)] | Literal["any"]
+    weights: _Weights
+    sensor: dict[str, Any]
+    config: dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -207,8 +225,7 @@ def _read(file: Path) -> tuple[dict[str, Any], bytes]:
     line, _, program = content.partition(b"\n")
     try:
         record = json.loads(line[:_MAX_RECORD])
-        if all(isinstance(record[name], dict) for name in ("config", "sensor", "weights")) and "batch" in record:
-            return record, program
-    except (ValueError, RecursionError, KeyError, TypeError):
-        pass
-    raise CheckpointError(f"{file}: found a forged record, {_EXPECTED}")
+        msgspec.convert(record, _Record)
+    except (ValueError, RecursionError):  # of which msgspec's is one
+        raise CheckpointError(f"{file}: found a forged record, {_EXPECTED}") from None
+    return record, program
