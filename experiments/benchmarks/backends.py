@@ -8,8 +8,8 @@ ones, with random weights and a background's prior of 0.5, so that NMS is at its
 Then the mAP of the shipped weights ``hdl32e`` with both, on unseen simulated frames and on the real keyframes in
 FOLDER (see ``transfer``). Needs ``pip install 'fcos-lidar-jax[cpu]'``.
 
-Cost: five minutes for the times on two CPU cores, and a second a frame for the mAP. Expected: at most half of XLA's
-time in bfloat16, nearly all of it in float32 (0.95), and an mAP within 0.005.
+Cost: five minutes for the times on two CPU cores, and a second a frame for the mAP. Expected: at most half of
+XLA's time in bfloat16, else at most 0.95 of it, and an mAP within 0.005.
 """
 
 import dataclasses

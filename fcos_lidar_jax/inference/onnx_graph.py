@@ -1,13 +1,12 @@
 """The network alone as an ONNX graph in float32, made from its parameters, batch norms folded into convolutions.
 
-From the features of a range image to the raw predictions of all levels, as ``Detector.apply``: projection, decoding
-and NMS are not in it. Images are [b, c, h, w] inside.
+From the features of a range image to the raw predictions of all levels, as ``Detector.apply``: neither projection
+nor decoding nor NMS is in it. Images are [b, c, h, w] inside.
 """
 
 import importlib
-import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -43,8 +42,8 @@ def network_graph(detector: TrainedDetector) -> bytes:
     """The network as an ONNX file, the same bytes for the same detector and versions.
 
     Its input is ``features`` f32[b, h, w, 9, r], a range image as ``project_points`` gives it, in raw units; its
-    outputs are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. Everything
-    is float32, whatever ``config.model.precision`` is. The metadata hold classes, configuration and sensor as JSON.
+    outputs are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. All is
+    float32, whatever ``config.model.precision`` is. The metadata hold classes, configuration and sensor as JSON.
 
     Raises:
         ValueError: onnx is not installed, or the network has parameters that the graph does not know.
@@ -56,18 +55,17 @@ def network_graph(detector: TrainedDetector) -> bytes:
     image = _preprocessing(network, "features", model, layout)
     image = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
     levels = _pyramid(network, _backbone(network, image, model.backbone_blocks))
-    _heads(network, levels, model, len(config.classes))
-    network.check_all_used()
-
-    number, k = layout.num_locations, len(config.classes)
-    described = onnx.helper.make_tensor_value_info
+    k = len(config.classes)
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
+    _heads(network, levels, model, shapes)
+    network.check_all_used()
+    described = onnx.helper.make_tensor_value_info
     float32 = onnx.TensorProto.FLOAT
     graph = onnx.helper.make_graph(
         network.nodes,
         config.name,
         [described("features", float32, ["b", layout.rows, layout.columns, len(CHANNELS), rounds])],
-        [described(name, float32, ["b", number, *shape]) for name, shape in shapes.items()],
+        [described(name, float32, ["b", layout.num_locations, *shape]) for name, shape in shapes.items()],
         list(network.constants.values()),
     )
     file = onnx.helper.make_model(
@@ -161,6 +159,13 @@ class _Network:
         y = self("InstanceNormalization", grouped, np.ones(groups), np.zeros(groups), epsilon=EPSILON)
         return self("Add", self("Mul", self("Reshape", y, self("Shape", x)), scale), bias)
 
+    def tower(self, x: str, path: str, depth: int) -> str:
+        for i in range(depth):
+            x = self(
+                "Relu", self.group_norm(self.conv(x, self.parameter(f"{path}/conv{i}/kernel")), f"{path}/norm{i}")
+            )
+        return x
+
     def upsample(self, x: str, rows: int, columns: int) -> str:
         """Every row and column repeated."""
         how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
@@ -237,23 +242,29 @@ def _pyramid(network: _Network, levels: Sequence[str]) -> list[str]:
     return [*outputs, network.conv_bias(network("Relu", outputs[-1]), "fpn/output7", stride=2)]
 
 
-def _heads(network: _Network, levels: Sequence[str], model: ModelConfig, classes: int) -> None:
+_TOWERS = ("classification", "regression")
+_PREDICTIONS = {
+    "logits": ("classification", ("logits",)),
+    "regression": ("regression", ("centre", "size", "heading", "velocity")),
+    "iou_logits": ("regression", ("iou",)),
+}
+"""Output -> tower, and the layers whose predictions it holds."""
+
+
+def _heads(
+    network: _Network, levels: Sequence[str], model: ModelConfig, shapes: Mapping[str, Sequence[int]]
+) -> None:
     """The outputs, at the locations of all levels."""
-    found: dict[str, list[str]] = {"classification": [], "regression": []}
-    layers = {"classification": ("logits",), "regression": ("centre", "size", "heading", "velocity", "iou")}
-    shapes = {"classification": [0, -1, classes + 1], "regression": [0, -1, 11, classes]}
-    for (level, image), name in itertools.product(enumerate(levels), found):
-        path, x = "heads/shared" if model.tied_heads else f"heads/level{level + 2}", image
-        for i in range(model.head_convs):
-            x = network.conv(x, network.parameter(f"{path}/{name}_tower/conv{i}/kernel"))
-            x = network("Relu", network.group_norm(x, f"{path}/{name}_tower/norm{i}"))
-        kernel, bias = (
-            np.concatenate([network.parameter(f"{path}/{name}/{layer}_{part}") for layer in layers[name]], axis=-1)
-            for part in ("kernel", "bias")
-        )
-        y = network("Transpose", network.conv(x, kernel, bias), perm=[0, 2, 3, 1])
-        found[name].append(network("Reshape", y, shapes[name]))
-    network("Concat", *found["classification"], axis=1, output="logits")
-    numbers = network("Concat", *found["regression"], axis=1)
-    network("Slice", numbers, [0], [10], [2], output="regression")
-    network("Squeeze", network("Slice", numbers, [10], [11], [2]), [2], output="iou_logits")
+    found: dict[str, list[str]] = {name: [] for name in _PREDICTIONS}
+    for level, image in enumerate(levels):
+        path = "heads/shared" if model.tied_heads else f"heads/level{level + 2}"
+        towers = {name: network.tower(image, f"{path}/{name}_tower", model.head_convs) for name in _TOWERS}
+        for name, (tower, layers) in _PREDICTIONS.items():
+            kernel, bias = (
+                np.concatenate([network.parameter(f"{path}/{tower}/{layer}_{part}") for layer in layers], axis=-1)
+                for part in ("kernel", "bias")
+            )
+            y = network("Transpose", network.conv(towers[tower], kernel, bias), perm=[0, 2, 3, 1])
+            found[name].append(network("Reshape", y, [0, -1, *shapes[name]]))
+    for name, of_levels in found.items():
+        network("Concat", *of_levels, axis=1, output=name)

@@ -15,7 +15,6 @@ from fcos_lidar_jax.inference.onnx_graph import network_graph
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
-from fcos_lidar_jax.sensors import TINY
 
 onnx = pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
 openvino = pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")
@@ -25,32 +24,28 @@ def with_model(config, **changes):
     return dataclasses.replace(config, model=dataclasses.replace(config.model, **changes))
 
 
-def with_stem(**changes):
-    """The tiny network with another stem, of two rounds."""
-    stem = StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2))
-    config = with_model(CONFIG, stem=dataclasses.replace(stem, **changes))
-    return dataclasses.replace(config, projection=dataclasses.replace(config.projection, num_rounds=2))
+def with_stem(rounds=2, **changes):
+    """The tiny network with another stem."""
+    config = with_model(CONFIG, stem=StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2), **changes))
+    return dataclasses.replace(config, projection=dataclasses.replace(config.projection, num_rounds=rounds))
 
 
-SLIM = {"backbone_blocks": (2, 1, 1, 1), "backbone_widths": (16, 8, 8, 8), "fpn_channels": 32, "head_channels": 16}
+SLIM = {"backbone_blocks": (2, 1, 1, 1), "backbone_widths": (8, 8, 8, 8), "fpn_channels": 32, "head_channels": 16}
 ODD = dataclasses.replace(SENSOR, num_columns=50)  # padded to 64 columns
 CASES = {
-    "quickstart": (QUICKSTART, TINY),
-    "compact, circular": (COMPACT, TINY),
-    "paper, slim behind the stem": (with_model(NUSCENES, **SLIM), TINY),
-    "modalities": (with_stem(groups="modalities"), SENSOR),
-    "one group": (with_stem(groups="all"), SENSOR),
-    "rounds apart": (with_stem(group_rounds=False), SENSOR),
-    "a shared merge": (with_stem(merge="shared"), SENSOR),
-    "three convolutions": (with_stem(num_convs=3), SENSOR),
-    "wide groups": (with_stem(channels_per_type=16), SENSOR),
-    "tied heads": (CONFIG, SENSOR),
-    "untied heads": (with_model(CONFIG, tied_heads=False, head_convs=2), SENSOR),
-    "padded columns": (CONFIG, ODD),
-    "padded columns, circular": (with_model(CONFIG, circular_width=True), ODD),
-    "padded rows": (with_model(CONFIG, row_upscale=3), SENSOR),
-    "remat": (with_model(CONFIG, remat=True), SENSOR),
-    "three classes": (dataclasses.replace(CONFIG, classes=("a", "b", "c")), SENSOR),
+    "quickstart": (QUICKSTART, SENSOR),
+    "compact, circular": (COMPACT, SENSOR),
+    "paper, slim behind the stem": (with_model(NUSCENES, **SLIM), SENSOR),
+    "modalities, a shared merge, three convolutions": (
+        with_stem(groups="modalities", merge="shared", num_convs=3),
+        ODD,
+    ),
+    "rounds apart, untied heads": (with_model(with_stem(group_rounds=False), tied_heads=False), SENSOR),
+    "one group, three classes": (dataclasses.replace(with_stem(groups="all"), classes=("a", "b", "c")), SENSOR),
+    "circular, padded columns and rows, remat": (
+        with_model(CONFIG, circular_width=True, row_upscale=3, remat=True),
+        ODD,
+    ),
 }
 
 
