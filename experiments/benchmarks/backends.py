@@ -119,8 +119,10 @@ def scores(args: Args) -> dict[str, Any]:
 
 def mean_ap(detector: TrainedDetector, sets: Sequence[FrameSet]) -> float:
     """Of all frames together."""
-    pairs = [detections(detector, frames) for frames in sets]
-    found, read = ([each for pair in pairs for each in pair[side]] for side in (0, 1))
+    found, read = [], []
+    for frames in sets:
+        for collected, new in zip((found, read), detections(detector, frames), strict=True):
+            collected.extend(new)
     return float(evaluate_frames(found, read, metric_of(detector.classes)).summary["mean_ap"])
 
 

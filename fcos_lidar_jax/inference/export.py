@@ -214,14 +214,14 @@ def _read(file: Path) -> tuple[dict[str, Any], bytes]:
             first = stream.readline(_MAX_FIRST_LINE)
             if not first.startswith(_MAGIC.encode() + b" "):
                 raise CheckpointError(f"{file}: found a file, {_EXPECTED}")
-            content = stream.read(_MAX_BYTES)
+            content = stream.read(min(file.stat().st_size, _MAX_BYTES))  # as much memory as is asked for is taken
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read: {error.strerror}") from None
     version, _, expected = first.decode("ascii", "replace").removeprefix(_MAGIC).strip().partition(" ")
     if version != str(_FORMAT):
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
     if (found := checksum(content)) != expected:
-        raise CheckpointError(f"{file}: checksum {found}, expected {expected}: damaged")
+        raise CheckpointError(f"{file}: checksum {found!r}, expected {expected!r}: damaged")
     line, _, program = content.partition(b"\n")
     try:
         record = json.loads(line[:_MAX_RECORD])

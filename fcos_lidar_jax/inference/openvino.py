@@ -41,7 +41,8 @@ class OpenVinoDetector(TrainedDetector):
 
         def one(points: np.ndarray, valid: np.ndarray) -> Detections:
             image = stages.project(points, valid)
-            return Detections(*stages.postprocess(self.network(image), image), image.num_dropped)
+            boxes, scores, labels, used = stages.postprocess(self.network(image), image)
+            return Detections(boxes, scores, labels, used, image.num_dropped)
 
         def several(points: Any, valid: Any) -> Detections:
             found = [one(*cloud) for cloud in zip(np.asarray(points), np.asarray(valid), strict=True)]

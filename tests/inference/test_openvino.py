@@ -70,8 +70,3 @@ def test_a_missing_package_is_one_line(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ValueError, match=rf"^{package} is not installed: pip install 'fcos-lidar-jax\[cpu\]'$"):
         load_detector("quickstart", backend="openvino")
-
-
-def test_backends_that_there_are_not():
-    with pytest.raises(ValueError, match="backend: got 'tpu', expected one of xla, openvino"):
-        load_detector("quickstart", backend="tpu")
