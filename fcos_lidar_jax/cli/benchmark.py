@@ -38,8 +38,8 @@ class Benchmark:
 
     Stages take turns, and each its clouds in turn, after a run that compiles; `detect` is one program of the three
     stages above it. Of an exported detector there is no more than `detect` to see. Of the network also the
-    operations are counted, and its speed compared with that of a float32 product of matrices, which does little but
-    multiply: narrow channels, which move more than they multiply, are far below.
+    operations are counted, and its speed compared with that of a float32 product of matrices, which does little
+    but multiply: narrow channels, which move more than they multiply, are far below.
     """
 
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]] = ()
@@ -132,7 +132,7 @@ def measure(
 
 
 def _product() -> Call:
-    """A float32 product of two matrices: what arithmetic reaches on this device, next to nothing but multiplying."""
+    """A float32 product of two matrices: what arithmetic reaches on this device."""
     matrix, multiply = jnp.ones((_SIDE, _SIDE)), jax.jit(jnp.matmul)
     return lambda: multiply(matrix, matrix)
 
