@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -16,15 +17,19 @@ from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference import CloudDetector, TrainedDetector, load_detector
+from fcos_lidar_jax.inference import Backend, CloudDetector, TrainedDetector, load_detector
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
 from fcos_lidar_jax.inference.export import ExportedDetector
+from fcos_lidar_jax.inference.openvino import OpenVinoDetector
 from fcos_lidar_jax.inference.stages import Stages
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
+from fcos_lidar_jax.locations import image_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
+from fcos_lidar_jax.types import CHANNELS, RangeImage
 
 _SIMULATED = 3  # Clouds, where no files are given.
+_SIDE = 2048  # Of the matrices whose product is timed.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +37,9 @@ class Benchmark:
     """Time a detector on one device: each stage, the whole from file to boxes, and clouds a second.
 
     Stages take turns, and each its clouds in turn, after a run that compiles; `detect` is one program of the three
-    stages above it. Of an exported detector there is no more than `detect` to see.
+    stages above it. Of an exported detector there is no more than `detect` to see. Of the network also the
+    operations are counted, and its speed compared with that of a float32 product of matrices, which does little
+    but multiply: narrow channels, which move more than they multiply, are far below.
     """
 
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]] = ()
@@ -44,6 +51,7 @@ class Benchmark:
     batch: tuple[int, ...] = ()
     """Clouds at once. Default: 1, 2 and 4, or what the file was exported for."""
     repeats: int = 20  # Turns.
+    backend: Backend = "xla"  # What the network runs in, as for `fcos-lidar detect`.
 
 
 def run(args: Benchmark) -> None:
@@ -54,9 +62,10 @@ def run(args: Benchmark) -> None:
     files = find_clouds(args.files)
     if args.out is not None:
         check_out_file("--out", args.out, keep=files)
-    detector = load_detector(args.checkpoint)
+    detector = load_detector(args.checkpoint, backend=args.backend)
     record = {
         "checkpoint": str(args.checkpoint),
+        "backend": f"openvino {detector.precision}" if isinstance(detector, OpenVinoDetector) else "xla",
         **measure(detector, files, args.batch, args.repeats),
         **machine(),
     }
@@ -102,7 +111,9 @@ def measure(
         calls["detect"] = _in_turn(lambda cloud: detect(1, [cloud]), clouds)
         start: Callable[[Any], Cloud] = (lambda file: clean(read(file))) if files else clean
         calls["whole"] = _in_turn(lambda given: detect(1, [start(given)]), files or arrays)
+    calls["product"] = _product()
     stages = interleaved(calls, repeats, percentile=95)
+    product_gflops = 2 * _SIDE**3 / 1e6 / stages.pop("product")["median_ms"]
     together = {
         size: functools.partial(detect, size, list(itertools.islice(itertools.cycle(clouds), size)))
         for size in sizes
@@ -112,7 +123,31 @@ def measure(
         for size, times in interleaved(together, repeats, percentile=95).items()
     }
     number = {"clouds": len(clouds), "points": round(float(np.mean([len(points) for points in arrays])))}
-    return {**number, "repeats": repeats, "stages": stages, "throughput": throughput}
+    record = {**number, "repeats": repeats, "stages": stages, "throughput": throughput}
+    if isinstance(detector, TrainedDetector) and (gflop := _network_gflop(detector)):
+        gflops = 1e3 * gflop / stages["network"]["median_ms"]
+        speed = {"gflop": gflop, "gflops": gflops, "product_gflops": product_gflops}
+        record["network"] = {**_rounded(speed), "share": round(gflops / product_gflops, 3)}
+    return record
+
+
+def _product() -> Call:
+    """A float32 product of two matrices: what arithmetic reaches on this device."""
+    matrix, multiply = jnp.ones((_SIDE, _SIDE)), jax.jit(jnp.matmul)
+    return lambda: multiply(matrix, matrix)
+
+
+def _network_gflop(detector: TrainedDetector) -> float:
+    """Operations of the network for one cloud as XLA counts them before it optimises; 0 where it does not."""
+    stages, sensor = Stages(detector.config, detector.sensor), image_sensor(detector.sensor, detector.config.model)
+    shape = sensor.num_rows, sensor.num_columns, len(CHANNELS), detector.config.projection.num_rounds
+    image: Any = RangeImage(jax.ShapeDtypeStruct(shape, jnp.float32), None, None)  # type: ignore[arg-type]
+    counted: Any = stages.network.lower(detector.variables, image).cost_analysis()  # type: ignore[attr-defined]
+    return (counted or {}).get("flops", 0.0) / 1e9
+
+
+def _rounded(values: dict[str, float]) -> dict[str, float]:
+    return {name: float(f"{value:.4g}") for name, value in values.items()}
 
 
 def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
@@ -123,30 +158,40 @@ def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
 
 def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
     stages = Stages(detector.config, detector.sensor)
-    variables = jax.device_put(detector.variables)
+    of_xla = functools.partial(stages.network, jax.device_put(detector.variables))
+    network = detector.network if isinstance(detector, OpenVinoDetector) else of_xla
     on_device = [jax.device_put((cloud.points, cloud.valid)) for cloud in clouds]
     images = [stages.project(*cloud) for cloud in on_device]
-    outputs = [stages.network(variables, image) for image in images]
+    outputs = [network(image) for image in images]
     return {
         "projection": _in_turn(lambda cloud: stages.project(*cloud), on_device),
-        "network": _in_turn(lambda image: stages.network(variables, image), images),
+        "network": _in_turn(network, images),
         "postprocess": _in_turn(lambda pair: stages.postprocess(*pair), list(zip(outputs, images, strict=True))),
     }
 
 
 def as_text(record: dict[str, Any]) -> str:
     """The figures as a table."""
+    lines = _as_lines(record)
+    if network := record.get("network"):
+        lines.append(
+            "network: {gflop:.4g} GFLOP a cloud, {gflops:.4g} GFLOP/s, {share:.2f} of what a float32 product of "
+            "matrices reaches here ({product_gflops:.4g})".format(**network)
+        )
+    return "\n".join(lines)
+
+
+def _as_lines(record: dict[str, Any]) -> list[str]:
 
     def line(name: str, times: Times) -> str:
         return f"{name:<12}{times['median_ms']:>12.2f}{times['p95_ms']:>12.2f}"
 
-    return "\n".join(
-        [
-            f"{record['checkpoint']}: {record['clouds']} clouds of {record['points']} points, {record['repeats']} "
-            f"turns, {record['device']} ({record['processor']}, {record['cores']} cores), jax {record['jax']}",
-            f"{'stage':<12}{'median ms':>12}{'95 % ms':>12}",
-            *(line(name, times) for name, times in record["stages"].items()),
-            f"{'batch':<12}{'median ms':>12}{'95 % ms':>12}{'clouds/s':>12}",
-            *(f"{line(size, t)}{t['clouds_per_s']:>12.2f}" for size, t in record["throughput"].items()),
-        ]
-    )
+    return [
+        f"{record['checkpoint']}: {record['clouds']} clouds of {record['points']} points, {record['repeats']} "
+        f"turns, {record['backend']}, {record['device']} ({record['processor']}, {record['cores']} cores), "
+        f"jax {record['jax']}",
+        f"{'stage':<12}{'median ms':>12}{'95 % ms':>12}",
+        *(line(name, times) for name, times in record["stages"].items()),
+        f"{'batch':<12}{'median ms':>12}{'95 % ms':>12}{'clouds/s':>12}",
+        *(f"{line(size, t)}{t['clouds_per_s']:>12.2f}" for size, t in record["throughput"].items()),
+    ]

@@ -12,7 +12,7 @@ from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import read_list
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference import load_detector
+from fcos_lidar_jax.inference import Backend, load_detector
 from fcos_lidar_jax.inference.cloud import expect_points
 from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.progress import Progress
@@ -51,6 +51,9 @@ class Detect:
     dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
     max_file_points: int = MAX_POINTS  # Refuse a point file of more points.
     batch_size: int = 1  # Clouds that a device takes at once; more than one changes boxes and scores by rounding.
+    backend: Backend = "xla"
+    """What the network runs in; openvino is faster on CPUs, in bfloat16 where the processor has it, and needs
+    pip install 'fcos-lidar-jax[cpu]'."""
 
 
 def run(args: Detect) -> None:
@@ -70,7 +73,7 @@ def run(args: Detect) -> None:
     for option, out in (("--out", args.out), ("--page", args.page or args.out)):
         if find_checkpoint(args.checkpoint).resolve() in out.resolve().parents:
             raise ValueError(f"{option}: {out}: found a place in the checkpoint, expected one elsewhere")
-    detector = load_detector(args.checkpoint)
+    detector = load_detector(args.checkpoint, backend=args.backend)
     projection = detector.config.projection
     clouds = CloudFiles(
         files,

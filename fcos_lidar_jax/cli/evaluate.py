@@ -26,7 +26,7 @@ from fcos_lidar_jax.evaluation.results import read_results, result_entries, writ
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
-from fcos_lidar_jax.inference import CloudDetector, load_detector
+from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
 from fcos_lidar_jax.inference.records import as_records
 from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
@@ -63,6 +63,7 @@ class Evaluate:
     ground_truth: Path | None = None
     """Truth as JSON, instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
     batch_size: int = 1  # Frames that a device takes at once; more than one changes boxes and scores by rounding.
+    backend: Backend = "xla"  # What the network runs in, as for `fcos-lidar detect`.
     bootstrap: int = 0  # Sets of samples to draw for the 95 % intervals of mAP and NDS; a few hundred will do.
     report: bool = True  # Write report.html with its pictures, and frames.html.
     sensor: str = "nuscenes_hdl32e"
@@ -72,7 +73,7 @@ class Evaluate:
 def run(args: Evaluate) -> None:
     """Detect where a detector is given, evaluate, write, and print the scores."""
     _check(args)
-    detector = None if args.checkpoint is None else load_detector(args.checkpoint)
+    detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
     sensor = load_sensor(args.sensor) if detector is None else detector.sensor
     with contextlib.ExitStack() as locked:
         if detector is not None:

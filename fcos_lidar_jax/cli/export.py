@@ -4,7 +4,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -12,6 +12,7 @@ from fcos_lidar_jax.cli.checks import check_out_file
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.export import PLATFORMS, Size, export_detector, load_exported
+from fcos_lidar_jax.inference.onnx_graph import network_graph
 from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 
@@ -20,7 +21,7 @@ class Export:
     """Write a detector as one file that runs with jax and flatbuffers alone, on CPUs, GPUs and TPUs.
 
     Points go in and boxes come out; the other commands take it as their --checkpoint. Prints what was written as
-    JSON, with the seconds that reading it took.
+    JSON, with the seconds that reading it took. With --network-only --format onnx, the network alone.
     """
 
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")]
@@ -32,16 +33,36 @@ class Export:
     trained."""
     batch: Annotated[Size, tyro.conf.arg(metavar="N|any")] = 1
     """Clouds at once, or any; more than one changes boxes and scores by rounding."""
+    network_only: bool = False  # Without projection, decoding and NMS, for other runtimes; needs --format onnx.
+    format: Literal["jax", "onnx"] = (
+        "jax"  # Of the file: a program of jax.export, or an ONNX graph of the network.
+    )
 
 
 def run(args: Export) -> None:
-    """Export, write, and read what was written."""
+    """Export and write."""
     found = find_checkpoint(args.checkpoint)
     check_out_file("--out", args.out, keep=())
     if found.resolve() in args.out.resolve().parents:
         raise ValueError(f"--out: {args.out}: found a place in the checkpoint, expected one elsewhere")
+    if args.network_only != (args.format == "onnx"):
+        raise ValueError("export: expected --network-only and --format onnx together: the rest has no ONNX form")
+    (_export_network if args.network_only else _export_program)(args, found)
+
+
+def _export_network(args: Export, checkpoint: Path) -> None:
+    if (args.points, args.batch) != (None, 1):
+        raise ValueError("--points, --batch: expected without --network-only, whose batch is any")
+    detector = load_trained(checkpoint)
+    content = network_graph(detector)
+    atomic_write(args.out, lambda path: path.write_bytes(content))
+    print(json.dumps({"file": str(args.out), "bytes": len(content), "name": detector.config.name}))
+
+
+def _export_program(args: Export, checkpoint: Path) -> None:
+    """Write, and read what was written."""
     began = time.perf_counter()
-    content = export_detector(load_trained(found), num_points=args.points, batch=args.batch)
+    content = export_detector(load_trained(checkpoint), num_points=args.points, batch=args.batch)
     written = time.perf_counter()
     atomic_write(args.out, lambda path: path.write_bytes(content))
     read = time.perf_counter()

@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenes
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
-from fcos_lidar_jax.inference import load_detector
+from fcos_lidar_jax.inference import Backend, load_detector
 from fcos_lidar_jax.inference.cloud import sensor_mismatch
 from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.inference.stream import Found, detect_stream
@@ -62,6 +62,7 @@ class Stream:
     """Also write a recording for the viewer rerun, with `pip install 'fcos-lidar-jax[viz]'`."""
     track: bool = False  # Give every box the identity of its object over time; needs poses.
     min_score: float = 0.0  # Leave out boxes below this score.
+    backend: Backend = "xla"  # What the network runs in, as for `fcos-lidar detect`.
     columns: int | None = None
     """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
     dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
@@ -71,7 +72,7 @@ class Stream:
 def run(args: Stream) -> None:
     """Detect, write a line a sweep, and the page at the end."""
     _check(args)
-    detector = load_detector(args.checkpoint)
+    detector = load_detector(args.checkpoint, backend=args.backend)
     drive = _open(args, detector.sensor)
     if args.track and not drive.posed:
         raise ValueError("--track: found no poses, expected --poses FILE, or --odometry of a recording of ROS")

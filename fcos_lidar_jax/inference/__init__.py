@@ -2,9 +2,10 @@
 
 from fcos_lidar_jax.inference.detect import make_detect, postprocess, select_candidates
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
-from fcos_lidar_jax.inference.load import load_detector, load_trained
+from fcos_lidar_jax.inference.load import Backend, load_detector, load_trained
 
 __all__ = [
+    "Backend",
     "CloudDetector",
     "TrainedDetector",
     "load_detector",

@@ -10,10 +10,11 @@ import functools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypedDict
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jax import export, lax
 from jax.sharding import Mesh
@@ -37,6 +38,23 @@ _MAGIC, _FORMAT = "fcos-lidar-detector", 1
 _MAX_FIRST_LINE, _MAX_RECORD, _MAX_BYTES = 100, 2**20, 2**31
 _EXPECTED = "expected a checkpoint folder or a file that `fcos-lidar export` has written"
 _WITHOUT_SOURCE_PATHS = {"jax_hlo_source_file_canonicalization_regex": ".*", "jax_traceback_in_locations_limit": 0}
+
+
+class _Weights(TypedDict):
+    parameters: int
+    blake2b: str
+
+
+class _Record(TypedDict):
+    """What the package itself needs of the record of a file."""
+
+    written_by: str
+    name: str
+    num_points: Annotated[int, msgspec.Meta(ge=1)] | Literal["any"]
+    batch: Annotated[int, msgspec.Meta(ge=1)] | Literal["any"]
+    weights: _Weights
+    sensor: dict[str, Any]
+    config: dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -196,19 +214,18 @@ def _read(file: Path) -> tuple[dict[str, Any], bytes]:
             first = stream.readline(_MAX_FIRST_LINE)
             if not first.startswith(_MAGIC.encode() + b" "):
                 raise CheckpointError(f"{file}: found a file, {_EXPECTED}")
-            content = stream.read(_MAX_BYTES)
+            content = stream.read(min(file.stat().st_size, _MAX_BYTES))  # as much memory as is asked for is taken
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read: {error.strerror}") from None
     version, _, expected = first.decode("ascii", "replace").removeprefix(_MAGIC).strip().partition(" ")
     if version != str(_FORMAT):
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
     if (found := checksum(content)) != expected:
-        raise CheckpointError(f"{file}: checksum {found}, expected {expected}: damaged")
+        raise CheckpointError(f"{file}: checksum {found!r}, expected {expected!r}: damaged")
     line, _, program = content.partition(b"\n")
     try:
         record = json.loads(line[:_MAX_RECORD])
-        if all(isinstance(record[name], dict) for name in ("config", "sensor", "weights")) and "batch" in record:
-            return record, program
-    except (ValueError, RecursionError, KeyError, TypeError):
-        pass
-    raise CheckpointError(f"{file}: found a forged record, {_EXPECTED}")
+        msgspec.convert(record, _Record)
+    except (ValueError, RecursionError):  # of which msgspec's is one
+        raise CheckpointError(f"{file}: found a forged record, {_EXPECTED}") from None
+    return record, program

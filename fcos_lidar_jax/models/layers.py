@@ -21,6 +21,13 @@ from jaxtyping import Array
 
 from fcos_lidar_jax.models.convolution import Image, convolve
 
+EPSILON = 1e-5  # Of the variances of both norms.
+
+
+def norm_groups(channels: int) -> int:
+    """Groups of a group norm: two channels each, at most 32."""
+    return max(1, min(32, channels // 2))
+
 
 def normal(key: Array, shape: Sequence[int], stddev: Any) -> Array:
     """``stddev * jax.random.normal(key, shape)``, to the bit; compiled for powers of two instead of for every
@@ -60,7 +67,6 @@ class BatchNorm(nn.Module):
     """
 
     momentum: float = 0.9  # Part of the running statistics that an update keeps.
-    epsilon: float = 1e-5
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
@@ -82,7 +88,7 @@ class BatchNorm(nn.Module):
             if not self.is_initializing():
                 running_mean.value = self.momentum * running_mean.value + (1 - self.momentum) * mean
                 running_var.value = self.momentum * running_var.value + (1 - self.momentum) * var
-        gain = scale * lax.rsqrt(var + self.epsilon)
+        gain = scale * lax.rsqrt(var + EPSILON)
         shift = bias - mean * gain
         return [(part * gain[cut] + shift[cut]).astype(given) for part, cut in zip(parts, cuts, strict=True)]
 
@@ -127,15 +133,13 @@ def recomputed(module: nn.Module) -> Callable[..., Image]:
 
 
 class GroupNorm(nn.Module):
-    """Group norm with ``min(32, channels // 2)`` groups (at least one), statistics per image."""
-
-    epsilon: float = 1e-5
+    """Group norm with :func:`norm_groups`, statistics per image."""
 
     @nn.compact
     def __call__(self, x: Image) -> Image:
         given, x = x.dtype, at_least_float32(x)
         channels = x.shape[-1]
-        groups = max(1, min(32, channels // 2))
+        groups = norm_groups(channels)
         scale = self.param("scale", nn.initializers.ones, (channels,))
         bias = self.param("bias", nn.initializers.zeros, (channels,))
 
@@ -145,5 +149,5 @@ class GroupNorm(nn.Module):
 
         mean = of_group(x.mean((1, 2)))
         var = of_group(jnp.square(x - lax.stop_gradient(mean)).mean((1, 2)))
-        gain = scale * lax.rsqrt(var + self.epsilon)
+        gain = scale * lax.rsqrt(var + EPSILON)
         return (x * gain + (bias - mean * gain)).astype(given)

@@ -5,7 +5,7 @@ import jax
 
 from fcos_lidar_jax.models.layers import ConvNorm, Image, recomputed
 
-_STRIDES = (1, 2, 2, 2)
+STAGE_STRIDES = (1, 2, 2, 2)
 _EXPANSION = 4
 
 
@@ -42,7 +42,7 @@ class Backbone(nn.Module):
         module = ConvNorm(x.shape[-1], 7, circular=self.circular, name="first")
         x = (recomputed(module) if self.remat else module)(x, train=train)
         levels = []
-        for stage, (count, width, stride) in enumerate(zip(self.blocks, self.widths, _STRIDES, strict=True)):
+        for stage, (count, width, stride) in enumerate(zip(self.blocks, self.widths, STAGE_STRIDES, strict=True)):
             for block in range(count):
                 first, name = block == 0, f"stage{stage}_block{block}"
                 module = Bottleneck(width, stride if first else 1, first, self.circular, name=name)

@@ -2,12 +2,18 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command
 from tiny_run import TINY_CONFIG, untrained
 
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.cli import benchmark
+from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.locations import image_layout
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import NUSCENES
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
@@ -41,8 +47,41 @@ def test_each_stage_and_the_whole_are_timed(home, tmp_path, capsys, name, parts)
     assert record["clouds"] == 2
     assert record["points"] == round(sum(len(np.load(file)) for file in clouds) / 2)
     assert record["cores"] >= 1
+    if parts:
+        speed = record["network"]
+        assert speed["gflops"] == pytest.approx(1e3 * speed["gflop"] / stages["network"]["median_ms"], rel=1e-3)
+        assert speed["share"] == pytest.approx(speed["gflops"] / speed["product_gflops"], abs=1e-3)
+        assert speed["gflop"] > 0
+    else:
+        assert "network" not in record
     shown = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in shown[2 : 2 + len(stages)]] == list(stages)
+
+
+def test_operations_are_those_of_the_convolutions():
+    model = build_detector(NUSCENES, NUSCENES_HDL32E)
+    variables = jax.eval_shape(model.init, jax.random.key(0))
+    layout, counted = image_layout(NUSCENES_HDL32E, NUSCENES.model), 0
+    pixels = dict(
+        zip(("stage0", "stage1", "stage2", "stage3", "level6", "level7"), layout.level_sizes, strict=True)
+    )
+    pixels |= {
+        f"{part}{i + 2}": size
+        for part in ("level", "lateral", "output")
+        for i, size in enumerate(layout.level_sizes)
+    }
+    for path, leaf in jax.tree_util.tree_leaves_with_path(variables["params"]):
+        words = [key.key for key in path]
+        size = pixels.get(words[1].partition("_")[0], layout.level_sizes[0])
+        before_the_stride = words[2:3] == ["reduce"] and words[1] in (
+            "stage1_block0",
+            "stage2_block0",
+            "stage3_block0",
+        )
+        if leaf.ndim in (2, 4):
+            counted += 2 * size * (4 if before_the_stride else 1) * np.prod(leaf.shape)
+    # XLA leaves out the taps on the padding, and counts norms, sums and what pads the predictions' channels.
+    assert 1e9 * benchmark._network_gflop(TrainedDetector(model, variables)) == pytest.approx(counted, rel=0.03)
 
 
 def test_without_files_the_clouds_are_simulated(home, tmp_path):

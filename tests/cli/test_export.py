@@ -106,7 +106,7 @@ def test_the_record_is_a_line_of_json(home):
 
 
 def test_the_documents_lines_run_without_this_package(home):
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), re.DOTALL)
+    code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), re.DOTALL)
     hide = "import os, sys; sys.modules['fcos_lidar_jax'] = sys.modules['flax'] = None"
     (home / "run.py").write_text(f"{hide}\nos.chdir({str(home)!r})\n{code}")
     ran = run_python(home / "run.py")

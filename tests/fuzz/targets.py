@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from random import Random
 
+import jax
 import numpy as np
+from jax import export
 from made_argoverse2 import START_NS, STEP_NS, write_boxes, write_poses, write_sweep
 from made_bags import Messages, structured, write_recording
 from made_kitti import calibration_text, label_text
@@ -42,6 +44,7 @@ from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.inference.export import load_exported
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
 from fcos_lidar_jax.input_pipeline.database import open_database, prepare_database
 from fcos_lidar_jax.presets import QUICKSTART
@@ -61,7 +64,7 @@ from fcos_lidar_jax.trainer.run import check_run
 from fcos_lidar_jax.training.checkpoint import read_description
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
-from .mutators import mutate, mutate_bytes
+from .mutators import mutate, mutate_bytes, mutate_json
 
 CONFIG = dataclasses.replace(QUICKSTART, max_points=64)
 _RNG = np.random.default_rng(0)
@@ -368,6 +371,43 @@ def _read_description(folder: Path, name: str) -> None:
         from_json(description[part], f"{folder / name}: {part}")
 
 
+def _exported() -> bytes:
+    """A file of `fcos-lidar export`, with a small program."""
+    add = export.export(jax.jit(lambda x: x + 1), platforms=("cpu",))
+    program = bytes(add(jax.ShapeDtypeStruct((3,), np.float32)).serialize())
+    record = {
+        "written_by": "fcos_lidar_jax",
+        "name": CONFIG.name,
+        "classes": list(CONFIG.classes),
+        "batch": 1,
+        "num_points": CONFIG.max_points,
+        "weights": {"parameters": 3, "blake2b": "0"},
+        "sensor": sensor_to_json(TINY),
+        "config": config_to_json(CONFIG),
+    }
+    content = _json(record) + b"\n" + program
+    return b"fcos-lidar-detector 1 " + checksum(content).encode() + b"\n" + content
+
+
+def _mutate_exported(name: str, content: bytes, rng: Random) -> bytes:
+    """The line of JSON, or anything."""
+    first, line, program = content.split(b"\n", 2)
+    if rng.random() < 0.5:
+        return mutate_bytes(content, rng)
+    return b"\n".join((first, mutate_json(line, rng), program))
+
+
+def _seal_exported(folder: Path, name: str) -> None:
+    first, newline, content = (folder / name).read_bytes().partition(b"\n")
+    (folder / name).write_bytes(first[:22] + checksum(content).encode() + newline + content)
+
+
+def _read_exported(folder: Path, name: str) -> None:
+    detector = load_exported(folder / name)
+    expect(detector.record["batch"] == "any" or detector.record["batch"] >= 1, "no batch")
+    expect(isinstance(detector.fingerprint, str) and detector.config.classes, "no detector")
+
+
 def _description() -> dict[str, object]:
     description = {"format": 3, "step": 4, "files": {"a": "0"}, "data": "", "score": None}
     return {**description, "config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY)}
@@ -511,6 +551,14 @@ def make_targets() -> list[Target]:
             {"checkpoint.json": _json(_description())},
             _read_description,
             seal=_seal_description,
+        ),
+        Target(
+            "exported detector",
+            {"a.fcos": _exported()},
+            _read_exported,
+            mutate=_mutate_exported,
+            seal=_seal_exported,
+            alone=True,
         ),
         Target(
             "ground-truth database",

@@ -1,0 +1,270 @@
+"""The network alone as an ONNX graph in float32, made from its parameters, batch norms folded into convolutions.
+
+From the features of a range image to the raw predictions of all levels, as ``Detector.apply``: neither projection
+nor decoding nor NMS is in it. Images are [b, c, h, w] inside.
+"""
+
+import importlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from fcos_lidar_jax import __version__
+from fcos_lidar_jax.config import ModelConfig, StemConfig, config_to_json
+from fcos_lidar_jax.inference.detector import TrainedDetector
+from fcos_lidar_jax.locations import ImageLayout, image_layout
+from fcos_lidar_jax.models.layers import EPSILON, norm_groups, pieces
+from fcos_lidar_jax.models.lidar_net import STAGE_STRIDES
+from fcos_lidar_jax.models.modality import channel_groups
+from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.types import CHANNELS
+
+_OPSET, _IR_VERSION = 17, 8  # Of 2022: any runtime of today reads them.
+_END = np.iinfo(np.int64).max
+
+
+def cpu_package(name: str) -> Any:
+    """A package of the extra ``cpu``.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ValueError(f"{name} is not installed: pip install 'fcos-lidar-jax[cpu]'") from None
+
+
+def network_graph(detector: TrainedDetector) -> bytes:
+    """The network as an ONNX file, the same bytes for the same detector and versions.
+
+    Its input is ``features`` f32[b, h, w, 9, r], a range image as ``project_points`` gives it, in raw units; its
+    outputs are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. All is
+    float32, whatever ``config.model.precision`` is. The metadata hold classes, configuration and sensor as JSON.
+
+    Raises:
+        ValueError: onnx is not installed, or the network has parameters that the graph does not know.
+    """
+    onnx = cpu_package("onnx")
+    config, model = detector.config, detector.config.model
+    layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
+    network = _Network(onnx, detector.variables, circular=model.circular_width)
+    image = _preprocessing(network, "features", model, layout)
+    image = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
+    levels = _pyramid(network, _backbone(network, image, model.backbone_blocks))
+    k = len(config.classes)
+    shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
+    _heads(network, levels, model, shapes)
+    network.check_all_used()
+    described = onnx.helper.make_tensor_value_info
+    float32 = onnx.TensorProto.FLOAT
+    graph = onnx.helper.make_graph(
+        network.nodes,
+        config.name,
+        [described("features", float32, ["b", layout.rows, layout.columns, len(CHANNELS), rounds])],
+        [described(name, float32, ["b", layout.num_locations, *shape]) for name, shape in shapes.items()],
+        list(network.constants.values()),
+    )
+    file = onnx.helper.make_model(
+        graph,
+        producer_name="fcos_lidar_jax",
+        producer_version=__version__,
+        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
+    )
+    about = {
+        "channels": CHANNELS,
+        "classes": detector.classes,
+        "config": config_to_json(config),
+        "sensor": sensor_to_json(detector.sensor),
+    }
+    onnx.helper.set_model_props(file, {name: json.dumps(value) for name, value in about.items()})
+    return file.SerializeToString(deterministic=True)
+
+
+class _Network:
+    """Nodes and constants in the order in which they are made, and the parameters by their paths."""
+
+    def __init__(self, onnx: Any, variables: Any, *, circular: bool) -> None:
+        self.onnx, self.circular = onnx, circular
+        self.nodes: list[Any] = []
+        self.constants: dict[Any, Any] = {}
+        leaves = jax.tree_util.tree_leaves_with_path(variables)
+        self.parameters = {"/".join(key.key for key in path): np.asarray(leaf) for path, leaf in leaves}
+        self.used: set[str] = set()
+
+    def parameter(self, path: str, kind: str = "params") -> np.ndarray:
+        """In float64, so that what is folded is rounded once."""
+        self.used.add(f"{kind}/{path}")
+        return self.parameters[f"{kind}/{path}"].astype(np.float64)
+
+    def check_all_used(self) -> None:
+        if unknown := sorted(self.parameters.keys() - self.used):
+            raise ValueError(f"ONNX: found the parameters {unknown[0]}, which the graph does not know")
+
+    def constant(self, value: Any) -> str:
+        """Numbers as float32, whole ones as int64; equal ones are one constant."""
+        array = np.asarray(value)
+        array = np.ascontiguousarray(array, np.int64 if array.dtype.kind == "i" else np.float32)
+        key = array.dtype.kind, array.shape, array.tobytes()
+        if key not in self.constants:
+            name = f"constant{len(self.constants)}"
+            self.constants[key] = self.onnx.numpy_helper.from_array(array, name)
+        return self.constants[key].name
+
+    def __call__(self, kind: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
+        """A node with one output, which is named here by default; inputs that are no names are constants."""
+        names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
+        output = output or f"{kind.lower()}{len(self.nodes)}"
+        self.nodes.append(self.onnx.helper.make_node(kind, names, [output], **attributes))
+        return output
+
+    def conv(
+        self, x: str, kernel: np.ndarray, *bias: np.ndarray, stride: int = 1, dilation: int = 1, groups: int = 1
+    ) -> str:
+        """As :func:`fcos_lidar_jax.models.convolution.convolve`, with the kernel in its layout."""
+        high, wide = (size // 2 * dilation for size in kernel.shape[:2])
+        if self.circular and wide:
+            last, first = self("Slice", x, [-wide], [_END], [3]), self("Slice", x, [0], [wide], [3])
+            x, wide = self("Concat", last, x, first, axis=3), 0
+        shape: Any = {
+            "strides": [stride] * 2,
+            "dilations": [dilation] * 2,
+            "pads": [high, wide] * 2,
+            "group": groups,
+        }
+        return self("Conv", x, kernel.transpose(3, 2, 0, 1), *bias, **shape)
+
+    def conv_norm(self, x: str, path: str, *, stride: int = 1, relu: bool = True) -> str:
+        gain, shift = self.batch_norm(f"{path}/norm")
+        y = self.conv(x, self.parameter(f"{path}/conv/kernel") * gain, shift, stride=stride)
+        return self("Relu", y) if relu else y
+
+    def conv_bias(self, x: str, path: str, *, stride: int = 1) -> str:
+        return self.conv(x, self.parameter(f"{path}/kernel"), self.parameter(f"{path}/bias"), stride=stride)
+
+    def batch_norm(self, path: str) -> tuple[np.ndarray, np.ndarray]:
+        """What a channel is multiplied by, and what is added then."""
+        mean, var = (self.parameter(f"{path}/{name}", "batch_stats") for name in ("mean", "var"))
+        gain = self.parameter(f"{path}/scale") / np.sqrt(var + EPSILON)
+        return gain, self.parameter(f"{path}/bias") - mean * gain
+
+    def group_norm(self, x: str, path: str) -> str:
+        scale, bias = (self.parameter(f"{path}/{name}")[:, None, None] for name in ("scale", "bias"))
+        groups = norm_groups(len(scale))
+        grouped = self("Reshape", x, [0, groups, -1])
+        y = self("InstanceNormalization", grouped, np.ones(groups), np.zeros(groups), epsilon=EPSILON)
+        return self("Add", self("Mul", self("Reshape", y, self("Shape", x)), scale), bias)
+
+    def tower(self, x: str, path: str, depth: int) -> str:
+        for i in range(depth):
+            x = self(
+                "Relu", self.group_norm(self.conv(x, self.parameter(f"{path}/conv{i}/kernel")), f"{path}/norm{i}")
+            )
+        return x
+
+    def upsample(self, x: str, rows: int, columns: int) -> str:
+        """Every row and column repeated."""
+        how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+        return self("Resize", x, "", [1.0, 1.0, rows, columns], **how)
+
+
+def _preprocessing(network: _Network, features: str, model: ModelConfig, layout: ImageLayout) -> str:
+    """As :func:`fcos_lidar_jax.models.detector.network_input`."""
+    mean, scale = (np.array(values)[:, None] for values in (model.channel_mean, model.channel_scale))
+    exists = network("Greater", network("Slice", features, [7], [8], [3]), 0.0)
+    scaled = network("Div", network("Sub", features, mean), scale)
+    scaled = network("Where", exists, scaled, 0.0)
+    image = network("Transpose", network("Reshape", scaled, [0, 0, 0, -1]), perm=[0, 3, 1, 2])
+    if model.row_upscale > 1:
+        image = network.upsample(image, model.row_upscale, 1)
+    if extra := layout.width - layout.columns:
+        image = network("Concat", image, network("Slice", image, [0], [extra], [3]), axis=3)
+    if below := layout.height - layout.rows * model.row_upscale:
+        image = network("Pad", image, [0, 0, 0, 0, 0, 0, below, 0])
+    return image
+
+
+def _stem(network: _Network, image: str, config: StemConfig, groups: Sequence[tuple[int, int]]) -> str:
+    gain, shift = network.batch_norm("stem/norm")
+    merged = ""
+    for index, dilation in enumerate(config.dilations):
+        path, x = f"stem/branch{index}", image
+        for layer in range(config.num_convs):
+            kernels = [network.parameter(f"{path}/conv{layer}_group{g}") for g in range(len(groups))]
+            factor, bias = network.batch_norm(f"{path}/norm{layer}")
+            alike = len(set(groups)) == 1 and groups[0][1] % _LANES == 0
+            kernel = np.concatenate(kernels, axis=-1) if alike else _block_diagonal(kernels)
+            together = len(groups) if alike else 1
+            x = network("Relu", network.conv(x, kernel * factor, bias, dilation=dilation, groups=together))
+        merge = network.parameter(f"stem/merge{index if config.merge == 'per_branch' else 0}") * gain
+        y = network.conv(x, merge[None, None], *([] if merged else [shift]))
+        merged = network("Add", merged, y) if merged else y
+    return network("Relu", merged)
+
+
+_LANES = 16
+"""Channels of a group of which the widths must be multiples: grouped convolutions of others are slow on CPUs."""
+
+
+def _block_diagonal(kernels: Sequence[np.ndarray]) -> np.ndarray:
+    rows, columns = (pieces([kernel.shape[axis] for kernel in kernels]) for axis in (2, 3))
+    whole = np.zeros((*kernels[0].shape[:2], rows[-1].stop, columns[-1].stop))
+    for kernel, row, column in zip(kernels, rows, columns, strict=True):
+        whole[:, :, row, column] = kernel
+    return whole
+
+
+def _backbone(network: _Network, x: str, blocks: Sequence[int]) -> list[str]:
+    x, levels = network.conv_norm(x, "backbone/first"), []
+    for stage, (count, stride) in enumerate(zip(blocks, STAGE_STRIDES, strict=True)):
+        for block in range(count):
+            path, step = f"backbone/stage{stage}_block{block}", stride if block == 0 else 1
+            y = network.conv_norm(x, f"{path}/reduce")
+            y = network.conv_norm(y, f"{path}/spatial", stride=step)
+            y = network.conv_norm(y, f"{path}/expand", relu=False)
+            if block == 0:
+                x = network.conv_norm(x, f"{path}/shortcut", stride=step, relu=False)
+            x = network("Relu", network("Add", x, y))
+        levels.append(x)
+    return levels
+
+
+def _pyramid(network: _Network, levels: Sequence[str]) -> list[str]:
+    laterals = [network.conv_bias(x, f"fpn/lateral{i + 2}") for i, x in enumerate(levels)]
+    for i in range(len(laterals) - 2, -1, -1):
+        laterals[i] = network("Add", laterals[i], network.upsample(laterals[i + 1], 2, 2))
+    outputs = [network.conv_bias(x, f"fpn/output{i + 2}") for i, x in enumerate(laterals)]
+    outputs.append(network.conv_bias(outputs[-1], "fpn/output6", stride=2))
+    return [*outputs, network.conv_bias(network("Relu", outputs[-1]), "fpn/output7", stride=2)]
+
+
+_TOWERS = ("classification", "regression")
+_PREDICTIONS = {
+    "logits": ("classification", ("logits",)),
+    "regression": ("regression", ("centre", "size", "heading", "velocity")),
+    "iou_logits": ("regression", ("iou",)),
+}
+"""Output -> tower, and the layers whose predictions it holds."""
+
+
+def _heads(
+    network: _Network, levels: Sequence[str], model: ModelConfig, shapes: Mapping[str, Sequence[int]]
+) -> None:
+    """The outputs, at the locations of all levels."""
+    found: dict[str, list[str]] = {name: [] for name in _PREDICTIONS}
+    for level, image in enumerate(levels):
+        path = "heads/shared" if model.tied_heads else f"heads/level{level + 2}"
+        towers = {name: network.tower(image, f"{path}/{name}_tower", model.head_convs) for name in _TOWERS}
+        for name, (tower, layers) in _PREDICTIONS.items():
+            kernel, bias = (
+                np.concatenate([network.parameter(f"{path}/{tower}/{layer}_{part}") for layer in layers], axis=-1)
+                for part in ("kernel", "bias")
+            )
+            y = network("Transpose", network.conv(towers[tower], kernel, bias), perm=[0, 2, 3, 1])
+            found[name].append(network("Reshape", y, [0, -1, *shapes[name]]))
+    for name, of_levels in found.items():
+        network("Concat", *of_levels, axis=1, output=name)

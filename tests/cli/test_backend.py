@@ -1,0 +1,107 @@
+"""``--backend openvino`` of the commands, and the network's graph as a file."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import assert_one_line_error, command, run_python
+from tiny_run import TINY_CONFIG, untrained
+
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.training import Checkpoint, save_checkpoint
+
+onnx = pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
+pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("backend")
+    save_checkpoint(folder / "checkpoint", Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 7))
+    (folder / "clouds").mkdir()
+    for seed in range(2):
+        np.save(folder / "clouds" / f"{seed}.npy", make_frame(seed, TINY).points)
+    return folder
+
+
+def test_detect_and_stream_find_what_xla_finds(home, tmp_path):
+    for backend in ("xla", "openvino"):
+        options = "--checkpoint", home / "checkpoint", "--backend", backend, "--out"
+        command("detect", home / "clouds", *options, tmp_path / f"{backend}.json")
+        command("stream", home / "clouds", *options, tmp_path / f"{backend}.jsonl")
+    ours, found = (json.loads((tmp_path / f"{name}.json").read_text())["files"] for name in ("xla", "openvino"))
+    for a, b in zip(ours, found, strict=True):
+        assert a["num_dropped"] == b["num_dropped"]
+        scores = [[box["score"] for box in of["boxes"]] for of in (a, b)]
+        assert len(scores[0]) > 0
+        np.testing.assert_allclose(*scores, atol=0.02)  # bfloat16
+    lines = [json.loads(line) for line in (tmp_path / "openvino.jsonl").read_text().splitlines()]
+    assert [line["boxes"] for line in lines] == [file["boxes"] for file in found]
+
+
+def test_benchmark_times_the_same_stages(home, tmp_path):
+    command(
+        "benchmark --backend openvino --repeats 1 --batch 1 2 --checkpoint",
+        home / "checkpoint",
+        "--out",
+        tmp_path / "a",
+    )
+    record = json.loads((tmp_path / "a").read_text())
+    assert list(record["stages"]) == ["clean", "projection", "network", "postprocess", "detect", "whole"]
+    assert record["backend"] in ("openvino float32", "openvino bfloat16")
+
+
+def test_evaluate_resumes_with_the_same_backend_alone(home, tmp_path):
+    data = "--format simulated --sensor tiny --samples 0:2 --no-report --checkpoint"
+    command("evaluate", data, home / "checkpoint", "--backend openvino --out", tmp_path)
+    assert json.loads((tmp_path / "metrics_summary.json").read_text())["mean_ap"] >= 0
+
+
+def test_export_writes_the_graph(home, tmp_path, capsys):
+    for name in "ab":
+        options = "export --network-only --format onnx --checkpoint", home / "checkpoint", "--out"
+        command(*options, tmp_path / f"{name}.onnx")
+    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+    onnx.checker.check_model(tmp_path / "a.onnx", full_check=True)
+    assert json.loads(capsys.readouterr().out.splitlines()[0])["bytes"] == (tmp_path / "a.onnx").stat().st_size
+
+
+def test_the_documents_lines_run(home):
+    text = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[-1]
+    command("export --network-only --format onnx --checkpoint quickstart --out", home / "network.onnx")
+    (home / "run.py").write_text(f"import os\nos.chdir({str(home)!r})\n{code}\nprint(boxes.shape)")
+    ran = run_python(home / "run.py")
+    assert ran.stdout == "(500, 9)\n", ran.stderr
+
+
+WRONG = {
+    "export --format onnx": "expected --network-only and --format onnx together",
+    "export --network-only": "expected --network-only and --format onnx together",
+    "export --network-only --format onnx --batch 2": "--points, --batch: expected without --network-only",
+    "detect HOME/clouds --backend openvino --batch-size 0": "--batch-size: got 0",
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_mistakes_get_one_line(home, tmp_path, capsys, line):
+    words = f"{line} --checkpoint HOME/checkpoint --out {tmp_path / 'a'}".replace("HOME", str(home)).split()
+    assert_one_line_error(capsys, words, WRONG[line])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_exported_program_has_no_other_backend(home, tmp_path, capsys):
+    command("export --checkpoint", home / "checkpoint", "--out", tmp_path / "detector.fcos")
+    words = ["benchmark", "--backend", "openvino", "--checkpoint", str(tmp_path / "detector.fcos")]
+    assert_one_line_error(capsys, words, "detector.fcos: found an exported program, expected a checkpoint")
+
+
+def test_a_missing_package_is_one_line(home, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    words = ["export", "--network-only", "--format", "onnx", "--checkpoint", str(home / "checkpoint"), "--out"]
+    assert_one_line_error(capsys, [*words, str(tmp_path / "a")], r"pip install 'fcos-lidar-jax\[cpu\]'")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,125 @@
+"""The ONNX graph of the network against Flax, for every choice of a configuration that changes the network."""
+
+import dataclasses
+import functools
+import json
+
+import jax
+import numpy as np
+import pytest
+from tiny_run import CONFIG, SENSOR
+
+from fcos_lidar_jax.config import StemConfig
+from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.inference.onnx_graph import network_graph
+from fcos_lidar_jax.locations import image_layout
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
+
+onnx = pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
+openvino = pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")
+
+
+def with_model(config, **changes):
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **changes))
+
+
+def with_stem(rounds=2, **changes):
+    """The tiny network with another stem."""
+    config = with_model(CONFIG, stem=StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2), **changes))
+    return dataclasses.replace(config, projection=dataclasses.replace(config.projection, num_rounds=rounds))
+
+
+SLIM = {"backbone_blocks": (2, 1, 1, 1), "backbone_widths": (8, 8, 8, 8), "fpn_channels": 32, "head_channels": 16}
+ODD = dataclasses.replace(SENSOR, num_columns=50)  # padded to 64 columns
+CASES = {
+    "quickstart": (QUICKSTART, SENSOR),
+    "compact, circular": (COMPACT, SENSOR),
+    "paper, slim behind the stem": (with_model(NUSCENES, **SLIM), SENSOR),
+    "modalities, a shared merge, three convolutions": (
+        with_stem(groups="modalities", merge="shared", num_convs=3),
+        ODD,
+    ),
+    "rounds apart, untied heads": (with_model(with_stem(group_rounds=False), tied_heads=False), SENSOR),
+    "one group, three classes": (dataclasses.replace(with_stem(groups="all"), classes=("a", "b", "c")), SENSOR),
+    "circular, padded columns and rows, remat": (
+        with_model(CONFIG, circular_width=True, row_upscale=3, remat=True),
+        ODD,
+    ),
+}
+
+
+def made_detector(config, sensor):
+    """Random parameters of every kind, so that nothing that is left out or exchanged goes unnoticed."""
+    rng = np.random.default_rng(0)
+
+    def fill(path, leaf):
+        positive = path[-1].key in ("scale", "var")
+        values = rng.uniform(0.5, 2, leaf.shape) if positive else rng.normal(0, 0.15, leaf.shape)
+        return values.astype(np.float32)
+
+    model = build_detector(config, sensor)
+    shapes = jax.eval_shape(model.init, jax.random.key(0))
+    return TrainedDetector(model, jax.tree_util.tree_map_with_path(fill, shapes))
+
+
+def made_features(detector):
+    """Of two clouds, a third of the slots empty."""
+    rng, model = np.random.default_rng(1), detector.config.model
+    layout, rounds = image_layout(detector.sensor, model), detector.config.projection.num_rounds
+    shape = 2, layout.rows, layout.columns, 9, rounds
+    mean, scale = (np.array(values)[:, None] for values in (model.channel_mean, model.channel_scale))
+    features = rng.normal(size=shape) * scale + mean
+    features[..., 7, :] = rng.random(shape[:3] + shape[4:]) > 0.3
+    return np.where(features[..., 7:8, :] > 0, features, 0).astype(np.float32)
+
+
+def by_flax(detector, features):
+    apply = jax.jit(functools.partial(detector.model.apply, train=False))
+    return {name: np.asarray(value) for name, value in vars(apply(detector.variables, features)[0]).items()}
+
+
+def by_openvino(content, features):
+    core = openvino.Core()
+    program = core.compile_model(core.read_model(content), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    return {output.any_name: value for output, value in program([features]).items()}
+
+
+def assert_same_outputs(found, expected):
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert found[name].shape == value.shape
+        assert np.abs(found[name] - value).max() <= 1e-4 * np.abs(value).max(), name
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_graph_is_the_network(name):
+    detector = made_detector(*CASES[name])
+    content, features = network_graph(detector), made_features(detector)
+    onnx.checker.check_model(onnx.load_model_from_string(content), full_check=True)
+    assert_same_outputs(by_openvino(content, features), by_flax(detector, features))
+
+
+def test_it_is_not_the_graph_of_one_runtime():
+    evaluator = pytest.importorskip("onnx.reference").ReferenceEvaluator
+    detector = made_detector(with_model(CONFIG, circular_width=True, row_upscale=2), SENSOR)
+    content, features = network_graph(detector), made_features(detector)
+    graph = evaluator(onnx.load_model_from_string(content))
+    found = dict(zip(graph.output_names, graph.run(None, {"features": features}), strict=True))
+    assert_same_outputs(found, by_flax(detector, features))
+
+
+def test_the_same_bytes_twice_and_what_it_is():
+    detector = made_detector(CONFIG, SENSOR)
+    content = network_graph(detector)
+    assert network_graph(made_detector(CONFIG, SENSOR)) == content
+    about = {entry.key: json.loads(entry.value) for entry in onnx.load_model_from_string(content).metadata_props}
+    assert about["classes"] == list(CONFIG.classes)
+    assert about["sensor"]["num_columns"] == SENSOR.num_columns
+
+
+def test_parameters_that_it_does_not_know_are_told():
+    detector = made_detector(CONFIG, SENSOR)
+    detector.variables["params"]["neck"] = {"kernel": np.zeros(3, np.float32)}
+    with pytest.raises(ValueError, match=r"ONNX: found the parameters params/neck/kernel"):
+        network_graph(detector)
