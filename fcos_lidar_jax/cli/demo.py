@@ -29,7 +29,7 @@ from fcos_lidar_jax.visualization.drive import Scene, draw_drive
 from fcos_lidar_jax.visualization.evaluation_report import write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 
-WEIGHTS = "quickstart"  # That are shown.
+WEIGHTS = "hdl32e"  # That are shown.
 _SETS = 200  # Of keyframes, drawn for the intervals.
 _CAPTION = """The drive, a keyframe every half a second: the range image, and the view from above, where higher
 points are darker, detections have the colour of their class, and the truth is dashed."""
