@@ -36,7 +36,11 @@ def _check_choices(config: Any) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class ProjectionConfig:
-    """Points to range image (paper, sections 3.1 and 3.2)."""
+    """Points to range image (paper, sections 3.1 and 3.2).
+
+    >>> ProjectionConfig(num_rounds=3).prioritize_current
+    True
+    """
 
     num_rounds: int = 5  # Rounds of the multi-round projection.
     prioritize_current: bool = True  # Points of the current sweep win every collision with older ones (table 2).
@@ -53,7 +57,11 @@ class ProjectionConfig:
 
 @dataclasses.dataclass(frozen=True)
 class StemConfig:
-    """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
+    """Modality-wise convolutions (paper, section 3.3, tables 3-5).
+
+    >>> StemConfig(groups="modalities").dilations
+    (1, 3, 6)
+    """
 
     groups: Literal["types", "modalities", "all"] = "types"
     """9 groups by channel type, 5 by modality, or one group (table 3)."""
@@ -76,7 +84,11 @@ class StemConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """LiDAR-Net, feature pyramid and heads (paper, section 3.4)."""
+    """LiDAR-Net, feature pyramid and heads (paper, section 3.4).
+
+    >>> ModelConfig(head_channels=128).stem.num_convs
+    2
+    """
 
     stem: StemConfig = StemConfig()  # Modality-wise convolutions.
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -116,7 +128,12 @@ class ModelConfig:
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """Assignment and losses (paper, section 3.4)."""
+    """Assignment and losses (paper, section 3.4).
+
+    >>> LossConfig(top_q=0)
+    Traceback (most recent call last):
+    ValueError: top_q: got 0, expected at least 1
+    """
 
     top_q: int = 20  # Q: K of a box is the rounded sum of its Q highest IoUs.
     regress_on: Literal["positives", "candidates"] = "positives"
@@ -139,7 +156,11 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class InferenceConfig:
-    """Predictions to detections (paper, section 3.4)."""
+    """Predictions to detections (paper, section 3.4).
+
+    >>> InferenceConfig(max_detections=100).iou_threshold
+    0.2
+    """
 
     min_probability: float = 0.01  # Candidates need a class probability above this, before the IoU factor.
     iou_threshold: float = 0.2  # NMS suppresses what overlaps a better box of its class by more than this.
@@ -163,7 +184,11 @@ class InferenceConfig:
 
 @dataclasses.dataclass(frozen=True)
 class AugmentConfig:
-    """On-device augmentation of points and boxes together (paper, section 4)."""
+    """On-device augmentation of points and boxes together (paper, section 4).
+
+    >>> AugmentConfig(max_rotation_rad=0.0).scale_range
+    (0.95, 1.05)
+    """
 
     flip_x_probability: float = 0.5  # Reading: of x -> -x.
     flip_y_probability: float = 0.5  # Reading: of y -> -y, drawn independently.
@@ -180,7 +205,11 @@ class AugmentConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CopyPasteConfig:
-    """Objects of other frames pasted into a training frame (paper, section 4, after SECOND)."""
+    """Objects of other frames pasted into a training frame (paper, section 4, after SECOND).
+
+    >>> CopyPasteConfig(targets=(2, 3)).min_points
+    5
+    """
 
     targets: tuple[int, ...] = ()
     """Reading: boxes of each class that a frame is filled up to, those present included; (): by the class's name,
@@ -194,7 +223,12 @@ class CopyPasteConfig:
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
-    """One-cycle AdamW (paper, section 4)."""
+    """One-cycle AdamW (paper, section 4).
+
+    >>> OptimizerConfig(batch_size=32, accumulate=3)
+    Traceback (most recent call last):
+    ValueError: accumulate: got 3, expected a divisor of the batch size 32
+    """
 
     peak_learning_rate: float = 1e-2  # At the end of the warm-up.
     initial_divisor: float = 10.0  # The first learning rate is the peak divided by it.
@@ -297,6 +331,10 @@ def config_from_json(record: Any, where: str = "config") -> Config:
 
     Raises:
         ValueError: naming ``where``, the field, what was found and what was expected.
+
+    >>> config_from_json({"name": "mine"}, "mine.json")
+    Traceback (most recent call last):
+    ValueError: mine.json.sensor: missing
     """
     return _from_json(Config, record, where)
 

@@ -29,6 +29,10 @@ class ImageLayout:
         width: columns, padded on the right to a multiple of 32.
         full_turn: the first column follows the last one, so that copies of the first columns pad the image; else
             empty columns do.
+
+    >>> layout = ImageLayout(rows=32, columns=1086, row_upscale=2)
+    >>> layout.height, layout.width, layout.level_sizes[0]
+    (64, 1088, 69632)
     """
 
     rows: int

@@ -21,7 +21,13 @@ CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "exis
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RangeImage:
-    """A multi-round range image (paper, sections 3.1 and 3.2)."""
+    """A multi-round range image (paper, sections 3.1 and 3.2).
+
+    >>> import numpy as np
+    >>> empty = RangeImage(np.zeros((32, 1086, 9, 5)), np.full((32, 1086, 5), -1), np.int32(0))
+    >>> empty.features[:, :, CHANNELS.index("range"), 0].shape  # ranges of the first round
+    (32, 1086)
+    """
 
     features: Float32[Array, "*b h w 9 r"]
     """Raw units, channels in the order of :data:`CHANNELS`; zero in all nine where a slot is empty."""
@@ -33,7 +39,14 @@ class RangeImage:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """One training batch: raw points and padded ground truth."""
+    """One training batch: raw points and padded ground truth.
+
+    >>> import numpy as np
+    >>> clouds = np.zeros((2, 4096, 5)), np.zeros((2, 4096), bool)
+    >>> batch = Batch(*clouds, np.zeros((2, 32, 9)), np.zeros((2, 32), int), np.zeros((2, 32), bool))
+    >>> jax.tree.map(lambda leaf: leaf[0], batch).boxes.shape  # of the first sample
+    (32, 9)
+    """
 
     points: Float32[Array, "b n c"]
     """x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a sixth
@@ -47,7 +60,11 @@ class Batch:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class HostBatch:
-    """A batch on its way to the device, with what is to be reported about it."""
+    """A batch on its way to the device, with what is to be reported about it.
+
+    >>> HostBatch(batch=None, counts={"truncated_points": 3}, names=("frame 0", "frame 7")).counts
+    {'truncated_points': 3}
+    """
 
     batch: Batch  # NumPy arrays of this process's rows.
     counts: dict[str, int]  # To be recorded beside the metrics, such as ``truncated_points``.
@@ -57,7 +74,14 @@ class HostBatch:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Locations:
-    """What every location of the feature levels looks at (paper, section 3.4)."""
+    """What every location of the feature levels looks at (paper, section 3.4).
+
+    >>> import numpy as np
+    >>> from fcos_lidar_jax.locations import ImageLayout, locate
+    >>> image = RangeImage(np.ones((32, 128, 9, 1)), np.zeros((32, 128, 1), int), np.int32(0))
+    >>> locate(image, ImageLayout(rows=32, columns=128, row_upscale=1)).points.shape
+    (5460, 3)
+    """
 
     points: Float32[Array, "*b l 3"]  # First-round point of the location's pixel, metres; zero where empty.
     azimuth_rad: Float32[Array, "*b l"]  # Azimuth of that point; zero where empty.
@@ -68,7 +92,13 @@ class Locations:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Outputs:
-    """Raw predictions of the network at all locations."""
+    """Raw predictions of the network at all locations.
+
+    >>> import numpy as np
+    >>> outputs = Outputs(np.zeros((5460, 11)), np.zeros((5460, 10, 10)), np.zeros((5460, 10)))
+    >>> outputs.regression[:, :3, 0].shape  # of the first class, the offset to the centre of its box
+    (5460, 3)
+    """
 
     logits: Float32[Array, "*b l c"]  # Class logits, k classes and the background last.
     regression: Float32[Array, "*b l 10 k"]
@@ -79,7 +109,14 @@ class Outputs:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Targets:
-    """The outcome of the assignment for one sample."""
+    """The outcome of the assignment for one sample.
+
+    >>> import jax.numpy as jnp
+    >>> from fcos_lidar_jax.assignment import assign
+    >>> targets = assign(jnp.array([0, 0, -1]), jnp.ones(3), jnp.array([0.9, 0.8, 0.0]), num_boxes=1)
+    >>> targets.num_positive.tolist(), targets.positive.tolist()
+    ([2], [True, True, False])
+    """
 
     owner: Int32[Array, "*b l"]  # Box whose points the location sees, -1 for none.
     positive: Bool[Array, "*b l"]  # Among the K cheapest locations of its owner.
@@ -89,7 +126,13 @@ class Targets:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Detections:
-    """Final boxes, best first, padded to a fixed count."""
+    """Final boxes, best first, padded to a fixed count.
+
+    >>> import numpy as np
+    >>> none = Detections(np.zeros((5, 9)), np.zeros(5), np.zeros(5, int), np.zeros(5, bool), np.int32(0))
+    >>> none.boxes[none.valid].shape
+    (0, 9)
+    """
 
     boxes: Float32[Array, "*b d 9"]  # Boxes as the module describes; zero where invalid.
     scores: Float32[Array, "*b d"]  # Class probability times predicted IoU; zero where invalid.
@@ -101,7 +144,13 @@ class Detections:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrainState:
-    """All that training carries from step to step: arrays, no functions."""
+    """All that training carries from step to step: arrays, no functions.
+
+    >>> import numpy as np
+    >>> state = TrainState(np.int32(0), {"kernel": np.ones(3)}, {}, (), None, jax.random.key(0))
+    >>> len(jax.tree.leaves(state))  # step, kernel, key
+    3
+    """
 
     step: Int32[Array, ""]  # Updates done.
     params: Any  # Trainable arrays of the network.

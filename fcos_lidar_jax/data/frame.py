@@ -14,7 +14,12 @@ from fcos_lidar_jax.sensors import Sensor
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """Points and boxes of one keyframe in its LiDAR frame, unpadded."""
+    """Points and boxes of one keyframe in its LiDAR frame, unpadded.
+
+    >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
+    >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
+    [4.0, 2.0, 2.0]
+    """
 
     points: np.ndarray
     """f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a
@@ -33,6 +38,12 @@ class FrameSet(Protocol):
     """Frames in a fixed order: what every reader offers to the training pipeline and the commands.
 
     Readers inherit from it, so that what their data do not have (poses, times, scenes) has its default.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+    >>> frames: FrameSet = SimulatedFrames(TINY, 3)
+    >>> len(frames), frames.frame(0).points.shape[1], frames.classes[0]
+    (3, 5, 'car')
     """
 
     classes: tuple[str, ...]  # what labels count, in their order

@@ -31,7 +31,15 @@ _MIN_NEIGHBOURS = 0.3
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """One cloud as a detector takes it, always of ``config.max_points`` rows."""
+    """One cloud as a detector takes it, always of ``config.max_points`` rows.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> ahead = np.array([[0, 9, 0, 50], [0, np.nan, 0, 50]], np.float32)
+    >>> cloud = make_cloud(ahead, QUICKSTART, sensor=SHORT_RANGE)
+    >>> cloud.points.shape, int(cloud.valid.sum()), cloud.num_invalid
+    ((4096, 5), 1, 1)
+    """
 
     points: np.ndarray
     """f32[max_points, c]: x, y, z (m), intensity (0-255), time lag (s), and the laser number for sensors that need

@@ -37,6 +37,15 @@ def select_candidates(
 
     Returns:
         boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c].
+
+    >>> layout = ImageLayout(rows=32, columns=32, row_upscale=1)
+    >>> l = layout.num_locations
+    >>> first = jnp.arange(l) == 0  # alone has a point
+    >>> seen = Locations(jnp.zeros((l, 3)), jnp.zeros(l), jnp.zeros(l, int), first)
+    >>> outputs = Outputs(jnp.zeros((l, 2)), jnp.zeros((l, 10, 1)), jnp.zeros((l, 1)))
+    >>> boxes, scores, labels, valid = select_candidates(outputs, seen, config=InferenceConfig(), layout=layout)
+    >>> scores[valid].tolist()  # probability 0.5, IoU 0.5
+    [0.25]
     """
     num_classes = outputs.iou_logits.shape[-1]
     probability = jax.nn.softmax(outputs.logits)[:, :num_classes]
@@ -63,6 +72,15 @@ def postprocess(
 
     Returns:
         boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d]; zero where invalid.
+
+    >>> layout = ImageLayout(rows=32, columns=32, row_upscale=1)
+    >>> l = layout.num_locations
+    >>> seen = Locations(jnp.zeros((l, 3)), jnp.zeros(l), jnp.zeros(l, int), jnp.arange(l) < 3)
+    >>> outputs = Outputs(jnp.zeros((l, 2)), jnp.zeros((l, 10, 1)), jnp.zeros((l, 1)))
+    >>> few = InferenceConfig(max_detections=5, candidates_per_level=10)
+    >>> boxes, scores, labels, valid = postprocess(outputs, seen, config=few, layout=layout)
+    >>> valid.tolist()  # of three times the same box
+    [True, False, False, False, False]
     """
     return _suppress(select_candidates(outputs, locations, config=config, layout=layout), config)
 
@@ -96,6 +114,15 @@ def make_detect(detector: Detector) -> Detect:
         pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` of one cloud, to be jitted by the
         caller: one compilation for a point count. Close points are the caller's to drop, see
         :func:`fcos_lidar_jax.projection.remove_close`.
+
+    >>> from fcos_lidar_jax.models import build_detector
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> detector = build_detector(QUICKSTART, SHORT_RANGE)
+    >>> variables = jax.eval_shape(detector.init, jax.random.key(0))
+    >>> points, valid = jax.ShapeDtypeStruct((4096, 5), jnp.float32), jax.ShapeDtypeStruct((4096,), bool)
+    >>> jax.eval_shape(make_detect(detector), variables, points, valid).boxes.shape
+    (500, 9)
     """
     config, sensor = detector.config, detector.sensor
     binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)

@@ -95,7 +95,12 @@ class CloudDetector(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class TrainedDetector(CloudDetector):
-    """A network with its weights."""
+    """A network with its weights.
+
+    >>> from fcos_lidar_jax.inference import load_trained
+    >>> sorted(load_trained("quickstart").variables)
+    ['batch_stats', 'params']
+    """
 
     variables: Variables  # ``params`` and ``batch_stats``.
 

@@ -26,6 +26,9 @@ def load_detector(checkpoint: str | Path, *, backend: Backend = "xla") -> CloudD
     Raises:
         CheckpointError: naming the folder or file, what was found and what was expected.
         ValueError: the backend is not installed, or does not run here.
+
+    >>> load_detector("quickstart").classes[:2]
+    ('car', 'truck')
     """
     if backend not in get_args(Backend):
         raise ValueError(f"backend: got {backend!r}, expected one of {', '.join(get_args(Backend))}")
@@ -38,6 +41,10 @@ def load_detector(checkpoint: str | Path, *, backend: Backend = "xla") -> CloudD
 
 
 def load_trained(checkpoint: str | Path) -> TrainedDetector:
-    """As :func:`load_detector`, with the weights: an exported file is refused."""
+    """As :func:`load_detector`, with the weights: an exported file is refused.
+
+    >>> load_trained("quickstart").config.name
+    'quickstart'
+    """
     read = load_checkpoint(find_checkpoint(Path(checkpoint)))
     return TrainedDetector(build_detector(read.config, read.sensor), read.variables)

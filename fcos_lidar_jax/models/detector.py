@@ -31,6 +31,15 @@ class Detector(NamedTuple):
             features are a range image's, in raw units; the batch statistics are the given ones unless training.
         config: all choices.
         sensor: the image's geometry.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> detector = build_detector(QUICKSTART, SHORT_RANGE)
+    >>> variables = jax.eval_shape(detector.init, jax.random.key(0))
+    >>> image = jax.ShapeDtypeStruct((1, 32, 128, 9, 1), jnp.float32)
+    >>> outputs, _ = jax.eval_shape(detector.apply, variables, image)
+    >>> outputs.logits.shape  # all levels' locations; ten classes and the background
+    (1, 5460, 11)
     """
 
     init: Callable[[Any], Variables]

@@ -26,7 +26,12 @@ _AHEAD = 2  # Groups of frames that are read while the devices work on others.
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
-    """What was found in a frame."""
+    """What was found in a frame.
+
+    >>> nothing = Detections(*np.zeros((3, 0)), valid=np.zeros(0, bool), num_dropped=np.int32(0))
+    >>> Prediction(7, nothing, frame=None, cloud=None).detections.valid.sum()
+    np.int64(0)
+    """
 
     index: int  # Of the frame.
     detections: Detections  # NumPy arrays.
@@ -57,6 +62,12 @@ def predict(
 
     Raises:
         ValueError: a batch size below 1, or a frame that cannot be read.
+
+    >>> from fcos_lidar_jax.inference import load_detector
+    >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
+    >>> detector = load_detector("quickstart")
+    >>> [found.detections.boxes.shape for found in predict(detector, unseen_frames(detector.sensor, 2))]
+    [(500, 9), (500, 9)]
     """
     if batch_size < 1:
         raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
@@ -116,6 +127,12 @@ def evaluate(
     Returns:
         precision and errors over the detector's classes, see
         :func:`fcos_lidar_jax.evaluation.frames.evaluate_frames`.
+
+    >>> from fcos_lidar_jax.inference import load_detector
+    >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
+    >>> detector = load_detector("quickstart")
+    >>> 0 <= evaluate(detector, unseen_frames(detector.sensor, 2)).summary["mean_ap"] <= 1
+    True
     """
     mapped = MappedFrames(frames, detector.classes)
     progress = Progress("test frames", len(mapped))

@@ -56,7 +56,11 @@ Hook = Callable[[int, Record], None]  # Called with (steps done, metrics of the 
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """When a run saves and evaluates."""
+    """When a run saves and evaluates.
+
+    >>> Schedule(save_every=100).keep
+    2
+    """
 
     save_every: int | None = None  # Steps between two checkpoints; default: a fiftieth of the run.
     evaluate_every: int | None = None
@@ -132,6 +136,13 @@ def train(
         NonFiniteLossError, NonFiniteStateError: the last checkpoint is from before.
         KeyboardInterrupt: after Ctrl-C, when all is saved.
         SystemExit: after SIGTERM, likewise.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.simulation.frame_set import fresh_streets
+    >>> config, frames = fresh_streets(QUICKSTART, steps=500)
+    >>> train(dataclasses.replace(config, classes=("boat",)), frames, "run", steps=500)
+    Traceback (most recent call last):
+    ValueError: ...
     """
     frames = MappedFrames(frames, config.classes)
     tests = None if tests is None else MappedFrames(tests, config.classes)

@@ -40,12 +40,22 @@ class NonFiniteStateError(ArithmeticError):
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used: the message names the folder, the finding and the expectation."""
+    """A checkpoint that cannot be used: the message names the folder, the finding and the expectation.
+
+    >>> issubclass(CheckpointError, ValueError)
+    True
+    """
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A trained detector; weights of another precision, such as float16, are read as float32."""
+    """A trained detector; weights of another precision, such as float16, are read as float32.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> Checkpoint(QUICKSTART, SHORT_RANGE, {"params": {}, "batch_stats": {}}, step=500).score is None
+    True
+    """
 
     config: Config
     sensor: Sensor
@@ -64,6 +74,14 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     Raises:
         NonFiniteStateError: nothing is written.
         OSError: it cannot be written; in one line.
+
+    >>> from fcos_lidar_jax.inference import load_trained
+    >>> detector = load_trained("quickstart")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     mine = Checkpoint(detector.config, detector.sensor, detector.variables, step=7)
+    ...     save_checkpoint(f"{folder}/mine", mine)
+    ...     load_checkpoint(f"{folder}/mine").step
+    7
     """
     folder = Path(folder).absolute()
     parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
@@ -105,6 +123,10 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
 
     Raises:
         CheckpointError: naming the folder, what was found and what was expected.
+
+    >>> load_checkpoint("/no/such/folder")
+    Traceback (most recent call last):
+    fcos_lidar_jax.training.checkpoint.CheckpointError: /no/such/folder: found nothing, ...
     """
     folder = Path(folder).absolute()
     description = _verify(folder)

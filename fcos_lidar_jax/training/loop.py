@@ -15,7 +15,11 @@ Record = dict[str, float | list[float]]
 
 
 class NonFiniteLossError(ArithmeticError):
-    """Loss or gradient stopped being a number; the message names the step, the parts and the samples."""
+    """Loss or gradient stopped being a number; the message names the step, the parts and the samples.
+
+    >>> issubclass(NonFiniteLossError, ArithmeticError)
+    True
+    """
 
 
 def fit(
@@ -51,6 +55,14 @@ def fit(
 
     Raises:
         NonFiniteLossError: with the step's number, the parts of the loss and the samples.
+
+    >>> import dataclasses
+    >>> def count(state, batch):
+    ...     return dataclasses.replace(state, step=state.step + 1), {"loss/total": 1.0, "positive_iou": 0.5}
+    >>> state = TrainState(np.int32(0), {}, {}, (), None, jax.random.key(0))
+    >>> batches = [HostBatch(None, {}, (f"frame {i}",)) for i in range(3)]
+    >>> int(fit(count, state, batches, num_steps=3).step)
+    3
     """
     done = int(state.step)
     progress = Progress("steps", num_steps, every_s=log_every_s)

@@ -30,6 +30,15 @@ def make_state(
 
     ``key`` is the run's random key; ``variables`` are ``params`` and ``batch_stats`` to start from, by default
     random ones.
+
+    >>> from fcos_lidar_jax.models import build_detector
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> from fcos_lidar_jax.training import make_optimizer
+    >>> detector, optimizer = build_detector(QUICKSTART, SHORT_RANGE), make_optimizer(QUICKSTART.optimizer, 100)
+    >>> state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
+    >>> sorted(state.params)
+    ['backbone', 'fpn', 'heads', 'stem']
     """
     variables = detector.init(key) if variables is None else variables
     state = TrainState(
@@ -100,6 +109,18 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
     Returns:
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. The metrics are scalars but
         for ``positives_per_level`` i32[6].
+
+    >>> from fcos_lidar_jax.models import build_detector
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> from fcos_lidar_jax.training import make_optimizer
+    >>> detector, optimizer = build_detector(QUICKSTART, SHORT_RANGE), make_optimizer(QUICKSTART.optimizer, 100)
+    >>> state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
+    >>> clouds = jnp.zeros((2, 4096, 5)), jnp.zeros((2, 4096), bool)
+    >>> batch = Batch(*clouds, jnp.zeros((2, 32, 9)), jnp.zeros((2, 32), int), jnp.zeros((2, 32), bool))
+    >>> _, metrics = jax.eval_shape(make_train_step(detector, optimizer), state, batch)
+    >>> metrics["loss/total"].shape, metrics["positives_per_level"].shape
+    ((), (6,))
     """
     config, sensor = detector.config, detector.sensor
     gradient = make_gradient(detector)
@@ -131,5 +152,10 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
 
 
 def detection_variables(state: TrainState) -> dict[str, Any]:
-    """What to detect with: the running mean of the weights where there is one, and the batch statistics."""
+    """What to detect with: the running mean of the weights where there is one, and the batch statistics.
+
+    >>> state = TrainState(jnp.int32(9), {"w": 3.0}, {"mean": 0.0}, (), {"w": 2.0}, jax.random.key(0))
+    >>> detection_variables(state)
+    {'params': {'w': 2.0}, 'batch_stats': {'mean': 0.0}}
+    """
     return {"params": state.params if state.ema is None else state.ema, "batch_stats": state.batch_stats}

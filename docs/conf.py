@@ -1,0 +1,105 @@
+"""The documentation site: ``sphinx-build -W --keep-going docs docs/_build``."""
+
+import dataclasses
+import re
+import typing
+from importlib.metadata import version as installed
+from os.path import relpath
+from pathlib import Path
+
+import sphinx.pycode.parser
+from sphinx.application import Sphinx
+
+typing.GENERATING_DOCUMENTATION = True  # jaxtyping then names arrays without the modules that define them
+
+_ROOT = Path(__file__).resolve().parents[1]
+
+project = "fcos_lidar_jax"
+author = copyright = "the fcos_lidar_jax developers"
+version = release = installed("fcos-lidar-jax")
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+]
+exclude_patterns = ["_build"]
+
+html_theme = "furo"
+html_title = "FCOS-LiDAR in JAX"
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
+pygments_style = "friendly"
+copybutton_exclude = ".linenos, .gp, .go"
+
+myst_enable_extensions = ["dollarmath", "colon_fence", "attrs_block"]
+myst_heading_anchors = 3
+
+napoleon_use_ivar = True
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+autodoc_default_options = {"members": True}
+# Fields and constants are described by plain comments behind them.
+sphinx.pycode.parser.comment_re = re.compile(r"^\s*#:? ?(.*)\r?\n?$")
+
+# Names within the package must lead somewhere; those of other packages are text.
+nitpicky = True
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!fcos_lidar_jax).*"),
+    # What is no part of the reference, and is read in its source.
+    (
+        r"py:.*",
+        r"fcos_lidar_jax\.(inference\.(export|stream)|evaluation\.metrics|input_pipeline\.database|data\.sweeps"
+        r"|training\.sharding)\..*",
+    ),
+]
+
+
+def setup(app: Sphinx) -> None:
+    """What the extensions do not do by themselves."""
+    app.connect("source-read", _with_parts)
+    app.connect("autodoc-process-signature", _short_signature)
+    app.connect("autodoc-process-docstring", _whole_comment, priority=400)  # before napoleon's
+
+
+def _short_signature(app, what, name, obj, options, signature, returned):
+    """Arrays without the module that defines them; no signature of dataclasses, whose fields are listed."""
+    if what not in ("function", "method"):
+        return ("", None) if what == "class" and dataclasses.is_dataclass(obj) else None
+    return _short_arrays(signature or ""), _short_arrays(returned or "") or None
+
+
+def _short_arrays(text: str) -> str:
+    return re.sub(r"(\w+)\[Array, ('[^']*')\] \| \1\[ndarray, \2\]", r"\1[Array | ndarray, \2]", text)
+
+
+def _whole_comment(app, what, name, obj, options, lines):
+    """A colon in the comment of a field is no end of a type, which napoleon takes it for in the first line."""
+    if what in ("attribute", "data", "property"):
+        lines.insert(0, "\\")
+
+
+def _with_parts(app, docname, source):
+    """Parts of the repository's other documents in place of ``<!-- part: FILE: HEADING -->``."""
+    source[0] = re.sub(r"<!-- part: (\S+): (.+) -->", lambda found: _part(found[1], found[2]), source[0])
+
+
+def _part(name: str, heading: str) -> str:
+    """What follows a heading of a document, up to the next of its kind, with links as they are from here."""
+    file = _ROOT / name
+    mark, text = heading.split()[0], file.read_text(encoding="utf-8")
+    if f"\n{heading}\n" not in f"\n{text}":
+        raise ValueError(f"{name}: no heading {heading!r}, which a page of the site includes")
+    after = f"\n{text}".split(f"\n{heading}\n")[1].split(f"\n{mark} ")[0]
+    return re.sub(r"(!?)\[([^\]]+)\]\(([^):]+)\)", lambda link: _link(file, *link.groups()), after)
+
+
+def _link(file: Path, image: str, text: str, target: str) -> str:
+    """Pages and data are linked, other documents and folders are named, for the site does not have them."""
+    path = (file.parent / target).resolve()
+    if path.is_dir() or (path.suffix == ".md" and not path.is_relative_to(_ROOT / "docs")):
+        return f"{text} (`{path.relative_to(_ROOT)}`)"
+    return f"{image}[{text}]({relpath(path, _ROOT / 'docs')})"

@@ -1,0 +1,129 @@
+"""The documents do what they say: code runs, commands exist, every public function has an example."""
+
+import importlib
+import importlib.util
+import inspect
+import json
+import pkgutil
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fcos_lidar_jax
+from fcos_lidar_jax.cli.commands import parse
+from fcos_lidar_jax.sensors import SHORT_RANGE
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+RUN_ELSEWHERE = {  # pages that have a test of their own, which goes on from what they make
+    "own_data.md": "cli/test_own_data.py",
+    "export.md": "cli/test_export.py",
+}
+CORE = (
+    *("sensors", "types", "config", "presets", "geometry", "projection", "locations"),
+    *("coding", "iou", "assignment", "losses", "nms", "augment"),
+)
+)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a page that are no fragments, in their order."""
+    found = re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [block for block in found if block.strip()]
+
+
+def referred() -> dict[str, object]:
+    """Functions and classes of the reference, by their full names."""
+    listed: dict[str, object] = {}
+    for page in (DOCS / "api").glob("*.md"):
+        for kind, name in re.findall(
+            r"^\.\. auto(module|class|function):: (\S+)$", page.read_text(), re.MULTILINE
+        ):
+            if kind == "module":
+                listed |= public(importlib.import_module(name))
+            else:
+                module, _, attribute = name.rpartition(".")
+                listed[name] = getattr(importlib.import_module(module), attribute)
+    return listed
+
+
+def public(module) -> dict[str, object]:
+    """What a module offers: what it says, or the functions and classes that it defines."""
+    own = [
+        n
+        for n, v in vars(module).items()
+        if not n.startswith("_") and getattr(v, "__module__", "") == module.__name__
+    ]
+    members = {name: getattr(module, name) for name in getattr(module, "__all__", own)}
+    return {
+        f"{module.__name__}.{n}": v
+        for n, v in members.items()
+        if inspect.isclass(v) or inspect.isfunction(inspect.unwrap(v))
+    }
+
+
+def test_every_public_function_and_class_has_an_example():
+    listed = referred()
+    missing = [name for name, value in listed.items() if ">>>" not in (value.__doc__ or "")]
+    assert len(listed) > 100
+    assert missing == []
+
+
+def test_the_reference_holds_the_core_and_whatever_a_package_exports():
+    packages = [m.name for m in pkgutil.walk_packages(fcos_lidar_jax.__path__, "fcos_lidar_jax.") if m.ispkg]
+    modules = [m for m in map(importlib.import_module, packages) if hasattr(m, "__all__")]
+    modules += [importlib.import_module(f"fcos_lidar_jax.{name}") for name in CORE]
+    offered = {value for module in (fcos_lidar_jax, *modules) for value in public(module).values()}
+    assert {value.__qualname__ for value in offered - set(referred().values())} == set()
+
+
+def make_drive(folder: Path) -> None:
+    """A folder of clouds of the quickstart's sensor, and their poses."""
+    (folder / "drive").mkdir()
+    frames, poses = SimulatedFrames(SHORT_RANGE, 2), []
+    for index in range(len(frames)):
+        np.save(folder / "drive" / f"{index}.npy", frames.frame(index).points)
+        pose = {"timestamp_us": index * 100_000, "sensor_to_world": np.eye(4).tolist()}
+        poses.append({"file": f"drive/{index}.npy", **pose})
+    (folder / "poses.json").write_text(json.dumps(poses))
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=lambda page: page.name)
+def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
+    if page.name in RUN_ELSEWHERE:
+        assert page.name in (Path(__file__).parent / RUN_ELSEWHERE[page.name]).read_text()
+        return
+    monkeypatch.chdir(tmp_path)
+    if page.name == "stream.md":
+        make_drive(tmp_path)
+    namespace: dict = {}
+    for block in blocks(page, "python"):
+        exec(compile(block, page.name, "exec"), namespace)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "bash")], ids=lambda page: page.name)
+def test_the_commands_of_a_page_exist(page):
+    for line in "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines():
+        for words in re.findall(r"\bfcos-lidar (.*?)(?:&&|$)", line):
+            parse(shlex.split(words))
+        for module in re.findall(r"python -m ([\w.]+)", line):
+            assert importlib.util.find_spec(module), line
+
+
+def test_json_of_the_pages_parses():
+    for page in PAGES:
+        for block in blocks(page, "json"):
+            json.loads(block)
+
+
+def test_blocks_of_code_are_run_or_marked():
+    known = {"python", "bash", "json", "{code-block} python", "{toctree}"}
+    for page in PAGES:
+        openings = re.findall(r"^```(.*)$", page.read_text(), re.MULTILINE)[::2]
+        assert set(openings) <= known, page.name
+        directives = re.findall(r"^```\{code-block\} python\n(.*)$", page.read_text(), re.MULTILINE)
+        assert all(":class: fragment" in line for line in directives), page.name
