@@ -18,8 +18,8 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import CloudDetector, TrainedDetector, load_detector
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
+from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.export import ExportedDetector
-from fcos_lidar_jax.inference.stages import Stages
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
@@ -122,15 +122,15 @@ def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
 
 
 def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
-    stages = Stages(detector.config, detector.sensor)
+    prepare, network, postprocess = map(jax.jit, make_stages(detector.model))
     variables = jax.device_put(detector.variables)
     on_device = [jax.device_put((cloud.points, cloud.valid)) for cloud in clouds]
-    images = [stages.project(*cloud) for cloud in on_device]
-    outputs = [stages.network(variables, image) for image in images]
+    images = [prepare(*cloud) for cloud in on_device]
+    outputs = [network(variables, image) for image in images]
     return {
-        "projection": _in_turn(lambda cloud: stages.project(*cloud), on_device),
-        "network": _in_turn(lambda image: stages.network(variables, image), images),
-        "postprocess": _in_turn(lambda pair: stages.postprocess(*pair), list(zip(outputs, images, strict=True))),
+        "projection": _in_turn(lambda cloud: prepare(*cloud), on_device),
+        "network": _in_turn(lambda image: network(variables, image), images),
+        "postprocess": _in_turn(lambda pair: postprocess(*pair), list(zip(outputs, images, strict=True))),
     }
 
 

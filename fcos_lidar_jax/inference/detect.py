@@ -1,7 +1,8 @@
 """Points to boxes as one pure function (paper, section 3.4)."""
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +10,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from fcos_lidar_jax.centres import decode_centres
 from fcos_lidar_jax.coding import decode
-from fcos_lidar_jax.config import InferenceConfig
+from fcos_lidar_jax.config import Config, InferenceConfig
 from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.nms import rotated_nms
+from fcos_lidar_jax.pillars import Grid, make_pillars, pillar_grid
 from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.types import Detections, Locations, Outputs
+from fcos_lidar_jax.types import CentreOutputs, Detections, Locations, Outputs, RangeImage
+
+_BEYOND_M = 10.0  # How far beyond CenterPoint's map, and above or below the sensor, a box may lie.
 
 Detect = Callable[[Any, Array, Array], Detections]
 
@@ -61,7 +66,39 @@ def postprocess(
     Returns:
         boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d]; zero where invalid.
     """
-    boxes, scores, labels, valid = select_candidates(outputs, locations, config=config, layout=layout)
+    return suppress(*select_candidates(outputs, locations, config=config, layout=layout), config)
+
+
+def centre_candidates(
+    outputs: CentreOutputs, *, config: Config, grid: Grid
+) -> tuple[Array, Array, Array, Array]:
+    """The best (cell, class) pairs of CenterPoint's heat map, decoded; boxes far beyond the map are none.
+
+    Args:
+        outputs: of one sample.
+        config, grid: thresholds and counts, and the cells of the heat map (static).
+
+    Returns:
+        as :func:`select_candidates`.
+    """
+    assert config.pillars is not None
+    probability = jax.nn.sigmoid(outputs.heat)
+    scores = jnp.where(probability > config.inference.min_probability, probability, -1.0).reshape(-1)
+    score, pair = lax.top_k(scores, min(config.inference.candidates_per_level, scores.shape[0]))
+    cell, label = pair // len(config.classes), (pair % len(config.classes)).astype(jnp.int32)
+    group = jnp.array(config.class_groups)[label]
+    regression = outputs.regression.reshape(-1, *outputs.regression.shape[-2:])[cell, group]
+    boxes = decode_centres(regression, cell, grid)
+    reach, centre = config.pillars.range_m + _BEYOND_M, np.asarray(grid.low_m) + config.pillars.range_m
+    near = (jnp.abs(boxes[:, :2] - centre.astype(np.float32)) <= reach).all(axis=1) & (jnp.abs(boxes[:, 2]) <= _BEYOND_M)
+    valid = (score >= 0) & near
+    return boxes, jnp.where(valid, score, 0.0), label, valid
+
+
+def suppress(
+    boxes: Array, scores: Array, labels: Array, valid: Array, config: InferenceConfig
+) -> tuple[Array, Array, Array, Array]:
+    """Class-wise rotated NMS of candidates; returns what :func:`postprocess` does."""
     with jax.named_scope("nms"):
         index, used = rotated_nms(
             boxes,
@@ -76,26 +113,64 @@ def postprocess(
     return best_boxes, jnp.where(used, scores[index], 0.0), jnp.where(used, labels[index], 0), used
 
 
+class DetectStages(NamedTuple):
+    """The stages of detection in one cloud, pure functions.
+
+    Attributes:
+        prepare: ``(points f32[n, c], valid bool[n]) -> image``, a RangeImage, or Pillars for CenterPoint.
+        network: ``(variables, image) -> outputs``.
+        postprocess: ``(outputs, image) -> boxes, scores, labels, valid`` as of :func:`postprocess`.
+    """
+
+    prepare: Callable[..., Any]
+    network: Callable[..., Any]
+    postprocess: Callable[..., tuple[Array, Array, Array, Array]]
+
+
+def make_stages(detector: Detector) -> DetectStages:
+    """The stages that :func:`make_detect` joins, to be jitted by the caller."""
+    config, sensor = detector.config, detector.sensor
+    if config.pillars is not None:
+        cells = pillar_grid(config.pillars, sensor, stride=config.pillars.output_stride)
+        return DetectStages(
+            functools.partial(make_pillars, grid=pillar_grid(config.pillars, sensor), sensor=sensor),
+            lambda variables, pillars: _of_one(detector, variables, pillars),
+            lambda outputs, _: suppress(*centre_candidates(outputs, config=config, grid=cells), config.inference),
+        )
+    binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
+
+    def project(points: Array | np.ndarray, valid: Array | np.ndarray) -> RangeImage:
+        rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
+        return project_points(points, valid, binned, num_rounds=rounds, prioritize_current=current_first)
+
+    return DetectStages(
+        project,
+        lambda variables, image: _of_one(detector, variables, image.features),
+        lambda outputs, image: postprocess(outputs, locate(image, layout), config=config.inference, layout=layout),
+    )
+
+
+def _of_one(detector: Detector, variables: Any, image: Any) -> Any:
+    """The network's outputs for one sample."""
+    outputs, _ = detector.apply(variables, jax.tree.map(lambda leaf: leaf[None], image), train=False)
+    return jax.tree.map(lambda leaf: leaf[0], outputs)
+
+
 def make_detect(detector: Detector) -> Detect:
-    """The whole path from points to boxes: projection, network, decoding, NMS.
+    """The whole path from points to boxes: projection or pillars, network, decoding, NMS.
 
     Returns:
         pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` of one cloud, to be jitted by the
         caller: one compilation for a point count. Close points are the caller's to drop, see
         :func:`fcos_lidar_jax.projection.remove_close`.
     """
-    config, sensor = detector.config, detector.sensor
-    binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
+    stages = make_stages(detector)
 
     def detect(variables: Any, points: Array | np.ndarray, valid: Array | np.ndarray) -> Detections:
         with jax.named_scope("mrv"):
-            rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
-            image = project_points(points, valid, binned, num_rounds=rounds, prioritize_current=current_first)
-        outputs, _ = detector.apply(variables, image.features[None], train=False)
-        outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
-        boxes, scores, labels, used = postprocess(
-            outputs, locate(image, layout), config=config.inference, layout=layout
-        )
+            image = stages.prepare(points, valid)
+        outputs = stages.network(variables, image)
+        boxes, scores, labels, used = stages.postprocess(outputs, image)
         return Detections(boxes, scores, labels, used, image.num_dropped)
 
     return detect
