@@ -10,7 +10,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from fcos_lidar_jax.config import PillarConfig
@@ -58,39 +57,36 @@ def cells_below(xy: Float[Array, "*n 2"], grid: Grid) -> tuple[Int32[Array, "*n"
     >>> cell.tolist(), inside.tolist()
     ([2, 4], [True, False])
     """
-    # The barriers fence the arithmetic off, so that it rounds alike whatever program it is compiled into.
-    steps = (lax.optimization_barrier(xy) - np.asarray(grid.low_m, np.float32)) * np.float32(1 / grid.cell_m)
+    steps = (xy - np.asarray(grid.low_m, np.float32)) * np.float32(1 / grid.cell_m)
     inside = ((steps >= 0) & (steps < grid.side)).all(axis=-1)
     column_row = jnp.floor(jnp.where(inside[..., None], steps, 0.0)).astype(jnp.int32)
     cell = column_row[..., 1] * grid.side + column_row[..., 0]
-    return lax.optimization_barrier((jnp.where(inside, cell, grid.num_cells), inside))
+    return jnp.where(inside, cell, grid.num_cells), inside
 
 
-def cell_corners(cell: Int32[Array, "*n"], grid: Grid, *, part: float = 0.0) -> Float32[Array, "*n 2"]:
+def cell_positions(cell: Int32[Array, "*n"], grid: Grid, *, part: float = 0.0) -> Float32[Array, "*n 2"]:
     """x and y of the corner of least x and y, or ``part`` of the cell away from it along both, metres.
 
-    >>> cell_corners(jnp.array([2]), Grid(2, 1.0, (0.0, 0.0))).tolist()
-    [[0.0, 1.0]]
+    >>> cell_positions(jnp.array([2]), Grid(2, 1.0, (0.0, 0.0)), part=0.5).tolist()
+    [[0.5, 1.5]]
     """
-    column_row = jnp.stack([cell % grid.side, cell // grid.side], axis=-1)
-    first = np.asarray([low / grid.cell_m + part for low in grid.low_m], np.float32)
-    # A sum and then a product: the other way around some programs would round once, some twice.
-    return lax.optimization_barrier((column_row.astype(jnp.float32) + first) * np.float32(grid.cell_m))
+    # Looked up: computed, they would be rounded once in some programs and twice in others.
+    x, y = (np.float32(low + (np.arange(grid.side + 1) + part) * grid.cell_m) for low in grid.low_m)
+    return jnp.stack([jnp.asarray(x)[cell % grid.side], jnp.asarray(y)[cell // grid.side]], axis=-1)
 
 
-def cell_means(values: Float32[Array, "n c"], cell: Int32[Array, "n"], num_cells: int) -> Float32[Array, "n c"]:
-    """For every row the mean over the rows of its cell, to a 65536th of the unit, in any order of the rows.
+def from_cell_means(values: Float32[Array, "n c"], cell: Int32[Array, "n"], num_cells: int) -> Float32[Array, "n c"]:
+    """Every row without the mean over the rows of its cell, to a 65536th of the unit.
 
-    >>> cell_means(jnp.array([[1.0], [2.0], [9.0]]), jnp.array([0, 0, 1]), 2).tolist()
-    [[1.5], [1.5], [9.0]]
+    >>> from_cell_means(jnp.array([[1.0], [2.0], [9.0]]), jnp.array([0, 0, 1]), 2).tolist()
+    [[-0.5], [0.5], [0.0]]
     """
+    count = jnp.zeros(num_cells + 1, jnp.int32).at[cell].add(1)[cell]
     with jax.enable_x64(True):  # for the sums alone
         steps = jnp.round(values * np.float32(_STEPS_PER_M)).astype(jnp.int64)
         total = jnp.zeros((num_cells + 1, values.shape[1]), jnp.int64).at[cell].add(steps)[cell]
-        total = total.astype(jnp.float32)
-    count = jnp.zeros(num_cells + 1, jnp.int32).at[cell].add(1)[cell]
-    scale = lax.optimization_barrier(1 / (count.astype(jnp.float32) * np.float32(_STEPS_PER_M)))
-    return lax.optimization_barrier(total * scale[:, None])
+        difference = (steps * count[:, None].astype(jnp.int64) - total).astype(jnp.float32)
+    return difference / (count.astype(jnp.float32) * np.float32(_STEPS_PER_M))[:, None]
 
 
 def cell_maxima(values: Float[Array, "n c"], cell: Int32[Array, "n"], num_cells: int) -> Float[Array, "_ c"]:
@@ -133,8 +129,8 @@ def make_pillars(
         usable &= inside
         cell = jnp.where(usable, cell, grid.num_cells)
         cloud = jnp.where(usable[:, None], cloud, 0.0)
-        from_mean = cloud[:, :3] - cell_means(cloud[:, :3], cell, grid.num_cells)
-        from_axis = cloud[:, :2] - cell_corners(cell, grid, part=0.5)
+        from_mean = from_cell_means(cloud[:, :3], cell, grid.num_cells)
+        from_axis = cloud[:, :2] - cell_positions(cell, grid, part=0.5)
         features = jnp.concatenate([cloud, from_mean, from_axis], axis=1)
         return Pillars(
             features=jnp.where(usable[:, None], features, 0.0),

@@ -31,15 +31,19 @@ def prepared(config):
 def outputs(config, seed=0):
     rng, groups = np.random.default_rng(seed), max(config.class_groups) + 1
     heat = rng.normal(-2, 1, (GRID.side, GRID.side, 10)).astype(np.float32)
-    return CentreOutputs(heat, rng.normal(0, 0.3, (GRID.side, GRID.side, groups, 10)).astype(np.float32))
+    regression = rng.normal(0, 0.3, (GRID.side, GRID.side, groups, 10)).astype(np.float32)
+    return CentreOutputs(*map(jnp.asarray, (heat, regression)))
+
+
+def ground_truth():
+    batch = host_batch()
+    return tuple(map(jnp.asarray, (batch.boxes[0], batch.labels[0], batch.box_valid[0])))
 
 
 @pytest.mark.parametrize("config", [CONFIG, GROUPED], ids=["one group", "six groups"])
 def test_sums_are_those_of_a_loop_over_boxes(config):
-    batch = host_batch()
-    boxes, labels, valid = batch.boxes[0], batch.labels[0], batch.box_valid[0]
-    boxes = np.where(np.arange(9) == 7, np.where(np.arange(len(boxes)) % 2, np.nan, 1.0)[:, None], boxes)
-    boxes = boxes.astype(np.float32)
+    boxes, labels, valid = ground_truth()
+    boxes = boxes.at[::2, 7:].set(jnp.nan)
     predicted = outputs(config)
     parts, counts = sample_losses(predicted, boxes, labels, valid, config=config, grid=GRID)
     options = {"num_classes": 10, "min_overlap": PILLARS.min_overlap, "min_radius": PILLARS.min_radius}
@@ -91,8 +95,7 @@ def test_a_batch_without_points_or_boxes_has_finite_losses_and_gradients():
 
 
 def test_an_exact_prediction_costs_nothing_but_confidence_and_overlaps_fully():
-    batch = host_batch()
-    boxes, labels, valid = batch.boxes[0], batch.labels[0], batch.box_valid[0]
+    boxes, labels, valid = ground_truth()
     options = {"num_classes": 10, "min_overlap": PILLARS.min_overlap, "min_radius": PILLARS.min_radius}
     targets = centre_targets(boxes, labels, valid, grid=GRID, **options)
     numbers = encode_centres(targets.boxes, targets.cell, GRID)
@@ -103,8 +106,8 @@ def test_an_exact_prediction_costs_nothing_but_confidence_and_overlaps_fully():
     regression[cell, 0] = np.asarray(numbers)[chosen]
     heat = np.full((GRID.side**2, 10), -20, np.float32)
     heat[cell, labels[chosen]] = 20
-    alone = np.isin(np.arange(len(boxes)), chosen)
-    exact = CentreOutputs(heat.reshape(GRID.side, GRID.side, 10), regression.reshape(GRID.side, GRID.side, 1, 10))
+    alone, side = jnp.isin(jnp.arange(len(boxes)), chosen), GRID.side
+    exact = CentreOutputs(jnp.array(heat).reshape(side, side, 10), jnp.array(regression).reshape(side, side, 1, 10))
     parts, counts = sample_losses(exact, boxes, labels, alone, config=CONFIG, grid=GRID)
     assert float(parts["classification"].sum()) < 1e-4
     assert float(parts["l1"].sum()) < 1e-3
