@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
@@ -53,9 +52,9 @@ def gaussian_radius(
 
 
 def centre_targets(
-    boxes: Float32[Array | np.ndarray, "m 9"],
-    labels: Int32[Array | np.ndarray, "m"],
-    box_valid: Bool[Array | np.ndarray, "m"],
+    boxes: Float32[Array, "m 9"],
+    labels: Int32[Array, "m"],
+    box_valid: Bool[Array, "m"],
     *,
     grid: Grid,
     num_classes: int,
@@ -71,7 +70,6 @@ def centre_targets(
     >>> centre_targets(box, jnp.array([0]), jnp.array([True]), **options).heat[0, :, 0].round(2).tolist()
     [0.14000000059604645, 1.0, 0.14000000059604645, 0.0]
     """
-    boxes = jnp.asarray(boxes)
     cell, inside = cells_below(boxes[:, :2], grid)
     valid = box_valid & inside
     boxes = jnp.where(valid[:, None], boxes, jnp.array(_HARMLESS, boxes.dtype))
@@ -99,10 +97,10 @@ def centre_targets(
 
 
 def focal_loss(
-    logits: Float[Array | np.ndarray, "h w k"],
+    logits: Float[Array, "h w k"],
     heat: Float32[Array, "h w k"],
     cell: Int32[Array, "m"],
-    labels: Int32[Array | np.ndarray, "m"],
+    labels: Int32[Array, "m"],
     valid: Bool[Array, "m"],
 ) -> tuple[Float[Array, "k"], Float[Array, "m"]]:
     """Penalty-reduced focal loss of the heat map, alpha 2 and beta 4, as sums.
@@ -126,9 +124,7 @@ def focal_loss(
     return away.sum(axis=(0, 1)), jnp.where(valid, missed, 0.0)
 
 
-def encode_centres(
-    boxes: Float32[Array | np.ndarray, "*m 9"], cell: Int32[Array | np.ndarray, "*m"], grid: Grid
-) -> Float32[Array, "*m 10"]:
+def encode_centres(boxes: Float32[Array, "*m 9"], cell: Int32[Array, "*m"], grid: Grid) -> Float32[Array, "*m 10"]:
     """Regression targets of boxes in the cells below their centres, as :func:`fcos_lidar_jax.coding.encode` but
     with x and y in cells.
 
@@ -141,7 +137,11 @@ def encode_centres(
 
 
 def decode_centres(
-    regression: Float[Array | np.ndarray, "*m 10"], cell: Int32[Array | np.ndarray, "*m"], grid: Grid, *, oriented: bool = False
+    regression: Float[Array, "*m 10"],
+    cell: Int32[Array, "*m"],
+    grid: Grid,
+    *,
+    oriented: bool = False,
 ) -> Float[Array, "*m _"]:
     """Boxes from the ten numbers of a cell, the inverse of :func:`encode_centres`.
 

@@ -116,7 +116,7 @@ class ModelConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PillarConfig:
-    """CenterPoint on pillars (Yin et al., CVPR 2021, after PointPillars) with the numbers published for nuScenes."""
+    """CenterPoint on pillars (Yin et al., CVPR 2021), with the numbers that its authors publish for nuScenes."""
 
     range_m: float = 51.2  # Half the side of the square around the sensor that is divided into pillars, metres.
     pillar_m: float = 0.2  # Side of a pillar, metres.
@@ -279,7 +279,7 @@ class Config:
     augment: AugmentConfig | None = AugmentConfig()  # Augmentation of a training step; None for none.
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
     pillars: PillarConfig | None = None
-    """Where given, the detector is CenterPoint: it takes the place of ``model`` and of the image of ``projection``."""
+    """Where given, the detector is CenterPoint, and ``model`` and the rounds of ``projection`` have no say."""
 
     def __post_init__(self) -> None:
         _check_least(self, 1, "num_sweeps", "max_points", "max_boxes")

@@ -75,7 +75,9 @@ def cell_positions(cell: Int32[Array, "*n"], grid: Grid, *, part: float = 0.0) -
     return jnp.stack([jnp.asarray(x)[cell % grid.side], jnp.asarray(y)[cell // grid.side]], axis=-1)
 
 
-def from_cell_means(values: Float32[Array, "n c"], cell: Int32[Array, "n"], num_cells: int) -> Float32[Array, "n c"]:
+def from_cell_means(
+    values: Float32[Array, "n c"], cell: Int32[Array, "n"], num_cells: int
+) -> Float32[Array, "n c"]:
     """Every row without the mean over the rows of its cell, to a 65536th of the unit.
 
     >>> from_cell_means(jnp.array([[1.0], [2.0], [9.0]]), jnp.array([0, 0, 1]), 2).tolist()
@@ -124,7 +126,9 @@ def make_pillars(
         usable = given & jnp.isfinite(cloud).all(axis=1)
         cloud = jnp.where(usable[:, None], cloud, 0.0)
         low, high = sensor.limit_z_m
-        usable &= (jnp.abs(cloud[:, :2]) < sensor.limit_xy_m).all(axis=1) & (cloud[:, 2] > low) & (cloud[:, 2] < high)
+        usable &= (
+            (jnp.abs(cloud[:, :2]) < sensor.limit_xy_m).all(axis=1) & (cloud[:, 2] > low) & (cloud[:, 2] < high)
+        )
         cell, inside = cells_below(cloud[:, :2], grid)
         usable &= inside
         cell = jnp.where(usable, cell, grid.num_cells)

@@ -20,7 +20,15 @@ from fcos_lidar_jax.config import (
     config_from_json,
     config_to_json,
 )
-from fcos_lidar_jax.presets import CENTERPOINT_PILLARS, COMPACT, NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, PRESETS, QUICKSTART
+from fcos_lidar_jax.presets import (
+    CENTERPOINT_PILLARS,
+    COMPACT,
+    NUSCENES,
+    NUSCENES_SINGLE,
+    NUSCENES_TEST,
+    PRESETS,
+    QUICKSTART,
+)
 
 MISSING = object()
 

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from fcos_lidar_jax.config import PillarConfig
-from fcos_lidar_jax.pillars import Grid, cell_maxima, cell_positions, cells_below, from_cell_means, make_pillars, pillar_grid
+from fcos_lidar_jax.pillars import (
+    Grid,
+    cell_maxima,
+    cell_positions,
+    cells_below,
+    from_cell_means,
+    make_pillars,
+    pillar_grid,
+)
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
 GRID = Grid(16, 0.5, (-3.0, -4.0))

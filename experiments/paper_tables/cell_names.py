@@ -7,7 +7,8 @@ Format 1, the only one: the name is the BLAKE2b hash of 8 bytes, in hexadecimal,
 with sorted keys. The configuration holds :data:`FIELDS`, all fields of the first cells, read from today's
 configuration; :data:`CONSTANTS` in place of first fields that are gone or never mattered; the number of classes
 as ``model.num_classes``; of :data:`ADDED` those that differ from what was done before there was such a field; and
-the :data:`SECTIONS` that are given. A new field of ``Config`` belongs into :data:`ADDED`, or into :data:`IGNORED` if it cannot change a result.
+:data:`SECTIONS` that are given. A new field of ``Config`` belongs into :data:`ADDED`, or into :data:`IGNORED` if
+it cannot change a result.
 """
 
 import dataclasses

@@ -69,9 +69,7 @@ def postprocess(
     return suppress(*select_candidates(outputs, locations, config=config, layout=layout), config)
 
 
-def centre_candidates(
-    outputs: CentreOutputs, *, config: Config, grid: Grid
-) -> tuple[Array, Array, Array, Array]:
+def centre_candidates(outputs: CentreOutputs, *, config: Config, grid: Grid) -> tuple[Array, Array, Array, Array]:
     """The best (cell, class) pairs of CenterPoint's heat map, decoded; boxes far beyond the map are none.
 
     Args:
@@ -90,7 +88,9 @@ def centre_candidates(
     regression = outputs.regression.reshape(-1, *outputs.regression.shape[-2:])[cell, group]
     boxes = decode_centres(regression, cell, grid)
     reach, centre = config.pillars.range_m + _BEYOND_M, np.asarray(grid.low_m) + config.pillars.range_m
-    near = (jnp.abs(boxes[:, :2] - centre.astype(np.float32)) <= reach).all(axis=1) & (jnp.abs(boxes[:, 2]) <= _BEYOND_M)
+    near = (jnp.abs(boxes[:, :2] - centre.astype(np.float32)) <= reach).all(axis=1) & (
+        jnp.abs(boxes[:, 2]) <= _BEYOND_M
+    )
     valid = (score >= 0) & near
     return boxes, jnp.where(valid, score, 0.0), label, valid
 

@@ -66,8 +66,8 @@ def make_sums(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Metrics, 
     """The weighted losses of a batch of raw points before the division, as of
     :func:`fcos_lidar_jax.training.objective.make_sums`.
 
-    The losses of every group of classes are divided by its own boxes. Its sums are weighed so that the one division
-    by all boxes does it; with one group this is exact over micro-batches, with more each has its own shares.
+    The losses of every group of classes are divided by its own boxes: its sums are weighed so that the one
+    division by all boxes does it. Over micro-batches this is exact with one group; with more, each has its shares.
     """
     config, sensor = detector.config, detector.sensor
     assert config.pillars is not None

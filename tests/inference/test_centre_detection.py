@@ -59,7 +59,9 @@ def test_candidates_are_the_best_pairs_of_cell_and_class(outputs, form):
 def test_boxes_are_those_of_class_wise_suppression(outputs):
     candidates = centre_candidates(outputs, config=SMALL, grid=GRID)
     boxes, scores, labels, used = suppress(*candidates, SMALL.inference)
-    kept = oracles.nms(*(np.asarray(c) for c in (candidates[0], candidates[1], candidates[3], candidates[2])), 0.2, 20)
+    kept = oracles.nms(
+        *(np.asarray(c) for c in (candidates[0], candidates[1], candidates[3], candidates[2])), 0.2, 20
+    )
     assert int(used.sum()) == len(kept) > 5
     np.testing.assert_array_equal(boxes[: len(kept)], candidates[0][np.array(kept)])
     np.testing.assert_array_equal(labels[: len(kept)], candidates[2][np.array(kept)])
@@ -78,5 +80,3 @@ def test_points_to_boxes_in_any_order_and_of_nothing():
     every = np.ones(len(points), bool)
     for nothing in (detect(variables, points, ~every), detect(variables, points * np.nan, every)):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nothing))
-
-

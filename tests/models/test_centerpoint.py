@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tiny_peer import CONFIG, SENSOR
 
+from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.models.centerpoint import Neck, from_channels
 from fcos_lidar_jax.pillars import make_pillars, pillar_grid
@@ -21,12 +22,12 @@ from fcos_lidar_jax.simulation.frames import make_frame
 def scene():
     detector = build_detector(CONFIG, SENSOR)
     grid = pillar_grid(CONFIG.pillars, SENSOR)  # type: ignore[arg-type]
-    clouds = [make_frame(seed, SENSOR).points[:900] for seed in (0, 1)]
-    valid = np.ones((2, 900), bool)
+    clouds = [make_cloud(make_frame(seed, SENSOR).points, CONFIG, sensor=SENSOR) for seed in (0, 1)]
+    points, valid = (np.stack([getattr(cloud, name) for cloud in clouds]) for name in ("points", "valid"))
     valid[1, 500:] = False
     make = jax.jit(jax.vmap(functools.partial(make_pillars, grid=grid, sensor=SENSOR)))
     apply = jax.jit(detector.apply, static_argnames="train")
-    return apply, jax.jit(detector.init)(jax.random.key(0)), make, np.stack(clouds), valid
+    return apply, jax.jit(detector.init)(jax.random.key(0)), make, points, valid
 
 
 def sizes(config):

@@ -3,7 +3,7 @@
 import dataclasses
 
 from tiny_run import CONFIG as OURS
-from tiny_run import FRAMES, SENSOR
+from tiny_run import FRAMES
 
 from fcos_lidar_jax.config import ModelConfig, PillarConfig
 from fcos_lidar_jax.input_pipeline.loader import make_batches

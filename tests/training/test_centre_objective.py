@@ -80,7 +80,10 @@ def test_a_batch_without_points_or_boxes_has_finite_losses_and_gradients():
     detector, variables = prepared(CONFIG)
     batch = host_batch()
     nothing = dataclasses.replace(
-        batch, valid=np.zeros_like(batch.valid), box_valid=np.zeros_like(batch.box_valid), boxes=batch.boxes * np.nan
+        batch,
+        valid=np.zeros_like(batch.valid),
+        box_valid=np.zeros_like(batch.box_valid),
+        boxes=batch.boxes * np.nan,
     )
     empty = dataclasses.replace(batch, points=batch.points * np.nan)
     for shown in (nothing, empty):
@@ -107,7 +110,9 @@ def test_an_exact_prediction_costs_nothing_but_confidence_and_overlaps_fully():
     heat = np.full((GRID.side**2, 10), -20, np.float32)
     heat[cell, labels[chosen]] = 20
     alone, side = jnp.isin(jnp.arange(len(boxes)), chosen), GRID.side
-    exact = CentreOutputs(jnp.array(heat).reshape(side, side, 10), jnp.array(regression).reshape(side, side, 1, 10))
+    exact = CentreOutputs(
+        jnp.array(heat).reshape(side, side, 10), jnp.array(regression).reshape(side, side, 1, 10)
+    )
     parts, counts = sample_losses(exact, boxes, labels, alone, config=CONFIG, grid=GRID)
     assert float(parts["classification"].sum()) < 1e-4
     assert float(parts["l1"].sum()) < 1e-3
