@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from tiny_peer import CONFIG, SENSOR
+from tiny_peer import CONFIG
+from tiny_run import SENSOR
 
 from fcos_lidar_jax.centres import decode_centres
 from fcos_lidar_jax.config import Config, InferenceConfig, PillarConfig

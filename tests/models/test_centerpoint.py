@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_peer import CONFIG, SENSOR
+from tiny_peer import CONFIG
+from tiny_run import SENSOR
 
 from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.models import build_detector, count_parameters

@@ -1,4 +1,4 @@
-"""The objective of CenterPoint against loops over boxes, on empty batches, and in micro-batches."""
+"""The objective of CenterPoint against loops over boxes, by group, and on empty batches."""
 
 import dataclasses
 import functools
@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_peer import CONFIG, SENSOR, host_batch
+from tiny_peer import CONFIG, host_batch
+from tiny_run import SENSOR
 
 from fcos_lidar_jax.centres import centre_targets, decode_centres, encode_centres, focal_loss
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.pillars import pillar_grid
+from fcos_lidar_jax.pillars import make_pillars, pillar_grid
 from fcos_lidar_jax.training.centre_objective import batch_metrics, make_sums, sample_losses
 from fcos_lidar_jax.training.step import make_gradient
 from fcos_lidar_jax.types import CentreOutputs
@@ -68,12 +69,24 @@ def test_sums_are_those_of_a_loop_over_boxes(config):
 
 def test_every_group_is_divided_by_its_own_boxes():
     detector, variables = prepared(GROUPED)
-    batch = host_batch()
-    totals, (_, parts, counts) = make_sums(detector)(variables["params"], variables["batch_stats"], batch)
+    batch, grid = host_batch(), pillar_grid(PILLARS, SENSOR)
+    totals, (_, parts, counts) = jax.jit(make_sums(detector))(variables["params"], variables["batch_stats"], batch)
     metrics = batch_metrics(parts, counts, GROUPED)
-    expected = metrics["loss/classification"] + 0.25 * metrics["loss/l1"]
-    assert float(totals["positives"] / counts["positives"]) == pytest.approx(float(expected), rel=1e-5)
-    assert float(metrics["loss/total"]) == pytest.approx(float(expected), rel=1e-5)
+    pillars = jax.vmap(lambda p, v: make_pillars(p, v, grid=grid, sensor=SENSOR))(batch.points, batch.valid)
+    found, _ = detector.apply(variables, pillars, train=True)
+    sums, boxes = {"classification": np.zeros(6), "l1": np.zeros(6)}, np.zeros(6)
+    for i in range(2):
+        truth = (jnp.asarray(leaf[i]) for leaf in (batch.boxes, batch.labels, batch.box_valid))
+        sample = jax.tree.map(lambda leaf, i=i: leaf[i], found)
+        own, count = sample_losses(sample, *truth, config=GROUPED, grid=GRID)
+        sums, boxes = {name: sums[name] + own[name] for name in sums}, boxes + count["positives"]
+    assert np.count_nonzero(boxes) > 2
+    expected = {name: float((part / np.maximum(boxes, 1)).sum()) for name, part in sums.items()}
+    for name, value in expected.items():
+        assert float(metrics[f"loss/{name}"]) == pytest.approx(value, rel=1e-4)
+    total = expected["classification"] + 0.25 * expected["l1"]
+    assert float(metrics["loss/total"]) == pytest.approx(total, rel=1e-4)
+    assert float(totals["positives"] / counts["positives"]) == pytest.approx(total, rel=1e-4)
 
 
 def test_a_batch_without_points_or_boxes_has_finite_losses_and_gradients():
