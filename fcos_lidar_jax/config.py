@@ -127,6 +127,41 @@ class ModelConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class PillarConfig:
+    """CenterPoint on pillars (Yin et al., CVPR 2021), with the numbers that its authors publish for nuScenes."""
+
+    range_m: float = 51.2  # Half the side of the square around the sensor that is divided into pillars, metres.
+    pillar_m: float = 0.2  # Side of a pillar, metres.
+    point_channels: tuple[int, ...] = (64, 64)  # Of the layers that points pass before they meet in their pillar.
+    backbone_blocks: tuple[int, int, int] = (3, 5, 5)
+    """3x3 convolutions a stage, beside the first one of each, which halves the size."""
+    backbone_widths: tuple[int, int, int] = (64, 128, 256)  # Channels a stage.
+    neck_channels: int = 128  # Channels that each stage gives to the heads.
+    output_stride: Literal[2, 4, 8] = 4  # Pillars a side of a cell of the heat map.
+    head_channels: int = 64  # Channels of the convolution that all heads share, and of those of each head.
+    groups: tuple[int, ...] = ()
+    """The group of each class, counted from 0: each has heads of its own; () for one of all classes."""
+    min_overlap: float = 0.1  # IoU that a box keeps when its centre moves by the radius of its Gaussian.
+    min_radius: int = 2  # Least radius of a Gaussian, cells of the heat map.
+    centre_prior: float = 0.1  # Probability of a centre at the start, everywhere.
+
+    def __post_init__(self) -> None:
+        _check(0 < self.pillar_m < self.range_m, "pillar_m", self.pillar_m, f"between 0 and {self.range_m} m")
+        side = 2 * self.range_m / self.pillar_m
+        whole = abs(side - round(side)) < 1e-3 and round(side) % 8 == 0
+        _check(whole, "pillar_m", self.pillar_m, f"a part of {2 * self.range_m:g} m by a multiple of 8")
+        layers = len(self.point_channels) >= 1 and min(self.point_channels) >= 2
+        _check(layers, "point_channels", self.point_channels, "one or more integers of at least 2")
+        _check_least(self, 1, "neck_channels", "head_channels", "min_radius")
+        _check(min(self.backbone_widths) >= 1, "backbone_widths", self.backbone_widths, "counts of at least 1")
+        numbered = set(self.groups) == set(range(max(self.groups, default=-1) + 1))
+        _check(numbered, "groups", self.groups, "the numbers from 0 up to the last group")
+        for name in ("min_overlap", "centre_prior"):
+            _check(0 < getattr(self, name) < 1, name, getattr(self, name), "between 0 and 1")
+        _check_choices(self)
+
+
+@dataclasses.dataclass(frozen=True)
 class LossConfig:
     """Assignment and losses (paper, section 3.4).
 
@@ -284,6 +319,8 @@ class Config:
     inference: InferenceConfig = InferenceConfig()  # Predictions to detections.
     augment: AugmentConfig | None = AugmentConfig()  # Augmentation of a training step; None for none.
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
+    pillars: PillarConfig | None = None
+    """Where given, the detector is CenterPoint, and ``model`` and the rounds of ``projection`` have no say."""
 
     def __post_init__(self) -> None:
         _check_least(self, 1, "num_sweeps", "max_points", "max_boxes")
@@ -298,6 +335,11 @@ class Config:
         for axis in self.inference.flips if self.inference.flips != "none" else "":
             seen = self.augment is not None and getattr(self.augment, f"flip_{axis}_probability") > 0
             _check(seen, "inference.flips", self.inference.flips, f"augment.flip_{axis}_probability above 0")
+        if self.pillars is not None:
+            groups = self.pillars.groups
+            one_each = len(groups) in (0, len(names))
+            _check(one_each, "pillars.groups", groups, f"{len(names)} values, one a class, or none")
+            _check(self.model == ModelConfig(), "model", "choices", "none: pillars takes its place")
 
     @property
     def ranges_m(self) -> dict[str, float]:
@@ -313,6 +355,11 @@ class Config:
         by_name = tuple(PASTE_TARGETS.get(name, DEFAULT_PASTE_TARGET) for name in self.classes)
         return self.copy_paste.targets or by_name
 
+    @property
+    def class_groups(self) -> tuple[int, ...]:
+        """The group of heads of each class, for a configuration with ``pillars``."""
+        return (self.pillars and self.pillars.groups) or (0,) * len(self.classes)
+
 
 def config_to_json(config: Config) -> dict[str, Any]:
     """The configuration as a JSON object.
@@ -320,7 +367,10 @@ def config_to_json(config: Config) -> dict[str, Any]:
     >>> config_from_json(config_to_json(Config())) == Config()
     True
     """
-    return dataclasses.asdict(config)
+    record = dataclasses.asdict(config)
+    if config.pillars is None:  # as before there was another detector
+        del record["pillars"]
+    return record
 
 
 def config_from_json(record: Any, where: str = "config") -> Config:
@@ -336,7 +386,7 @@ def config_from_json(record: Any, where: str = "config") -> Config:
     Traceback (most recent call last):
     ValueError: mine.json.sensor: missing
     """
-    return _from_json(Config, record, where)
+    return _from_json(Config, {"pillars": None, **record} if isinstance(record, Mapping) else record, where)
 
 
 def _from_json(kind: Any, value: Any, where: str) -> Any:

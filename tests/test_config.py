@@ -14,12 +14,21 @@ from fcos_lidar_jax.config import (
     LossConfig,
     ModelConfig,
     OptimizerConfig,
+    PillarConfig,
     ProjectionConfig,
     StemConfig,
     config_from_json,
     config_to_json,
 )
-from fcos_lidar_jax.presets import COMPACT, NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, PRESETS, QUICKSTART
+from fcos_lidar_jax.presets import (
+    CENTERPOINT_PILLARS,
+    COMPACT,
+    NUSCENES,
+    NUSCENES_SINGLE,
+    NUSCENES_TEST,
+    PRESETS,
+    QUICKSTART,
+)
 
 MISSING = object()
 
@@ -77,6 +86,7 @@ def test_json_gives_back_the_configuration(name):
         (("num_sweeps",), True, "run.num_sweeps: got True, expected int"),
         (("augment", "scale_range"), [1.05, 0.95], "run.augment.scale_range"),
         (("loss",), MISSING, r"run\.loss: missing"),
+        (("pillars",), {"pillar_m": 0.2}, r"run\.pillars\.range_m: missing"),
     ],
 )
 def test_bad_json_gets_one_line_with_the_field(path, value, message):
@@ -105,6 +115,14 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: InferenceConfig(nms_overlap="4d"),  # type: ignore[arg-type]
         lambda: AugmentConfig(flip_x_probability=2),
         lambda: OptimizerConfig(warmup_fraction=1.0),
+        lambda: PillarConfig(pillar_m=0.3),
+        lambda: PillarConfig(pillar_m=0.0),
+        lambda: PillarConfig(output_stride=3),  # type: ignore[arg-type]
+        lambda: PillarConfig(point_channels=()),
+        lambda: PillarConfig(groups=(0, 2)),
+        lambda: PillarConfig(min_overlap=1.0),
+        lambda: Config(pillars=PillarConfig(groups=(0, 1))),
+        lambda: Config(pillars=PillarConfig(), model=ModelConfig(tied_heads=True)),
         lambda: Config(max_points=0),
         lambda: Config(classes=()),
         lambda: Config(classes=("crate", "crate")),
@@ -132,4 +150,15 @@ def test_what_follows_from_the_names_of_the_classes_and_what_is_given():
 def test_the_papers_presets_keep_close_points_of_the_current_sweep():
     """Which gives its numbers of points; the presets of the shipped weights do without them."""
     modes = {name: preset.projection.remove_close for name, preset in PRESETS.items()}
-    assert modes == dict.fromkeys(PRESETS, "sweeps") | {"compact": "all", "quickstart": "all"}
+    assert modes == dict.fromkeys(PRESETS, "sweeps") | dict.fromkeys(
+        ("compact", "centerpoint_compact", "quickstart"), "all"
+    )
+
+
+def test_a_configuration_without_pillars_is_written_as_before_there_were_any():
+    assert "pillars" not in config_to_json(NUSCENES)
+    record = json.loads(json.dumps(config_to_json(CENTERPOINT_PILLARS)))
+    assert record["pillars"]["pillar_m"] == 0.2
+    assert config_from_json({**config_to_json(NUSCENES), "pillars": None}) == NUSCENES
+    assert CENTERPOINT_PILLARS.class_groups[CENTERPOINT_PILLARS.classes.index("barrier")] == 3
+    assert Config(classes=("a", "b"), pillars=PillarConfig()).class_groups == (0, 0)

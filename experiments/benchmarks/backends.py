@@ -32,8 +32,9 @@ from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.onnx_graph import cpu_package
-from fcos_lidar_jax.inference.openvino import Precision, processor_precision, stages_of, with_openvino
+from fcos_lidar_jax.inference.openvino import Precision, processor_precision, with_openvino
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import PRESETS
@@ -64,11 +65,12 @@ def times(preset: str, repeats: int) -> dict[str, Any]:
     if (best := processor_precision()) not in precisions:
         precisions = (best, *precisions)
     others = {precision: with_openvino(trained, precision=precision) for precision in precisions}
-    stages, variables = stages_of(config, sensor), jax.device_put(trained.variables)
-    image = stages.project(cloud.points, cloud.valid)
+    stages, variables = make_stages(model), jax.device_put(trained.variables)
+    network = jax.jit(stages.network)
+    image = stages.prepare(cloud.points, cloud.valid)
     calls: dict[str, Call] = {
         "points to boxes, xla": lambda: trained.detect(cloud),
-        "network, xla": lambda: stages.network(variables, image),
+        "network, xla": lambda: network(variables, image),
     }
     for precision, other in others.items():
         calls[f"points to boxes, {precision}"] = lambda other=other: other.detect(cloud)
@@ -82,7 +84,7 @@ def times(preset: str, repeats: int) -> dict[str, Any]:
             for name in found
         },
         "largest_difference": {
-            precision: difference(stages.network(variables, image), other.network(image))
+            precision: difference(network(variables, image), other.network(image))
             for precision, other in others.items()
         },
     }

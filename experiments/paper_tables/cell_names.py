@@ -6,8 +6,9 @@ Format 1, the only one: the name is the BLAKE2b hash of 8 bytes, in hexadecimal,
 
 with sorted keys. The configuration holds :data:`FIELDS`, all fields of the first cells, read from today's
 configuration; :data:`CONSTANTS` in place of first fields that are gone or never mattered; the number of classes
-as ``model.num_classes``; and of :data:`ADDED` those that differ from what was done before there was such a field.
-A new field of ``Config`` belongs into :data:`ADDED`, or into :data:`IGNORED` if it cannot change a result.
+as ``model.num_classes``; of :data:`ADDED` those that differ from what was done before there was such a field; and
+:data:`SECTIONS` that are given. A new field of ``Config`` belongs into :data:`ADDED`, or into :data:`IGNORED` if
+it cannot change a result.
 """
 
 import dataclasses
@@ -47,6 +48,7 @@ ADDED: dict[str, Any] = {
     "inference.flips": "none",
 }
 """Later fields, and their values in older cells."""
+SECTIONS = ("pillars",)  # Later sections, of which all fields name a cell where they are given.
 IGNORED = frozenset({*CONSTANTS, "model.remat"})  # Fields that cannot change a result.
 _SENSOR = "name inclinations_rad num_columns origin_m limit_xy_m limit_z_m intensity_scale row_source"
 SENSOR_FIELDS = tuple(_SENSOR.split())  # Of a scale's description.
@@ -66,6 +68,7 @@ def cell_name(config: Config, trained_on: Mapping[str, Any], seed: int) -> str:
     if config.copy_paste is not None:
         named["copy_paste.targets"] = config.paste_targets
     named |= {field: today[field] for field, before in ADDED.items() if today[field] != before}
+    named |= {field: value for field, value in today.items() if field.split(".")[0] in SECTIONS}
     text = json.dumps([unflatten_dict(named, sep="."), trained_on, seed], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 

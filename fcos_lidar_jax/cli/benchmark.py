@@ -19,14 +19,12 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import Backend, CloudDetector, TrainedDetector, load_detector
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
+from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.export import ExportedDetector
 from fcos_lidar_jax.inference.openvino import OpenVinoDetector
-from fcos_lidar_jax.inference.stages import Stages
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
-from fcos_lidar_jax.locations import image_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
-from fcos_lidar_jax.types import CHANNELS, RangeImage
 
 _SIMULATED = 3  # Clouds, where no files are given.
 _SIDE = 2048  # Of the matrices whose product is timed.
@@ -139,10 +137,10 @@ def _product() -> Call:
 
 def _network_gflop(detector: TrainedDetector) -> float:
     """Operations of the network for one cloud as XLA counts them before it optimises; 0 where it does not."""
-    stages, sensor = Stages(detector.config, detector.sensor), image_sensor(detector.sensor, detector.config.model)
-    shape = sensor.num_rows, sensor.num_columns, len(CHANNELS), detector.config.projection.num_rounds
-    image: Any = RangeImage(jax.ShapeDtypeStruct(shape, jnp.float32), None, None)  # type: ignore[arg-type]
-    counted: Any = stages.network.lower(detector.variables, image).cost_analysis()  # type: ignore[attr-defined]
+    stages, columns = make_stages(detector.model), detector.sensor.point_columns
+    points = jax.ShapeDtypeStruct((detector.config.max_points, columns), jnp.float32)
+    image = jax.eval_shape(stages.prepare, points, jax.ShapeDtypeStruct(points.shape[:1], bool))
+    counted: Any = jax.jit(stages.network).lower(detector.variables, image).cost_analysis()
     return (counted or {}).get("flops", 0.0) / 1e9
 
 
@@ -157,16 +155,17 @@ def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
 
 
 def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
-    stages = Stages(detector.config, detector.sensor)
-    of_xla = functools.partial(stages.network, jax.device_put(detector.variables))
+    stages = make_stages(detector.model)
+    prepare, postprocess = jax.jit(stages.prepare), jax.jit(stages.postprocess)
+    of_xla = functools.partial(jax.jit(stages.network), jax.device_put(detector.variables))
     network = detector.network if isinstance(detector, OpenVinoDetector) else of_xla
     on_device = [jax.device_put((cloud.points, cloud.valid)) for cloud in clouds]
-    images = [stages.project(*cloud) for cloud in on_device]
+    images = [prepare(*cloud) for cloud in on_device]
     outputs = [network(image) for image in images]
     return {
-        "projection": _in_turn(lambda cloud: stages.project(*cloud), on_device),
+        "projection": _in_turn(lambda cloud: prepare(*cloud), on_device),
         "network": _in_turn(network, images),
-        "postprocess": _in_turn(lambda pair: stages.postprocess(*pair), list(zip(outputs, images, strict=True))),
+        "postprocess": _in_turn(lambda pair: postprocess(*pair), list(zip(outputs, images, strict=True))),
     }
 
 

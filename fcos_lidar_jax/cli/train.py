@@ -34,6 +34,8 @@ _ABOUT = {
     "argoverse2": "one sweep of Argoverse 2, 26 classes",
     "compact": "one sweep of nuScenes, quick on two CPU cores",
     "quickstart": "small enough for two CPU cores",
+    "centerpoint_pillars": "CenterPoint on ten sweeps, for comparison",
+    "centerpoint_compact": "CenterPoint on one sweep, of about the cost of compact",
 }
 _PRESETS: Any = (
     tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT.get(name, ""))

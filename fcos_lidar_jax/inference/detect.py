@@ -1,7 +1,8 @@
 """Points to boxes as one pure function (paper, section 3.4)."""
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +11,18 @@ from jax import lax
 from jaxtyping import Array
 
 from fcos_lidar_jax.augment import flip_x, flip_y
+from fcos_lidar_jax.centres import decode_centres
 from fcos_lidar_jax.coding import decode
-from fcos_lidar_jax.config import InferenceConfig
+from fcos_lidar_jax.config import Config, InferenceConfig
 from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.nms import merge_boxes, rotated_nms
+from fcos_lidar_jax.pillars import Grid, make_pillars, pillar_grid
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import Detections, Locations, Outputs
+from fcos_lidar_jax.types import CentreOutputs, Detections, Locations, Outputs
+
+_BEYOND_M = 10.0  # How far beyond CenterPoint's map, and above or below the sensor, a box may lie.
 
 Detect = Callable[[Any, Array, Array], Detections]
 _MIRRORS = {"none": ("",), "x": ("", "x"), "y": ("", "y"), "xy": ("", "x", "y", "xy")}
@@ -82,14 +87,39 @@ def postprocess(
     >>> valid.tolist()  # of three times the same box
     [True, False, False, False, False]
     """
-    return _suppress(select_candidates(outputs, locations, config=config, layout=layout), config)
+    return suppress(*select_candidates(outputs, locations, config=config, layout=layout), config)
 
 
-def _suppress(
-    candidates: tuple[Array, Array, Array, Array], config: InferenceConfig
+def centre_candidates(outputs: CentreOutputs, *, config: Config, grid: Grid) -> tuple[Array, Array, Array, Array]:
+    """The best (cell, class) pairs of CenterPoint's heat map, decoded; boxes far beyond the map are none.
+
+    Args:
+        outputs: of one sample.
+        config, grid: thresholds and counts, and the cells of the heat map (static).
+
+    Returns:
+        as :func:`select_candidates`.
+    """
+    assert config.pillars is not None
+    probability = jax.nn.sigmoid(outputs.heat)
+    scores = jnp.where(probability > config.inference.min_probability, probability, -1.0).reshape(-1)
+    score, pair = lax.top_k(scores, min(config.inference.candidates_per_level, scores.shape[0]))
+    cell, label = pair // len(config.classes), (pair % len(config.classes)).astype(jnp.int32)
+    group = jnp.array(config.class_groups)[label]
+    regression = outputs.regression.reshape(-1, *outputs.regression.shape[-2:])[cell, group]
+    boxes = decode_centres(regression, cell, grid)
+    reach, centre = config.pillars.range_m + _BEYOND_M, np.asarray(grid.low_m) + config.pillars.range_m
+    near = (jnp.abs(boxes[:, :2] - centre.astype(np.float32)) <= reach).all(axis=1) & (
+        jnp.abs(boxes[:, 2]) <= _BEYOND_M
+    )
+    valid = (score >= 0) & near
+    return boxes, jnp.where(valid, score, 0.0), label, valid
+
+
+def suppress(
+    boxes: Array, scores: Array, labels: Array, valid: Array, config: InferenceConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """The best boxes of the candidates; in and out as of :func:`postprocess`."""
-    boxes, scores, labels, valid = candidates
+    """Class-wise rotated NMS of candidates; returns what :func:`postprocess` does."""
     options: dict[str, Any] = {"labels": labels, "overlap": config.nms_overlap}
     with jax.named_scope("nms"):
         index, used = rotated_nms(
@@ -107,8 +137,61 @@ def _suppress(
     return best_boxes, jnp.where(used, scores[index], 0.0), jnp.where(used, labels[index], 0), used
 
 
+class DetectStages(NamedTuple):
+    """The stages of detection in one cloud, pure functions.
+
+    Attributes:
+        prepare: ``(points f32[n, c], valid bool[n]) -> image``, a RangeImage, or Pillars for CenterPoint.
+        network: ``(variables, image) -> outputs``.
+        candidates: ``(outputs, image) -> boxes, scores, labels, valid`` as of :func:`select_candidates`.
+        postprocess: the same as of :func:`postprocess`.
+    """
+
+    prepare: Callable[..., Any]
+    network: Callable[..., Any]
+    candidates: Callable[..., tuple[Array, Array, Array, Array]]
+    postprocess: Callable[..., tuple[Array, Array, Array, Array]]
+
+
+def make_stages(detector: Detector) -> DetectStages:
+    """The stages that :func:`make_detect` joins, to be jitted by the caller."""
+    config, sensor = detector.config, detector.sensor
+    if config.pillars is not None:
+        cells = pillar_grid(config.pillars, sensor, stride=config.pillars.output_stride)
+        prepare: Callable[..., Any] = functools.partial(
+            make_pillars, grid=pillar_grid(config.pillars, sensor), sensor=sensor
+        )
+
+        def candidates(outputs: Any, image: Any) -> tuple[Array, Array, Array, Array]:
+            return centre_candidates(outputs, config=config, grid=cells)
+    else:
+        layout, options = image_layout(sensor, config.model), dataclasses.asdict(config.projection)
+        prepare = functools.partial(
+            project_points,
+            sensor=image_sensor(sensor, config.model),
+            **{name: options[name] for name in ("num_rounds", "prioritize_current")},
+        )
+
+        def candidates(outputs: Any, image: Any) -> tuple[Array, Array, Array, Array]:
+            return select_candidates(outputs, locate(image, layout), config=config.inference, layout=layout)
+
+    def network(variables: Any, image: Any) -> Any:
+        return _of_one(detector, variables, image if config.pillars is not None else image.features)
+
+    def postprocess(outputs: Any, image: Any) -> tuple[Array, Array, Array, Array]:
+        return suppress(*candidates(outputs, image), config.inference)
+
+    return DetectStages(prepare, network, candidates, postprocess)
+
+
+def _of_one(detector: Detector, variables: Any, image: Any) -> Any:
+    """The network's outputs for one sample."""
+    outputs, _ = detector.apply(variables, jax.tree.map(lambda leaf: leaf[None], image), train=False)
+    return jax.tree.map(lambda leaf: leaf[0], outputs)
+
+
 def make_detect(detector: Detector) -> Detect:
-    """The whole path from points to boxes: projection, network, decoding, NMS.
+    """The whole path from points to boxes: projection or pillars, network, decoding, NMS.
 
     Returns:
         pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` of one cloud, to be jitted by the
@@ -124,27 +207,21 @@ def make_detect(detector: Detector) -> Detect:
     >>> jax.eval_shape(make_detect(detector), variables, points, valid).boxes.shape
     (500, 9)
     """
-    config, sensor = detector.config, detector.sensor
-    binned, layout = image_sensor(sensor, config.model), image_layout(sensor, config.model)
-
-    rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
+    config, sensor, stages = detector.config, detector.sensor, make_stages(detector)
     views = _MIRRORS[config.inference.flips]
     no_points, no_boxes = jnp.zeros((0, 5)), jnp.zeros((0, 9))
 
     def detect(variables: Any, points: Array | np.ndarray, valid: Array | np.ndarray) -> Detections:
         with jax.named_scope("mrv"):
-            images = [
-                project_points(cloud, valid, binned, num_rounds=rounds, prioritize_current=current_first)
-                for cloud in (_mirror(view, sensor, jnp.asarray(points), no_boxes)[0] for view in views)
-            ]
-        outputs, _ = detector.apply(variables, jnp.stack([image.features for image in images]), train=False)
+            clouds = [_mirror(view, sensor, jnp.asarray(points), no_boxes)[0] for view in views]
+            images = [stages.prepare(cloud, valid) for cloud in clouds]
         found = []
-        for i, (view, image) in enumerate(zip(views, images, strict=True)):
-            seen = jax.tree.map(lambda leaf, i=i: leaf[i], outputs)
-            boxes, *rest = select_candidates(seen, locate(image, layout), config=config.inference, layout=layout)
+        for view, image in zip(views, images, strict=True):
+            boxes, *rest = stages.candidates(stages.network(variables, image), image)
             found.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
-        candidates = tuple(jnp.concatenate(parts) for parts in zip(*found, strict=True))
-        return Detections(*_suppress(candidates, config.inference), images[0].num_dropped)  # type: ignore[arg-type]
+        boxes, scores, labels, valid = (jnp.concatenate(parts) for parts in zip(*found, strict=True))
+        best = suppress(boxes, scores, labels, valid, config.inference)
+        return Detections(*best, images[0].num_dropped)
 
     return detect
 

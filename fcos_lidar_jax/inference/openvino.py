@@ -80,6 +80,10 @@ def with_openvino(detector: TrainedDetector, *, precision: Precision | None = No
     if jax.default_backend() != "cpu" or jax.process_count() > 1:
         found = f"{jax.process_count()} processes on {jax.default_backend()}"
         raise ValueError(f"backend openvino: found {found}, expected one on cpu")
+    if detector.config.inference.flips != "none":
+        raise ValueError(
+            f"backend openvino: found inference.flips {detector.config.inference.flips}, expected none"
+        )
     precision = precision or processor_precision()
     openvino = cpu_package("openvino")
     core = openvino.Core()

@@ -35,12 +35,6 @@ class Stages:
         self.stem, self.backbone = part("stem", train=False), part("backbone", train=False)
         self.fpn, self.heads = part("fpn"), part("heads")
 
-        def whole(variables: Variables, image: RangeImage) -> Outputs:
-            outputs = network.apply(variables, network_input(image.features[None], model, layout), train=False)
-            return jax.tree.map(lambda leaf: leaf[0], outputs)
-
-        self.network = jax.jit(whole)
-
         select = functools.partial(postprocess, config=config.inference, layout=layout)
         self.postprocess = jax.jit(lambda outputs, image: select(outputs, locate(image, layout)))
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import Config, ModelConfig
 from fcos_lidar_jax.locations import ImageLayout, image_layout, pad_image
+from fcos_lidar_jax.models.centerpoint import build_centerpoint
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
 from fcos_lidar_jax.models.layers import Image, recomputed
@@ -29,6 +30,7 @@ class Detector(NamedTuple):
         init: ``key -> variables``.
         apply: ``(variables, features f32[b, h, w, 9, r], train=False) -> (Outputs, batch_stats)``. The
             features are a range image's, in raw units; the batch statistics are the given ones unless training.
+            With ``config.pillars``: ``(variables, Pillars, train=False) -> (CentreOutputs, batch_stats)``.
         config: all choices.
         sensor: the image's geometry.
 
@@ -43,7 +45,7 @@ class Detector(NamedTuple):
     """
 
     init: Callable[[Any], Variables]
-    apply: Callable[..., tuple[Outputs, Any]]
+    apply: Callable[..., tuple[Any, Any]]
     config: Config
     sensor: Sensor
 
@@ -91,7 +93,7 @@ def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, la
 
 @functools.cache
 def build_detector(config: Config, sensor: Sensor) -> Detector:
-    """The network of a configuration for a sensor's images; equal arguments share one object and its programs.
+    """The network of a configuration for a sensor's clouds; equal arguments share one object and its programs.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import TINY
@@ -99,6 +101,8 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     >>> sorted(jax.eval_shape(detector.init, jax.random.key(0)))
     ['batch_stats', 'params']
     """
+    if config.pillars is not None:
+        return Detector(*build_centerpoint(config, sensor), config, sensor)
     network = Network(config.model, len(config.classes))
     layout = image_layout(sensor, config.model)
     channels = 9 * config.projection.num_rounds

@@ -69,7 +69,8 @@ class BatchNorm(nn.Module):
     momentum: float = 0.9  # Part of the running statistics that an update keeps.
 
     @nn.compact
-    def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
+    def __call__(self, parts: Sequence[Image], *, train: bool, where: Array | None = None) -> list[Image]:
+        """The parts, normalised; only what ``where`` marks, by default everything, enters the statistics."""
         cuts = pieces([part.shape[-1] for part in parts])
         total = cuts[-1].stop
         scale = self.param("scale", nn.initializers.ones, (total,))
@@ -79,12 +80,11 @@ class BatchNorm(nn.Module):
         mean, var = running_mean.value, running_var.value
         given, parts = parts[0].dtype, [at_least_float32(part) for part in parts]
         if train:
-            mean = jnp.concatenate([part.mean((0, 1, 2)) for part in parts])
+            mean = jnp.concatenate([part.mean((0, 1, 2), where=where) for part in parts])
             # Its derivative by the mean is zero; left out, the backward pass reads the image once less.
             fixed = lax.stop_gradient(mean)
-            var = jnp.concatenate(
-                [jnp.square(part - fixed[cut]).mean((0, 1, 2)) for part, cut in zip(parts, cuts, strict=True)]
-            )
+            squares = [jnp.square(part - fixed[cut]) for part, cut in zip(parts, cuts, strict=True)]
+            var = jnp.concatenate([square.mean((0, 1, 2), where=where) for square in squares])
             if not self.is_initializing():
                 running_mean.value = self.momentum * running_mean.value + (1 - self.momentum) * mean
                 running_var.value = self.momentum * running_var.value + (1 - self.momentum) * var

@@ -12,7 +12,8 @@ from jax import lax
 
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.models import Detector, Variables
-from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_sums
+from fcos_lidar_jax.training import centre_objective, objective
+from fcos_lidar_jax.training.objective import Metrics
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
 from fcos_lidar_jax.types import Batch, TrainState
 
@@ -66,7 +67,8 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
         pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``.
     """
     config = detector.config
-    sums = make_sums(detector)
+    chosen = objective if config.pillars is None else centre_objective
+    sums = chosen.make_sums(detector)
     pieces = config.optimizer.accumulate
 
     def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
@@ -98,7 +100,7 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
             return jax.tree.map(lambda leaf: leaf * scale.astype(leaf.dtype), grads[name])
 
         grads = functools.reduce(optax.tree.add, [divided(name) for name in grads])
-        return grads, batch_stats, batch_metrics(parts, counts, config)
+        return grads, batch_stats, chosen.batch_metrics(parts, counts, config)
 
     return gradient
 

@@ -1,0 +1,178 @@
+"""CenterPoint on pillars: point layers, a backbone that sees the scene from above, heads of centres and boxes."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from fcos_lidar_jax.config import Config, PillarConfig
+from fcos_lidar_jax.models.heads import Predictions
+from fcos_lidar_jax.models.layers import BatchNorm, Conv, ConvNorm, Image, pieces
+from fcos_lidar_jax.pillars import cell_maxima, pillar_grid
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.types import CentreOutputs, Pillars
+
+_NUMBERS = {"offset": 2, "height": 1, "size": 3, "heading": 2, "velocity": 2}  # In the order of ``coding.encode``.
+
+
+class PointLayers(nn.Module):
+    """Points to an image: every point by itself, then the maximum over its pillar (PointPillars, section 2.1).
+
+    Each layer but the last has half the channels and gives each point its pillar's maxima beside its own.
+    """
+
+    channels: tuple[int, ...]
+    side: int
+
+    @nn.compact
+    def __call__(self, pillars: Pillars, *, train: bool) -> Image:
+        x, cell, number = pillars.features[:, :, None], pillars.cell, self.side * self.side
+        inside = (cell < number)[:, :, None, None]
+        where = inside | ~inside.any()  # The statistics of no point at all are those of zeros, not NaN.
+        maxima = x[:, :, 0]
+        for i, wide in enumerate(self.channels):
+            last = i == len(self.channels) - 1
+            x = Conv(wide if last else wide // 2, 1, name=f"linear{i}")(x)
+            (x,) = BatchNorm(name=f"norm{i}")([x], train=train, where=where)
+            x = jax.nn.relu(x)
+            maxima = jax.vmap(cell_maxima, (0, 0, None))(x[:, :, 0], cell, number)
+            if not last:
+                seen = jax.vmap(lambda values, index: values[index])(maxima, cell)
+                x = jnp.concatenate([x, seen[:, :, None]], axis=-1)
+        return maxima[:, :-1].reshape(-1, self.side, self.side, maxima.shape[-1])
+
+
+class Backbone(nn.Module):
+    """Three stages of 3x3 convolutions, the first of each at stride 2 (PointPillars, section 2.2)."""
+
+    blocks: tuple[int, ...]
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x: Image, *, train: bool) -> list[Image]:
+        """The stages' outputs at 1/2, 1/4 and 1/8 of the grid."""
+        levels = []
+        for stage, (count, width) in enumerate(zip(self.blocks, self.widths, strict=True)):
+            for block in range(count + 1):
+                x = ConvNorm(width, 3, 1 if block else 2, name=f"stage{stage}_block{block}")(x, train=train)
+            levels.append(x)
+        return levels
+
+
+def to_channels(x: Image, factor: int) -> Image:
+    """Squares of ``factor`` x ``factor`` cells to channels of one.
+
+    >>> to_channels(jnp.ones((1, 4, 4, 3)), 2).shape
+    (1, 2, 2, 12)
+    """
+    b, h, w, c = x.shape
+    x = x.reshape(b, h // factor, factor, w // factor, factor, c)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h // factor, w // factor, -1)
+
+
+def from_channels(x: Image, factor: int) -> Image:
+    """The inverse of :func:`to_channels`.
+
+    >>> image = jnp.arange(48.0).reshape(1, 4, 4, 3)
+    >>> bool((from_channels(to_channels(image, 2), 2) == image).all())
+    True
+    """
+    b, h, w, _ = x.shape
+    x = x.reshape(b, h, w, factor, factor, -1).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(b, h * factor, w * factor, -1)
+
+
+class Neck(nn.Module):
+    """All stages at one resolution, side by side.
+
+    (Transposed) convolutions whose size is their stride are matrix products of squares of cells.
+    """
+
+    channels: int
+    stride: int  # Of the output, pillars.
+
+    @nn.compact
+    def __call__(self, levels: list[Image], *, train: bool) -> Image:
+        outputs = []
+        for i, x in enumerate(levels):
+            own, name = 2 ** (i + 1), f"level{i}"
+            up, down = max(own // self.stride, 1), max(self.stride // own, 1)
+            x = Conv(self.channels * up * up, 1, name=f"{name}_conv")(to_channels(x, down))
+            (x,) = BatchNorm(name=f"{name}_norm")([from_channels(x, up)], train=train)
+            outputs.append(jax.nn.relu(x))
+        return jnp.concatenate(outputs, axis=-1)
+
+
+class CentreHeads(nn.Module):
+    """A convolution for all, and for each group of classes a heat map and the numbers of a box."""
+
+    groups: tuple[int, ...]  # Of each class.
+    channels: int
+    prior: float
+
+    @nn.compact
+    def __call__(self, x: Image, *, train: bool) -> CentreOutputs:
+        x = ConvNorm(self.channels, name="shared")(x, train=train)
+        bias, heat, regression = math.log(self.prior / (1 - self.prior)), [], []
+        for group in range(max(self.groups) + 1):
+            sizes = {**_NUMBERS, "heat": self.groups.count(group)}
+            # The hidden layers of all heads of a group are one convolution.
+            hidden = ConvNorm(self.channels * len(sizes), name=f"group{group}_hidden")(x, train=train)
+            predicted: dict[str, Array] = {}
+            for (name, size), cut in zip(sizes.items(), pieces([self.channels] * len(sizes)), strict=True):
+                biases = {name: (bias,) * size} if name == "heat" else {}
+                head = Predictions({name: size}, biases, name=f"group{group}_{name}")
+                predicted |= head(hidden[..., cut])
+            heat.append(predicted["heat"])
+            regression.append(jnp.concatenate([predicted[name] for name in _NUMBERS], axis=-1))
+        by_group = sorted(range(len(self.groups)), key=lambda label: self.groups[label])
+        order = [by_group.index(label) for label in range(len(self.groups))]
+        return CentreOutputs(jnp.concatenate(heat, axis=-1)[..., jnp.array(order)], jnp.stack(regression, axis=-2))
+
+
+class CenterPoint(nn.Module):
+    """Points, backbone, neck and heads."""
+
+    config: PillarConfig
+    groups: tuple[int, ...]
+    side: int
+
+    def setup(self) -> None:
+        c = self.config  # the four names are the top level of the parameters
+        self.points = PointLayers(c.point_channels, self.side)
+        self.backbone = Backbone(c.backbone_blocks, c.backbone_widths)
+        self.neck = Neck(c.neck_channels, c.output_stride)
+        self.heads = CentreHeads(self.groups, c.head_channels, c.centre_prior)
+
+    def __call__(self, pillars: Pillars, *, train: bool) -> CentreOutputs:
+        with jax.named_scope("points"):
+            x = self.points(pillars, train=train)
+        with jax.named_scope("backbone"):
+            levels = self.backbone(x, train=train)
+        with jax.named_scope("neck"):
+            x = self.neck(levels, train=train)
+        with jax.named_scope("heads"):
+            return self.heads(x, train=train)
+
+
+def build_centerpoint(config: Config, sensor: Sensor) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """``init`` and ``apply`` of :class:`fcos_lidar_jax.models.Detector` for a configuration with ``pillars``."""
+    assert config.pillars is not None
+    side = pillar_grid(config.pillars, sensor).side
+    network = CenterPoint(config.pillars, config.class_groups, side)
+
+    def init(key: Any) -> dict[str, Any]:
+        # Parameters do not depend on the number of points, and nothing of the forward pass is computed.
+        features, cell = jax.ShapeDtypeStruct((1, 8, 10), jnp.float32), jax.ShapeDtypeStruct((1, 8), jnp.int32)
+        pillars = Pillars(features, cell, jax.ShapeDtypeStruct((1,), jnp.int32))  # type: ignore[arg-type]
+        return network.lazy_init(key, pillars, train=False)  # type: ignore[return-value]
+
+    def apply(variables: dict[str, Any], pillars: Pillars, *, train: bool = False) -> tuple[CentreOutputs, Any]:
+        outputs, updates = network.apply(variables, pillars, train=train, mutable=["batch_stats"] if train else [])
+        return outputs, updates["batch_stats"] if train else variables["batch_stats"]
+
+    return init, apply

@@ -1,0 +1,70 @@
+"""The second detector through the same commands: train, evaluate, detect, export, benchmark."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from commands import command
+from test_formats import SENSOR, sensor_options
+from tiny_peer import NETWORK_OPTIONS
+from tiny_run import bits
+
+import fcos_lidar_jax as fcos
+from fcos_lidar_jax.inference import load_trained
+from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.training.checkpoint import load_checkpoint
+from fcos_lidar_jax.training.checkpoints import find_checkpoint
+from fcos_lidar_jax.training.metrics_log import read_metrics
+
+STEPS = 20
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A run of twenty steps on two frames."""
+    folder = tmp_path_factory.mktemp("peer")
+    preset = f"centerpoint_compact --no-copy-paste --no-augment {sensor_options(folder, SENSOR, 1024)}"
+    often = f"--steps {STEPS} --save-every {STEPS} --evaluate-every {STEPS} --samples 0:2 --val-samples 0:2"
+    command("train", preset, "--format simulated --out", folder / "run", *NETWORK_OPTIONS, often)
+    np.save(folder / "cloud.npy", make_frame(0, SENSOR).points)
+    return folder
+
+
+def test_the_loss_falls_and_is_that_of_its_parts(home):
+    lines = [line for line in read_metrics(home / "run") if "loss/total" in line]
+    assert len(lines) == STEPS
+    totals = [line["loss/total"] for line in lines]
+    assert np.mean(totals[-3:]) < 0.7 * np.mean(totals[:3])
+    assert totals[0] == pytest.approx(lines[0]["loss/classification"] + 0.25 * lines[0]["loss/l1"], rel=1e-5)
+    assert 0 <= lines[-1]["positive_iou"] <= 1
+    assert (home / "run" / "loss.png").is_file()
+
+
+def test_evaluates_and_detects(home, tmp_path):
+    command("evaluate --format simulated --samples 0:2 --checkpoint", home / "run", "--out", tmp_path / "scores")
+    assert 0 <= json.loads((tmp_path / "scores" / "metrics_summary.json").read_text())["mean_ap"] <= 1
+    command("detect", home / "cloud.npy", "--checkpoint", home / "run", "--out", tmp_path / "boxes.json")
+    [record] = json.loads((tmp_path / "boxes.json").read_text())["files"]
+    found = fcos.load_detector(home / "run")(home / "cloud.npy")
+    assert [box["box"] for box in record["boxes"]] == found.boxes[found.valid].tolist()
+    assert record["boxes"]
+
+
+def test_a_checkpoint_and_an_exported_file_give_back_the_detector(home):
+    trained = load_trained(home / "run")
+    again = load_checkpoint(find_checkpoint(home / "run"))
+    assert again.config == trained.config
+    assert again.config.pillars is not None
+    assert bits(again.variables) == bits(trained.variables)
+    command("export --checkpoint", home / "run", "--out", home / "detector.fcos")
+    exported = fcos.load_detector(home / "detector.fcos")
+    assert exported.config == trained.config
+    for a, b in zip(*(jax.tree.leaves(d(home / "cloud.npy")) for d in (exported, trained)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)  # the same bits where programs are optimised
+
+
+def test_benchmark_times_the_same_stages(home, tmp_path):
+    command("benchmark --repeats 1 --batch 2 --checkpoint", home / "run", "--out", tmp_path / "times.json")
+    stages = json.loads((tmp_path / "times.json").read_text())["stages"]
+    assert list(stages) == ["clean", "projection", "network", "postprocess"]

@@ -1,0 +1,83 @@
+"""CenterPoint's candidates and boxes against loops."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+from tiny_peer import CONFIG
+from tiny_run import SENSOR
+
+from fcos_lidar_jax.centres import decode_centres
+from fcos_lidar_jax.config import Config, InferenceConfig, PillarConfig
+from fcos_lidar_jax.inference import make_detect
+from fcos_lidar_jax.inference.detect import centre_candidates, suppress
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.pillars import Grid
+from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.types import CentreOutputs
+
+GRID = Grid(12, 1.0, (-6.0, -6.0))
+SMALL = Config(
+    classes=("a", "b", "c"),
+    pillars=PillarConfig(range_m=6.0, pillar_m=0.5, output_stride=2, groups=(0, 1, 0)),
+    inference=InferenceConfig(min_probability=0.3, candidates_per_level=90, max_detections=20),
+)
+
+
+@pytest.fixture(scope="module")
+def outputs():
+    rng = np.random.default_rng(0)
+    regression = rng.normal(0, 0.7, (12, 12, 2, 10))
+    regression[3, 4, :, 0], regression[5, 6, :, 2] = 40.0, -11.0  # far beside, far below
+    return CentreOutputs(jnp.float32(rng.normal(0, 2, (12, 12, 3))), jnp.float32(regression))
+
+
+@pytest.mark.parametrize("form", ["eager", "jit", "vmap"])
+def test_candidates_are_the_best_pairs_of_cell_and_class(outputs, form):
+    def find(o):
+        return centre_candidates(o, config=SMALL, grid=GRID)
+
+    if form == "vmap":
+        two = jax.tree.map(lambda leaf: jnp.stack([leaf[::-1], leaf]), outputs)
+        boxes, scores, labels, valid = (np.asarray(leaf)[1] for leaf in jax.vmap(find)(two))
+    else:
+        boxes, scores, labels, valid = map(np.asarray, (jax.jit(find) if form == "jit" else find)(outputs))
+    p = 1 / (1 + np.exp(-np.asarray(outputs.heat, np.float64)))
+    pairs = sorted((-p[i, j, k], i * 12 + j, k) for i, j, k in np.ndindex(12, 12, 3) if p[i, j, k] > 0.3)[:90]
+    assert 0 < valid.sum() < len(pairs)
+    for slot, (score, cell, label) in enumerate(pairs):
+        numbers = outputs.regression[cell // 12, cell % 12, (0, 1, 0)[label]]
+        expected = np.asarray(decode_centres(numbers, jnp.int32(cell), GRID))
+        near = (np.abs(expected[:2]) <= 16).all() and abs(expected[2]) <= 10
+        assert valid[slot] == near
+        assert (labels[slot], scores[slot]) == (label, pytest.approx(-score if near else 0, abs=1e-6))
+        np.testing.assert_allclose(boxes[slot], expected, atol=1e-4)
+
+
+def test_boxes_are_those_of_class_wise_suppression(outputs):
+    candidates = centre_candidates(outputs, config=SMALL, grid=GRID)
+    boxes, scores, labels, used = suppress(*candidates, SMALL.inference)
+    kept = oracles.nms(
+        *(np.asarray(c) for c in (candidates[0], candidates[1], candidates[3], candidates[2])), 0.2, 20
+    )
+    assert int(used.sum()) == len(kept) > 5
+    np.testing.assert_array_equal(boxes[: len(kept)], candidates[0][np.array(kept)])
+    np.testing.assert_array_equal(labels[: len(kept)], candidates[2][np.array(kept)])
+    assert (np.diff(scores) <= 0).all()
+
+
+def test_points_to_boxes_in_any_order_and_of_nothing():
+    detector = build_detector(dataclasses.replace(CONFIG, max_points=4096), SENSOR)
+    variables, detect = jax.jit(detector.init)(jax.random.key(0)), jax.jit(make_detect(detector))
+    points = make_frame(0, SENSOR).points
+    order = np.random.default_rng(0).permutation(len(points))
+    found, shuffled = (detect(variables, p, np.ones(len(p), bool)) for p in (points, points[order]))
+    assert found.valid.any()
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(shuffled), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+    every = np.ones(len(points), bool)
+    for nothing in (detect(variables, points, ~every), detect(variables, points * np.nan, every)):
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nothing))
