@@ -34,9 +34,9 @@ html_css_files = ["site.css"]
 pygments_style = "friendly"
 copybutton_exclude = ".linenos, .gp, .go"
 
-myst_enable_extensions = ["dollarmath", "colon_fence", "attrs_block"]
 myst_heading_anchors = 3
 
+add_module_names = False
 napoleon_use_ivar = True
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
@@ -52,8 +52,8 @@ nitpick_ignore_regex = [
     # What is no part of the reference, and is read in its source.
     (
         r"py:.*",
-        r"fcos_lidar_jax\.(inference\.(export|stream)|evaluation\.metrics|input_pipeline\.database|data\.sweeps"
-        r"|training\.sharding)\..*",
+        r"fcos_lidar_jax\.(inference\.(export|stream)|evaluation\.metrics|input_pipeline\.database"
+        r"|data\.(sweeps|nuscenes\.index)|training\.sharding)\..*",
     ),
 ]
 

@@ -27,7 +27,6 @@ CORE = (
     *("sensors", "types", "config", "presets", "geometry", "projection", "locations"),
     *("coding", "iou", "assignment", "losses", "nms", "augment"),
 )
-)
 
 
 def blocks(page: Path, language: str) -> list[str]:

@@ -26,7 +26,12 @@ _COLUMNS = 5  # x, y, z, intensity, ring: float32 each
 
 @dataclasses.dataclass(frozen=True)
 class Boxes:
-    """The boxes of one keyframe in its LiDAR frame, the ten classes only, unpadded."""
+    """The boxes of one keyframe in its LiDAR frame, the ten classes only, unpadded.
+
+    >>> one = Boxes(np.zeros((1, 9)), np.zeros(1, int), np.ones(1, int), attributes=("",), tokens=("a1",))
+    >>> one.boxes.shape, NUSCENES_CLASSES[one.labels[0]]
+    ((1, 9), 'car')
+    """
 
     boxes: np.ndarray  # f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN velocity where unknown
     labels: np.ndarray  # i32[m]: index into NUSCENES_CLASSES
@@ -56,6 +61,17 @@ class NuScenes:
 
     Raises:
         ValueError: naming the file, the record, the field, what was found and what was expected.
+
+    >>> import tempfile
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
+    >>> from fcos_lidar_jax.simulation.render import DatasetSpec
+    >>> toy = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=False, version="v1.0-toy")
+    >>> with tempfile.TemporaryDirectory() as root:
+    ...     written = write_dataset(toy, Path(root), workers=1, report=lambda sweeps: None)
+    ...     keyframes = NuScenes(root, "v1.0-toy")
+    ...     keyframes.sweeps(keyframes.sample_tokens[0]).shape[1]
+    5
     """
 
     def __init__(
