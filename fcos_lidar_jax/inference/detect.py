@@ -1,5 +1,6 @@
 """Points to boxes as one pure function (paper, section 3.4)."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
