@@ -128,7 +128,12 @@ class ModelConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PillarConfig:
-    """CenterPoint on pillars (Yin et al., CVPR 2021), with the numbers that its authors publish for nuScenes."""
+    """CenterPoint on pillars (Yin et al., CVPR 2021), with the numbers that its authors publish for nuScenes.
+
+    >>> PillarConfig(range_m=50.0)
+    Traceback (most recent call last):
+    ValueError: pillar_m: got 0.2, expected a part of 100 m by a multiple of 8
+    """
 
     range_m: float = 51.2  # Half the side of the square around the sensor that is divided into pillars, metres.
     pillar_m: float = 0.2  # Side of a pillar, metres.

@@ -109,7 +109,12 @@ class Outputs:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pillars:
-    """A cloud divided into pillars, the input of CenterPoint."""
+    """A cloud divided into pillars, the input of CenterPoint.
+
+    >>> import jax.numpy as jnp
+    >>> Pillars(jnp.zeros((5, 10)), jnp.full(5, 64), jnp.int32(0)).features.shape  # nothing in 8 x 8 pillars
+    (5, 10)
+    """
 
     features: Float32[Array, "*b n 10"]
     """x, y, z, intensity, time lag, offset from the mean of the pillar's points 3, from the pillar's axis 2; zero
@@ -121,7 +126,12 @@ class Pillars:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CentreOutputs:
-    """Raw predictions of CenterPoint on the map from above: rows by y, columns by x."""
+    """Raw predictions of CenterPoint on the map from above: rows by y, columns by x.
+
+    >>> import jax.numpy as jnp
+    >>> CentreOutputs(jnp.zeros((8, 8, 3)), jnp.zeros((8, 8, 1, 10))).heat.shape
+    (8, 8, 3)
+    """
 
     heat: Float32[Array, "*b h w k"]  # Logit of a centre of the class.
     regression: Float32[Array, "*b h w g 10"]
