@@ -13,6 +13,7 @@ from experiments.paper_tables.cell_names import (
     FIELDS,
     IGNORED,
     SECTIONS,
+    SENSOR_FIELDS,
     cell_name,
     config_of_cell,
     describe_sensor,
@@ -79,7 +80,7 @@ def test_a_sensor_is_described_by_its_first_fields_and_by_what_was_added():
     class Grown(scales.Sensor):
         added: float = 0.0
 
-    first = dataclasses.asdict(scales.TINY)
+    first = {name: getattr(scales.TINY, name) for name in SENSOR_FIELDS}
     grown = Grown(**first)
     assert describe_sensor(grown) == first
     assert describe_sensor(dataclasses.replace(grown, added=1.0)) == {**first, "added": 1.0}

@@ -340,7 +340,7 @@ def squares(monkeypatch):
         counts = {"positives": count, "owned_boxes": count, "iou_sum": total}
         return {"positives": total}, (batch_stats, parts, counts)
 
-    monkeypatch.setattr("fcos_lidar_jax.training.step.make_sums", lambda *_: sums)
+    monkeypatch.setattr("fcos_lidar_jax.training.objective.make_sums", lambda *_: sums)
     batch = empty_batch(0)
     batch = jax.tree.map(lambda leaf: np.repeat(leaf, 8, axis=0), batch)
     batch.boxes[:, :, 0] = np.arange(8)[:, None]
