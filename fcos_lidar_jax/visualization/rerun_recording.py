@@ -20,7 +20,7 @@ def check_rerun() -> None:
         ValueError: it is not installed.
     """
     try:
-        import rerun  # noqa: F401
+        import rerun  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
         line = "rerun is not installed, which writes it: pip install 'fcos-lidar-jax[viz]'"
         raise ValueError(f"--rrd: {line}") from None
@@ -42,7 +42,7 @@ def rerun_recording(path: Path | None, classes: Sequence[str]) -> Iterator[Calla
     if path is None:
         yield lambda *_, **__: None
         return
-    import rerun as rr
+    import rerun as rr  # pyright: ignore[reportMissingImports]
 
     with atomic_path(path) as temporary:
         recording = rr.RecordingStream("fcos_lidar_jax")
@@ -67,7 +67,7 @@ def _record(
 ) -> None:
     """Points by height, boxes with class, score and identity, in the frame of the sensor, which has its pose."""
     import matplotlib as mpl
-    import rerun as rr
+    import rerun as rr  # pyright: ignore[reportMissingImports]
 
     recording.set_time("frame", sequence=number)
     if time_us is not None:
