@@ -1,0 +1,112 @@
+"""What do weighted NMS and mirrored views add to a trained detector, and what do they cost?
+
+    python -m experiments.studies.post_processing --out experiments/results/post_processing.json
+
+Both are switches of the detection alone (``inference.merge_iou``, ``inference.flips``). The shipped weights find
+boxes with each in the same unseen simulated frames, and in the real keyframes where the environment's
+``FCOS_LIDAR_REAL_DATA`` has them; the intervals are of the paired difference of the mAP over frames drawn anew.
+Cost: two seconds a frame on two CPU cores.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from experiments.changes import change
+from experiments.real_frames import real_frames
+from experiments.script import Options, find_real_data, run_measurement
+from experiments.statistics import paired_difference
+from fcos_lidar_jax import open_frames
+from fcos_lidar_jax.data.frame import ChosenFrames, Frame, FrameSet
+from fcos_lidar_jax.evaluation.frames import evaluate_frames
+from fcos_lidar_jax.evaluation.metrics import metric_of
+from fcos_lidar_jax.inference import TrainedDetector, load_trained
+from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.inference.detect import make_detect
+from fcos_lidar_jax.inference.timing import Call, interleaved
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.types import Detections
+
+PLAIN = "plain"
+VARIANTS: dict[str, dict[str, Any]] = {
+    PLAIN: {},
+    "weighted NMS": {"inference__merge_iou": 0.3},
+    "mirrored view": {"inference__flips": "x"},
+    "mirrored view, weighted NMS": {"inference__flips": "x", "inference__merge_iou": 0.3},
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Args(Options):
+    """Which weights, and on how much."""
+
+    weights: Path = Path("hdl32e")  # Trained with flips of x.
+    frames: int = 400  # Unseen simulated frames.
+    data: Path | None = None  # Folder with the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
+    repeats: int = 15  # Turns of the timing.
+
+
+def programs(trained: TrainedDetector) -> dict[str, Any]:
+    """Pure detection of one cloud, by variant."""
+    configs = {name: change(**fields)(trained.config) for name, fields in VARIANTS.items()}
+    return {name: make_detect(build_detector(config, trained.sensor)) for name, config in configs.items()}
+
+
+def find(trained: TrainedDetector, sets: Sequence[FrameSet]) -> tuple[dict[str, list[Detections]], list[Frame]]:
+    """What every variant finds, and the frames."""
+    # One program, in which the variants share what they have in common.
+    each = programs(trained)
+    together = jax.jit(lambda *given: {name: detect(*given) for name, detect in each.items()})
+    variables, found, read = jax.device_put(trained.variables), {name: [] for name in VARIANTS}, []
+    for frames in sets:
+        for index in range(len(frames)):
+            read.append(frames.frame(index))
+            cloud = make_cloud(read[-1].points, trained.config, sensor=trained.sensor, remove_close="none")
+            for name, detections in jax.device_get(together(variables, cloud.points, cloud.valid)).items():
+                found[name].append(detections)
+    return found, read
+
+
+def compare(found: dict[str, list[Detections]], frames: list[Frame], classes: Sequence[str]) -> dict[str, Any]:
+    """mAP of every variant, and its difference from that of the plain detector."""
+    metric = metric_of(classes)
+    evaluations = {name: evaluate_frames(boxes, frames, metric) for name, boxes in found.items()}
+    record: dict[str, Any] = {"frames": len(frames)}
+    for name, evaluation in evaluations.items():
+        record[name] = {"mAP": round(evaluation.summary["mean_ap"], 4)}
+        if name != PLAIN:
+            low, high = paired_difference(evaluations[PLAIN], evaluation)
+            difference = evaluation.summary["mean_ap"] - evaluations[PLAIN].summary["mean_ap"]
+            record[name] |= {"difference": round(difference, 4), "interval": [round(low, 4), round(high, 4)]}
+    return record
+
+
+def times(trained: TrainedDetector, repeats: int) -> dict[str, Any]:
+    """Milliseconds from points to boxes, in turns."""
+    frame = open_frames(format="simulated", split="val", sensor=trained.sensor).frame(0)
+    cloud = make_cloud(frame.points, trained.config, sensor=trained.sensor)
+    given = jax.device_put(trained.variables), cloud.points, cloud.valid
+    jitted = {name: jax.jit(detect) for name, detect in programs(trained).items()}
+    calls: dict[str, Call] = {
+        name: lambda detect=detect: jax.block_until_ready(detect(*given)) for name, detect in jitted.items()
+    }
+    return interleaved(calls, repeats)
+
+
+def measure(args: Args) -> dict[str, Any]:
+    """Scores and times."""
+    trained = load_trained(args.weights)
+    close: dict[str, Any] = {"remove_close": trained.config.projection.remove_close}
+    unseen = open_frames(format="simulated", split="val", sensor=trained.sensor, **close)
+    sets: dict[str, Sequence[FrameSet]] = {"unseen simulated": [ChosenFrames(unseen, tuple(range(args.frames)))]}
+    if find_real_data(args.data) is not None:
+        sets["real keyframes"] = list(real_frames(args.data, trained.config.projection).values())
+    record: dict[str, Any] = {"weights": str(args.weights), "times": times(trained, args.repeats)}
+    return record | {name: compare(*find(trained, frames), trained.classes) for name, frames in sets.items()}
+
+
+if __name__ == "__main__":
+    run_measurement(measure, Args, __doc__)
