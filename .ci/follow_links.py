@@ -38,6 +38,7 @@ for file, page in pages.items():
         followed += 1
         if not there.is_relative_to(site) or not there.is_file() or place not in pages.get(there, page).places:
             broken.append(f"{file.relative_to(site)}: {link}: leads nowhere")
-print("\n".join(sorted(set(broken))))
+for line in sorted(set(broken)):
+    print(line)
 print(f"{site.name}: {len(pages)} pages, {followed} links inside, {len(broken)} broken")
 sys.exit(bool(broken or not pages))
