@@ -17,6 +17,8 @@ NEEDED = (
     "simulation/clutter.toml",
     "visualization/page.html",
 )
+BESIDE = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in")  # the package, in the source archive
+MADE = ("PKG-INFO", "setup.cfg")  # by the build
 KINDS = {".py", ".typed", ".toml", ".html"}  # and whatever Orbax calls its arrays
 
 wheel, source = sys.argv[1:]
@@ -30,7 +32,11 @@ own = [p for p in inside if p.parts[0] == "fcos_lidar_jax" and (p.suffix in KIND
 if strangers := sorted(set(inside) - set(own)):
     sys.exit(f"{wheel}: holds {strangers[0]}, expected the package alone")
 with tarfile.open(source) as archive:
-    packed = archive.getnames()
-if not any(name.endswith("/pyproject.toml") for name in packed):
-    sys.exit(f"{source}: no pyproject.toml in it")
+    packed = [PurePosixPath(*PurePosixPath(m.name).parts[1:]) for m in archive.getmembers() if m.isfile()]
+for name in (*BESIDE, *(f"fcos_lidar_jax/{name}" for name in NEEDED)):
+    if PurePosixPath(name) not in packed:
+        sys.exit(f"{source}: no {name} in it")
+known = {*own, *map(PurePosixPath, (*BESIDE, *MADE))}
+if strangers := sorted(p for p in packed if p not in known and p.parts[0] != "fcos_lidar_jax.egg-info"):
+    sys.exit(f"{source}: holds {strangers[0]}, expected the package and {', '.join(BESIDE)}")
 print(f"{wheel}: {len(names)} files; {source}: {len(packed)} files")

@@ -4,7 +4,7 @@ import re
 import tomllib
 from pathlib import Path
 
-TOOLS = ("ruff", "pyright", "import-linter")
+TOOLS = ("ruff", "pyright", "import-linter", "check-jsonschema")
 
 project = tomllib.loads(Path(__file__).parent.with_name("pyproject.toml").read_text(encoding="utf-8"))["project"]
 for requirement in sorted({*project["dependencies"], *project["optional-dependencies"]["test"]}):

@@ -1,6 +1,7 @@
 """The documentation site: ``sphinx-build -W --keep-going docs docs/_build``."""
 
 import dataclasses
+import json
 import re
 import typing
 from importlib.metadata import version as installed
@@ -25,6 +26,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
 ]
+source_suffix = {".md": "markdown", ".ipynb": "markdown"}
 exclude_patterns = ["_build"]
 
 html_theme = "furo"
@@ -83,8 +85,16 @@ def _whole_comment(app, what, name, obj, options, lines):
 
 
 def _with_parts(app, docname, source):
-    """Parts of the repository's other documents in place of ``<!-- part: FILE: HEADING -->``."""
+    """Notebooks as Markdown; the repository's other documents in place of ``<!-- part: FILE: HEADING -->``."""
+    if app.env.doc2path(docname).endswith(".ipynb"):
+        source[0] = "\n\n".join(map(_cell, json.loads(source[0])["cells"]))
     source[0] = re.sub(r"<!-- part: (\S+): (.+) -->", lambda found: _part(found[1], found[2]), source[0])
+
+
+def _cell(cell: dict) -> str:
+    """A cell of a notebook; outputs are not stored."""
+    text = "".join(cell["source"])
+    return text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```"
 
 
 def _part(name: str, heading: str) -> str:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fcos_lidar_jax.presets import PRESETS
     from fcos_lidar_jax.sensors import load_sensor
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["PRESETS", "load_detector", "load_sensor", "open_frames"]
 
 _HOME = {

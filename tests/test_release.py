@@ -1,0 +1,86 @@
+"""What is no code of the package: version, scripts of the checks, workflows."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fcos_lidar_jax import __version__
+
+ROOT = Path(__file__).parents[1]
+SCRIPTS = ROOT / ".ci"
+
+
+def test_changelog_and_citation_have_the_version_and_its_date():
+    versions = re.findall(r"^## (\S+)(?: - (\S+))?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    version, date = next((version, date) for version, date in versions if version != "Unreleased")
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert version == __version__
+    assert f"\nversion: {version}\n" in citation
+    assert f"\ndate-released: {date}\n" in citation
+
+
+def test_workflows_only_call_the_scripts_and_all_of_them():
+    text = "".join(file.read_text() for file in (ROOT / ".github" / "workflows").glob("*.yml"))
+    commands = re.findall(r"\brun: *(.*)", text)
+    assert commands
+    assert all(re.fullmatch(r"bash \.ci/(\w+|\$\{\{ matrix\.check \}\})", command) for command in commands)
+    called = {name for names in re.findall(r"check: \[(.*)\]", text) for name in names.split(", ")}
+    called |= {command.rpartition("/")[2] for command in commands if "matrix" not in command}
+    assert called == {"run", "lowest", "newest", "wheel", "site", "notebook"}
+    assert all((SCRIPTS / name).is_file() for name in called)
+
+
+def real_data_of(repository: Path) -> str:
+    """What the search for real data prints in a repository."""
+    (repository / ".ci").mkdir(parents=True)
+    shutil.copy(SCRIPTS / "real_data", repository / ".ci")
+    command = ["bash", repository / ".ci" / "real_data"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.mark.parametrize("place", ["data", "shared/data"])
+def test_real_data_are_found_beside_the_repository(place, tmp_path):
+    data = tmp_path / "work" / place
+    (data / "nuscenes_scene0523").mkdir(parents=True)
+    assert real_data_of(tmp_path / "work" / "main") == str(data)
+
+
+@pytest.mark.parametrize("place", ["holdout", "shared/holdout", "far/shared/data"])
+def test_held_out_and_far_folders_are_no_real_data(place, tmp_path):
+    (tmp_path / "work" / place / "nuscenes_scene0523").mkdir(parents=True)
+    assert real_data_of(tmp_path / "work" / "main") == ""
+
+
+def followed(site: Path) -> subprocess.CompletedProcess:
+    command = [sys.executable, SCRIPTS / "follow_links.py", site]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_links_inside_the_site_are_followed(tmp_path):
+    (tmp_path / "api").mkdir()
+    (tmp_path / "index.html").write_text(
+        '<h1 id="one"></h1><a href="#one"></a><a href="api/core.html#iou%20of"></a><img src="a.png">'
+        '<a href="https://example.org/nothing"></a><a href="mailto:a@example.org"></a>'
+    )
+    (tmp_path / "api" / "core.html").write_text('<p id="iou of"></p><a href="../index.html?q=1#one"></a>')
+    (tmp_path / "a.png").touch()
+    run = followed(tmp_path)
+    assert (run.returncode, run.stdout) == (0, f"{tmp_path.name}: 2 pages, 4 links inside, 0 broken\n")
+
+
+@pytest.mark.parametrize("link", ["gone.html", "index.html#two", "#two", "../outside.html", "gone.png"])
+def test_a_link_that_leads_nowhere_is_named(link, tmp_path):
+    (tmp_path / "site").mkdir()
+    (tmp_path / "outside.html").touch()
+    (tmp_path / "site" / "index.html").write_text(f'<h1 id="one"></h1><a href="{link}"></a>')
+    run = followed(tmp_path / "site")
+    assert run.returncode == 1
+    assert run.stdout.startswith(f"index.html: {link}: leads nowhere\n")
+
+
+def test_a_site_without_pages_is_refused(tmp_path):
+    assert followed(tmp_path).returncode == 1
