@@ -19,7 +19,12 @@ from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, city_frames
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "experiments" / "README.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "experiments" / "README.md",
+    *sorted(DOCS.glob("*.md")),
+]
 RUN_ELSEWHERE = {  # pages that have a test of their own, which goes on from what they make
     "own_data.md": "cli/test_own_data.py",
     "export.md": "cli/test_export.py",
@@ -144,7 +149,11 @@ def test_links_and_files_that_a_page_names_exist(page):
             target = page.parent / file if file else page
             assert target.exists(), link
             assert not place or page.parent == DOCS or place in places(target), link
-    files = [file.as_posix() for folder in ("fcos_lidar_jax", "experiments", "tests") for file in (ROOT / folder).rglob("*.py")]
+    files = [
+        file.as_posix()
+        for folder in ("fcos_lidar_jax", "experiments", "tests")
+        for file in (ROOT / folder).rglob("*.py")
+    ]
     for name in re.findall(r"`((?:\w+/)*\w+\.py)`", text):
         assert "NAME" in name or any(file.endswith(f"/{name}") for file in files), name
     tests = "".join(Path(file).read_text() for file in files if "/tests/" in file)
@@ -153,7 +162,7 @@ def test_links_and_files_that_a_page_names_exist(page):
 
 
 def places(page: Path) -> set[str]:
-    """What links can name in a document, as GitHub does: its headings in small letters, with hyphens for spaces."""
+    """What links to a document can name, as on GitHub: its headings in small letters, with hyphens for spaces."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

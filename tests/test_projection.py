@@ -13,7 +13,6 @@ from fcos_lidar_jax.sensors import (
     KITTI_HDL64E,
     NUSCENES_HDL32E,
     PRESETS,
-    TINY,
     WAYMO_TOP,
     Sensor,
     even_inclinations,

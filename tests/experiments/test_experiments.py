@@ -372,7 +372,9 @@ def test_every_row_of_the_tables_has_its_paper_figures():
 
 
 def test_every_row_of_a_study_can_be_trained(tmp_path):
-    modules = (importlib.import_module(f"{studies.__name__}.{m.name}") for m in pkgutil.iter_modules(studies.__path__))
+    modules = (
+        importlib.import_module(f"{studies.__name__}.{m.name}") for m in pkgutil.iter_modules(studies.__path__)
+    )
     tables_of = [value for module in modules for value in vars(module).values() if isinstance(value, Table)]
     scale = smoke(tmp_path)
     assert tables_of
