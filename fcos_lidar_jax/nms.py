@@ -1,7 +1,7 @@
 """Rotated non-maximum suppression with static shapes (paper, section 3.4)."""
 
 import functools
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
 
+_FEW = 1024  # A trained detector has mostly no more valid boxes, of thousands of slots.
 _MAX_TURN_RAD = np.pi / 3  # Boxes that point elsewhere are no estimates of the same heading.
 
 
@@ -117,7 +118,25 @@ def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
     return intersection > threshold * union
 
 
-def _by_rows(
+def _ranking(scores: Array, valid: Array) -> Array:
+    """Valid boxes first, by falling score, equal ones by index."""
+    return jnp.lexsort((-scores, ~valid)).astype(jnp.int32)
+
+
+def _by_rows(boxes: Array, scores: Array, valid: Array, labels: Array, **options: Any) -> tuple[Array, Array]:
+    order = _ranking(scores, valid)
+
+    def of_best(number: int) -> tuple[Array, Array]:
+        best = order[:number]
+        kept, used = _greedy(boxes[best], scores[best], valid[best], labels[best], **options)
+        return jnp.where(used, best[kept], 0), used
+
+    if len(order) <= _FEW:
+        return of_best(len(order))
+    return lax.cond(valid.sum() <= _FEW, lambda: of_best(_FEW), lambda: of_best(len(order)))
+
+
+def _greedy(
     boxes: Array, scores: Array, valid: Array, labels: Array, *, threshold: float, max_outputs: int, vertical: bool
 ) -> tuple[Array, Array]:
     def unfinished(state: tuple[Array, Array, Array]) -> Array:
@@ -141,8 +160,7 @@ def _by_matrix(
     boxes: Array, scores: Array, valid: Array, labels: Array, *, threshold: float, max_outputs: int, vertical: bool
 ) -> tuple[Array, Array]:
     number = scores.shape[0]
-    # Valid boxes first, by falling score, equal ones by index.
-    order = jnp.lexsort((-scores, ~valid)).astype(jnp.int32)
+    order = _ranking(scores, valid)
     boxes, labels, valid = boxes[order], labels[order], valid[order]
     beats = _overlaps(boxes[:, None], boxes[None, :], threshold, vertical) & (labels[:, None] == labels)
     beats &= jnp.arange(number)[:, None] < jnp.arange(number)

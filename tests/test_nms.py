@@ -43,6 +43,18 @@ def test_keeps_what_shapely_keeps(form, overlap, max_outputs):
         assert len(expected) < valid.sum()
 
 
+@pytest.mark.parametrize("valid", [0, 700, 1024, 1025, 1500])
+def test_of_many_slots_only_the_valid_ones_count(valid):
+    """Rows of more than 1,024 slots are computed for as many where no more are valid."""
+    boxes, scores, _, labels = clusters(5, 1500)
+    used = np.random.default_rng(0).permutation(1500) < valid
+    assert used.sum() == valid
+    options = {"iou_threshold": 0.2, "max_outputs": 100}
+    found = keep(boxes, scores, used, labels, **options, form="rows")
+    assert found == keep(boxes, scores, used, labels, **options, form="matrix")
+    assert bool(found) == bool(valid)
+
+
 @FORMS
 def test_ties_go_to_the_lower_index_and_nan_scores_are_out(form):
     boxes = np.repeat(np.array([[0, 0, 0, 4, 2, 1, 0.0]], np.float32), 4, 0)

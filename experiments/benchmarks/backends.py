@@ -3,10 +3,10 @@
     python -m experiments.benchmarks.backends --data FOLDER --out experiments/results/backends.json
     taskset -c 0 python -m experiments.benchmarks.backends --frames 0  # times on one core
 
-Points to boxes, and the network alone, of ``compact`` on a simulated sweep and of the paper's preset on ten fused
-ones, with random weights and a background's prior of 0.5, so that NMS is at its busiest; both backends take turns.
-Then the mAP of the shipped weights ``hdl32e`` with both, on unseen simulated frames and on the real keyframes in
-FOLDER (see ``transfer``). Needs ``pip install 'fcos-lidar-jax[cpu]'``.
+Points to boxes, and the network alone: of ``compact`` on a simulated sweep, with the weights ``hdl32e`` and with
+random ones, and of the paper's preset on ten fused sweeps. Random weights have a background's prior of 0.5, so
+that NMS is at its busiest. Both backends take turns. Then the mAP of ``hdl32e`` with both, on unseen simulated
+frames and on the real keyframes in FOLDER (see ``transfer``). Needs ``pip install 'fcos-lidar-jax[cpu]'``.
 
 Cost: five minutes for the times on two CPU cores, and a second a frame for the mAP. Expected: at most half of
 XLA's time in bfloat16, else at most 0.95 of it, and an mAP within 0.005.
@@ -46,7 +46,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 class Args(Options):
     """What to time, how often, and on what to score."""
 
-    presets: tuple[str, ...] = ("compact", "nuscenes")  # To be timed.
+    presets: tuple[str, ...] = ("hdl32e", "compact", "nuscenes")  # To be timed; or shipped weights.
     repeats: int = 15  # Turns.
     weights: Path = Path("hdl32e")  # To be scored.
     frames: int = 200  # Unseen simulated frames; 0 scores nothing, on real keyframes neither.
@@ -55,10 +55,13 @@ class Args(Options):
 
 def times(preset: str, repeats: int) -> dict[str, Any]:
     """Milliseconds of both backends, turn by turn, and OpenVINO's share of XLA's."""
-    config = change(model__background_prior=0.5)(PRESETS[preset])
-    sensor = load_sensor(config.sensor)
-    model = build_detector(config, sensor)
-    trained = TrainedDetector(model, jax.jit(model.init)(jax.random.key(0)))
+    if preset in PRESETS:
+        config = change(model__background_prior=0.5)(PRESETS[preset])
+        model = build_detector(config, load_sensor(config.sensor))
+        trained = TrainedDetector(model, jax.jit(model.init)(jax.random.key(0)))
+    else:
+        trained = load_trained(preset)
+    config, sensor, model = trained.config, trained.sensor, trained.model
     points = make_frame(0, sensor).points if config.num_sweeps == 1 else fused_cloud(None, sensor)[0]
     cloud = make_cloud(points, config, sensor=sensor)
     precisions: tuple[Precision, ...] = ("float32",)

@@ -6,6 +6,7 @@ nor decoding nor NMS is in it. Images are [b, c, h, w] inside.
 
 import importlib
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,19 +24,30 @@ from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import CHANNELS
 
 _OPSET, _IR_VERSION = 17, 8  # Of 2022: any runtime of today reads them.
+_TELEMETRY = "openvino_telemetry"
 _END = np.iinfo(np.int64).max
 
 
 def cpu_package(name: str) -> Any:
-    """A package of the extra ``cpu``.
+    """A package of the extra ``cpu``; OpenVINO without its telemetry.
+
+    Telemetry would report every import to OpenVINO's makers, from a fork of this process, whose threads may then
+    hang. OpenVINO does without where it cannot be imported.
 
     Raises:
         ValueError: it is not installed.
     """
+    reporter = sys.modules.get(_TELEMETRY)
+    sys.modules[_TELEMETRY] = None  # type: ignore[assignment]
     try:
         return importlib.import_module(name)
     except ImportError:
         raise ValueError(f"{name} is not installed: pip install 'fcos-lidar-jax[cpu]'") from None
+    finally:
+        if reporter is None:
+            del sys.modules[_TELEMETRY]
+        else:
+            sys.modules[_TELEMETRY] = reporter
 
 
 def network_graph(detector: TrainedDetector) -> bytes:

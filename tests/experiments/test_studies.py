@@ -2,8 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 from commands import run_python
+
+from experiments.studies.track_switches import count_switches
 
 
 def run_study(name: str, tmp_path, *options: object) -> dict:
@@ -40,3 +43,13 @@ def test_hostile_clouds_do_no_harm(tmp_path):
     assert 0 < record["projected"]["in_image"] < record["projected"]["points"]
     assert record["projected"]["dropped"] > 0
     assert record["detected"]["boxes"] > 0
+
+
+def test_switches_of_tracks_are_counted():
+    """The first of two objects moves 3 m a frame, more than a track may be off; the second is once not seen."""
+    first, second = np.zeros((6, 9)), np.full((6, 9), 40.0)
+    first[:, 0], first[:, 7:9], second[:, 7:9] = 3.0 * np.arange(6), (6, 0), 0
+    both = [(np.stack([a, b]), np.zeros(2, int), np.arange(2)) for a, b in zip(first, second, strict=True)]
+    both[2] = tuple(column[:1] for column in both[2])
+    assert count_switches(both, 0.5, velocities=True) == (0, 9)
+    assert count_switches(both, 0.5, velocities=False) == (5, 9)

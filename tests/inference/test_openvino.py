@@ -3,11 +3,13 @@
 import dataclasses
 import re
 import sys
+import textwrap
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from commands import run_python
 from tiny_run import TINY_CONFIG, bits, untrained
 
 from fcos_lidar_jax.inference import TrainedDetector, load_detector
@@ -70,3 +72,22 @@ def test_a_missing_package_is_one_line(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ValueError, match=rf"^{package} is not installed: pip install 'fcos-lidar-jax\[cpu\]'$"):
         load_detector("quickstart", backend="openvino")
+
+
+def test_mirrored_views_are_refused(trained):
+    config = dataclasses.replace(TINY_CONFIG, inference=dataclasses.replace(TINY_CONFIG.inference, flips="y"))
+    mirrored = dataclasses.replace(trained, model=build_detector(config, TINY))
+    with pytest.raises(ValueError, match=r"^backend openvino: found inference.flips y, expected none$"):
+        with_openvino(mirrored)
+
+
+def test_openvino_reports_nothing_to_anyone():
+    """Its telemetry, a dependency, would fork the process and send."""
+    code = """
+        import os, sys
+        os.register_at_fork(before=lambda: sys.exit("forked"))
+        from fcos_lidar_jax.inference.onnx_graph import cpu_package
+        cpu_package("openvino").Core()
+        sys.exit("openvino_telemetry" in sys.modules)
+    """
+    assert run_python("-c", textwrap.dedent(code)).returncode == 0
