@@ -54,7 +54,7 @@ nitpick_ignore_regex = [
     # What is no part of the reference, and is read in its source.
     (
         r"py:.*",
-        r"fcos_lidar_jax\.(inference\.(export|stream)|evaluation\.metrics|input_pipeline\.database"
+        r"fcos_lidar_jax\.(inference\.(export|openvino|stream)|evaluation\.metrics|input_pipeline\.database"
         r"|data\.(sweeps|nuscenes\.index)|training\.sharding)\..*",
     ),
 ]

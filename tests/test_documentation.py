@@ -14,11 +14,17 @@ import pytest
 
 import fcos_lidar_jax
 from fcos_lidar_jax.cli.commands import parse
-from fcos_lidar_jax.sensors import SHORT_RANGE
-from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, city_frames
 
-DOCS = Path(__file__).parents[1] / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "experiments" / "README.md",
+    *sorted(DOCS.glob("*.md")),
+]
 RUN_ELSEWHERE = {  # pages that have a test of their own, which goes on from what they make
     "own_data.md": "cli/test_own_data.py",
     "export.md": "cli/test_export.py",
@@ -27,6 +33,10 @@ CORE = (
     *("sensors", "types", "config", "presets", "geometry", "projection", "locations"),
     *("coding", "iou", "assignment", "losses", "nms", "augment"),
 )
+
+
+def page_name(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -91,7 +101,7 @@ def make_drive(folder: Path) -> None:
     (folder / "poses.json").write_text(json.dumps(poses))
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=page_name)
 def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
     if page.name in RUN_ELSEWHERE:
         assert page.name in (Path(__file__).parent / RUN_ELSEWHERE[page.name]).read_text()
@@ -99,12 +109,14 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     if page.name == "stream.md":
         make_drive(tmp_path)
+    if page.name == "README.md":
+        np.save("sweep.npy", city_frames(NUSCENES_HDL32E, 1).frame(0).points)
     namespace: dict = {}
     for block in blocks(page, "python"):
         exec(compile(block, page.name, "exec"), namespace)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "bash")], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "bash")], ids=page_name)
 def test_the_commands_of_a_page_exist(page):
     for line in "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines():
         for words in re.findall(r"\bfcos-lidar (.*?)(?:&&|$)", line):
@@ -126,3 +138,35 @@ def test_blocks_of_code_are_run_or_marked():
         assert set(openings) <= known, page.name
         directives = re.findall(r"^```\{code-block\} python\n(.*)$", page.read_text(), re.MULTILINE)
         assert all(":class: fragment" in line for line in directives), page.name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_links_and_files_that_a_page_names_exist(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        file, _, place = link.partition("#")
+        if not re.match(r"\w+:", link):
+            target = page.parent / file if file else page
+            assert target.exists(), link
+            assert not place or page.parent == DOCS or place in places(target), link
+    files = [
+        file.as_posix()
+        for folder in ("fcos_lidar_jax", "experiments", "tests")
+        for file in (ROOT / folder).rglob("*.py")
+    ]
+    for name in re.findall(r"`((?:\w+/)*\w+\.py)`", text):
+        assert "NAME" in name or any(file.endswith(f"/{name}") for file in files), name
+    tests = "".join(Path(file).read_text() for file in files if "/tests/" in file)
+    for name in re.findall(r"`(test_\w+)`", text):
+        assert f"def {name}(" in tests, name
+
+
+def places(page: Path) -> set[str]:
+    """What links to a document can name, as on GitHub: its headings in small letters, with hyphens for spaces."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_the_check_runs_the_readme_s_test_command():
+    (tests,) = [line for line in "\n".join(blocks(ROOT / "README.md", "bash")).splitlines() if "pytest" in line]
+    assert tests.split(" && ")[-1] in (ROOT / ".ci" / "run").read_text().splitlines()

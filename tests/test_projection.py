@@ -13,7 +13,6 @@ from fcos_lidar_jax.sensors import (
     KITTI_HDL64E,
     NUSCENES_HDL32E,
     PRESETS,
-    TINY,
     WAYMO_TOP,
     Sensor,
     even_inclinations,
@@ -69,7 +68,7 @@ def reference_cells(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.
 
 @pytest.mark.parametrize(
     "sensor",
-    [SMALL, LASER, TINY, NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, AHEAD, BEHIND],
+    [SMALL, LASER, AHEAD, BEHIND, *PRESETS.values()],
     ids=lambda s: s.name,
 )
 def test_cells_follow_the_definitions(sensor):

@@ -7,8 +7,8 @@ Format 1, the only one: the name is the BLAKE2b hash of 8 bytes, in hexadecimal,
 with sorted keys. The configuration holds :data:`FIELDS`, all fields of the first cells, read from today's
 configuration; :data:`CONSTANTS` in place of first fields that are gone or never mattered; the number of classes
 as ``model.num_classes``; of :data:`ADDED` those that differ from what was done before there was such a field; and
-:data:`SECTIONS` that are given. A new field of ``Config`` belongs into :data:`ADDED`, or into :data:`IGNORED` if
-it cannot change a result.
+:data:`SECTIONS` that are given. A new field of ``Config`` belongs into ``LATER_FIELDS`` of
+checkpoints, which is enough, or also into :data:`IGNORED` if it cannot change a result.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.training.checkpoint import LATER_FIELDS
 
 _SECTIONS = {
     "": "sensor num_sweeps max_points max_boxes fade_epochs copy_paste class_balanced augment",
@@ -41,15 +42,11 @@ FIELDS = frozenset(f"{part}.{name}".strip(".") for part, names in _SECTIONS.item
 """Fields that name a cell; ``copy_paste`` and ``augment`` themselves where they are null."""
 CONSTANTS = {"name": "", "model.stem.form": "split", "inference.nms_form": "rows"}
 """First fields that never changed a result."""
-ADDED: dict[str, Any] = {
-    "classes": NUSCENES_CLASSES,
-    "class_ranges_m": (),
-    "inference.merge_iou": None,
-    "inference.flips": "none",
-}
-"""Later fields, and their values in older cells."""
-SECTIONS = ("pillars",)  # Later sections, of which all fields name a cell where they are given.
 IGNORED = frozenset({*CONSTANTS, "model.remat"})  # Fields that cannot change a result.
+_LATER = {field: value for field, value in flatten_dict(LATER_FIELDS, sep=".").items() if field not in IGNORED}
+ADDED: dict[str, Any] = {"classes": NUSCENES_CLASSES, "class_ranges_m": (), **_LATER}
+"""Later fields, and their values in older cells; those that checkpoints know as later ones, too."""
+SECTIONS = ("pillars",)  # Later sections, of which all fields name a cell where they are given.
 _SENSOR = "name inclinations_rad num_columns origin_m limit_xy_m limit_z_m intensity_scale row_source"
 SENSOR_FIELDS = tuple(_SENSOR.split())  # Of a scale's description.
 

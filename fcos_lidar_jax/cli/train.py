@@ -38,7 +38,7 @@ _ABOUT = {
     "centerpoint_compact": "CenterPoint on one sweep, of about the cost of compact",
 }
 _PRESETS: Any = (
-    tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT.get(name, ""))
+    tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT[name])
     for name, preset in PRESETS.items()
 )
 _Preset: Any = reduce(or_, (Annotated[Config, preset] for preset in _PRESETS))

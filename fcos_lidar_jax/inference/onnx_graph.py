@@ -58,10 +58,13 @@ def network_graph(detector: TrainedDetector) -> bytes:
     float32, whatever ``config.model.precision`` is. The metadata hold classes, configuration and sensor as JSON.
 
     Raises:
-        ValueError: onnx is not installed, or the network has parameters that the graph does not know.
+        ValueError: the detector is CenterPoint, onnx is not installed, or the network has parameters that the
+            graph does not know.
     """
-    onnx = cpu_package("onnx")
     config, model = detector.config, detector.config.model
+    if config.pillars is not None:
+        raise ValueError(f"ONNX: got the detector {config.name!r} on pillars, expected one on range images")
+    onnx = cpu_package("onnx")
     layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
     network = _Network(onnx, detector.variables, circular=model.circular_width)
     image = _preprocessing(network, "features", model, layout)

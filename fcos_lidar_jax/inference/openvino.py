@@ -84,10 +84,11 @@ def with_openvino(detector: TrainedDetector, *, precision: Precision | None = No
         raise ValueError(
             f"backend openvino: found inference.flips {detector.config.inference.flips}, expected none"
         )
+    graph = network_graph(detector)
     precision = precision or processor_precision()
     openvino = cpu_package("openvino")
     core = openvino.Core()
-    model = core.read_model(network_graph(detector))
+    model = core.read_model(graph)
     (features,) = model.inputs
     model.reshape([1, *(size.get_length() for size in features.partial_shape[1:])])
     options = {"INFERENCE_PRECISION_HINT": _HINT[precision], "PERFORMANCE_HINT": "LATENCY"}

@@ -17,8 +17,8 @@ def draw_metrics(folder: Path) -> None:
     from fcos_lidar_jax.visualization.curves import draw_curves
 
     lines = read_metrics(folder)
-    parts = ("total", "classification", "l1", "iou", "iou_prediction")
-    losses = {p: [(line["step"], line[f"loss/{p}"]) for line in lines if f"loss/{p}" in line] for p in parts}
+    parts = dict.fromkeys(name for line in lines for name in line if name.startswith("loss/"))
+    losses = {p.removeprefix("loss/"): [(line["step"], line[p]) for line in lines if p in line] for p in parts}
     draw_curves(folder / "loss.png", losses, x_label="step", y_label="loss", title="training", log_y=True)
     scores = {"mAP": [(line["step"], line["test/mAP"]) for line in lines if "test/mAP" in line]}
     if scores["mAP"]:

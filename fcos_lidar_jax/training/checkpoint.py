@@ -28,7 +28,7 @@ from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
 _OLD_FORMAT = 2
-_LATER_FIELDS = {"model": {"remat": False}, "inference": {"merge_iou": None, "flips": "none"}}
+LATER_FIELDS = {"model": {"remat": False}, "inference": {"merge_iou": None, "flips": "none"}}
 """Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
 _DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
 _CARD = "README.md"
@@ -295,7 +295,7 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     {'remat': False}
     """
     later = dict[str, Any]()
-    for section, fields in _LATER_FIELDS.items():
+    for section, fields in LATER_FIELDS.items():
         if isinstance(found := config.get(section, {}), dict):
             later[section] = {**fields, **found}
     return {**config, **later}

@@ -5,7 +5,7 @@ import json
 import jax
 import numpy as np
 import pytest
-from commands import command
+from commands import assert_one_line_error, command
 from test_formats import SENSOR, sensor_options
 from tiny_peer import NETWORK_OPTIONS
 from tiny_run import bits
@@ -68,3 +68,12 @@ def test_benchmark_times_the_same_stages(home, tmp_path):
     command("benchmark --repeats 1 --batch 2 --checkpoint", home / "run", "--out", tmp_path / "times.json")
     stages = json.loads((tmp_path / "times.json").read_text())["stages"]
     assert list(stages) == ["clean", "projection", "network", "postprocess"]
+
+
+def test_what_runs_range_images_alone_refuses_it_in_one_line(home, tmp_path, capsys):
+    run, cloud, out = (str(path) for path in (home / "run", home / "cloud.npy", tmp_path / "out"))
+    export = ["export", "--checkpoint", run, "--network-only", "--format", "onnx", "--out", out]
+    detect = ["detect", cloud, "--checkpoint", run, "--backend", "openvino", "--out", out]
+    for args in (export, detect):
+        assert_one_line_error(capsys, args, "ONNX: got the detector 'centerpoint_compact' on pillars")
+    assert not (tmp_path / "out").exists()

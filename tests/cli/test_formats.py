@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import json
 from pathlib import Path
+from typing import get_args
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ from tiny_run import NETWORK_OPTIONS, SENSOR
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES
+from fcos_lidar_jax.input_pipeline.open import Format
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.trainer import predict
@@ -62,7 +64,14 @@ def simulated(root: Path) -> Made:
     return "--format simulated", f"quickstart --no-copy-paste {options}", root / "cloud.npy", NUSCENES_CLASSES
 
 
-@pytest.mark.parametrize("make", [nuscenes, argoverse2, kitti, simulated])
+MAKERS = (nuscenes, argoverse2, kitti, simulated)
+
+
+def test_every_format_is_tried():
+    assert {make.__name__ for make in MAKERS} | {"folder"} == set(get_args(Format))
+
+
+@pytest.mark.parametrize("make", MAKERS)
 def test_prepares_trains_evaluates_and_detects(make, tmp_path, capsys):
     data, preset, cloud, classes = make(tmp_path / "data")
     run, scores, boxes = tmp_path / "run", tmp_path / "scores", tmp_path / "boxes.json"

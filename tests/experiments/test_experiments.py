@@ -1,4 +1,4 @@
-"""The runner beneath the tables: cells, intervals, changes; and the example of the README of experiments/."""
+"""The runner beneath the tables: cells, intervals, changes; and the example of docs/variant.md."""
 
 import contextlib
 import dataclasses
@@ -6,6 +6,7 @@ import doctest
 import importlib
 import json
 import math
+import pkgutil
 import re
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import tiny_run
 
+from experiments import studies
 from experiments.changes import change
 from experiments.paper import PAPER
 from experiments.paper_tables import grid, scales, table1_mrv_rounds, table2_priority, table6_untied_heads, tables
@@ -22,7 +24,7 @@ from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cell_names import cell_name
 from experiments.paper_tables.grid import run_cell, run_cells
 from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, simulated, smoke
-from experiments.paper_tables.tables import Args, Row, run_table
+from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
 from experiments.statistics import interval
 from experiments.studies import more_rounds
@@ -369,6 +371,20 @@ def test_every_row_of_the_tables_has_its_paper_figures():
         assert NUSCENES in configs  # the paper's detector is a row of every table
 
 
+def test_every_row_of_a_study_can_be_trained(tmp_path):
+    modules = (
+        importlib.import_module(f"{studies.__name__}.{m.name}") for m in pkgutil.iter_modules(studies.__path__)
+    )
+    tables_of = [value for module in modules for value in vars(module).values() if isinstance(value, Table)]
+    scale = smoke(tmp_path)
+    assert tables_of
+    for table in tables_of:
+        configs = [row.change(scale.base) for row in table.rows]
+        assert len(set(configs)) == len(configs), table.name
+        for config in configs:
+            scale.check(config)
+
+
 def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(train_table):
     base, fade, c128, both = (row.change(NUSCENES) for row in table8.TABLE.rows)
     assert base == NUSCENES
@@ -404,13 +420,14 @@ def tiny_smoke(cache):
     return dataclasses.replace(smoke(cache), base=base, sensor=tiny_run.SENSOR, **sizes)
 
 
-def test_the_variant_of_the_readme_runs(tmp_path, monkeypatch, capsys):
-    text = (EXPERIMENTS / "README.md").read_text()
-    (code,) = re.findall(r"## Your own variant\n\n```python\n(.*?)```", text, re.DOTALL)
-    assert len([line for line in code.splitlines() if line]) <= 12
+def test_the_table_of_a_variant_of_the_documents_runs(tmp_path, monkeypatch, capsys):
+    text = (EXPERIMENTS.parent / "docs" / "variant.md").read_text()
+    change_of_config, table = re.findall(r"```(?:python|\{code-block\} python)\n(.*?)```", text, re.DOTALL)[:2]
+    code = change_of_config + table.replace(":class: fragment\n", "")
+    assert len([line for line in code.splitlines() if line]) <= 16
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tables, "smoke", tiny_smoke)
-    exec(compile(code, "README.md", "exec"), {})
+    exec(compile(code, "variant.md", "exec"), {})
     record = json.loads((tmp_path / "outputs" / "tables" / "smoke" / "mine.json").read_text())
     assert [row["label"] for row in record["rows"]] == ["base", "mine"]
     assert all(0 <= row["mAP"]["mean"] <= 100 for row in record["rows"])

@@ -1,8 +1,11 @@
 """The fuzzing in its short form, and that it notices what it looks for."""
 
 import json
+from typing import get_args
 
 from commands import run_python
+
+from fcos_lidar_jax.input_pipeline.open import Format
 
 
 def test_every_reader_refuses_in_one_line_or_returns_sound_data(tmp_path):
@@ -16,6 +19,8 @@ def test_every_reader_refuses_in_one_line_or_returns_sound_data(tmp_path):
     # What is damaged in the logs is left out; a run that differs in anything is another run.
     assert record["targets"].keys() - refused == {"metrics.jsonl", "resume log"}
     assert record["targets"].keys() - accepted <= {"run.json"}
+    fuzzed = {name.lower().replace(" ", "") for name in record["targets"]}
+    assert set(get_args(Format)) - fuzzed == {"simulated"}
 
 
 MISTREATED = """

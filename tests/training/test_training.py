@@ -16,6 +16,7 @@ from fcos_lidar_jax.evaluation.matching import match_frame
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout, locate, location_cells
+from fcos_lidar_jax.losses import loss_terms
 from fcos_lidar_jax.models import Detector, build_detector
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
@@ -336,7 +337,7 @@ def squares(monkeypatch):
         jax.debug.callback(lambda rows: seen.append(rows.tolist()), batch.boxes[:, 0, 0], ordered=True)
         count = batch.box_valid.sum(dtype=jnp.int32)
         total = jnp.where(batch.box_valid, jnp.square(params["w"] - batch.boxes[..., 0]), 0.0).sum()
-        parts = {name: total for name in ("classification", "l1", "iou", "iou_prediction")}
+        parts = {name: total for name in loss_terms(CONFIG.loss)}
         counts = {"positives": count, "owned_boxes": count, "iou_sum": total}
         return {"positives": total}, (batch_stats, parts, counts)
 
