@@ -5,7 +5,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -60,6 +60,9 @@ class Stream:
     """Also write a page that shows the drive: one file for any browser, which asks for nothing else."""
     rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
     """Also write a recording for the viewer rerun, with `pip install 'fcos-lidar-jax[viz]'`."""
+    yaw_deg: float = 0.0
+    """Turn the clouds by this angle about z for the detector, and the boxes back: 90 where x points ahead, as in
+    most recordings of ROS, and the detector is of nuScenes' sensor, whose y axis does (`hdl32e`)."""
     track: bool = False  # Give every box the identity of its object over time; needs poses.
     min_score: float = 0.0  # Leave out boxes below this score.
     backend: Backend = "xla"  # What the network runs in, as for `fcos-lidar detect`.
@@ -79,16 +82,17 @@ def run(args: Stream) -> None:
     if not drive.posed:
         print("no poses: every sweep is detected on its own, without those before it", file=sys.stderr)
     _tell(drive.notes)
-    print("compiling the detector", file=sys.stderr, flush=True)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
     with (
         rerun_recording(args.rrd, detector.classes) as record_rerun,
-        args.out.open("wb", buffering=0) as lines,  # a line is one write, so that interruptions leave whole ones
+        _write_lines(args.out) as write_line,
         _Timing() as timing,
     ):
-        sweeps = timing.read(drive.sweeps)
-        for found in timing.detect(detect_stream(sweeps, detector, num_sweeps=None if drive.posed else 1)):
+        sweeps, how = timing.read(_announcing(drive.sweeps)), {"yaw_rad": np.deg2rad(args.yaw_deg)}
+        if not drive.posed:
+            how["num_sweeps"] = 1
+        for found in timing.detect(detect_stream(sweeps, detector, **how)):
             points = found.cloud.points[found.cloud.valid]
             if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
                 print(f"warning: {line}", file=sys.stderr)
@@ -99,7 +103,7 @@ def run(args: Stream) -> None:
                 dt = 0.0 if before_us is None else (found.sweep.time_us - before_us) / 1e6
                 tracks, ids = track(tracks, to_world(boxes, found.sweep.sensor_to_world), labels, scores, dt)
                 record["boxes"] = [b | {"track": int(i)} for b, i in zip(record["boxes"], ids, strict=True)]
-            lines.write(json.dumps(record).encode() + b"\n")
+            write_line(record)
             look = {"name": Path(found.sweep.name).name, "ids": ids}
             if drive.posed:
                 look |= {"time_us": found.sweep.time_us, "pose": found.sweep.sensor_to_world}
@@ -111,7 +115,31 @@ def run(args: Stream) -> None:
     _tell(drive.notes)
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:
-        write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source))
+        shown: dict[str, Any] = {"min_score": args.min_score} if args.min_score else {}
+        write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source), **shown)
+
+
+@contextlib.contextmanager
+def _write_lines(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A function that writes a record as a line. What stood in the file is lost with the first, not before."""
+    with contextlib.ExitStack() as stack:
+        lines: list[Any] = []
+
+        def write(record: dict[str, Any]) -> None:
+            if not lines:
+                # Without a buffer: a line is one write, so that interruptions leave whole ones.
+                lines.append(stack.enter_context(path.open("wb", buffering=0)))
+            lines[0].write(json.dumps(record).encode() + b"\n")
+
+        yield write
+
+
+def _announcing(sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
+    """The sweeps; the first one, once it could be read, has the detector compiled."""
+    for number, sweep in enumerate(sweeps):
+        if not number:
+            print("compiling the detector", file=sys.stderr, flush=True)
+        yield sweep
 
 
 def _tell(notes: list[str]) -> None:
@@ -170,6 +198,10 @@ def _check(args: Stream) -> None:
     check_at_least(args, 1, "max_file_points")
     if not 0 <= args.min_score <= 1:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
+    if not np.isfinite(args.yaw_deg):
+        raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
+    if args.source is not None and not args.source.exists():
+        raise ValueError(f"{args.source}: no such file or folder")
     if (args.source is None) == (args.data_root is None):
         raise ValueError("stream: expected a folder of point files or --data-root, or a recording, one of them")
     if (args.data_root is None) != (args.scene is None):

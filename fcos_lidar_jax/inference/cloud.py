@@ -181,7 +181,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     """A line that says why a cloud is hardly of this sensor, or None.
 
     Judged by the current sweep: the share of points beyond the sensor's limits and outside its vertical field of
-    view, points a cell of the image, and how many points have a neighbour in the next column and in the next row.
+    view, points a cell of the image, how many points have a neighbour in the next column and in the next row, and
+    the scale of the intensity.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame
@@ -224,10 +225,12 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     filled = cells[:-1].reshape(sensor.num_rows, sensor.num_columns) > 0
     density = cells[:-1].sum() / filled.sum()
     if density > _MAX_DENSITY:
-        return f"{density:.1f} of the points share a cell, expected about one"
+        return f"{density:.1f} of the points share a cell, expected about one, with the origin in the sensor"
     beside = (filled & np.roll(filled, 1, axis=1)).sum() / filled.sum()
     below = (filled[1:] & filled[:-1]).sum() / filled.sum()
     for share, what in ((beside, "column"), (below, "row")):
         if share < _MIN_NEIGHBOURS:
             return f"{share:.0%} of the points have a neighbour in the next {what}, expected most"
+    if points[:, 3].max() <= 1:
+        return "no intensity is above 1, expected 0 to 255"
     return None

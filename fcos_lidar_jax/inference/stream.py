@@ -4,9 +4,12 @@ import dataclasses
 from collections import deque
 from collections.abc import Iterable, Iterator
 
+import numpy as np
+
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.inference.cloud import Cloud, expect_points, make_cloud
 from fcos_lidar_jax.inference.detector import CloudDetector
+from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.types import Detections
 
 
@@ -15,12 +18,12 @@ class Found:
     """What was found in one sweep and those before it."""
 
     sweep: Sweep  # The current one, as it was given.
-    cloud: Cloud  # What the network was given: the window's sweeps in the frame of the current one.
-    detections: Detections  # NumPy arrays, in that frame.
+    cloud: Cloud  # What the network was given: the window's sweeps in the frame of the current one, turned.
+    detections: Detections  # NumPy arrays, in the frame of the sweep.
 
 
 def detect_stream(
-    sweeps: Iterable[Sweep], detector: CloudDetector, *, num_sweeps: int | None = None
+    sweeps: Iterable[Sweep], detector: CloudDetector, *, num_sweeps: int | None = None, yaw_rad: float = 0.0
 ) -> Iterator[Found]:
     """Boxes in every sweep as it comes, with the sweeps before it fused into its frame.
 
@@ -31,6 +34,9 @@ def detect_stream(
         detector: compiled once, for the first sweep.
         num_sweeps: of the window, the current one included; default: as the detector was trained. 1 where poses
             are not known.
+        yaw_rad: by which sweeps are turned about z for the detector, and boxes back: pi / 2 for a sensor whose x
+            axis points ahead and a detector of one whose y axis does. A detector finds less in clouds that are
+            turned as its training's never were.
 
     Raises:
         ValueError: naming the sweep: its time is not after that of the one before, or no point of it is usable.
@@ -46,18 +52,29 @@ def detect_stream(
     window: deque[Sweep] = deque(maxlen=detector.config.num_sweeps if num_sweeps is None else num_sweeps)
     projection, sensor = detector.config.projection, detector.sensor
     before: Sweep | None = None
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
     for sweep in sweeps:
         if before is not None and sweep.time_us <= before.time_us:
             raise ValueError(
                 f"{sweep.name}: time: got {sweep.time_us} us, expected more than the {before.time_us} us of the "
                 f"sweep before, {before.name}"
             )
-        window.appendleft(sweep)
+        window.appendleft(_turned(sweep, turn) if yaw_rad else sweep)
         points, num_close = fuse_sweeps(
             window, sensor, remove_close=projection.remove_close, close_m=projection.close_m
         )
         cloud = make_cloud(points, detector.config, sensor=sensor, num_close=num_close, remove_close="none")
         found = detector.detect(cloud)
         expect_points(sweep.name, cloud, int(found.num_dropped), sensor)
+        if yaw_rad:
+            found = dataclasses.replace(found, boxes=to_world(np.asarray(found.boxes), turn.T).astype(np.float32))
         yield Found(sweep, cloud, found)
         before = sweep
+
+
+def _turned(sweep: Sweep, turn: np.ndarray) -> Sweep:
+    """The same sweep in a turned frame."""
+    points = np.array(sweep.points)
+    points[:, :3] = points[:, :3] @ turn[:3, :3].T
+    return dataclasses.replace(sweep, points=points, sensor_to_world=sweep.sensor_to_world @ turn.T)

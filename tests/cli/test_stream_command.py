@@ -163,6 +163,8 @@ MISTAKES = {
     "poses of a scene": ("--data-root HOME --scene a --poses HOME/poses.txt", "--poses: expected with a folder"),
     "no data set": ("--data-root HOME --scene a", "expected"),
     "score": ("HOME/drive --min-score 2", "--min-score: got 2, expected"),
+    "angle": ("HOME/drive --yaw-deg nan", "--yaw-deg: got nan, expected an angle"),
+    "no folder": ("HOME/nowhere", "nowhere: no such file or folder"),
     "page into poses": (
         "HOME/drive --poses HOME/poses.txt --page HOME/poses.txt",
         "--page: .*the same file as .*poses.txt",
@@ -174,4 +176,8 @@ MISTAKES = {
 def test_mistakes_are_one_line(home, tmp_path, capsys, case):
     text, message = MISTAKES[case]
     args = ["stream", *text.replace("HOME", str(home)).split(), "--checkpoint", str(home / "checkpoint")]
-    assert_one_line_error(capsys, [*args, "--out", str(tmp_path / "boxes.jsonl")], message)
+    out = tmp_path / "boxes.jsonl"
+    out.write_text("an earlier result")
+    assert_one_line_error(capsys, [*args, "--out", str(out)], message)
+    # Lost with the first line of the new one.
+    assert (out.read_text() == "an earlier result") == (case != "time going back")

@@ -54,6 +54,34 @@ def test_a_window_of_one_sweep_forgets_the_others(detector):
         assert bits(each.detections) == bits(alone.detections)
 
 
+def test_sweeps_of_other_axes_are_turned_and_boxes_back(detector):
+    """The same drive with x ahead and y to the left instead of y ahead and x to the right."""
+    turn = np.diag([0.0, 0, 1, 1])
+    turn[0, 1], turn[1, 0] = 1, -1
+    other = [
+        dataclasses.replace(s, points=turned(s.points, turn), sensor_to_world=s.sensor_to_world @ turn.T)
+        for s in drive(3)
+    ]
+    here, there = list(detect_stream(drive(3), detector)), list(detect_stream(other, detector, yaw_rad=np.pi / 2))
+    for one, two, given in zip(here, there, other, strict=True):
+        assert two.sweep is given
+        found = one.detections
+        np.testing.assert_array_equal(two.detections.valid, found.valid)
+        np.testing.assert_allclose(two.detections.scores, found.scores, atol=1e-4)
+        centres, velocities = np.asarray(found.boxes)[:, :3], np.asarray(found.boxes)[:, 7:9]
+        np.testing.assert_allclose(two.detections.boxes[:, :3], centres @ turn[:3, :3].T, atol=1e-3)
+        np.testing.assert_allclose(two.detections.boxes[:, 7:9], velocities @ turn[:2, :2].T, atol=1e-3)
+        late = np.asarray(two.detections.boxes[:, 6] - found.boxes[:, 6])[np.asarray(found.valid)]
+        np.testing.assert_allclose(np.exp(1j * late), np.exp(-0.5j * np.pi), atol=1e-3)
+        assert found.valid.any()
+
+
+def turned(points, turn):
+    points = points.copy()
+    points[:, :3] = points[:, :3] @ turn[:3, :3].T
+    return points
+
+
 def test_boxes_come_before_the_next_sweep_is_asked_for(detector):
     def only_one():
         yield next(drive(1))
