@@ -38,6 +38,8 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 myst_heading_anchors = 3
 
+# The source of what a module takes from elsewhere, built-in types too, is that of the module.
+viewcode_follow_imported_members = False
 add_module_names = False
 napoleon_use_ivar = True
 autodoc_member_order = "bysource"
@@ -86,7 +88,7 @@ def _whole_comment(app, what, name, obj, options, lines):
 
 def _with_parts(app, docname, source):
     """Notebooks as Markdown; the repository's other documents in place of ``<!-- part: FILE: HEADING -->``."""
-    if app.env.doc2path(docname).endswith(".ipynb"):
+    if Path(app.env.doc2path(docname)).suffix == ".ipynb":
         source[0] = "\n\n".join(map(_cell, json.loads(source[0])["cells"]))
     source[0] = re.sub(r"<!-- part: (\S+): (.+) -->", lambda found: _part(found[1], found[2]), source[0])
 
