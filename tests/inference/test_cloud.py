@@ -179,12 +179,14 @@ def test_a_sensor_knows_the_clouds_of_others(clouds, own, theirs):
 def test_what_a_mismatch_says(clouds):
     hdl32e = clouds["nuscenes_hdl32e"]
     millimetres = hdl32e * np.array([1000, 1000, 1000, 1, 1], np.float32)
+    shares = hdl32e * np.array([1, 1, 1, 1 / 255, 1], np.float32)
     for points, sensor, finding in (
         (hdl32e, "short_range", r"\d\.\d of the points share a cell"),
         (clouds["kitti_hdl64e"], "nuscenes_hdl32e", r"\d\.\d of the points share a cell"),
         (hdl32e, "kitti_hdl64e", "0% of the points have a neighbour in the next row|next column"),
         (hdl32e, "waymo_top", "outside its vertical field of view"),
         (millimetres, "nuscenes_hdl32e", "beyond its limits, .* < 54 m"),
+        (shares, "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255"),
     ):
         assert re.search(finding, sensor_mismatch(points, PRESETS[sensor]) or "")
 
