@@ -528,7 +528,7 @@ def make_targets() -> list[Target]:
         ),
         Target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor, alone=True),
         Target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses, alone=True),
-        Target("recordings of ROS", _files(_recordings), _read_recording),
+        Target("recordings of ROS", _files(_recordings), _read_recording, share=0.25),  # 25 ms each
         Target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map, alone=True),
         Target("results", {"a.json": _json({"meta": LIDAR_META, "results": found})}, _read_results, alone=True),
         Target("ground truth", {"a.json": _json(truth)}, _read_truth, alone=True),
