@@ -28,8 +28,9 @@ def close_to_sensor(
     >>> close_to_sensor(jnp.zeros((1, 5)), Sensor("two", (0.1, 0.0), 8)).tolist()
     [True]
     """
-    x, y = points[:, 0] - sensor.origin_m[0], points[:, 1] - sensor.origin_m[1]
-    return (abs(x) < close_m) & (abs(y) < close_m)
+    with np.errstate(invalid="ignore"):  # of a signalling NaN
+        x, y = points[:, 0] - sensor.origin_m[0], points[:, 1] - sensor.origin_m[1]
+        return (abs(x) < close_m) & (abs(y) < close_m)
 
 
 def remove_close(

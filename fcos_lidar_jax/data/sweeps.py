@@ -79,7 +79,9 @@ def fuse_sweeps(
             now_us, world_to_current = sweep.time_us, np.linalg.inv(sweep.sensor_to_world)
         else:
             motion = world_to_current @ sweep.sensor_to_world
-            points[:, :3] = points[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
+            # Rows beyond what a number can hold become infinite, and are removed with those that are.
+            with np.errstate(over="ignore", invalid="ignore"):
+                points[:, :3] = points[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
         points[:, 4] = (now_us - sweep.time_us) / 1e6
         parts.append(points)
     return np.concatenate(parts), num_close

@@ -182,9 +182,13 @@ def read_manifest(folder: Path) -> Manifest:
                 f"{file}: got {header.format!r} version {header.version}, expected {_FORMAT!r} version "
                 f"{_VERSION}; build it anew: fcos-lidar prepare"
             )
-        return msgspec.json.decode(data, type=Manifest)
+        manifest = msgspec.json.decode(data, type=Manifest)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DatabaseError(f"{file}: {error}") from None
+    for shard in manifest.shards:
+        if "/" in shard.name or "\0" in shard.name:  # which would lead elsewhere
+            raise DatabaseError(f"{file}: shards: name: got {shard.name!r}, expected one that a file can have")
+    return manifest
 
 
 def prepare_database(

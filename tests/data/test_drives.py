@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.data.drives import folder_drive, read_tum
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.data.sweeps import fuse_sweeps
+from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 
 CLOUD = np.array([[5, 0, 0, 1, 0]], np.float32)
@@ -68,3 +68,16 @@ def test_a_scene_is_all_its_sweeps_or_its_keyframes(tmp_path):
         np.testing.assert_array_equal(fused, data.sweeps(token, 3))
     with refused("scene: got 'scene-7', expected"):
         data.drive("scene-7")
+
+
+def test_rows_beyond_all_numbers_become_infinite_without_a_warning():
+    """They are then removed and counted as other rows that are not finite."""
+    turned = np.eye(4)
+    turned[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
+    points = np.full((2, 5), 3e38, np.float32)
+    points[1] = np.array([0x7F800001], np.uint32).view(np.float32)  # a signalling NaN
+    sweeps = [Sweep(points, np.eye(4), 50_000), Sweep(points, turned, 0)]
+    fused, _ = fuse_sweeps(sweeps, TINY, remove_close="all", close_m=1.0)
+    assert fused.shape == (4, 5)
+    assert np.isinf(fused[2, 1])
+    assert np.isnan(fused[[1, 3], :3]).all()

@@ -263,7 +263,7 @@ def _read_nuscenes(folder: Path, name: str) -> None:
     tokens = data.split("all")
     check_points(data.sweeps(tokens[0], 2, remove_close="none"), NUSCENES_HDL32E)
     boxes = data.boxes(tokens[0])
-    check_boxes(boxes.boxes, "frame")
+    check_boxes(boxes.boxes, str(folder / name))
     truth = split_truth(data, tokens)
     check_columns(truth.boxes)
 

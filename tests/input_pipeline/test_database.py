@@ -272,6 +272,9 @@ def edit(file, **changes):
     file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
 
 
+SHARD = {"name": "a", "objects": 0, "points": 0, "table_blake2b": ""}
+
+
 def recount(file, field):
     shards = json.loads(file.read_text())["shards"]
     shards[0][field] += 1
@@ -286,6 +289,12 @@ def recount(file, field):
         ("manifest.json", lambda f: edit(f, version=1), "got .* version 1, expected .* version 2; build it anew"),
         ("manifest.json", lambda f: edit(f, format="x"), "got 'x' version 2"),
         ("manifest.json", lambda f: edit(f, shards=3), "Expected `array`, got `int`"),
+        (
+            "manifest.json",
+            lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]),
+            "shards: name: got '/etc/x', expected",
+        ),
+        ("manifest.json", lambda f: edit(f, shards=[SHARD | {"name": "a\0"}]), "shards: name: got .*, expected"),
         ("manifest.json", lambda f: edit(f, shards=[{}]), r".* missing .* field `name` - at `\$.shards\[0\]`"),
         ("manifest.json", lambda f: edit(f, classes=["car"]), r"classes: got \['car'\], expected at least \d"),
         ("manifest.json", lambda f: recount(f, "objects"), r"scene-b: got \d+ objects of \d+ points"),
