@@ -59,7 +59,7 @@ CONFIGS = {
 }
 EVENER_CITY = dataclasses.replace(CITY, name="city, classes more even", city_classes=0.25)
 """A tenth of the mean is each class's, however rare; at a city's frequencies most are hardly ever trained."""
-_MORE_OBJECTS = 80  # Of 60: what a step costs does not depend on how many there are to learn from.
+_MORE_OBJECTS = 120  # Of 60: what a step costs hardly depends on how many there are to learn from.
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
 _TESTS_ALONG = 40  # Unseen frames of the evaluations during training.
