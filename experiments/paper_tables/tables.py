@@ -98,6 +98,17 @@ class Table:
         needed = {self.reference, *labels, *(r.reference for r in self.rows if r.label in labels)}
         return dataclasses.replace(self, rows=tuple(row for row in self.rows if row.label in needed))
 
+    def reference_of(self, row: Row) -> Row:
+        """The row that a row's differences are taken from."""
+        return next(r for r in self.rows if r.label == (row.reference or self.reference))
+
+    def paper_difference(self, row: Row) -> dict[str, float]:
+        """Score -> what the row gains over its reference in the paper, where the paper tells."""
+        if row.gain is not None:
+            return {"mAP": PAPER["text"][row.gain]["value"]}
+        theirs, base = (self.paper_rows.get(r.paper, {}) for r in (row, self.reference_of(row)))
+        return {s: round(theirs[s] - base[s], 2) for s in SCORES if s in theirs and s in base}
+
     @property
     def paper_rows(self) -> dict[Any, Any]:
         """The paper's rows, none where the table is not the paper's."""
@@ -186,15 +197,9 @@ def _cells(
 
 def _row_record(table: Table, row: Row, cells: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Scores of a row, their difference to the reference, seed by seed, and the paper's."""
-    reference = next(r for r in table.rows if r.label == (row.reference or table.reference))
-    theirs, base_of_theirs = (table.paper_rows.get(r.paper, {}) for r in (row, reference))
-    differences = {
-        s: round(theirs[s] - base_of_theirs[s], 2) for s in SCORES if s in theirs and s in base_of_theirs
-    }
-    if row.gain is not None:
-        differences = {"mAP": PAPER["text"][row.gain]["value"]}
-    record: dict[str, Any] = {"label": row.label, "reference": reference.label, "paper": theirs}
-    record["paper_difference"] = differences
+    reference = table.reference_of(row)
+    record: dict[str, Any] = {"label": row.label, "reference": reference.label}
+    record |= {"paper": table.paper_rows.get(row.paper, {}), "paper_difference": table.paper_difference(row)}
     if row.label in cells:
         own, base = cells[row.label], [cell.get("scores") for cell in cells[reference.label]]
         record["cells"] = [cell["name"] for cell in own]

@@ -1,0 +1,243 @@
+"""The ledger of the paper's claims: what it reports, what was measured here, and whether the two agree.
+
+    python -m experiments.ledger          # print it
+    python -m experiments.ledger --write  # put it into experiments/README.md as well
+
+Nothing is trained or timed: the figures are those of the files in ``experiments/results``, so the ledger is as
+new as they are. A claim about accuracy is a row of a table of the paper; it agrees or disagrees where the 95 %
+interval over the seeds tells its sign, and also disagrees where the interval excludes the paper's figure. All else
+is undecided.
+"""
+
+import dataclasses
+import json
+import math
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.paper import PAPER
+from experiments.paper_tables.__main__ import TABLES
+from experiments.paper_tables.cell_names import cell_name
+from experiments.paper_tables.scales import Simulated, calm, quarter, simulated
+from experiments.paper_tables.tables import Row, Table
+from experiments.script import run_script
+from experiments.statistics import interval
+from fcos_lidar_jax.files import atomic_write, read_json
+
+RESULTS = Path(__file__).parent / "results"
+README = Path(__file__).parent / "README.md"
+_SEEDS = range(3)
+_MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- end of the ledger -->\n")
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Where the figures are, and whether the document is written."""
+
+    results: Path = RESULTS  # Folder of the figures.
+    write: bool = False  # Put the ledger into experiments/README.md.
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A claim that needs no training."""
+
+    claim: str  # In words.
+    file: str  # Of the results, without .json.
+    value: Callable[[Any], float]  # Our figure, from what the file holds.
+    paper: float  # The paper's figure.
+    above: bool = False  # The paper gives a lower bound.
+    decides: str = ""  # What stands in the way, where they do not agree.
+
+
+def _kept(rounds: int, column: str) -> Callable[[Any], float]:
+    return lambda d: d["kept"]["ten sweeps, with close points"]["prioritized"][column][str(rounds)]
+
+
+def _stem(variant: str) -> Callable[[Any], float]:
+    return lambda d: d["variants"][variant]["ratio"]
+
+
+def _overall(d: Any, setting: str) -> float:
+    stages = ("MRV", "Backbone (stem and backbone)", "Heads (pyramid and heads)")
+    return sum(d["times"][setting][stage]["median_ms"] for stage in stages)
+
+
+def _paper_ratio(table: str, row: str, reference: str) -> float:
+    rows = PAPER["tables"][table]["rows"]
+    return rows[row]["time_ms"] / rows[reference]["time_ms"]
+
+
+_ON_A_GPU = "the same measurement on a GPU"
+FIGURES = (
+    Figure("Points that one round keeps, thousands", "mrv_figures", lambda d: _kept(1, "kept")(d) / 1000, 28),
+    Figure("Points that five rounds keep, %", "mrv_figures", _kept(5, "percent"), 50, above=True),
+    Figure(
+        "Time of the projection, ten sweeps: seven rounds relative to one",
+        "mrv_figures",
+        lambda d: d["times"]["multi"]["7"]["ratio"],
+        _paper_ratio("table1", "multi, 7", "multi, 1"),
+        decides=_ON_A_GPU,
+    ),
+    *(
+        Figure(
+            f"Time of the stem: {row}, relative to nine groups of two convolutions",
+            "module_latency",
+            _stem(variant),
+            _paper_ratio(table, key, reference),
+            decides=_ON_A_GPU,
+        )
+        for row, variant, table, key, reference in (
+            ("one group", "one group", "table3", "1 group", "9 groups"),
+            ("five groups", "5 modalities", "table3", "5 groups", "9 groups"),
+            ("rounds not grouped", "9 types, rounds apart", "table3", "9 groups, rounds not grouped", "9 groups"),
+            ("one convolution", "1 convolution", "table4", "1", "2"),
+            ("three convolutions", "3 convolutions", "table4", "3", "2"),
+        )
+    ),
+    Figure(
+        "Time of projection, backbone and heads: ten sweeps relative to one",
+        "latency",
+        lambda d: _overall(d, "multi") / _overall(d, "single"),
+        1.0,
+    ),
+)
+
+
+def verdict_of_figure(figure: Figure, ours: float) -> str:
+    """Agrees within a tenth, or above a lower bound; else in the direction alone, or not.
+
+    >>> figure = Figure("", "", float, 1.2)
+    >>> [verdict_of_figure(figure, ours) for ours in (1.25, 2.0, 0.9)]
+    ['agrees', 'agrees in direction alone', 'disagrees']
+    """
+    if figure.above:
+        return "agrees" if ours > figure.paper else "disagrees"
+    if abs(ours / figure.paper - 1) <= 0.1:
+        return "agrees"
+    return "agrees in direction alone" if (ours - 1) * (figure.paper - 1) > 0 else "disagrees"
+
+
+def verdict(gains: list[float], paper: float) -> tuple[str, str]:
+    """Whether gains, one a seed, agree with the paper's, and what would decide or turn it.
+
+    The number of seeds that would tell the paper's gain from none is for the scatter seen so far.
+
+    >>> verdict([2.0, 2.1, 2.2], 1.9)
+    ('agrees', '')
+    >>> verdict([-2.0, -2.1, -2.2], 1.9)
+    ('disagrees', "a training as long as the paper's")
+    >>> verdict([-1.0, 0.5, 2.0], 1.0)
+    ('undecided', '12 seeds, or a longer training')
+    """
+    bounds = interval(gains)
+    if bounds is None:
+        return "undecided", "more seeds"
+    _, low, high = bounds
+    if low <= 0 <= high and low <= paper <= high:
+        return "undecided", f"{_seeds_needed(gains, abs(paper))} seeds, or a longer training"
+    if (low > 0 and paper > 0) or (high < 0 and paper < 0):
+        return "agrees", ""
+    return "disagrees", "a training as long as the paper's"
+
+
+def _seeds_needed(gains: list[float], gain: float) -> int:
+    """Seeds after which the half-width of the interval falls below a gain, by the deviation of these."""
+    import numpy as np
+    from scipy.stats import t
+
+    deviation = float(np.std(gains, ddof=1))
+    number = len(gains)
+    while t.ppf(0.975, number - 1) * deviation / math.sqrt(number) >= gain and number < 10_000:
+        number += 1
+    return number
+
+
+def gains_of(table: Table, row: Row, scale: Simulated, cells: Path) -> tuple[list[float], int]:
+    """Points of mAP that a row gains over its reference, a seed whose cells are there; samples of a training."""
+    config, reference = (r.change(scale.base) for r in (row, table.reference_of(row)))
+    described, gains = scale.describe(), list[float]()
+    for seed in _SEEDS:
+        scores = [_score(cells / f"{cell_name(c, described, seed)}.json") for c in (config, reference)]
+        if None not in scores:
+            gains.append(100 * (scores[0] - scores[1]))  # type: ignore[operator]
+    return gains, scale.train_frames * config.optimizer.epochs
+
+
+def _score(file: Path) -> float | None:
+    scores = json.loads(file.read_text(encoding="utf-8")).get("scores") if file.is_file() else None
+    return scores and scores["mAP"]
+
+
+def figure_lines(results: Path) -> Iterator[str]:
+    """The claims that need no training, a line of Markdown each."""
+    for figure in FIGURES:
+        ours = figure.value(read_json(results / f"{figure.file}.json", dict[str, Any]))
+        said = verdict_of_figure(figure, ours)
+        paper = f"more than {figure.paper:g}" if figure.above else f"{figure.paper:.3g}"
+        source = f"[{figure.file}](results/{figure.file}.json)"
+        decides = "" if said == "agrees" else figure.decides
+        yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} | {decides} |"
+
+
+def training_lines(results: Path) -> Iterator[str]:
+    """The rows of the paper's tables with a gain in mAP, a line of Markdown for each scale that was run."""
+    scales = [make(Path("unused")) for make in (simulated, calm, quarter)]
+    for table in TABLES:
+        for row in table.rows:
+            label, paper = table.reference_of(row).label, table.paper_difference(row).get("mAP")
+            if row.label == label or paper is None:
+                continue
+            claim, run = f"{table.title}: {row.label} instead of {label}", False
+            for scale in scales:
+                gains, samples = gains_of(table, row, scale, results / "tables" / scale.name / "cells")
+                if gains:
+                    run = True
+                    said, decides = verdict(gains, paper)
+                    mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
+                    ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
+                    what = f"{scale.name}, {len(gains)} seeds, {samples:,} samples"
+                    yield f"| {claim} | {paper:+.2f} | {ours} | {what} | {said} | {decides} |"
+            if not run:
+                yield f"| {claim} | {paper:+.2f} | | | not run | |"
+
+
+def as_markdown(results: Path) -> str:
+    """The whole ledger."""
+    head = "| claim | paper | here | from | verdict | what would decide or turn it |\n|---|---|---|---|---|---|\n"
+    one, other = ("\n".join(lines(results)) for lines in (figure_lines, training_lines))
+    return f"Without training:\n\n{head}{one}\n\nGains in points of mAP:\n\n{head}{other}\n"
+
+
+def with_ledger(document: str, ledger: str) -> str:
+    """A document with the ledger between its two marks.
+
+    Raises:
+        ValueError: the marks are not there.
+
+    >>> print(with_ledger(_MARKS[0] + "old" + _MARKS[1], "new"), end="")
+    <!-- the ledger: python -m experiments.ledger --write -->
+    <BLANKLINE>
+    new
+    <!-- end of the ledger -->
+    """
+    first, last = map(re.escape, _MARKS)
+    if not re.search(f"{first}.*{last}", document, re.DOTALL):
+        raise ValueError(f"{README}: got no marks of the ledger, expected {_MARKS[0].strip()!r}")
+    inside = f"{_MARKS[0]}\n{ledger}\n{_MARKS[1]}"
+    return re.sub(f"{first}.*{last}", lambda _: inside, document, flags=re.DOTALL)
+
+
+def main(args: Args) -> None:
+    """Print the ledger, and write it."""
+    ledger = as_markdown(args.results)
+    print(ledger, end="", flush=True)
+    if args.write:
+        text = with_ledger(README.read_text(encoding="utf-8"), ledger)
+        atomic_write(README, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+if __name__ == "__main__":
+    run_script(main, Args, __doc__)
