@@ -221,7 +221,6 @@ def _report(args: Evaluate, compared: _Compared, evaluation: Evaluation, sensor:
         num_samples=len(compared.truth.tokens),
         examples=examples(*place, chosen.rows, min_score=chosen.min_score),
         sensor=sensor,
-        global_axes=compared.frames is None,
         links=[("Look at the worst and the best frames", PAGE)] if frames else [],
     )
 

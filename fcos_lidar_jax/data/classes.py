@@ -75,7 +75,8 @@ class MappedFrames(FramesOf):
         if (self._table < 0).all():
             raise ValueError(
                 f"classes: the data have {', '.join(self.frames.classes) or 'none'}, the detector "
-                f"{', '.join(self.wanted)}, expected a name in both: a class map translates names"
+                f"{', '.join(self.wanted)}, expected a name in both: choose classes of the data, or "
+                "translate their names by a class map"
             )
 
     @property

@@ -16,28 +16,34 @@ from fcos_lidar_jax.sensors import Sensor
 class Frame:
     """Points and boxes of one keyframe in its LiDAR frame, unpadded.
 
+    Attributes:
+        points: f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number
+            as a sixth column for sensors whose rows come from it.
+        boxes: f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
+        labels: i32[m]: index into the ``classes`` of the frame set.
+        num_points: i32[m]: LiDAR points of the current sweep inside each box, as annotated.
+        num_close: points on the ego vehicle that the reader has removed, of all sweeps.
+
     >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
     >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
     [4.0, 2.0, 2.0]
     """
 
     points: np.ndarray
-    """f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a
-    sixth column for sensors whose rows come from it."""
     boxes: np.ndarray
-    """f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown."""
     labels: np.ndarray
-    """i32[m]: index into the ``classes`` of the frame set."""
     num_points: np.ndarray
-    """i32[m]: LiDAR points of the current sweep inside each box, as annotated."""
     num_close: int = 0
-    """Points on the ego vehicle that the reader has removed, of all sweeps."""
 
 
 class FrameSet(Protocol):
     """Frames in a fixed order: what every reader offers to the training pipeline and the commands.
 
     Readers inherit from it, so that what their data do not have (poses, times, scenes) has its default.
+
+    Attributes:
+        classes: what labels count, in their order.
+        sensor: whose points they are.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -46,8 +52,8 @@ class FrameSet(Protocol):
     (3, 5, 'car')
     """
 
-    classes: tuple[str, ...]  # what labels count, in their order
-    sensor: Sensor  # whose points they are
+    classes: tuple[str, ...]
+    sensor: Sensor
 
     def __len__(self) -> int: ...
 
@@ -60,7 +66,7 @@ class FrameSet(Protocol):
         return self.frame(index).labels
 
     def name(self, index: int) -> str:
-        """What messages call a frame."""
+        """What messages and files of results call a frame, in any letters; no two frames have the same name."""
         ...
 
     def fingerprint(self) -> str:

@@ -37,8 +37,9 @@ def read_points(
 ) -> np.ndarray:
     """The points of a file.
 
-    ``.pcd.bin``: float32 x 5, the fifth the ring (nuScenes). ``.bin``: float32 x 4 (KITTI). Other raw layouts by
-    ``columns`` and ``dtype``; a fifth column is then the time lag, but in a ``.pcd.bin`` it stays the ring.
+    ``.pcd.bin``: float32 x 5, the fifth the ring (nuScenes). ``.bin``: float32 x 4 (KITTI). Other raw layouts, in
+    files of any name, by ``columns`` and ``dtype``; a fifth column is then the time lag, but in a ``.pcd.bin`` it
+    stays the ring.
     ``.npy`` and ``.npz`` (one array, or one named ``points``): N x 3 to 6. ``.pcd``: by its header. ``.feather``
     (Argoverse 2): columns x, y, z, intensity, laser_number.
 
@@ -67,7 +68,7 @@ def read_points(
     [[20.0, 3.0, -1.5, 51.0, 0.0], [8.0, -2.0, -1.7000000476837158, 102.0, 0.0]]
     """
     path = Path(path)
-    kind = _kind(path)
+    kind = _kind(path, raw=columns is not None or dtype is not None)
     if columns is not None and columns not in _RAW_COLUMNS:
         raise ValueError(f"{path}: columns: got {columns}, expected 3, 4, 5 or 6")
     if dtype is not None and dtype not in _RAW_DTYPES:
@@ -188,7 +189,8 @@ def _read_whole(path: Path, max_points: int) -> bytes:
     return content
 
 
-def _kind(path: Path) -> str:
+def _kind(path: Path, *, raw: bool) -> str:
+    """What a file's name says it is; with ``raw`` any other name is that of a raw file."""
     if os.path.isdir(path):
         raise ValueError(f"{path}: found a folder, expected a point file")
     if not os.path.isfile(path):
@@ -196,7 +198,10 @@ def _kind(path: Path) -> str:
     for ending in ENDINGS:
         if path.name.lower().endswith(ending):
             return ending
-    raise ValueError(f"{path}: unknown extension {path.suffix!r}, expected {', '.join(ENDINGS)}")
+    if raw:
+        return ".bin"
+    expected = f"expected {', '.join(ENDINGS)}, or the columns and dtype of a raw file"
+    raise ValueError(f"{path}: unknown extension {path.suffix!r}, {expected}")
 
 
 def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, assert_never
 
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
 from fcos_lidar_jax.data.classes import ClassMap, MappedFrames, mapped_classes, unknown_name
@@ -126,8 +126,10 @@ def _split_names(layout: Layout, splits: str | Path | None) -> list[str]:
         return sorted(file.stem for file in (layout.root / "ImageSets").glob("*.txt"))
     if layout.format == "argoverse2":
         return find_splits(layout.root)
-    file = layout.root / SPLITS if splits is None else Path(splits)
-    return list(read_splits(file)) if splits is not None or file.exists() else []
+    if layout.format == "folder":
+        file = layout.root / SPLITS if splits is None else Path(splits)
+        return list(read_splits(file)) if splits is not None or file.exists() else []
+    assert_never(layout.format)
 
 
 def open_frames(
@@ -198,9 +200,11 @@ def open_frames(
         frames = KittiFrames(layout.root, split, sensor=sensor or KITTI_HDL64E, **close)
     elif layout.format == "argoverse2":
         frames = Argoverse2Frames(layout.root, split, sensor=sensor or ARGOVERSE2, num_sweeps=num_sweeps, **close)
-    else:
+    elif layout.format == "folder":
         close["follow_links"] = follow_links
         frames = FolderFrames(layout.root, sensor, split=split, splits=splits, num_sweeps=num_sweeps, **close)
+    else:
+        assert_never(layout.format)
     if class_map is None:
         return frames
     return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)

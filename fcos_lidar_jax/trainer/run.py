@@ -23,6 +23,7 @@ from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.classes import MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.files import atomic_write, folder_lock, read_json
+from fcos_lidar_jax.inference.cloud import sensor_mismatch
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
@@ -176,6 +177,8 @@ def train(
         step = jit_step(make_train_step(run.detector, optimizer), mesh)
         metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
         if is_main_process:
+            if line := sensor_mismatch(frames.frame(0).points, frames.sensor):
+                print(f"warning: {frames.name(0)}: {line}", file=sys.stderr, flush=True)
             print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
 
         def report(number: int, record: Record) -> None:

@@ -24,9 +24,8 @@ def draw_bev(
     detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     truth: tuple[np.ndarray, np.ndarray] | None = None,
     title: str | None = None,
-    global_axes: bool = False,
 ) -> None:
-    """Draw a cloud from above, x right and y forward, higher points darker.
+    """Draw a cloud from above, x to the right and y up, higher points darker, a cross at the origin.
 
     Detections have solid outlines in their class's colour, and the score beside them where there is room, the
     best first. Truth has thin dashed black outlines, filled in its class's colour. A line from the centre through
@@ -38,10 +37,9 @@ def draw_bev(
         classes: names that the labels index.
         detections: boxes f32[d, 9], labels i32[d], scores f32[d].
         truth: boxes f32[m, 9], labels i32[m].
-        global_axes: x and y are the directions of the global frame and not the ego vehicle's.
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
-    options = {"limit_m": limit_m, "detections": detections, "truth": truth, "global_axes": global_axes}
+    options = {"limit_m": limit_m, "detections": detections, "truth": truth}
     present = bev_on(figure.add_subplot(), points, **options)
     class_legend(figure, sorted(present), classes, detections=detections is not None, truth=truth is not None)
     if title:
@@ -56,12 +54,11 @@ def bev_on(
     limit_m: float,
     detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     truth: tuple[np.ndarray, np.ndarray] | None = None,
-    global_axes: bool = False,
     scores: bool = True,
 ) -> set[int]:
     """As :func:`draw_bev`, on an axis of a figure, with or without scores; returns the labels that show."""
     _draw_points(axis, points, limit_m)
-    axis.plot(0, 0, marker="+" if global_axes else "^", color="black", markersize=8, zorder=2)
+    axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
     present: set[int] = set()
     for box, label in zip(*(truth or ()), strict=True):
         if _in_view(box, limit_m):
@@ -74,9 +71,8 @@ def bev_on(
         present.add(int(label))
     if scores:
         _write_scores(axis, shown, limit_m)
-    right, forward = ("global", "global") if global_axes else ("right", "forward")
     axis.set(xlim=(-limit_m, limit_m), ylim=(-limit_m, limit_m), aspect="equal")
-    axis.set(xlabel=f"x [m], {right}", ylabel=f"y [m], {forward}")
+    axis.set(xlabel="x [m]", ylabel="y [m]")  # which of them is ahead, the data decide
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
     return present

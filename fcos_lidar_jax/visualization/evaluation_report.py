@@ -46,7 +46,6 @@ def write_evaluation_report(
     num_samples: int,
     examples: Iterable[Example],
     sensor: Sensor,
-    global_axes: bool = False,
     pictures: Sequence[Picture] = (),
     links: Sequence[tuple[str, str]] = (),
 ) -> None:
@@ -58,7 +57,6 @@ def write_evaluation_report(
     Args:
         out: folder that holds these files.
         sensor: of their range images.
-        global_axes: x and y of the examples are the directions of the global frame.
         pictures: more of them, which stand first.
         links: text and name of files beside the report.
     """
@@ -66,7 +64,7 @@ def write_evaluation_report(
     file, folder = out / "bootstrap.json", out / "pictures"
     intervals = json.loads(file.read_text()) if file.is_file() else None
     precisions, errors = _draw_class_curves(folder, summary, curves)
-    views, images = _draw_examples(folder, examples, summary["cfg"]["class_range"], sensor, global_axes)
+    views, images = _draw_examples(folder, examples, summary["cfg"]["class_range"], sensor)
     defined = [error for error in ERROR_NAMES if error in summary["tp_errors"]]
     distances = [str(distance) for distance in summary["cfg"]["dist_ths"]]
     rows = [
@@ -187,7 +185,7 @@ def _save(figure: Any, path: str | Path, y_label: str, **legend: Any) -> None:
 
 
 def _draw_examples(
-    folder: Path, examples: Iterable[Example], ranges_m: Mapping[str, float], sensor: Sensor, global_axes: bool
+    folder: Path, examples: Iterable[Example], ranges_m: Mapping[str, float], sensor: Sensor
 ) -> tuple[list[Picture], list[Picture]]:
     """Samples from above, and their range images where there are points."""
     views, images = list[Picture](), list[Picture]()
@@ -201,7 +199,6 @@ def _draw_examples(
             classes=list(ranges_m),
             detections=example.detections,
             truth=example.truth,
-            global_axes=global_axes,
         )
         caption = f"The {kind} sample by hits and misses at 2 m ({example.name}): detections, truth dashed."
         views.append((caption, view))

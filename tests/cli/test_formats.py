@@ -20,10 +20,13 @@ from tiny_run import NETWORK_OPTIONS, SENSOR
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES
+from fcos_lidar_jax.data.frame import GivenFrames
 from fcos_lidar_jax.input_pipeline.open import Format
+from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, sensor_to_json
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.trainer import predict
+from fcos_lidar_jax.trainer import predict, train
 
 STEPS = 20
 Made = tuple[str, str, Path, tuple[str, ...]]
@@ -131,6 +134,21 @@ def test_a_cloud_of_another_sensor_is_told_in_one_line(tmp_path, capsys):
     command("detect", tmp_path / "cloud.npy", "--checkpoint quickstart --out", tmp_path / "boxes.json")
     [line] = [line for line in capsys.readouterr().err.splitlines() if "hardly of" in line]
     assert line.startswith("warning: ")
+    command("project", tmp_path / "cloud.npy", "--sensor short_range --out", tmp_path / "image.npz")
+    assert f"warning: {tmp_path / 'cloud.npy'}: points hardly of" in capsys.readouterr().err
+    command("project", tmp_path / "cloud.npy", "--out", tmp_path / "image.npz")
+    assert capsys.readouterr().err == ""
+
+
+def test_training_on_another_sensors_clouds_is_told_before_the_step_is_compiled(tmp_path, capsys, monkeypatch):
+    frames = SimulatedFrames(fcos.load_sensor("nuscenes_hdl32e"), 2)
+    wrong = GivenFrames((frames.frame(0), frames.frame(1)), fcos.load_sensor("short_range"), frames.classes)
+    monkeypatch.setattr("fcos_lidar_jax.trainer.run.jit_step", lambda step, mesh: None)
+    with pytest.raises(TypeError):  # there is no step
+        train(dataclasses.replace(QUICKSTART, copy_paste=None), wrong, tmp_path / "run", steps=1)
+    told, compiling = capsys.readouterr().err.splitlines()[:2]
+    assert told.startswith("warning: frame 0: points hardly of sensor 'short_range'")
+    assert compiling.startswith("compiling")
 
 
 def test_batches_change_boxes_by_rounding_alone(tmp_path):

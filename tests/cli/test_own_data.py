@@ -24,6 +24,18 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     filled, cells, dropped = (int(word) for word in re.findall(r"\d+", printed[1]))
     assert cells / 3 < filled
     assert dropped < filled / 50
+    assert printed[2] == "the points are this sensor's"
+    options = printed[3].split()
+    most = max(len(namespace["frames"].frame(i).points) for i in range(40))
+    assert options[:3] == ["--max-points", str(most + most // 8), "--model.channel-mean"]
+    mean, scale = np.array(options[3:12], float), np.array(options[13:], float)
+    assert len(scale) == 9
+    assert (scale > 0).all()
+    points = np.concatenate([namespace["frames"].frame(i).points for i in range(40)])
+    points = points[(np.abs(points[:, :2]) < namespace["frames"].sensor.limit_xy_m).all(axis=1)]
+    # Nearly every point has a cell of its own.
+    np.testing.assert_allclose(mean[:3], points[:, :3].mean(axis=0), atol=0.15)
+    np.testing.assert_allclose(scale[:3], points[:, :3].std(axis=0), rtol=0.05)
 
     commands = [shlex.split(line) for line in re.findall(r"^fcos-lidar .*", PAGE, re.MULTILINE)]
     assert [command[1] for command in commands] == ["prepare", "train", "evaluate", "detect"]

@@ -188,6 +188,17 @@ def test_four_and_five_columns_are_told_apart(tmp_path, points, intensity_scale,
         read_points(four, NUSCENES_HDL32E)
 
 
+def test_columns_or_dtype_make_a_file_of_any_name_raw(tmp_path, points):
+    rows = points[:, :4].astype(np.float64)
+    as_bin = read_points(save(tmp_path / "a.bin", rows), NUSCENES_HDL32E, dtype="float64")
+    for name in ("000001.f64", "scan"):
+        path = save(tmp_path / name, rows.tobytes())
+        for options in ({"columns": 4, "dtype": "float64"}, {"dtype": "float64"}):
+            np.testing.assert_array_equal(read_points(path, NUSCENES_HDL32E, **options), as_bin)
+        with refused(f"unknown extension {path.suffix!r}, expected .pcd.bin", path):
+            read_points(path, NUSCENES_HDL32E)
+
+
 @pytest.mark.parametrize("stored", ["float16", "float32", "float64"])
 @pytest.mark.parametrize("named", ["float16", "float32", "float64"])
 def test_a_wrong_number_type_is_refused_by_name(tmp_path, points, stored, named):

@@ -1,6 +1,7 @@
 """Do all readers of files refuse what is wrong in one line, and return sound data else?
 
-    python -m tests.fuzz --inputs 1000000
+    python -m tests.fuzz --inputs 1000000 --out experiments/results/fuzz.json
+    python -m tests.fuzz --only kitti --inputs 3000  # seconds
 
 Files of every kind that is read are mutated by their structure, by a seed, and read in processes of a thousand
 inputs each, with Python's debugging allocator, a limit on memory and one on time. Expected of each input: sound
@@ -39,7 +40,7 @@ class Args:
     """Address space of a process beyond what it began with."""
     seconds: float = 10.0
     """The longest that an input may take."""
-    out: Path = Path("experiments/results/fuzz.json")
+    out: Path = Path("outputs/fuzz.json")
     """Where the figures go."""
 
 

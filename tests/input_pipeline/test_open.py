@@ -4,6 +4,7 @@ import dataclasses
 import os
 import re
 import shutil
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -22,8 +23,24 @@ from fcos_lidar_jax.input_pipeline.open import default_split, find_layout, open_
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
-FORMATS = ("nuscenes", "kitti", "argoverse2", "folder")
-READERS = dict(zip(FORMATS, (NuScenesFrames, KittiFrames, Argoverse2Frames, FolderFrames), strict=True))
+
+
+class Format(NamedTuple):
+    """A data set of a format: its reader, how many frames it and its split have, and a file of its boxes."""
+
+    reader: type
+    frames: int
+    boxes: str
+    split: str = "train"
+    in_split: int = 2
+
+
+FORMATS = {
+    "nuscenes": Format(NuScenesFrames, 8, "sample_annotation.json", "scene-1", 4),
+    "kitti": Format(KittiFrames, 3, "label_2/000000.txt"),
+    "argoverse2": Format(Argoverse2Frames, 4, "annotations.feather"),
+    "folder": Format(FolderFrames, 3, "boxes/000.json"),
+}
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +59,8 @@ def roots(tmp_path_factory):
 def test_a_layout_is_recognised_and_its_frames_offer_the_contract(roots, format):
     assert find_layout(roots[format]).format == format
     frames = open_frames(roots[format])
-    assert type(frames) is READERS[format]
-    assert len(frames) == {"nuscenes": 8, "kitti": 3, "argoverse2": 4, "folder": 3}[format]
+    assert type(frames) is FORMATS[format].reader
+    assert len(frames) == FORMATS[format].frames
     for i in range(len(frames)):
         frame = frames.frame(i)
         assert frame.points.shape[1] == frames.sensor.point_columns
@@ -57,9 +74,8 @@ def test_a_layout_is_recognised_and_its_frames_offer_the_contract(roots, format)
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_split_is_a_part(roots, format):
-    split = {"nuscenes": "scene-1"}.get(format, "train")
-    whole, part = open_frames(roots[format]), open_frames(roots[format], split=split)
-    assert len(part) == {"nuscenes": 4}.get(format, 2) < len(whole)
+    whole, part = open_frames(roots[format]), open_frames(roots[format], split=FORMATS[format].split)
+    assert len(part) == FORMATS[format].in_split < len(whole)
     assert {part.name(i) for i in range(len(part))} < {whole.name(i) for i in range(len(whole))}
 
 
@@ -97,10 +113,9 @@ def test_a_fingerprint_follows_from_files_and_options(roots, tmp_path, format):
     assert open_frames(root).fingerprint() == same
     if format != "nuscenes":  # whose index is what counts: copied trees have other times there
         assert open_frames(roots[format]).fingerprint() == same
-    split = {"nuscenes": "scene-1"}.get(format, "train")
-    prints = [same, *(open_frames(root, **o).fingerprint() for o in ({"split": split}, {"close_m": 2.0}))]
-    names = {"nuscenes": "sample_annotation.json", "kitti": "label_2/000000.txt", "folder": "boxes/000.json"}
-    file = next(root.rglob(names.get(format, "annotations.feather")))
+    changes = ({"split": FORMATS[format].split}, {"close_m": 2.0})
+    prints = [same, *(open_frames(root, **change).fingerprint() for change in changes)]
+    file = next(root.rglob(FORMATS[format].boxes))
     if format == "nuscenes":
         file.write_text(file.read_text().replace('"size": [\n1.5', '"size": [\n1.6'))
     else:

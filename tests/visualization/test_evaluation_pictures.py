@@ -59,8 +59,8 @@ def test_range_image_with_truth_and_detections_below_each_other(drawn):
     assert "intensity" in titles[2]
 
 
-def test_global_axes_are_not_called_the_cars(drawn):
-    for global_axes in (False, True):
-        bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=10, classes=(), global_axes=global_axes)
-    labels = [figure.axes[0].get_xlabel() for figure in drawn]
-    assert labels == ["x [m], right", "x [m], global"]
+def test_axes_do_not_say_which_of_them_is_ahead(drawn):
+    bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=10, classes=())
+    axis = drawn[0].axes[0]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("x [m]", "y [m]")
+    assert [line.get_marker() for line in axis.lines] == ["+"]
