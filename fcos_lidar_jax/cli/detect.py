@@ -5,20 +5,24 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder
-from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
+from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
 from fcos_lidar_jax.data.point_files import MAX_POINTS
-from fcos_lidar_jax.data.sweeps import read_list
+from fcos_lidar_jax.data.sweeps import about_z, read_list, turned
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import Backend, load_detector
 from fcos_lidar_jax.inference.cloud import expect_points
 from fcos_lidar_jax.inference.records import as_records, confident
+from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.trainer import predict
 from fcos_lidar_jax.training.checkpoints import find_checkpoint
 from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
+
+_CLEAR = 0.2  # Boxes of this score and more are counted on the screen.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,12 +42,15 @@ class Detect:
     sweeps: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
     """Instead of files: a list of sweeps to fuse, [{"file", "timestamp_us", "sensor_to_world": 4x4}], the first
     is the current one."""
+    yaw_deg: float = 0.0
+    """Turn the clouds by this angle about z for the detector, and the boxes back: 90 where x points ahead and the
+    detector is of nuScenes' sensor, whose y axis does (`hdl32e`)."""
     min_score: float = 0.0  # Leave out boxes below this score.
     remove_close: Literal["all", "sweeps", "none"] | None = None
     """Drop points within a metre of the sensor in x and y: of all sweeps, of the older ones, or none. Default:
     as the detector was trained."""
     pictures: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also draw every cloud with its boxes, from above."""
+    """Also draw every cloud with its boxes of score 0.1 and more, or of --min-score, from above."""
     page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
     """Also write a page that shows the clouds: one file for any browser, which asks for nothing else."""
     columns: int | None = None
@@ -63,6 +70,8 @@ def run(args: Detect) -> None:
     check_at_least(args, 1, "batch_size", "max_file_points")
     if not 0 <= args.min_score <= 1:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
+    if not np.isfinite(args.yaw_deg):
+        raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
     files = find_clouds(args.files) if args.sweeps is None else (args.sweeps,)
     sweeps = () if args.sweeps is None else (args.sweeps.parent / each.file for each in read_list(args.sweeps))
     check_out_file("--out", args.out, keep=(*files, *sweeps))
@@ -84,11 +93,16 @@ def run(args: Detect) -> None:
         dtype=args.dtype,
         max_points=args.max_file_points,
     )
-    progress = Progress("files", len(clouds))
+    progress, back = Progress("files", len(clouds)), about_z(-np.deg2rad(args.yaw_deg))
     results, frames = list[dict[str, Any]](), list[PageFrame]()
-    for prediction in predict(detector, clouds, batch_size=args.batch_size):
+    seen = TurnedClouds(clouds, np.deg2rad(args.yaw_deg)) if args.yaw_deg else clouds
+    for prediction in predict(detector, seen, batch_size=args.batch_size):
         file, found, cloud = clouds.files[prediction.index], prediction.detections, prediction.cloud
         assert prediction.frame is not None
+        points = prediction.frame.points
+        if args.yaw_deg:
+            points = turned(points, back)
+            found = dataclasses.replace(found, boxes=to_world(np.asarray(found.boxes), back).astype(np.float32))
         assert cloud is not None
         expect_points(file, cloud, int(found.num_dropped), detector.sensor)
         boxes = as_records(found, detector.classes, min_score=args.min_score)
@@ -98,7 +112,7 @@ def run(args: Detect) -> None:
         results.append(record | {"boxes": boxes})
         if args.page is not None:
             shown = confident(found, args.min_score)
-            frames.append(page_frame(prediction.frame.points, shown, name=file.name))
+            frames.append(page_frame(points, shown, name=file.name))
         if args.pictures is not None:
             from fcos_lidar_jax.visualization.bev import draw_bev
 
@@ -106,9 +120,9 @@ def run(args: Detect) -> None:
             path, least = args.pictures / f"{len(results):04d}_{file.name}.png", max(args.min_score, 0.1)
             shown, limit_m = confident(found, least), detector.sensor.limit_xy_m
             title = f"{path.stem}: boxes of score {least:g} and more"
-            points, classes = prediction.frame.points, detector.classes
-            draw_bev(points, path, detections=shown, limit_m=limit_m, classes=classes, title=title)
-        progress.show(len(results), f"{file}: {len(boxes)} boxes")
+            draw_bev(points, path, detections=shown, limit_m=limit_m, classes=detector.classes, title=title)
+        clear = sum(box["score"] >= _CLEAR for box in boxes)
+        progress.show(len(results), f"{file}: {len(boxes)} boxes, {clear} of score {_CLEAR} and more")
     text = json.dumps({"files": results}, indent=1)
     atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))
     if args.page is not None:

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
+from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
-from fcos_lidar_jax.data.sweeps import read_sweeps
+from fcos_lidar_jax.data.sweeps import about_z, read_sweeps, turned
+from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.sensors import Sensor
 
 
@@ -48,6 +49,20 @@ class CloudFiles(FrameSet):
     def fingerprint(self) -> str:
         reading = self.remove_close, self.close_m, self.columns, self.dtype
         return files_fingerprint([file.absolute() for file in self.files], Path("/"), reading)
+
+
+@dataclasses.dataclass(frozen=True)
+class TurnedClouds(FramesOf):
+    """Clouds of a frame set, rotated about z after their close points were removed."""
+
+    yaw_rad: float  # counter-clockwise seen from above
+
+    def frame(self, index: int) -> Frame:
+        frame = self.frames.frame(index)
+        return dataclasses.replace(frame, points=turned(frame.points, about_z(self.yaw_rad)))
+
+    def fingerprint(self) -> str:
+        return checksum(repr((self.frames.fingerprint(), self.yaw_rad)).encode())
 
 
 def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:

@@ -120,7 +120,7 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
     if len(lag) and np.isfinite(lag).all() and lag.max() > 1 and not (lag % 1).any():
         raise ValueError(
             f"{where}: fifth column: got whole numbers up to {lag.max():g}, which look like a ring, expected the "
-            "time lag in seconds: leave the column out"
+            "time lag in seconds: leave the column out, or put 0 into it and the ring into a sixth"
         )
     names = ("x", "y", "z", "intensity", "time_lag", "laser")
     return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))

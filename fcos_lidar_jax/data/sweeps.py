@@ -178,3 +178,25 @@ def find_bad_pose(rotation: np.ndarray, translation: np.ndarray) -> tuple[int, s
             row = int(np.argmin(good))
             return row, f"{name}: got {values[row].tolist()}, expected {expected}"
     return None
+
+
+def about_z(yaw_rad: float) -> np.ndarray:
+    """A rotation about z, counter-clockwise seen from above, as a pose f64[4, 4].
+
+    >>> about_z(np.pi / 2)[:2, :2].round().tolist()
+    [[0.0, -1.0], [1.0, 0.0]]
+    """
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
+    return pose
+
+
+def turned(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Points f32[n, c] rotated by a pose f64[4, 4], whose translation does not count; the other columns stay.
+
+    >>> turned(np.array([[1, 0, 5, 9]], np.float32), about_z(np.pi / 2)).round(3).tolist()
+    [[0.0, 1.0, 5.0, 9.0]]
+    """
+    moved = np.array(points)
+    moved[:, :3] = moved[:, :3] @ pose[:3, :3].T
+    return moved

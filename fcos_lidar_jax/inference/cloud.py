@@ -20,6 +20,7 @@ MAX_TIME_LAG_S = 60.0
 
 _SEED = 0  # Which rows of a sweep are truncated.
 _MIN_ROWS = 500  # Fewer rows say nothing about the sensor.
+_NO_COORDINATE_M = 1000.0  # No LiDAR sees as far as half of its points would lie.
 _NEAR_M = 2.0  # Points on the ego vehicle say nothing either.
 _MAX_BEYOND = 0.9
 _MAX_OUTSIDE = 0.3
@@ -173,8 +174,18 @@ def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sens
     raise ValueError(
         f"{name}: none of its {cloud.num_points} points is usable ({cloud.num_invalid} not finite or beyond "
         f"physical limits, {cloud.num_close} on the ego vehicle, the others out of range or view), expected some "
-        f"with {limits} in the field of view of {sensor.name}"
+        f"with {limits} in the field of view of {sensor.name}{_no_coordinates(cloud.points[cloud.valid])}"
     )
+
+
+def _no_coordinates(points: np.ndarray) -> str:
+    """The end of a message where one of the first three columns cannot be metres, such as a time; else nothing."""
+    middle = np.median(np.abs(points[:, :3]), axis=0) if len(points) else np.zeros(3)
+    if middle.max() < _NO_COORDINATE_M:
+        return ""
+    wrong = int(middle.argmax())
+    expected = "metres in the columns x, y, z, intensity, time lag, laser number"
+    return f"; the values of {'xyz'[wrong]} are about {middle[wrong]:.4g}, expected {expected}"
 
 
 def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
@@ -193,6 +204,9 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     """
     points = _with_columns(points, sensor)
     points = points[usable_rows(points)]
+    about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
+    if len(points) >= _MIN_ROWS and (wrong := _no_coordinates(points)):
+        return f"points hardly of {about}{wrong}; expect poor detections"
     points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
     far = without_close(points, np.ones(len(points), bool), sensor, mode="all", close_m=_NEAR_M)
     points = points[np.asarray(far)]
@@ -203,7 +217,6 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     if len(points) < _MIN_ROWS:
         return None
     finding = _mismatch(points, sensor)
-    about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
     return finding and f"points hardly of {about}: {finding}; expect poor detections"
 
 
@@ -232,5 +245,5 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
         if share < _MIN_NEIGHBOURS:
             return f"{share:.0%} of the points have a neighbour in the next {what}, expected most"
     if points[:, 3].max() <= 1:
-        return "no intensity is above 1, expected 0 to 255"
+        return "no intensity is above 1, expected 0 to 255: multiply them by 255"
     return None

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
+from fcos_lidar_jax.data.sweeps import Sweep, about_z, fuse_sweeps, turned
 from fcos_lidar_jax.inference.cloud import Cloud, expect_points, make_cloud
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.inference.tracks import to_world
@@ -52,8 +52,7 @@ def detect_stream(
     window: deque[Sweep] = deque(maxlen=detector.config.num_sweeps if num_sweeps is None else num_sweeps)
     projection, sensor = detector.config.projection, detector.sensor
     before: Sweep | None = None
-    turn = np.eye(4)
-    turn[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
+    turn = about_z(yaw_rad)
     for sweep in sweeps:
         if before is not None and sweep.time_us <= before.time_us:
             raise ValueError(
@@ -75,6 +74,6 @@ def detect_stream(
 
 def _turned(sweep: Sweep, turn: np.ndarray) -> Sweep:
     """The same sweep in a turned frame."""
-    points = np.array(sweep.points)
-    points[:, :3] = points[:, :3] @ turn[:3, :3].T
-    return dataclasses.replace(sweep, points=points, sensor_to_world=sweep.sensor_to_world @ turn.T)
+    return dataclasses.replace(
+        sweep, points=turned(sweep.points, turn), sensor_to_world=sweep.sensor_to_world @ turn.T
+    )

@@ -84,6 +84,28 @@ def test_detect_writes_the_contract(home, tmp_path, capsys):
         assert [frame["pose"], frame["truth"]] == [None, None]
 
 
+def test_detect_turns_clouds_for_the_detector_and_boxes_back(home, tmp_path):
+    cloud = np.load(home / "good.npy")
+    np.save(tmp_path / "ahead.npy", np.column_stack([cloud[:, 1], -cloud[:, 0], cloud[:, 2:]]))  # x ahead
+    checkpoint, page = ("--checkpoint", home / "checkpoint"), tmp_path / "page.html"
+    command("detect", home / "good.npy", *checkpoint, "--out", tmp_path / "a.json")
+    command(
+        "detect", tmp_path / "ahead.npy", *checkpoint, "--yaw-deg 90 --out", tmp_path / "b.json", "--page", page
+    )
+    right, ahead = (json.loads((tmp_path / f"{name}.json").read_text())["files"][0]["boxes"] for name in "ab")
+    assert len(right) == len(ahead) > 0
+    for one, other in zip(right, ahead, strict=True):
+        assert one["label"] == other["label"]
+        assert one["score"] == pytest.approx(other["score"], abs=1e-4)
+        x, y, z, length, width, height, yaw, vx, vy = one["box"]
+        expected = [y, -x, z, length, width, height, yaw - np.pi / 2, vy, -vx]
+        found = np.array(other["box"])
+        found[6] += 2 * np.pi * round((expected[6] - found[6]) / (2 * np.pi))
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+    [frame] = page_content(page)["frames"]
+    assert frame["boxes"] == [box["box"] for box in ahead]
+
+
 def test_a_file_name_is_no_formula(home, tmp_path):
     """Nor need it be text."""
     cloud = tmp_path / os.fsdecode(b"$\\frac{a$\xff.npy")
@@ -131,6 +153,7 @@ BAD = {
     "folder without clouds": ("detect HOME/nothing", "nothing: no point file in it"),
     "empty file": ("detect HOME/empty.bin", "empty.bin: empty file"),
     "truncated file": ("detect HOME/cut.pcd.bin", "cut.pcd.bin: .* not a multiple of 20"),
+    "angle": ("detect HOME/good.npy --yaw-deg nan", "--yaw-deg: got nan, expected an angle in degrees"),
     "unknown extension": ("detect HOME/text.txt", "unknown extension '.txt'"),
     "pickled array": ("detect HOME/pickled.npy", "pickled.npy: not a readable .npy"),
     "one axis": ("detect HOME/flat.npy", "flat.npy: shape"),

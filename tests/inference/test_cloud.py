@@ -139,6 +139,10 @@ def test_an_empty_cloud_is_one_line_with_what_became_of_its_points():
     with pytest.raises(ValueError, match=message):
         expect_points("a.bin", cloud, 100, TINY)
     assert not cloud_of(points[:0]).valid.any()
+    points[:, 0] = 1.533e9  # the time, as the first column
+    message = r"none of its .* of tiny; the values of x are about 1\.533e\+09, expected metres in the columns x, y"
+    with pytest.raises(ValueError, match=message):
+        expect_points("a.bin", cloud_of(points), 130, TINY)
 
 
 @pytest.fixture(scope="module")
@@ -180,12 +184,19 @@ def test_what_a_mismatch_says(clouds):
     hdl32e = clouds["nuscenes_hdl32e"]
     millimetres = hdl32e * np.array([1000, 1000, 1000, 1, 1], np.float32)
     shares = hdl32e * np.array([1, 1, 1, 1 / 255, 1], np.float32)
+    timed = np.column_stack([np.full(len(hdl32e), 1.533e9), hdl32e[:, :3], hdl32e[:, 3] / 255])
     for points, sensor, finding in (
         (hdl32e, "short_range", r"\d\.\d of the points share a cell"),
         (clouds["kitti_hdl64e"], "nuscenes_hdl32e", r"\d\.\d of the points share a cell"),
         (hdl32e, "kitti_hdl64e", "0% of the points have a neighbour in the next row|next column"),
         (hdl32e, "waymo_top", "outside its vertical field of view"),
-        (millimetres, "nuscenes_hdl32e", "beyond its limits, .* < 54 m"),
+        (hdl32e + np.array([0, 0, 100, 0, 0]), "nuscenes_hdl32e", "beyond its limits, .* < 54 m"),
+        (
+            millimetres,
+            "nuscenes_hdl32e",
+            r"the values of [xy] are about \d+, expected metres in the columns x, y, z",
+        ),
+        (timed, "nuscenes_hdl32e", r"the values of x are about 1.533e\+09, expected metres in the columns x, y"),
         (shares, "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255"),
     ):
         assert re.search(finding, sensor_mismatch(points, PRESETS[sensor]) or "")
