@@ -4,9 +4,10 @@
     python -m experiments.ledger --write  # put it into experiments/README.md as well
 
 Nothing is trained or timed: the figures are those of the files in ``experiments/results``, so the ledger is as
-new as they are. A claim about accuracy is a row of a table of the paper; it agrees or disagrees where the 95 %
-interval over the seeds tells its sign, and also disagrees where the interval excludes the paper's figure. All else
-is undecided.
+new as they are. A claim about accuracy is a row of a table of the paper. Where the 95 % interval over the seeds
+excludes zero and has the paper's sign, the claim agrees, or, if the interval excludes the paper's figure, agrees
+in direction alone; with the other sign it disagrees. Where the interval holds zero, the claim is undecided, or,
+if the interval excludes the paper's figure, disagrees.
 """
 
 import dataclasses
@@ -29,6 +30,8 @@ from fcos_lidar_jax.files import atomic_write, read_json
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
 _SEEDS = range(3)
+_MOST_SEEDS = 100  # More would not be trained.
+_DIRECTION = "agrees in direction alone"
 _MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- end of the ledger -->\n")
 
 
@@ -117,16 +120,19 @@ def verdict_of_figure(figure: Figure, ours: float) -> str:
         return "agrees" if ours > figure.paper else "disagrees"
     if abs(ours / figure.paper - 1) <= 0.1:
         return "agrees"
-    return "agrees in direction alone" if (ours - 1) * (figure.paper - 1) > 0 else "disagrees"
+    return _DIRECTION if (ours - 1) * (figure.paper - 1) > 0 else "disagrees"
 
 
 def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     """Whether gains, one a seed, agree with the paper's, and what would decide or turn it.
 
-    The number of seeds that would tell the paper's gain from none is for the scatter seen so far.
+    What would decide is the number of seeds whose interval would tell the paper's gain from none, if they scatter
+    as those so far.
 
     >>> verdict([2.0, 2.1, 2.2], 1.9)
     ('agrees', '')
+    >>> verdict([4.0, 4.1, 4.2], 1.9)[0]
+    'agrees in direction alone'
     >>> verdict([-2.0, -2.1, -2.2], 1.9)
     ('disagrees', "a training as long as the paper's")
     >>> verdict([-1.0, 0.5, 2.0], 1.0)
@@ -137,9 +143,11 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
         return "undecided", "more seeds"
     _, low, high = bounds
     if low <= 0 <= high and low <= paper <= high:
-        return "undecided", f"{_seeds_needed(gains, abs(paper))} seeds, or a longer training"
+        needed = _seeds_needed(gains, abs(paper))
+        number = str(needed) if needed <= _MOST_SEEDS else f"over {_MOST_SEEDS}"
+        return "undecided", f"{number} seeds, or a longer training"
     if (low > 0 and paper > 0) or (high < 0 and paper < 0):
-        return "agrees", ""
+        return "agrees" if low <= paper <= high else _DIRECTION, ""
     return "disagrees", "a training as long as the paper's"
 
 
@@ -150,7 +158,7 @@ def _seeds_needed(gains: list[float], gain: float) -> int:
 
     deviation = float(np.std(gains, ddof=1))
     number = len(gains)
-    while t.ppf(0.975, number - 1) * deviation / math.sqrt(number) >= gain and number < 10_000:
+    while t.ppf(0.975, number - 1) * deviation / math.sqrt(number) >= gain and number <= _MOST_SEEDS:
         number += 1
     return number
 

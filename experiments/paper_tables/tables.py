@@ -31,6 +31,7 @@ from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
 
 SCORES = ("mAP", "NDS")
+_NOTHING = "the scores mean nothing"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,36 +221,51 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     """The table, ours beside the paper's."""
     columns = record["figures"].get("columns", {})
     extra = list(dict.fromkeys(name for values in columns.values() for name in values))
-    trained = bool(record["seeds"])
+    trained, theirs = bool(record["seeds"]), any(row["paper_difference"] for row in record["rows"])
     header = [""]
     for s in SCORES:
         header += [f"{s}, ours", "difference, ours"] if trained else []
-        header += [f"{s}, paper", "difference, paper"]
+        header += [f"{s}, paper", "difference, paper"] if theirs else []
     note = f"; {_training_text(record['trained_on'])}" if trained else ""
     lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}{note}.", ""]
     lines += ["| " + " | ".join([*header, *extra]) + " |", "|---" * (len(header) + len(extra)) + "|"]
     for row in record["rows"]:
         cells, itself = [row["label"]], row["label"] == row["reference"]
         for s in SCORES:
-            ours, theirs = row.get(f"{s}_difference"), row["paper_difference"].get(s)
             if trained:
-                cells += [_text(row.get(s)), "-" if itself else _text(ours, sign=True)]
-            cells += [_number(row["paper"].get(s)), "-" if itself else _number(theirs, sign=True)]
+                cells += [_text(row.get(s)), "-" if itself else _text(row.get(f"{s}_difference"), sign=True)]
+            if theirs:
+                gain = row["paper_difference"].get(s)
+                cells += [_number(row["paper"].get(s)), "-" if itself else _number(gain, sign=True)]
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         lines.append("| " + " | ".join(cells) + " |")
     drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
-    lines += ["", f"Differences are to {_references(record)}{drawn}.", ""]
+    lines += ["", f"Differences are to {_references(record)}{drawn}.", *_warnings(record), ""]
     lines += [f"{row['label']}: {line}" for row in record["rows"] for line in row.get("diverged", ())]
     if trained:
         lines += [f"Trained by revision {'; '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
 
 
+def _warnings(record: dict[str, Any]) -> list[str]:
+    """What a reader of a table must not overlook."""
+    said = [f"At this scale {_NOTHING}: that the rows run is all they say."] if record["scale"] == "smoke" else []
+    if len(record["seeds"]) == 2:
+        said.append("Two seeds can agree by chance: an interval of two says nothing about their spread.")
+    return said
+
+
 def _training_text(trained_on: dict[str, Any]) -> str:
     """What a row that changes nothing is trained on, and how long."""
     optimizer, precision = trained_on["base"]["optimizer"], trained_on["base"]["model"]["precision"]
     shown = {name: value for name, value in trained_on.items() if isinstance(value, int | float | str)}
-    shown |= {"scale": None, "splits": " and ".join(trained_on.get("splits", ())) or None}
+    # What cells call hurry is fast traffic.
+    shown |= {
+        "scale": None,
+        "hurry": None,
+        "fast_traffic": trained_on.get("hurry"),
+        "splits": " and ".join(trained_on.get("splits", ())) or None,
+    }
     shown["epochs"] = None if trained_on.get("steps") else optimizer["epochs"]
     shown |= {**{name: optimizer[name] for name in ("batch_size", "accumulate")}, "precision": precision}
     return "; ".join(f"{n.replace('_', ' ')} {str(v).lower()}" for n, v in shown.items() if v is not None)
@@ -291,7 +307,8 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
     axis.set_ylim(len(rows) - 0.5, -0.5)
     axis.set_xlabel(f"mAP, points more than {_references(record)}")
-    axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds)", fontsize=11)
+    said = f", {_NOTHING}" if record["scale"] == "smoke" else ""
+    axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds{said})", fontsize=11)
     handles, labels = axis.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
     axis.legend(kinds.values(), kinds.keys(), fontsize=9, frameon=False)

@@ -86,6 +86,18 @@ def test_a_finished_cell_is_never_run_again(tmp_path):
     assert {"jax", "git", "device", "seed"} <= set(record)
 
 
+def test_a_table_of_ones_own_has_no_columns_of_the_paper_and_says_what_smoke_is_worth(train_table, tmp_path):
+    rows = (Row("one", change(projection__num_rounds=1)), Row("three", change(projection__num_rounds=3)))
+    for seeds in ((0,), (0, 1)):
+        train_table(Table("own", "Own", rows, reference="one"), seeds=seeds)
+        text = (tmp_path / "smoke" / "own.md").read_text()
+        assert "paper" not in text
+        assert "the scores mean nothing" in text
+        assert ("Two seeds can agree by chance" in text) == (len(seeds) == 2)
+    train_table(table1_mrv_rounds.TABLE)
+    assert "mAP, paper | difference, paper" in (tmp_path / "smoke" / "table1.md").read_text()
+
+
 def test_a_cell_names_the_revisions_of_all_who_trained_it(tmp_path, monkeypatch):
     class Interrupted(Pretended):
         def score(self, config, seed, folder):

@@ -31,8 +31,10 @@ def test_a_seed_without_its_reference_does_not_count(tmp_path):
 @pytest.mark.parametrize(
     ("gains", "paper", "expected"),
     [
-        ([3.0, 3.1, 3.2], 0.5, "agrees"),  # more than the paper's, but the sign is clear
-        ([-3.0, -3.1, -3.2], -0.5, "agrees"),
+        ([0.4, 0.5, 0.6], 0.5, "agrees"),
+        ([-0.4, -0.5, -0.6], -0.5, "agrees"),
+        ([3.0, 3.1, 3.2], 0.5, "agrees in direction alone"),
+        ([-3.0, -3.1, -3.2], -0.5, "agrees in direction alone"),
         ([-3.0, -3.1, -3.2], 0.5, "disagrees"),
         ([-0.1, 0.0, 0.1], 2.0, "disagrees"),  # no gain, and the paper's is excluded
         ([-3.0, 0.0, 3.0], 2.0, "undecided"),
@@ -46,6 +48,10 @@ def test_verdicts(gains, paper, expected):
 def test_the_seeds_that_would_decide_shrink_the_interval_to_the_gain():
     # Deviation 1: t(0.975, 5) / sqrt(6) = 1.049, t(0.975, 6) / sqrt(7) = 0.925.
     assert verdict([-0.5, 0.5, 1.5], 1.0)[1].startswith("7 seeds")
+
+
+def test_more_seeds_than_anybody_trains_are_not_counted():
+    assert verdict([-9.0, 0.5, 9.0], 0.01)[1].startswith("over 100 seeds")
 
 
 def test_a_document_without_marks_is_refused():
