@@ -216,6 +216,7 @@ def test_a_full_disk_is_one_line_and_loses_no_checkpoint(finished, tmp_path):
     """Writes beyond a file size fail, as they do where there is no room, from the third checkpoint on."""
     done = run_python("-c", FULL, tmp_path)
     lines = [line for line in done.stderr.splitlines() if not line.startswith(("compiling ", "steps "))]
+    lines = [line for line in lines if "cpu_aot_loader.cc" not in line]  # jaxlib 0.10.1 about its own cache
     refused = tmp_path / "checkpoints" / "00000003"
     assert (done.returncode, lines) == (1, [f"program: error: {refused}: cannot be written: File too large"])
     kept = sorted(refused.parent.iterdir())
