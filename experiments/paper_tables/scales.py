@@ -22,6 +22,7 @@ import numpy as np
 
 from experiments.changes import change
 from experiments.paper_tables.cell_names import describe_sensor
+from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.data.cached import CachedFrames
@@ -141,7 +142,10 @@ class Simulated:
             return database.prepare_database(self.frames("train", num_sweeps), folder)
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``, ``curve: [[samples, mAP]]``."""
+        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``.
+
+        With looks also ``curve``, [[samples, mAP]], ``ranges``, mAP and AP by distance, and ``seconds_of_steps``.
+        """
         frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
         steps, options = config.optimizer.epochs * steps_per_epoch(frames, config), dict[str, Any]()
@@ -149,10 +153,16 @@ class Simulated:
             along = ChosenFrames(tests, tuple(range(min(_LOOKED_AT, len(tests)))))
             options = {"tests": along, "schedule": Schedule(-(-steps // 20), -(-steps // self.looks))}
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
-        scores = _scores(benchmark(*detections(detector, tests)).summary)
+        found, seen = detections(detector, tests)
+        scores = _scores(benchmark(found, seen).summary)
+        if not self.looks:
+            return scores
         batch, records = config.optimizer.batch_size, read_metrics(folder)
-        curve = [[r["step"] * batch, round(r["test/mAP"], 5)] for r in records if "test/mAP" in r]
-        return scores | ({"curve": curve} if curve else {})
+        return scores | {
+            "curve": [[r["step"] * batch, round(r["test/mAP"], 5)] for r in records if "test/mAP" in r],
+            "ranges": scores_by_range(found, seen),
+            "seconds_of_steps": round(sum(r.get("seconds", 0.0) for r in records)),
+        }
 
 
 @dataclasses.dataclass(frozen=True)

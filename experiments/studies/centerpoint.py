@@ -1,0 +1,83 @@
+"""CenterPoint beside the range view: what both find after the same samples and after the same time.
+
+    python -m experiments.studies.centerpoint  # smoke: minutes, a toy
+    python -m experiments.studies.centerpoint --scale sector  # 3 cells, three seeds
+
+Both see the same ten sweeps and share trainer, augmentation, optimizer, post-processing and evaluation;
+CenterPoint has the pillars of its compact preset. It computes a whole square, of which a sector sees a quarter, so
+its steps take longer, and the range view is trained for half as many epochs again in a row of its own. The seconds
+that the steps took stand in the cells, beside the scores by class and by range. The times from a cloud to boxes,
+in the form of the paper's table 7, are those of random weights and need no training (``--only-figures``).
+
+The paper compares itself with CenterPoint in table 7 and has no table of both after equal training.
+"""
+
+from typing import Any
+
+import jax
+
+from experiments.changes import change
+from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
+from experiments.script import run_script
+from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.inference.detect import make_stages
+from fcos_lidar_jax.inference.timing import Call, interleaved
+from fcos_lidar_jax.models import build_detector, count_parameters
+from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
+
+_AS_LONG = 1.5  # Times the epochs of the scale, in which CenterPoint takes about as long.
+_OF_THE_PEER = {part: getattr(CENTERPOINT_COMPACT, part) for part in ("model", "loss", "pillars")}
+
+
+def _as_long(config: Config) -> Config:
+    return change(optimizer__epochs=round(_AS_LONG * config.optimizer.epochs))(config)
+
+
+OURS, PEER = Row("FCOS-LiDAR", change()), Row("CenterPoint", change(**_OF_THE_PEER))
+ROWS = (PEER, OURS, Row(f"FCOS-LiDAR, {_AS_LONG} x epochs", _as_long))
+
+
+def stage_calls(config: Config, points: Any, sensor: Any) -> tuple[dict[str, Call], int]:
+    """The stages of a detector with random weights on one cloud, each to be timed alone, and its parameters."""
+    detector = build_detector(config, sensor)
+    stages, variables = make_stages(detector), detector.init(jax.random.key(0))
+    cloud = make_cloud(points, config, sensor=sensor, remove_close="none")
+    prepare, network, boxes = (jax.jit(part) for part in (stages.prepare, stages.network, stages.postprocess))
+    image = prepare(cloud.points, cloud.valid)
+    outputs = network(variables, image)
+    calls: dict[str, Call] = {
+        "image or pillars": lambda: prepare(cloud.points, cloud.valid),
+        "network": lambda: network(variables, image),
+        "boxes": lambda: boxes(outputs, image),
+    }
+    return calls, count_parameters(variables["params"])["total"]
+
+
+def figures(args: Args) -> dict[str, Any]:
+    """Times of the stages and parameters, by row."""
+    scale = simulated_scale(args)
+    assert scale is not None
+    points, calls, columns = scale.clouds(scale.base.num_sweeps)[0], dict[tuple[str, str], Call](), {}
+    for row in (OURS, PEER):
+        parts, parameters = stage_calls(row.change(scale.base), points, scale.sensor)
+        calls |= {(row.label, stage): call for stage, call in parts.items()}
+        columns[row.label] = {"parameters, thousands": parameters / 1000}
+    measured = interleaved(calls, 2 if args.scale == "smoke" else 15)
+    for (label, stage), times in measured.items():
+        columns[label][f"{stage}, ms"] = times["median_ms"]
+    return {"columns": columns, "lines": []}
+
+
+TABLE = Table("centerpoint", "CenterPoint and the range view", ROWS, reference=PEER.label, figures=figures)
+
+
+def main(args: Args) -> None:
+    """The table."""
+    if args.scale == "nuscenes":
+        raise ValueError("--scale: got nuscenes, expected simulated frames: smoke, simulated, calm or sector")
+    run_table(TABLE, args)
+
+
+if __name__ == "__main__":
+    run_script(main, Args, __doc__)

@@ -1,0 +1,73 @@
+"""The table of CenterPoint beside the range view, and what cells of long trainings hold beside their scores."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.paper_tables import scales
+from experiments.paper_tables.scales import quarter, smoke
+from experiments.paper_tables.tables import Args
+from experiments.studies import centerpoint
+from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.inference.detect import make_detect
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
+from fcos_lidar_jax.types import Detections
+
+
+def test_both_detectors_share_all_but_themselves(tmp_path):
+    base = quarter(tmp_path).base
+    peer, ours, longer = (row.change(base) for row in centerpoint.ROWS)
+    assert ours == base
+    assert peer.pillars == CENTERPOINT_COMPACT.pillars
+    assert dataclasses.replace(peer, pillars=None, model=base.model, loss=base.loss) == base
+    assert (base.optimizer.epochs, longer.optimizer.epochs) == (2, 3)
+    assert dataclasses.replace(longer, optimizer=base.optimizer) == base
+
+
+def test_the_stages_that_are_timed_are_the_detector(tmp_path):
+    scale = smoke(tmp_path)
+    points, config = scale.clouds(scale.base.num_sweeps)[0], scale.base
+    calls, parameters = centerpoint.stage_calls(config, points, scale.sensor)
+    detector = build_detector(config, scale.sensor)
+    variables = detector.init(jax.random.key(0))
+    assert parameters == sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
+    cloud = make_cloud(points, config, sensor=scale.sensor, remove_close="none")
+    whole = jax.jit(make_detect(detector))(variables, cloud.points, cloud.valid)
+    expected = whole.boxes, whole.scores, whole.labels, whole.valid
+    for stage, of_whole in zip(calls["boxes"](), expected, strict=True):
+        np.testing.assert_allclose(stage, of_whole, rtol=1e-5, atol=1e-5)
+
+
+def test_the_peer_refuses_a_data_set(capsys):
+    with pytest.raises(ValueError, match="--scale: got nuscenes, expected simulated frames"):
+        centerpoint.main(Args(scale="nuscenes"))
+
+
+def test_a_cell_that_is_looked_at_says_how_long_and_how_far(tmp_path, monkeypatch):
+    """A detector that finds all within 20 m and nothing beyond, after two steps of 1.5 and 2.5 seconds."""
+    plain = smoke(tmp_path)
+    scale = dataclasses.replace(plain, looks=1, reach_m=40.0, sensor=quarter(tmp_path).sensor, num_objects=40)
+    records = [{"step": 1, "seconds": 1.5}, {"step": 2, "seconds": 2.5, "test/mAP": 0.25}]
+
+    def near(_, frames):
+        seen = [frames.frame(i) for i in range(len(frames))]
+        found = []
+        for frame in seen:
+            close = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1]) < 20
+            scores = np.ones(len(close), np.float32)
+            found.append(Detections(frame.boxes, scores, frame.labels, close, np.int32(0)))
+        return found, seen
+
+    monkeypatch.setattr(scales, "trained", lambda *_, **__: None)
+    monkeypatch.setattr(scales, "detections", near)
+    monkeypatch.setattr(scales, "read_metrics", lambda _: records)
+    scores = scale.score(scale.base, 0, tmp_path)
+    assert scores["seconds_of_steps"] == 4
+    assert scores["curve"] == [[2 * scale.base.optimizer.batch_size, 0.25]]
+    assert scores["ranges"]["0-20 m"]["mAP"] == pytest.approx(1)
+    assert scores["ranges"]["20-40 m"]["mAP"] == 0
+    assert 0 < scores["ranges"]["all"]["mAP"] < 1
+    assert "ranges" not in dataclasses.replace(scale, looks=0).score(scale.base, 0, tmp_path)
