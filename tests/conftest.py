@@ -17,9 +17,11 @@ _MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", 
 _ROOMS = ["models", "training", "inference", "evaluation"]
 install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "typecheck.check")
 
-# A shell's background job ignores Ctrl-C, and so would the processes that the tests start and interrupt.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell's background job ignores Ctrl-C, what nohup starts a hang-up, and so would the processes that the tests
+# start and interrupt.
+for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, usual)
 
 jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
