@@ -7,7 +7,8 @@ Both see the same ten sweeps and share trainer, augmentation, optimizer, post-pr
 CenterPoint has the pillars of its compact preset. It computes a whole square, of which a sector sees a quarter, so
 its steps take longer, and the range view is trained for half as many epochs again in a row of its own. The seconds
 that the steps took stand in the cells, beside the scores by class and by range. The times from a cloud to boxes,
-in the form of the paper's table 7, are those of random weights and need no training (``--only-figures``).
+in the form of the paper's table 7, need no training (``--only-figures``): they are those of random weights, whose
+candidates are not as many as a trained detector's, so the stage of the boxes is not to be compared.
 
 The paper compares itself with CenterPoint in table 7 and has no table of both after equal training.
 """
