@@ -7,9 +7,11 @@ and ``transfer.json`` of the same folder; figures of other weights than those in
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 import fcos_lidar_jax
 from experiments.script import run_script
@@ -68,8 +70,23 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield ""
     scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
     yield f"On {record['unseen_frames']} unseen frames of the same kind: {scored}.\n"
+    yield from _curve([*record["earlier"], trained])
     yield f"Made by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`.\n"
     yield "## What it finds\n"
+
+
+def _curve(legs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """The mAP over the frames seen in all trainings together."""
+    ends = np.cumsum([leg["frames_seen"] for leg in legs]).tolist()
+    begins = [0, *ends[:-1]]
+    points = [(n + seen, score) for n, leg in zip(begins, legs, strict=True) for seen, score in leg["curve"]]
+    if not points:
+        return
+    yield "During the training, on a few unseen frames, the same each time; where the learning rate rises anew,"
+    yield "the score may fall at first:\n"
+    yield "| frames seen in all | mAP |\n|---|---|"
+    yield from (f"| {seen:,} | {score:.3f} |" for seen, score in points)
+    yield ""
 
 
 def _figures(file: Path, weights: str) -> Iterator[str]:
