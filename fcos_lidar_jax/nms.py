@@ -1,7 +1,8 @@
 """Rotated non-maximum suppression with static shapes (paper, section 3.4)."""
 
 import functools
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,8 @@ from jaxtyping import Array, Bool, Float32, Int32
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
 
-_FEW = 1024  # A trained detector has mostly no more valid boxes, of thousands of slots.
+T = TypeVar("T")
+_FEW = (1024, 2048)  # A trained detector has mostly no more valid boxes, of thousands of slots.
 _MAX_TURN_RAD = np.pi / 3  # Boxes that point elsewhere are no estimates of the same heading.
 
 
@@ -93,23 +95,30 @@ def merge_boxes(
     >>> merge_boxes(boxes, jnp.array([0.8, 0.4]), valid, *best, iou_threshold=0.3)[0, 0].round(3).tolist()
     0.10000000149011612
     """
-    candidates, turned = jnp.asarray(boxes), oriented(boxes)
+    table = jnp.asarray(boxes, jnp.float32)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
     kinds = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
+    best, best_kinds, number = table[kept], kinds[kept], used.sum()
 
-    def merged(slot: Array, result: Array) -> Array:
-        index = kept[slot]
-        offsets = candidates - candidates[index]
-        offsets = offsets.at[:, 6].set(wrap_angle(offsets[:, 6]))
-        member = _overlaps(turned[index], turned, iou_threshold, overlap == "3d") & (kinds == kinds[index])
-        weight = jnp.where(member & (jnp.abs(offsets[:, 6]) <= _MAX_TURN_RAD), weights, 0.0)
-        shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
-        total = weight.sum()
-        mean = candidates[index] + shift / jnp.where(total > 0, total, 1.0)
-        return result.at[slot].set(mean.at[6].set(wrap_angle(mean[6])))
+    def of_best(order: Array) -> Array:
+        candidates, strengths, groups = table[order], weights[order], kinds[order]
+        turned = oriented(candidates)
 
-    return lax.fori_loop(0, used.sum(), merged, jnp.zeros((kept.shape[0], candidates.shape[1]), jnp.float32))
+        def merged(slot: Array, result: Array) -> Array:
+            offsets = candidates - best[slot]
+            offsets = offsets.at[:, 6].set(wrap_angle(offsets[:, 6]))
+            member = _overlaps(oriented(best[slot]), turned, iou_threshold, overlap == "3d")
+            member &= (groups == best_kinds[slot]) & (jnp.abs(offsets[:, 6]) <= _MAX_TURN_RAD)
+            weight = jnp.where(member, strengths, 0.0)
+            shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
+            total = weight.sum()
+            mean = best[slot] + shift / jnp.where(total > 0, total, 1.0)
+            return result.at[slot].set(mean.at[6].set(wrap_angle(mean[6])))
+
+        return lax.fori_loop(0, number, merged, jnp.zeros_like(best))
+
+    return _with_few(of_best, jnp.argsort(~usable, stable=True), usable)
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
@@ -118,22 +127,24 @@ def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
     return intersection > threshold * union
 
 
+def _with_few(compute: Callable[[Array], T], order: Array, valid: Array) -> T:
+    """What is computed of boxes in an order, valid ones first: of the first few alone where no more are valid."""
+    numbers = [*(few for few in _FEW if few < len(order)), len(order)]
+    branches = [functools.partial(lambda number: compute(order[:number]), number) for number in numbers]
+    return lax.switch(jnp.searchsorted(jnp.array(numbers[:-1], jnp.int32), valid.sum()), branches)
+
+
 def _ranking(scores: Array, valid: Array) -> Array:
     """Valid boxes first, by falling score, equal ones by index."""
     return jnp.lexsort((-scores, ~valid)).astype(jnp.int32)
 
 
 def _by_rows(boxes: Array, scores: Array, valid: Array, labels: Array, **options: Any) -> tuple[Array, Array]:
-    order = _ranking(scores, valid)
-
-    def of_best(number: int) -> tuple[Array, Array]:
-        best = order[:number]
+    def of_best(best: Array) -> tuple[Array, Array]:
         kept, used = _greedy(boxes[best], scores[best], valid[best], labels[best], **options)
         return jnp.where(used, best[kept], 0), used
 
-    if len(order) <= _FEW:
-        return of_best(len(order))
-    return lax.cond(valid.sum() <= _FEW, lambda: of_best(_FEW), lambda: of_best(len(order)))
+    return _with_few(of_best, _ranking(scores, valid), valid)
 
 
 def _greedy(

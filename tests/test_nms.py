@@ -158,6 +158,25 @@ def test_merged_boxes_are_the_weighted_means_of_those_that_overlap(overlap):
         assert np.abs(expected - boxes[chosen]).max() > 0.05
 
 
+@pytest.mark.parametrize("slots", [300, 1500])
+def test_merging_does_not_depend_on_unused_slots(slots):
+    """Few valid boxes among many slots, and more valid ones than are looked at together."""
+    boxes, scores, _, labels = clusters(5, slots)
+    scores = np.maximum(scores, np.float32(0.01))
+    options = {"iou_threshold": 0.3}
+    alone = rotated_nms(boxes, scores, np.ones(slots, bool), labels=labels, **OPTIONS)
+    expected = merge_boxes(boxes, scores, np.ones(slots, bool), *alone, labels=labels, **options)
+    place = np.sort(np.random.default_rng(0).permutation(4000)[:slots])
+    spread = [np.zeros((4000, *part.shape[1:]), part.dtype) for part in (boxes, scores, labels)]
+    for into, part in zip(spread, (boxes, scores, labels), strict=True):
+        into[place] = part
+    valid = np.isin(np.arange(4000), place)
+    kept, used = jnp.where(alone[1], place[alone[0]], 0), alone[1]
+    found = merge_boxes(*spread[:2], valid, kept, used, labels=spread[2], **options)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    assert np.abs(np.asarray(expected) - boxes[alone[0]])[np.asarray(used)].max() > 0.05
+
+
 def test_boxes_without_size_or_score_stay_as_they_are_and_gradients_are_finite():
     boxes = np.zeros((4, 9), np.float32)
     boxes[:, 0] = [0, 5, 5, 9]

@@ -28,14 +28,15 @@ from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.types import Detections
 
 PLAIN = "plain"
 VARIANTS: dict[str, dict[str, Any]] = {
-    PLAIN: {},
-    "weighted NMS": {"inference__merge_iou": 0.3},
-    "mirrored view": {"inference__flips": "x"},
-    "mirrored view, weighted NMS": {"inference__flips": "x", "inference__merge_iou": 0.3},
+    PLAIN: {"inference__merge_iou": None, "inference__flips": "none"},
+    "weighted NMS": {"inference__merge_iou": 0.3, "inference__flips": "none"},
+    "mirrored view": {"inference__merge_iou": None, "inference__flips": "x"},
+    "mirrored view, weighted NMS": {"inference__merge_iou": 0.3, "inference__flips": "x"},
 }
 
 
@@ -61,12 +62,14 @@ def find(trained: TrainedDetector, sets: Sequence[FrameSet]) -> tuple[dict[str, 
     each = programs(trained)
     together = jax.jit(lambda *given: {name: detect(*given) for name, detect in each.items()})
     variables, found, read = jax.device_put(trained.variables), {name: [] for name in VARIANTS}, []
+    progress = Progress("frames", sum(map(len, sets)))
     for frames in sets:
         for index in range(len(frames)):
             read.append(frames.frame(index))
             cloud = make_cloud(read[-1].points, trained.config, sensor=trained.sensor, remove_close="none")
             for name, detections in jax.device_get(together(variables, cloud.points, cloud.valid)).items():
                 found[name].append(detections)
+            progress.show(len(read))
     return found, read
 
 

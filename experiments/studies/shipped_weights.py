@@ -135,10 +135,17 @@ def half_precision(checkpoint: Checkpoint) -> Checkpoint:
     return dataclasses.replace(checkpoint, variables=halved)
 
 
+def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
+    """The checkpoint with the preset's post-processing of today, which no training depends on."""
+    config = dataclasses.replace(checkpoint.config, inference=CONFIGS[name].inference)
+    return dataclasses.replace(checkpoint, config=config)
+
+
 def export(args: Args) -> dict[str, Any]:
     """Write the weights of the newest checkpoint and their card; returns training and scores."""
     folder = SHIPPED / args.name
-    save_checkpoint(folder, half_precision(load_checkpoint(find_checkpoint(args.work))))
+    checkpoint = with_todays_inference(load_checkpoint(find_checkpoint(args.work)), args.name)
+    save_checkpoint(folder, half_precision(checkpoint))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     if size > _MAX_BYTES:
         raise ValueError(f"{folder}: got {size} bytes, expected at most {_MAX_BYTES}")
