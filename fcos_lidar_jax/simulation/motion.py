@@ -45,6 +45,10 @@ def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
     way, _ = travelled(motion, time_s)
     curvature = motion["curvature"]
     bends = curvature != 0
+    c, s = np.cos(motion["yaw"]), np.sin(motion["yaw"])
+    if not bends.any():  # the same bits as below, sooner: most motions are straight
+        x, y, yaw = np.broadcast_arrays(motion["x"] + c * way, motion["y"] + s * way, motion["yaw"])
+        return np.stack([x, y, yaw], axis=-1)
     safe = np.where(bends, curvature, 1.0)
     length = np.where(bends, motion["turn"] / safe, 0.0)
     before = np.where(bends, np.minimum(way, motion["straight"]), way)
@@ -52,7 +56,6 @@ def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
     after = np.maximum(way - before - length, 0)
     along = before + np.sin(angle) / safe + after * np.cos(angle)
     across = (1 - np.cos(angle)) / safe + after * np.sin(angle)
-    c, s = np.cos(motion["yaw"]), np.sin(motion["yaw"])
     x, y = motion["x"] + c * along - s * across, motion["y"] + s * along + c * across
     return np.stack([x, y, motion["yaw"] + angle], axis=-1)
 

@@ -34,6 +34,7 @@ _CLEARANCE_M = 0.35  # objects keep this from each other, at all times
 _ROW_CLEARANCE_M = 0.08  # but in a row only this
 _STEP_S = 0.5  # they are compared at moments so far apart
 _FUSED_STEP_S = 0.025  # but in worlds of a few sweeps so often that nothing slips through between two of them
+_ROUNDING_M = 1e-6
 _TRIES = 25
 EGO_SIZE_M = (4.6, 2.0)  # length and width of the ego vehicle
 EGO_MIDDLE_M = 1.35  # its middle is this far before its rear axle
@@ -120,17 +121,31 @@ class _Taken:
     def __init__(self, times: np.ndarray, occupied: np.ndarray) -> None:
         self._poses = np.repeat(occupied[:, None, [0, 1, 4]], len(times), axis=1)
         self._sizes = occupied[:, 2:4]
+        self._discs = _discs(self._poses, self._sizes)
 
     def add(self, poses: np.ndarray, size: np.ndarray | tuple[float, float]) -> None:
+        sizes = np.array([[size[0], size[1]]])
         self._poses = np.concatenate([self._poses, poses[None]])
-        self._sizes = np.concatenate([self._sizes, [[size[0], size[1]]]])
+        self._sizes = np.concatenate([self._sizes, sizes])
+        self._discs = np.concatenate([self._discs, _discs(poses[None], sizes)])
 
     def has_room(self, poses: np.ndarray, size: np.ndarray, clearance: float) -> bool:
-        others, sizes = self._poses, self._sizes
+        # Most are too far away at every moment, which takes less to see than where they are at each.
+        x, y, radius = _discs(poses[None], size[None])[0]
+        there_x, there_y, radii = self._discs.T
+        near = np.hypot(there_x - x, there_y - y) < radii + radius + clearance + _ROUNDING_M
+        others, sizes = self._poses[near], self._sizes[near]
         reach = np.hypot(sizes[:, 0], sizes[:, 1])[:, None] / 2 + np.hypot(size[0], size[1]) / 2 + clearance
         which, when = np.nonzero(np.hypot(*(others[..., :2] - poses[:, :2]).transpose(2, 0, 1)) < reach)
         own = _footprints(poses[when], size[:2] + 2 * clearance)
         return not footprints_overlap(own, _footprints(others[which, when], sizes[which])).any()
+
+
+def _discs(poses: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Discs that hold rectangles at all their moments, f64[k, 3], ``x, y, radius``, of poses [k, moments, 3]."""
+    low, high = poses[..., :2].min(axis=1), poses[..., :2].max(axis=1)
+    radii = (np.hypot(*(high - low).T) + np.hypot(sizes[:, 0], sizes[:, 1])) / 2
+    return np.column_stack([(low + high) / 2, radii])
 
 
 def _footprints(poses: np.ndarray, sizes: np.ndarray) -> np.ndarray:
