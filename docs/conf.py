@@ -14,6 +14,11 @@ from sphinx.application import Sphinx
 typing.GENERATING_DOCUMENTATION = True  # jaxtyping then names arrays without the modules that define them
 
 _ROOT = Path(__file__).resolve().parents[1]
+_PAGES = {  # Documents of the repository that are pages of the site, by ``part`` below.
+    "CONTRIBUTING.md": "contributing.md",
+    "experiments/README.md": "evidence.md",
+    "fcos_lidar_jax/weights/hdl32e/README.md": "model_card.md",
+}
 
 project = "fcos_lidar_jax"
 author = copyright = "the fcos_lidar_jax developers"
@@ -90,6 +95,8 @@ def _with_parts(app, docname, source):
     """Notebooks as Markdown; the repository's other documents in place of ``<!-- part: FILE: HEADING -->``."""
     if Path(app.env.doc2path(docname)).suffix == ".ipynb":
         source[0] = "\n\n".join(map(_cell, json.loads(source[0])["cells"]))
+    for name, page in _PAGES.items():
+        source[0] = source[0].replace(f"](../{name}", f"]({page}")
     source[0] = re.sub(r"<!-- part: (\S+): (.+) -->", lambda found: _part(found[1], found[2]), source[0])
 
 
@@ -111,7 +118,10 @@ def _part(name: str, heading: str) -> str:
 
 def _link(file: Path, image: str, text: str, target: str) -> str:
     """Pages and data are linked, other documents and folders are named, for the site does not have them."""
-    path = (file.parent / target).resolve()
+    name, mark, place = target.partition("#")
+    path = (file.parent / name).resolve() if name else file
+    if page := _PAGES.get(path.relative_to(_ROOT).as_posix()):
+        return f"{image}[{text}]({page}{mark}{place})"
     if path.is_dir() or (path.suffix == ".md" and not path.is_relative_to(_ROOT / "docs")):
         return f"{text} (`{path.relative_to(_ROOT)}`)"
-    return f"{image}[{text}]({relpath(path, _ROOT / 'docs')})"
+    return f"{image}[{text}]({relpath(path, _ROOT / 'docs')}{mark}{place})"

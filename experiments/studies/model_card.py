@@ -23,6 +23,10 @@ from fcos_lidar_jax.training.checkpoint import read_description
 RESULTS = Path("experiments/results")
 SHIPPED = Path(fcos_lidar_jax.__file__).parent / "weights"
 _BANDS = ("all", "0-20 m", "20-40 m")
+_UNSEEN = {
+    "hdl32e": "with classes as frequent as in cities and half the objects of the training's",
+    "quickstart": "streets of the same kind",
+}
 _WEAK_AP, _WEAK_BOXES = 0.05, 10
 """Classes with fewer boxes say nothing; those with less AP are listed as hardly found."""
 
@@ -67,9 +71,11 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
         done = f"{leg['frames_seen']:,} frames, step {leg['steps']:,} of {leg['steps_planned']:,}"
         hours = f"{leg['seconds_of_steps'] / 3600:.1f} hours of steps"
         yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {hours}"
-    yield ""
     scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
-    yield f"On {record['unseen_frames']} unseen frames of the same kind: {scored}.\n"
+    if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
+        yield f"\nWhere one began with {name}, that is what the trainings before it had made."
+    yield ""
+    yield f"On {record['unseen_frames']} unseen frames, {_UNSEEN[name]}: {scored}.\n"
     yield from _curve([*record["earlier"], trained])
     yield f"Made by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`.\n"
     yield "## What it finds\n"

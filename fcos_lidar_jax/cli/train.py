@@ -104,6 +104,9 @@ def run(args: Train) -> None:
     val_split, tests = args.val_split or args.data.split("val", required=False), None
     if val_split != "none" and (val_split or args.val_samples):
         tests = args.data.open(config, split=val_split, samples=args.val_samples, option="--val-samples")
+    if split is None and args.samples is None and tests is None and jax.process_index() == 0:
+        line = f"no splits: all {len(frames)} frames are trained on, none is left to evaluate on"
+        print(f"{layout.root}: {line}", file=sys.stderr)
     an_epoch = steps_per_epoch(frames, config)
     steps = args.steps or config.optimizer.epochs * an_epoch
     if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:

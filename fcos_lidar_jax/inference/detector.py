@@ -17,7 +17,7 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.inference.detect import make_detect
-from fcos_lidar_jax.models import Detector, Variables
+from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.types import Detections
@@ -110,6 +110,23 @@ class TrainedDetector(CloudDetector):
         for leaf in jax.tree.leaves(self.variables):
             digest.update(np.ascontiguousarray(leaf).data)
         return digest.hexdigest()
+
+    def with_inference(self, **fields: Any) -> "TrainedDetector":
+        """The same weights with other post-processing, which no training depends on.
+
+        Args:
+            fields: of :class:`~fcos_lidar_jax.config.InferenceConfig`; the others stay.
+
+        Raises:
+            ValueError: a value that the field does not take, or flips that the training did not have.
+
+        >>> from fcos_lidar_jax.inference import load_trained
+        >>> load_trained("hdl32e").with_inference(merge_iou=None).config.inference.merge_iou is None
+        True
+        """
+        inference = dataclasses.replace(self.config.inference, **fields)
+        config = dataclasses.replace(self.config, inference=inference)
+        return TrainedDetector(build_detector(config, self.sensor), self.variables)
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         return functools.partial(_split_detect(self.model, mesh, batch_size), replicate(self.variables, mesh))

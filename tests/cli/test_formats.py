@@ -140,6 +140,28 @@ def test_a_cloud_of_another_sensor_is_told_in_one_line(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_data_without_splits_are_told_where_all_frames_serve_both_ends(tmp_path, capsys, monkeypatch):
+    root = tmp_path / "data"
+    make_folder(root, train=2, val=1, sensor=fcos.load_sensor("short_range"))
+    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
+    data = f"--class-map {tmp_path}/map.json --data-root {root}"
+    train_it = f"train quickstart --no-copy-paste {data} --out"
+    evaluate_it = f"evaluate {data} --checkpoint quickstart --out"
+
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", stop)
+    monkeypatch.setattr("fcos_lidar_jax.cli.evaluate.write_predictions", stop)
+    for name, splits in (("with", True), ("without", False)):
+        if not splits:
+            (root / "splits.json").unlink()
+        for args, said in ((train_it, "all 3 frames are trained on"), (evaluate_it, "all 3 frames are evaluated")):
+            with pytest.raises(AssertionError):  # stopped
+                command(args, tmp_path / name / args[:5])
+            assert (f"{root}: no splits: {said}" in capsys.readouterr().err) != splits
+
+
 def test_training_on_another_sensors_clouds_is_told_before_the_step_is_compiled(tmp_path, capsys, monkeypatch):
     frames = SimulatedFrames(fcos.load_sensor("nuscenes_hdl32e"), 2)
     wrong = GivenFrames((frames.frame(0), frames.frame(1)), fcos.load_sensor("short_range"), frames.classes)

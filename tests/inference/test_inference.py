@@ -118,6 +118,20 @@ def test_a_trained_detector_takes_a_file_as_its_points_and_tells_another_sensors
         detector(make_frame(0, NUSCENES_HDL32E).points)
 
 
+def test_other_post_processing_keeps_the_weights_and_the_other_fields():
+    detector = TrainedDetector(build_detector(TINY_CONFIG, TINY), untrained(TINY_CONFIG, TINY))
+    fewer = detector.with_inference(max_detections=3)
+    assert fewer.config == dataclasses.replace(
+        TINY_CONFIG, inference=dataclasses.replace(TINY_CONFIG.inference, max_detections=3)
+    )
+    assert (fewer.sensor, fewer.fingerprint) == (detector.sensor, detector.fingerprint)
+    points = make_frame(0, TINY).points
+    found, all_found = fewer(points), detector(points)
+    np.testing.assert_array_equal(found.scores, all_found.scores[:3])
+    with pytest.raises(ValueError, match=r"^max_detections: got 0"):
+        detector.with_inference(max_detections=0)
+
+
 @pytest.mark.parametrize("flips", ["x", "xy"])
 def test_mirrored_views_are_detected_too_and_their_boxes_mirrored_back(flips):
     """A mirrored cloud has the mirrored boxes, and without further views the candidates of one view are left."""
