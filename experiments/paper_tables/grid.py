@@ -7,6 +7,7 @@ it stands in the file.
 """
 
 import json
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,17 +24,20 @@ _PATIENCE_S = 5.0  # Between looks at what other processes train.
 
 
 def run_cells(
-    cells: Sequence[tuple[Config, int]], scale: Scale, *, results: Path, runs: Path
+    cells: Sequence[tuple[Config, int]], scale: Scale, *, results: Path, runs: Path, labels: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
     """The records of configurations with seeds, in their order, each from its file or by training it.
 
-    A cell that another process trains is left to it and looked at again when the others are done.
+    A label is told when its cell's training begins. A cell that another process trains is left to it and looked at again when the others are done.
     """
     found: dict[int, dict[str, Any]] = {}
     while len(found) < len(cells):
         known = len(found)
         for i, (config, seed) in enumerate(cells):
-            record = None if i in found else run_cell(config, scale, seed, results=results, runs=runs)
+            title = f"cell {i + 1} of {len(cells)}: {labels[i]}" if labels else ""
+            record = None
+            if i not in found:
+                record = run_cell(config, scale, seed, results=results, runs=runs, title=title)
             if record is not None:
                 found[i] = record
         if len(found) == known:
@@ -41,7 +45,9 @@ def run_cells(
     return [found[i] for i in range(len(cells))]
 
 
-def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Path) -> dict[str, Any] | None:
+def run_cell(
+    config: Config, scale: Scale, seed: int, *, results: Path, runs: Path, title: str = ""
+) -> dict[str, Any] | None:
     """What a cell's file holds, trained if need be, and its ``name``; None while another process trains it.
 
     A run whose loss stopped being finite is a result too: ``diverged`` in place of ``scores``, and what was said.
@@ -54,6 +60,8 @@ def run_cell(config: Config, scale: Scale, seed: int, *, results: Path, runs: Pa
             return {"name": name, **json.loads(file.read_text(encoding="utf-8"))}
         if not mine:
             return None
+        if title:
+            print(title, file=sys.stderr, flush=True)
         revisions = _join(runs / name, hardware()["git"])
         try:
             outcome: dict[str, Any] = {"scores": scale.score(config, seed, runs / name)}

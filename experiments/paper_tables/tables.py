@@ -192,7 +192,8 @@ def _cells(
         for config in configs.values():
             scale.check(config)
     wanted = [(config, seed) for config in configs.values() for seed in seeds]
-    found = iter(run_cells(wanted, scale, results=results, runs=args.runs / args.scale))
+    labels = [f"{label}, seed {seed}" for label in configs for seed in seeds]
+    found = iter(run_cells(wanted, scale, results=results, runs=args.runs / args.scale, labels=labels))
     return {label: [next(found) for _ in seeds] for label in configs}
 
 

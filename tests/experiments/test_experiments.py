@@ -73,6 +73,15 @@ def train_table(tmp_path, monkeypatch):
     return run
 
 
+def test_a_row_is_told_when_its_training_begins_and_not_when_it_is_known(train_table, capsys):
+    rows = (Row("one", change(projection__num_rounds=1)), Row("three", change(projection__num_rounds=3)))
+    table = Table("own", "Own", rows, reference="one")
+    train_table(table, rows=("one",))
+    assert capsys.readouterr().err.splitlines() == ["cell 1 of 1: one, seed 0"]
+    train_table(table)
+    assert capsys.readouterr().err.splitlines() == ["cell 2 of 2: three, seed 0"]
+
+
 def test_a_finished_cell_is_never_run_again(tmp_path):
     scale, folders = Pretended(), {"results": tmp_path, "runs": tmp_path}
     three = change(projection__num_rounds=3)(QUICKSTART)
