@@ -19,6 +19,7 @@ from experiments.paper_tables.scales import Scale
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
 from fcos_lidar_jax.training import NonFiniteLossError
+from fcos_lidar_jax.training.checkpoint import NonFiniteStateError
 
 _PATIENCE_S = 5.0  # Between looks at what other processes train.
 
@@ -51,8 +52,8 @@ def run_cell(
 ) -> dict[str, Any] | None:
     """What a cell's file holds, trained if need be, and its ``name``; None while another process trains it.
 
-    A run whose loss stopped being finite is a result too: ``diverged`` in place of ``scores``, and what was said.
-    ``git`` names the revisions of all processes that took part, in their order.
+    A run whose loss or state stopped being finite is a result too: ``diverged`` in place of ``scores``, and what
+    was said. ``git`` names the revisions of all processes that took part, in their order.
     """
     name = cell_name(config, scale.describe(), seed)
     file = results / f"{name}.json"
@@ -66,7 +67,7 @@ def run_cell(
         revisions = _join(runs / name, hardware()["git"])
         try:
             outcome: dict[str, Any] = {"scores": scale.score(config, seed, runs / name)}
-        except NonFiniteLossError as error:
+        except (NonFiniteLossError, NonFiniteStateError) as error:
             outcome = {"diverged": str(error)}
         record = {**outcome, "seed": seed, "scale": scale.describe(), "config": config_to_json(config)}
         record |= {**hardware(), "git": ", then ".join(revisions)}

@@ -325,6 +325,8 @@ def draw_learning(table: Table, record: dict[str, Any], path: Path) -> None:
     axis = figure.add_subplot()
     for i, row in enumerate(record["rows"]):
         curves = [np.array(cell["curve"]) for cell in row["scores"] if cell]
+        if not curves:  # all diverged
+            continue
         for curve in curves:
             axis.plot(curve[:, 0], 100 * curve[:, 1], color=f"C{i}", linewidth=0.5)
         mean = np.mean(curves, axis=0)

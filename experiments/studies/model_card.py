@@ -51,8 +51,11 @@ def write_card(name: str, results: Path, training: Mapping[str, Any] | None = No
         the file.
     """
     folder = SHIPPED / name
-    record = training or read_json(results / f"{name}.json", dict[str, Any])
-    lines = [*_about(name, record), *_figures(results / "transfer.json", read_description(folder)["hash"])]
+    file, weights = results / f"{name}.json", read_description(folder)["hash"]
+    record = training or read_json(file, dict[str, Any])
+    if record.get("hash", weights) != weights:
+        raise ValueError(f"{file}: hash: got {record['hash']}, expected that of the weights: {weights}")
+    lines = [*_about(name, record), *_figures(results / "transfer.json", weights)]
     path = folder / "README.md"
     atomic_write(path, lambda file: file.write_text("\n".join(lines) + "\n", encoding="utf-8"))
     return path

@@ -6,9 +6,10 @@
 ``hdl32e`` is the preset ``compact`` for nuScenes' sensor, ``quickstart`` the preset of that name. Every frame is
 another street. The training runs at low priority and saves every few minutes; the same command resumes it, bit for
 bit, after any kind of stop. ``--export`` trains nothing: it writes the running mean of the weights at the newest
-checkpoint into the package, as float16, scores them on unseen frames, and writes their model card; another process
-may be training meanwhile. Where the folder is lost, ``--warm-start hdl32e --seed 2`` begins a new one-cycle with
-the weights in the package, on other streets.
+checkpoint into the package, as float16, scores them on unseen frames, and writes ``experiments/results/NAME.json``
+and their model card; another process may be training meanwhile. Where the folder is lost, ``--warm-start hdl32e
+--seed 2`` begins a new one-cycle with the weights in the package, on streets ``seed * steps`` and on; choose a
+seed whose streets none of the trainings before it had.
 
 Cost: seconds a step, that is hours, on two CPU cores. Expected: an mAP of at least 0.6 for quickstart.
 """
@@ -25,7 +26,7 @@ import numpy as np
 
 from experiments.changes import change
 from experiments.runs import detections, trained
-from experiments.script import Options, run_measurement
+from experiments.script import Options, run_script, save
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.config import Config
@@ -41,7 +42,7 @@ from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, fresh_streets
 from fcos_lidar_jax.simulation.streets import CITY
 from fcos_lidar_jax.trainer import Schedule
 from fcos_lidar_jax.training import load_checkpoint, save_checkpoint
-from fcos_lidar_jax.training.checkpoint import Checkpoint
+from fcos_lidar_jax.training.checkpoint import Checkpoint, read_description
 from fcos_lidar_jax.training.checkpoints import find_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
@@ -156,6 +157,7 @@ def export(args: Args) -> dict[str, Any]:
     training = training_record(args.work)
     record = {
         "name": args.name,
+        "hash": read_description(folder)["hash"],
         "bytes": size,
         "training": training,
         "earlier": earlier_trainings(args.name, training, RESULTS),
@@ -168,10 +170,11 @@ def export(args: Args) -> dict[str, Any]:
     return record
 
 
-def measure(args: Args) -> dict[str, Any]:
-    """Train, or export."""
-    return export(args) if args.export else train(args)
+def main(args: Args) -> None:
+    """Train, or export; the record of an export lies where the next one looks for the trainings before it."""
+    record = export(args) if args.export else train(args)
+    save(record, args.out or (RESULTS / f"{args.name}.json" if args.export else None))
 
 
 if __name__ == "__main__":
-    run_measurement(measure, Args, __doc__)
+    run_script(main, Args, __doc__)

@@ -101,8 +101,9 @@ def fine_tuning(args: Args) -> dict[str, Any]:
     test, shown = (ChosenFrames(street, tuple(chosen)) for chosen in (TEST, TRAIN))
     record: dict[str, Any] = {"steps": args.fine_tuning_steps, "keyframes": len(shown)}
     beginnings = {"from the checkpoint": (FINE_TUNING, args.checkpoint), "from scratch": (FROM_SCRATCH, None)}
+    of = read_description(find_checkpoint(args.checkpoint))["hash"][:12]  # Others of the same name are others.
     for name, (config, weights) in beginnings.items():
-        folder = args.work / name.replace(" ", "_")
+        folder = args.work / of / name.replace(" ", "_")
         detector = trained(folder, config, shown, steps=args.fine_tuning_steps, seed=0, weights=weights)
         record[name] = measured(detector, test)
     return record
@@ -118,9 +119,11 @@ def main(args: Args) -> None:
     of = {"name": str(args.checkpoint), "step": described["step"], "hash": described["hash"]}
     record = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
     if record.get("checkpoint") != of:
-        record = {"checkpoint": of, "drives": {n: getattr(args, n) for n in ("scenes", "keyframes", "seed")}}
+        record = {"checkpoint": of}
     for name, frames in parts(args, detector):
         record[name] = measured(detector, frames)
+        if name == "simulated":
+            record["drives"] = {n: getattr(args, n) for n in ("scenes", "keyframes", "seed")}
         save(record, out, f"{name}: mAP {record[name]['all']['mAP']} on {len(frames)} keyframes")
     if not args.only or "fine_tuning" in args.only:
         record["fine_tuning"] = found = fine_tuning(args)

@@ -11,7 +11,7 @@ import tyro
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder
 from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
 from fcos_lidar_jax.data.point_files import MAX_POINTS
-from fcos_lidar_jax.data.sweeps import about_z, read_list, turned
+from fcos_lidar_jax.data.sweeps import about_z, before_turning, read_list, turned
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import Backend, load_detector
 from fcos_lidar_jax.inference.cloud import expect_points
@@ -86,7 +86,7 @@ def run(args: Detect) -> None:
     projection = detector.config.projection
     clouds = CloudFiles(
         files,
-        detector.sensor,
+        before_turning(detector.sensor, np.deg2rad(args.yaw_deg)),
         args.remove_close or projection.remove_close,
         projection.close_m,
         columns=args.columns,

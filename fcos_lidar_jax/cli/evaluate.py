@@ -40,8 +40,8 @@ from fcos_lidar_jax.visualization.page import page_frame, write_page
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Evaluate detections: on nuScenes as the benchmark does, number by number; elsewhere by the same average
-    precision and errors over the detector's classes, without NDS.
+    """Evaluate detections: on nuScenes as the benchmark does, number by number; elsewhere, or with a class map, by
+    the same average precision and errors over the detector's classes, without NDS.
 
     Either a detector is run over a split (--checkpoint), or a results file is read (--results), against the
     annotations of a data set (--data-root) or, for an official results file, a file of ground truth
@@ -59,7 +59,9 @@ class Evaluate:
     checkpoint: Path | None = None
     """Trained detector to run: a checkpoint; a run, which stands for its last one, RUN/best for its best; or
     `hdl32e` or `quickstart`, which come with the package."""
-    results: Path | None = None  # Results file to evaluate: the benchmark's, or detections.json.
+    results: Path | None = None
+    """Results file to evaluate: the benchmark's, without a checkpoint; or detections.json, with the one whose
+    classes it has."""
     ground_truth: Path | None = None
     """Truth as JSON, instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
     batch_size: int = 1  # Frames that a device takes at once; more than one changes boxes and scores by rounding.
@@ -75,6 +77,11 @@ def run(args: Evaluate) -> None:
     _check(args)
     detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
     sensor = load_sensor(args.sensor) if detector is None else detector.sensor
+    if args.ground_truth is None and _by_the_benchmark(args, args.data.layout(), detector):
+        if args.data.class_map is not None:
+            raise ValueError("--class-map: expected none with a results file: nuScenes' classes are fixed")
+        if detector is not None and args.results is not None:
+            raise ValueError("--results: got --checkpoint too, expected one of them for nuScenes")
     with contextlib.ExitStack() as locked:
         if detector is not None:
             locked.enter_context(folder_lock(args.out, "evaluating"))
@@ -102,11 +109,10 @@ def run(args: Evaluate) -> None:
 def _check(args: Evaluate) -> None:
     if args.checkpoint is None and args.results is None:
         raise ValueError("evaluate: expected --checkpoint or --results")
-    place = (args.data.data_root, args.data.format, args.split, args.samples)
     if args.ground_truth is not None:
         if args.checkpoint is not None:
             raise ValueError("--ground-truth: expected --results with it: a checkpoint needs --data-root")
-        if any(option is not None for option in place):
+        if args.data != DataOptions() or args.split is not None or args.samples is not None:
             raise ValueError("--ground-truth: expected no data set with it")
     elif args.data.data_root is None and args.data.format is None:
         raise ValueError("evaluate: expected --data-root, or --results with --ground-truth")
@@ -140,7 +146,7 @@ def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) ->
     layout = args.data.layout()
     split = args.split or args.data.split("val")
     name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), layout.version, split)))
-    if layout.format == "nuscenes" and (detector is None or set(detector.classes) <= set(NUSCENES_CLASSES)):
+    if _by_the_benchmark(args, layout, detector):
         frames = _keyframes(args, layout, detector, sensor, split)
         if detector is not None:
             _detect_keyframes(args, detector, frames)
@@ -163,6 +169,13 @@ def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) ->
     predictions, truth = frame_columns(found, (frames.frame(i) for i in range(len(frames))))
     metric = metric_of(detector.classes, tuple(detector.config.ranges_m.values()))
     return _Compared(name, predictions, truth, metric, {}, frames)
+
+
+def _by_the_benchmark(args: Evaluate, layout: Layout, detector: CloudDetector | None) -> bool:
+    """Whether nuScenes' own metric is meant: its data, for a detector of its classes as they are."""
+    if layout.format != "nuscenes" or detector is None:
+        return layout.format == "nuscenes"
+    return set(detector.classes) <= set(NUSCENES_CLASSES) and args.data.class_map is None
 
 
 def _official(args: Evaluate, truth: GroundTruth, frames: FrameSet | None, *, of: str, name: str) -> _Compared:

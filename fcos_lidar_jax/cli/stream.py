@@ -210,7 +210,7 @@ def _check(args: Stream) -> None:
     foreign: dict[str, str] = {}  # an option, and what alone it is for
     if args.source is not None:
         foreign |= dict.fromkeys(("version", "keyframes"), "--data-root")
-    if args.source is None or is_ros:
+    if args.source is None or is_ros or _is_log(args):
         foreign |= dict.fromkeys(("columns", "dtype"), "a folder of point files")
     if not is_ros:
         foreign |= dict.fromkeys(("topic", "odometry"), "a recording of ROS (.bag, .mcap, .db3, metadata.yaml)")
@@ -226,6 +226,12 @@ def _check(args: Stream) -> None:
         check_rerun()
         check_out_file("--rrd", args.rrd, keep=[*keep, args.out, *filter(None, [args.page])])
     args.out.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _is_log(args: Stream) -> bool:
+    """Whether the source is a drive of KITTI or Argoverse 2, which knows its poses and its files' layout."""
+    source = args.source
+    return args.poses is None and source is not None and (is_kitti_raw(source) or is_argoverse2_log(source))
 
 
 def _open(args: Stream, sensor: Sensor) -> Drive:

@@ -41,6 +41,7 @@ _PRESETS: Any = (
     tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT[name])
     for name, preset in PRESETS.items()
 )
+_MADE_BEFORE = 2000  # Simulated frames that may be made before the first step: minutes.
 _Preset: Any = reduce(or_, (Annotated[Config, preset] for preset in _PRESETS))
 
 
@@ -107,6 +108,8 @@ def run(args: Train) -> None:
     if split is None and args.samples is None and tests is None and jax.process_index() == 0:
         line = f"no splits: all {len(frames)} frames are trained on, none is left to evaluate on"
         print(f"{layout.root}: {line}", file=sys.stderr)
+    if layout.format == "simulated":
+        _check_simulated(len(frames), config)
     an_epoch = steps_per_epoch(frames, config)
     steps = args.steps or config.optimizer.epochs * an_epoch
     if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:
@@ -155,6 +158,17 @@ def _check(args: Train) -> None:
         raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
     if args.process_index is not None and not 0 <= args.process_index < (args.num_processes or 0):
         raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
+
+
+def _check_simulated(number: int, config: Config) -> None:
+    """Simulated frames are made one by one, so nothing should need all of very many before the first step."""
+    wanted = {"class_balanced": config.class_balanced, "copy_paste": config.copy_paste is not None}
+    if number > _MADE_BEFORE and any(wanted.values()):
+        options = " ".join(f"--no-{name.replace('_', '-')}" for name, on in wanted.items() if on)
+        raise ValueError(
+            f"--format simulated: all {number} frames would be made before the first step, expected {options}, or "
+            f"at most {_MADE_BEFORE} of them by --samples"
+        )
 
 
 def _database(args: Train, config: Config, layout: Layout, split: str | None) -> database.GroundTruthDatabase:

@@ -30,11 +30,10 @@ class CloudFiles(FrameSet):
 
     def frame(self, index: int) -> Frame:
         file, mode, close_m = self.files[index], self.remove_close, self.close_m
+        layout = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
         if file.suffix == ".json":
-            how = {"remove_close": mode, "close_m": close_m, "max_points": self.max_points}
-            points, num_close = read_sweeps(file, self.sensor, **how)
+            points, num_close = read_sweeps(file, self.sensor, remove_close=mode, close_m=close_m, **layout)
         else:
-            layout = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
             cloud = read_points(file, self.sensor, **layout)
             points, num_close = drop_close(cloud, self.sensor, mode=mode, close_m=close_m)
         none = np.zeros(0, np.int32)

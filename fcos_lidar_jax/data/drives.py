@@ -1,7 +1,7 @@
 """Drives: the sweeps of one sensor in the order of time, with their poses where these are known."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -99,7 +99,7 @@ def folder_drive(
     elif poses.suffix == ".json":
         files, times, matrices = _listed(files, poses)
     else:
-        times, matrices = _posed(files, poses)
+        files, times, matrices = _posed(files, poses)
 
     def read() -> Iterator[Sweep]:
         for file, time_us, matrix in zip(files, times, matrices, strict=True):
@@ -121,8 +121,8 @@ def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list
     return [file for file, _ in entries], times, [np.array(entry.sensor_to_world) for _, entry in entries]
 
 
-def _posed(files: Sequence[Path], path: Path) -> tuple[list[int], list[np.ndarray]]:
-    """Times and poses of clouds from a file of lines."""
+def _posed(files: list[Path], path: Path) -> tuple[list[Path], list[int], list[np.ndarray]]:
+    """The clouds in the order of time, with times and poses from a file of lines."""
     track = read_tum(path)
     times = [_time_of(file) for file in files]
     if any(time is None for time in times):
@@ -131,9 +131,10 @@ def _posed(files: Sequence[Path], path: Path) -> tuple[list[int], list[np.ndarra
                 f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one a cloud, or "
                 f"clouds whose names are times (seconds with a decimal point, or nanoseconds)"
             )
-        return track.times_us.tolist(), list(pose_matrix(track.rotations, track.translations))
-    clouds = zip(files, times, strict=True)
-    return times, [track.at(t, f"{path}: {f}") for f, t in clouds]  # type: ignore
+        return files, track.times_us.tolist(), list(pose_matrix(track.rotations, track.translations))
+    timed = sorted((time, file) for time, file in zip(times, files, strict=True) if time is not None)
+    matrices = [track.at(time, f"{path}: {file}") for time, file in timed]
+    return [file for _, file in timed], [time for time, _ in timed], matrices
 
 
 def _time_of(file: Path) -> int | None:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -94,6 +94,8 @@ def read_sweeps(
     remove_close: str,
     close_m: float,
     num_sweeps: int | None = None,
+    columns: int | None = None,
+    dtype: str | None = None,
     max_points: int = MAX_POINTS,
 ) -> tuple[np.ndarray, int]:
     """The fused cloud of a JSON list of sweeps, as :func:`fuse_sweeps` gives it.
@@ -101,15 +103,17 @@ def read_sweeps(
     Args:
         path: the JSON file, see :func:`read_list`.
         num_sweeps: how many of the list to read at most, from the current one on; None for all.
-        max_points: of a file.
+        columns, dtype, max_points: of the files, as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
 
     Raises:
         ValueError: naming the file, the entry, the field, what was found and what was expected.
     """
 
+    layout: dict[str, Any] = {"columns": columns, "dtype": dtype, "max_points": max_points}
+
     def read(index: int, each: ListedSweep) -> Sweep:
         try:
-            points = read_points(path.parent / each.file, sensor, max_points=max_points)
+            points = read_points(path.parent / each.file, sensor, **layout)
         except ValueError as error:
             raise ValueError(f"{path}: $[{index}].file: {error}") from None
         return Sweep(points, np.array(each.sensor_to_world), each.timestamp_us)
@@ -189,6 +193,20 @@ def about_z(yaw_rad: float) -> np.ndarray:
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
     return pose
+
+
+def before_turning(sensor: Sensor, yaw_rad: float) -> Sensor:
+    """The sensor in the frame that becomes its own by a rotation about z.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> ahead = dataclasses.replace(TINY, origin_m=(0.0, 1.0, 2.0))
+    >>> np.round(before_turning(ahead, np.pi / 2).origin_m, 3).tolist()
+    [1.0, 0.0, 2.0]
+    """
+    if yaw_rad == 0:
+        return sensor
+    origin = np.array(sensor.origin_m) @ about_z(yaw_rad)[:3, :3]
+    return dataclasses.replace(sensor, origin_m=tuple(origin.tolist()))
 
 
 def turned(points: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from fcos_lidar_jax.data.sweeps import Sweep, about_z, fuse_sweeps, turned
+from fcos_lidar_jax.data.sweeps import Sweep, about_z, before_turning, fuse_sweeps, turned
 from fcos_lidar_jax.inference.cloud import Cloud, expect_points, make_cloud
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.inference.tracks import to_world
@@ -52,17 +52,19 @@ def detect_stream(
     window: deque[Sweep] = deque(maxlen=detector.config.num_sweeps if num_sweeps is None else num_sweeps)
     projection, sensor = detector.config.projection, detector.sensor
     before: Sweep | None = None
-    turn = about_z(yaw_rad)
+    turn, unturned = about_z(yaw_rad), before_turning(sensor, yaw_rad)
     for sweep in sweeps:
         if before is not None and sweep.time_us <= before.time_us:
             raise ValueError(
                 f"{sweep.name}: time: got {sweep.time_us} us, expected more than the {before.time_us} us of the "
                 f"sweep before, {before.name}"
             )
-        window.appendleft(_turned(sweep, turn) if yaw_rad else sweep)
+        window.appendleft(sweep)
         points, num_close = fuse_sweeps(
-            window, sensor, remove_close=projection.remove_close, close_m=projection.close_m
+            window, unturned, remove_close=projection.remove_close, close_m=projection.close_m
         )
+        if yaw_rad:
+            points = turned(points, turn)
         cloud = make_cloud(points, detector.config, sensor=sensor, num_close=num_close, remove_close="none")
         found = detector.detect(cloud)
         expect_points(sweep.name, cloud, int(found.num_dropped), sensor)
@@ -70,10 +72,3 @@ def detect_stream(
             found = dataclasses.replace(found, boxes=to_world(np.asarray(found.boxes), turn.T).astype(np.float32))
         yield Found(sweep, cloud, found)
         before = sweep
-
-
-def _turned(sweep: Sweep, turn: np.ndarray) -> Sweep:
-    """The same sweep in a turned frame."""
-    return dataclasses.replace(
-        sweep, points=turned(sweep.points, turn), sensor_to_world=sweep.sensor_to_world @ turn.T
-    )

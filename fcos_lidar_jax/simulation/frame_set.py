@@ -78,11 +78,12 @@ UNSEEN_SEED = 1_000_000  # seeds of test frames start here; training frames neve
 
 
 def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config, SimulatedFrames]:
-    """Training frames of which none is shown twice, and a configuration for them.
+    """Training frames of which none is shown twice, up to half a million, and a configuration for them.
 
     Args:
         config: what makes more of few frames is taken out: class balance, copy-paste, augmentation.
-        seed: another seed gives other streets.
+        seed: for the same number of steps, fewer than half a million samples in all, another seed gives other
+            streets: frames ``seed * steps * batch_size`` and on. Runs of other lengths may share some.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> config, frames = fresh_streets(QUICKSTART, steps=10)

@@ -12,6 +12,7 @@ from commands import assert_one_line_error, in_use, page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import evaluate
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.evaluate import Evaluate, run
@@ -214,6 +215,17 @@ def test_classes_without_truth_are_named(home, tmp_path, capsys):
     assert re.search("no ground truth counts of .*bus.*barrier", capsys.readouterr().err)
 
 
+def test_a_class_map_changes_the_truth_that_a_detector_is_compared_with(home, tmp_path):
+    """Which is no longer the benchmark's: no NDS."""
+    (tmp_path / "map.json").write_text(json.dumps(dict.fromkeys(NUSCENES_CLASSES[1:], None)))
+    data = dataclasses.replace(place(home)["data"], class_map=tmp_path / "map.json")
+    run(Evaluate(data, tmp_path / "out", split=SPLIT, checkpoint=home / "checkpoint", report=False))
+    summary = read(tmp_path / "out" / "metrics_summary.json")
+    assert "nd_score" not in summary
+    assert list(summary["mean_dist_aps"]) == ["car"]
+    assert (tmp_path / "out" / "detections.json").exists()
+
+
 @pytest.mark.parametrize("what", ["checkpoint", "results"])
 def test_a_folder_in_use_is_left_alone(home, tmp_path, what):
     given = {what: home / {"checkpoint": "checkpoint", "results": "results.json"}[what]}
@@ -229,6 +241,15 @@ MISTAKES = {
     "no such version": ("--results HOME/results.json --data-root HOME --version v2", "v2: no such folder"),
     "checkpoint and truth": (f"--checkpoint x {TRUTH}", "a checkpoint needs --data-root"),
     "truth and tables": (f"--results x --split val {TRUTH}", "--ground-truth: expected no data set with it"),
+    "class map and truth": (f"--results x --class-map y {TRUTH}", "--ground-truth: expected no data set with it"),
+    "class map and results": (
+        f"--results HOME/results.json --data-root HOME --version {VERSION} --class-map y",
+        "--class-map: expected none with a results file",
+    ),
+    "checkpoint and results": (
+        f"--results HOME/results.json --data-root HOME --version {VERSION} --checkpoint HOME/checkpoint",
+        "--results: got --checkpoint too, expected one of them for nuScenes",
+    ),
     "no such truth": ("--results x --ground-truth HOME/none.json", "none.json: no such file"),
     "no such results": (f"--results HOME/none.json {TRUTH}", "none.json: no such file"),
     "other samples": (

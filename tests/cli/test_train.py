@@ -205,6 +205,14 @@ def test_mistakes_get_one_line_and_leave_nothing(root, tmp_path, capsys, name):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_very_many_simulated_frames_are_not_made_before_the_first_step(tmp_path, capsys):
+    args = ["train", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out")]
+    message = "all 100000 frames would be made before the first step, expected --no-class-balanced"
+    for given, said in (((), f"{message} --no-copy-paste"), (("--no-copy-paste",), message)):
+        assert_one_line_error(capsys, [*args, *given], f"{said}, or at most 2000 of them by --samples")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
     """The objects of some samples are cut in the run's folder, so before they are."""
     with in_use(tmp_path / "run"):

@@ -34,6 +34,16 @@ def test_poses_are_interpolated_where_names_are_times(poses):
         np.testing.assert_allclose(sweep.sensor_to_world[:3, 3], (1 + 2 * share, 0, 0), atol=1e-12)
 
 
+def test_names_that_are_times_are_in_the_order_of_time(poses):
+    (poses / "poses.txt").write_text("9.8 0 0 0 0 0 0 1\n10.2 4 0 0 0 0 0 1\n")
+    for name in ("9.9", "10.0", "10.1", "9.8"):
+        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
+    sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
+    assert [sweep.time_us for sweep in sweeps] == [9_800_000, 9_900_000, 10_000_000, 10_100_000]
+    assert [sweep.name.rpartition("/")[2] for sweep in sweeps] == ["9.8.npy", "9.9.npy", "10.0.npy", "10.1.npy"]
+    np.testing.assert_allclose([sweep.sensor_to_world[0, 3] for sweep in sweeps], [0, 1, 2, 3], atol=1e-12)
+
+
 def test_other_names_have_a_line_each(poses):
     for name in ("b", "a"):
         np.save(poses / "clouds" / f"{name}.npy", CLOUD)

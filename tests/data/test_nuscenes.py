@@ -1,5 +1,6 @@
 """The reader of nuScenes: joins, poses, velocities, index, bad tables; the real scene and the official devkit."""
 
+import dataclasses
 import itertools
 import json
 import pickle
@@ -22,6 +23,7 @@ from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames, default_index
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import SampleData, read_table
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +141,20 @@ def test_index_opens_to_what_was_saved_and_frames_are_the_same(made, tmp_path):
         assert (len(frames), frame.points.shape[1], len(frame.boxes)) == (KEYFRAMES, 5, 2)
         np.testing.assert_array_equal(frame.points, plain.sweeps(token("sample", 0, 2), 4))
         assert frames.labels(2).tolist() == frame.labels[frame.num_points > 0].tolist()
+
+
+def test_close_points_are_those_near_the_sensor_wherever_its_frame_begins(made):
+    data = NuScenes(made, VERSION)
+    tokens = tuple(data.split("scene-0"))
+    x, y, _ = data.sweeps(tokens[0], 1, remove_close="none")[0, :3].tolist()
+    for origin in ((0.0, 0.0, 0.0), (x, y, 0.0)):
+        sensor = dataclasses.replace(NUSCENES_HDL32E, origin_m=origin)
+        frame = NuScenesFrames(data, tokens, 1, "all", 1.0, sensor).frame(0)
+        points = data.sweeps(tokens[0], 1, remove_close="none")
+        close = (np.abs(points[:, :2] - np.float32(origin[:2])) < 1).all(axis=1)
+        assert frame.num_close == close.sum()
+        assert close.any() or origin == (0.0, 0.0, 0.0)
+        np.testing.assert_array_equal(frame.points, points[~close])
 
 
 def test_an_older_sweep_may_be_missing_when_allowed(tmp_path):

@@ -463,6 +463,15 @@ def test_sweeps_see_a_fixed_world(tmp_path):
         np.testing.assert_array_equal(part[:, 4], np.float32(0.049999 * i))
 
 
+def test_raw_sweeps_of_another_layout_are_read_as_it_is_said(tmp_path):
+    rows = np.random.default_rng(0).uniform(3, 9, (40, 6))
+    rows.tofile(tmp_path / "a.bin")
+    (tmp_path / "sweeps.json").write_text(json.dumps([entry("a.bin")]))
+    options = {"remove_close": "all", "close_m": 1.0, "columns": 6, "dtype": "float64"}
+    fused, _ = read_sweeps(tmp_path / "sweeps.json", TINY, **options)
+    np.testing.assert_array_equal(fused[:, :4], rows[:, :4].astype(np.float32))
+
+
 @pytest.mark.parametrize(("mode", "counts"), [("all", [1, 1]), ("sweeps", [2, 1]), ("none", [2, 2])])
 def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
     np.save(tmp_path / "a.npy", np.array([[0.5, 0, 0], [10, 0, 0]]))

@@ -37,6 +37,7 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.training import NonFiniteLossError
+from fcos_lidar_jax.training.checkpoint import NonFiniteStateError
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -249,6 +250,24 @@ def test_more_rounds_changes_the_traffic_or_the_epochs_alone(tmp_path, monkeypat
     assert by_label["1 round, 3 x epochs"].projection.num_rounds == 1
     with pytest.raises(ValueError, match="--scale: got nuscenes, expected smoke or simulated"):
         more_rounds.main(Args(scale="nuscenes"))
+
+
+def test_a_row_without_a_curve_is_left_out_of_the_picture(tmp_path):
+    """All of its cells diverged."""
+    curve = {"curve": [[100, 0.1], [200, 0.2]]}
+    rows = [{"label": "gone", "scores": [None, None]}, {"label": "there", "scores": [None, curve]}]
+    record = {"rows": rows, "scale": "sector", "seeds": [0, 1]}
+    tables.draw_learning(table1_mrv_rounds.TABLE, record, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_a_state_that_is_not_finite_is_a_result_too(tmp_path):
+    class Overflows(Pretended):
+        def score(self, config, seed, folder):
+            raise NonFiniteStateError("checkpoints/00000007: not saved: var: not finite")
+
+    record = run_cell(QUICKSTART, Overflows(), 0, results=tmp_path, runs=tmp_path)
+    assert record["diverged"] == "checkpoints/00000007: not saved: var: not finite"
 
 
 def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_table):

@@ -3,17 +3,20 @@
 import dataclasses
 import json
 import math
+import shutil
 
 import jax
 import numpy as np
 import pytest
+from refusal import refused
 from tiny_run import TINY_CONFIG, untrained
 
 from experiments.real_frames import SPANS_M, scores_by_range, within
-from experiments.studies import model_card, shipped_weights
+from experiments.studies import model_card, shipped_weights, transfer
 from experiments.studies.shipped_weights import earlier_trainings, half_precision
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError
 from fcos_lidar_jax.types import Detections
@@ -110,8 +113,9 @@ def shipped(tmp_path, monkeypatch):
     (run / "run.json").write_text(json.dumps({"seed": 4, "weights": None, "steps": 9}))
     lines = ({"step": s, "loss/total": 1.0, "seconds": 2.0} for s in (1, 2, 3))
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    args = shipped_weights.Args(name="hdl32e", work=run, export=True, test_frames=2)
-    return package, shipped_weights.measure(args)
+    monkeypatch.setattr(shipped_weights, "RESULTS", tmp_path / "results")
+    shipped_weights.main(shipped_weights.Args(name="hdl32e", work=run, export=True, test_frames=2))
+    return package, json.loads((tmp_path / "results" / "hdl32e.json").read_text())
 
 
 def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
@@ -156,6 +160,27 @@ def test_a_card_has_the_figures_of_its_own_weights_alone(shipped, tmp_path):
         car = part["all"]["AP"]["car"], part["all"]["truths"]["car"]
         assert (f"| car | {car[0]:.3f} ({car[1]}) |" in text) is own
     load_checkpoint(package / "hdl32e")  # the card is no part of the checkpoint
+
+
+def test_a_card_of_other_weights_is_refused(shipped, tmp_path):
+    _, record = shipped
+    (tmp_path / "hdl32e.json").write_text(json.dumps({**record, "hash": "other"}))
+    with refused(f"hdl32e.json: hash: got other, expected that of the weights: {record['hash']}"):
+        model_card.write_card("hdl32e", tmp_path)
+
+
+def test_fine_tuning_from_other_weights_of_the_same_name_is_another_run(tmp_path, monkeypatch):
+    folders = []
+    monkeypatch.setattr(transfer, "real_data", lambda *_: tmp_path)
+    monkeypatch.setattr(transfer, "open_frames", lambda *_, **__: SimulatedFrames(TINY, 40))
+    monkeypatch.setattr(transfer, "trained", lambda folder, *_, **__: folders.append(folder))
+    monkeypatch.setattr(transfer, "measured", lambda *_: {})
+    for value in (0.0, 1.0):
+        weights = jax.tree.map(lambda leaf, v=value: leaf + np.float32(v), untrained(CONFIG, TINY))
+        shutil.rmtree(tmp_path / "weights", ignore_errors=True)
+        save_checkpoint(tmp_path / "weights", Checkpoint(CONFIG, TINY, weights, 3))
+        transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=tmp_path / "weights", work=tmp_path))
+    assert len(set(folders)) == 4
 
 
 def test_a_card_counts_the_frames_of_all_trainings(shipped, tmp_path):

@@ -1,6 +1,7 @@
 """A stream of sweeps: the window, and how often it is compiled."""
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from refusal import refused
 from tiny_run import TINY_CONFIG, bits, untrained
 
-from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
+from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds
+from fcos_lidar_jax.data.sweeps import Sweep, before_turning, fuse_sweeps
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detector import _split_detect
@@ -74,6 +76,31 @@ def test_sweeps_of_other_axes_are_turned_and_boxes_back(detector):
         late = np.asarray(two.detections.boxes[:, 6] - found.boxes[:, 6])[np.asarray(found.valid)]
         np.testing.assert_allclose(np.exp(1j * late), np.exp(-0.5j * np.pi), atol=1e-3)
         assert found.valid.any()
+
+
+def test_turned_sweeps_lose_the_same_points_as_a_list_of_them_does(tmp_path):
+    """Those near the sensor, which is not where the frame begins."""
+    yaw, sensor = 0.8, dataclasses.replace(TINY, origin_m=(1.0, -0.5, 0.2))
+    config = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
+    config = dataclasses.replace(config, projection=dataclasses.replace(config.projection, remove_close="all"))
+    detector = TrainedDetector(build_detector(config, sensor), untrained(config, sensor))
+    here = before_turning(sensor, yaw).origin_m[:2]
+    sweeps = [
+        dataclasses.replace(s, points=np.concatenate([s.points, s.points[:5] * 0 + np.float32([*here, 0, 1, 0])]))
+        for s in drive(2)
+    ]
+    entries = []
+    for i, sweep in enumerate(sweeps):
+        np.save(tmp_path / f"{i}.npy", sweep.points)
+        pose = {"timestamp_us": sweep.time_us, "sensor_to_world": sweep.sensor_to_world.tolist()}
+        entries.insert(0, {"file": f"{i}.npy", **pose})
+    (tmp_path / "sweeps.json").write_text(json.dumps(entries))
+    *_, found = detect_stream(sweeps, detector, yaw_rad=yaw)
+    files = CloudFiles((tmp_path / "sweeps.json",), before_turning(sensor, yaw), "all", config.projection.close_m)
+    frame = TurnedClouds(files, yaw).frame(0)
+    assert frame.num_close == found.cloud.num_close >= 10
+    cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close, remove_close="none")
+    assert bits((cloud.points, cloud.valid)) == bits((found.cloud.points, found.cloud.valid))
 
 
 def turned(points, turn):

@@ -154,15 +154,15 @@ class NuScenes:
         return self.fuse_sweeps(sample_token, num, remove_close=remove_close, close_m=close_m)[0]
 
     def fuse_sweeps(
-        self, sample_token: str, num: int, *, remove_close: str, close_m: float
+        self, sample_token: str, num: int, *, remove_close: str, close_m: float, sensor: Sensor = NUSCENES_HDL32E
     ) -> tuple[np.ndarray, int]:
-        """As :meth:`sweeps`, and how many points on the ego vehicle were dropped."""
+        """As :meth:`sweeps`, and how many points on the ego vehicle, those near the sensor, were dropped."""
         chain = self._chain(sample_token, num)
         if self.allow_missing_sweeps:
             chain = [row for row in chain if row == chain[0] or os.path.isfile(self._path(row))]
         times = self.index.sweep_time_us
         sweeps = (Sweep(self._read(row), self._sensor_to_global(row), times[row]) for row in chain)
-        return fuse_sweeps(sweeps, NUSCENES_HDL32E, remove_close=remove_close, close_m=close_m)
+        return fuse_sweeps(sweeps, sensor, remove_close=remove_close, close_m=close_m)
 
     def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
         """The sweeps of a scene in the order of time, read as they are asked for; only keyframes if so wished.
@@ -294,16 +294,17 @@ class NuScenesFrames(FrameSet):
     num_sweeps: int = 10  # this and the next two as in NuScenes.sweeps
     remove_close: str = "all"
     close_m: float = 1.0
-    sensor: Sensor = NUSCENES_HDL32E  # whose points they are; its origin is the frame's
+    sensor: Sensor = NUSCENES_HDL32E  # whose points they are
     classes = NUSCENES_CLASSES
 
     def __len__(self) -> int:
         return len(self.tokens)
 
     def frame(self, index: int) -> Frame:
-        data, token, mode, close_m = self.nuscenes, self.tokens[index], self.remove_close, self.close_m
+        data, token = self.nuscenes, self.tokens[index]
+        close = {"remove_close": self.remove_close, "close_m": self.close_m, "sensor": self.sensor}
         truth = data.boxes(token)
-        points, num_close = data.fuse_sweeps(token, self.num_sweeps, remove_close=mode, close_m=close_m)
+        points, num_close = data.fuse_sweeps(token, self.num_sweeps, **close)
         return Frame(points, truth.boxes, truth.labels, truth.num_lidar_pts, num_close)
 
     def labels(self, index: int) -> np.ndarray:
