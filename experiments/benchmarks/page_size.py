@@ -5,7 +5,7 @@
 Keyframes of the real scene-0523 below the environment's ``FCOS_LIDAR_REAL_DATA``, over and over, with their
 annotated boxes as detections and as truth; without these data, simulated frames. Where Chromium or Chrome is
 installed the page is opened in it, at 1280 x 800 pixels, without a GPU (software rendering): drawing a frame of
-one sweep and of ten. Other programs lengthen it; their load average is told.
+one sweep and of ten. Other programs lengthen it; their load average is recorded.
 
 Cost: a minute. Expected: at most 8 MB.
 """
