@@ -207,6 +207,9 @@ class InferenceConfig:
     max_detections: int = 500  # Boxes kept.
     candidates_per_level: int = 1000  # Reading: (location, class) pairs that enter NMS from each level.
     nms_overlap: Literal["bev", "3d"] = "bev"  # Reading: rotated IoU in the ground plane, or of the boxes.
+    iou_exponent: float = 1.0
+    """The score is the class probability times the predicted IoU to this power: 1 in the paper, 0 for none, others
+    as in CIA-SSD (Zheng et al., AAAI 2021)."""
     merge_iou: float | None = None
     """Not in the paper: weighted NMS, by which a kept box becomes the mean of those that overlap it by more than
     this, see ``nms.merge_boxes``; None: it stays as it is."""
@@ -218,6 +221,7 @@ class InferenceConfig:
         _check(0 <= self.min_probability < 1, "min_probability", self.min_probability, "within [0, 1)")
         _check(0 <= self.iou_threshold <= 1, "iou_threshold", self.iou_threshold, "within [0, 1]")
         _check_least(self, 1, "max_detections", "candidates_per_level")
+        _check(0 <= self.iou_exponent < math.inf, "iou_exponent", self.iou_exponent, "finite, 0 or more")
         _check(self.merge_iou is None or 0 <= self.merge_iou <= 1, "merge_iou", self.merge_iou, "within [0, 1]")
         _check_choices(self)
 
@@ -345,6 +349,8 @@ class Config:
             one_each = len(groups) in (0, len(names))
             _check(one_each, "pillars.groups", groups, f"{len(names)} values, one a class, or none")
             _check(self.model == ModelConfig(), "model", "choices", "none: pillars takes its place")
+            exponent = self.inference.iou_exponent
+            _check(exponent == 1, "inference.iou_exponent", exponent, "1 with pillars, which predict no IoU")
 
     @property
     def ranges_m(self) -> dict[str, float]:

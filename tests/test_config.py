@@ -115,6 +115,8 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: LossConfig(iou_loss="l2"),  # type: ignore[arg-type]
         lambda: InferenceConfig(iou_threshold=2),
         lambda: InferenceConfig(nms_overlap="4d"),  # type: ignore[arg-type]
+        lambda: InferenceConfig(iou_exponent=-0.5),
+        lambda: InferenceConfig(iou_exponent=float("inf")),
         lambda: AugmentConfig(flip_x_probability=2),
         lambda: OptimizerConfig(warmup_fraction=1.0),
         lambda: PillarConfig(pillar_m=0.3),
@@ -125,6 +127,7 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: PillarConfig(min_overlap=1.0),
         lambda: Config(pillars=PillarConfig(groups=(0, 1))),
         lambda: Config(pillars=PillarConfig(), model=ModelConfig(tied_heads=True)),
+        lambda: Config(pillars=PillarConfig(), inference=InferenceConfig(iou_exponent=0.5)),
         lambda: Config(max_points=0),
         lambda: Config(classes=()),
         lambda: Config(classes=("crate", "crate")),

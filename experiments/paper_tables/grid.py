@@ -29,8 +29,8 @@ def run_cells(
 ) -> list[dict[str, Any]]:
     """The records of configurations with seeds, in their order, each from its file or by training it.
 
-    A label is printed when its cell's training begins. A cell that another process trains is left to it and looked at
-    again when the others are done.
+    A label is printed when its cell's training begins. A cell that another process trains is left to it and
+    looked at again when the others are done.
     """
     found: dict[int, dict[str, Any]] = {}
     while len(found) < len(cells):

@@ -155,8 +155,8 @@ def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) ->
         raise ValueError("--results: expected --checkpoint too: its classes are those of detections.json")
     frames = args.data.open(detector.config, split=split, samples=args.samples, sensor=detector.sensor)
     if split is None and args.samples is None:
-        line = f"no splits: all {len(frames)} frames are evaluated; scores of frames that were trained on are too high"
-        print(f"{layout.root}: {line}", file=sys.stderr)
+        line = f"no splits: all {len(frames)} frames are evaluated"
+        print(f"{layout.root}: {line}; scores of frames that were trained on are too high", file=sys.stderr)
     file = args.out / "detections.json"
     if args.results is None:
 

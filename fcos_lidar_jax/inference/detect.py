@@ -56,7 +56,8 @@ def select_candidates(
     num_classes = outputs.iou_logits.shape[-1]
     probability = jax.nn.softmax(outputs.logits)[:, :num_classes]
     eligible = (probability > config.min_probability) & locations.occupied[:, None]
-    scores = jnp.where(eligible, probability * jax.nn.sigmoid(outputs.iou_logits), -1.0)
+    quality = jax.nn.sigmoid(outputs.iou_logits) ** config.iou_exponent
+    scores = jnp.where(eligible, probability * quality, -1.0)
     kept, first = [], 0
     for size in layout.level_sizes:
         level = scores[first : first + size].reshape(-1)

@@ -23,7 +23,8 @@ def test_both_detectors_share_all_but_themselves(tmp_path):
     peer, ours, longer = (row.change(base) for row in centerpoint.ROWS)
     assert ours == base
     assert peer.pillars == CENTERPOINT_COMPACT.pillars
-    assert dataclasses.replace(peer, pillars=None, model=base.model, loss=base.loss) == base
+    inference = dataclasses.replace(peer.inference, iou_exponent=base.inference.iou_exponent)
+    assert dataclasses.replace(peer, pillars=None, model=base.model, loss=base.loss, inference=inference) == base
     assert (base.optimizer.epochs, longer.optimizer.epochs) == (2, 3)
     assert dataclasses.replace(longer, optimizer=base.optimizer) == base
 

@@ -39,7 +39,7 @@ def scene():
 def candidates_by_loops(outputs, locations, config):
     logits = np.asarray(outputs.logits, np.float64)
     p = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
-    quality = 1 / (1 + np.exp(-np.asarray(outputs.iou_logits, np.float64)))
+    quality = (1 + np.exp(-np.asarray(outputs.iou_logits, np.float64))) ** -config.iou_exponent
     found, first = [], 0
     for size in LAYOUT.level_sizes:
         level = []
@@ -54,9 +54,10 @@ def candidates_by_loops(outputs, locations, config):
     return found
 
 
-def test_candidates_are_the_best_pairs_of_each_level(scene):
+@pytest.mark.parametrize("iou_exponent", [1.0, 0.5, 0.0])
+def test_candidates_are_the_best_pairs_of_each_level(scene, iou_exponent):
     outputs, locations = scene
-    config = InferenceConfig(min_probability=0.2, candidates_per_level=150)
+    config = InferenceConfig(min_probability=0.2, candidates_per_level=150, iou_exponent=iou_exponent)
     boxes, scores, labels, valid = map(
         np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT)
     )
