@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import atomic_write
@@ -60,6 +60,7 @@ def run(args: Benchmark) -> None:
     files = find_clouds(args.files)
     if args.out is not None:
         check_out_file("--out", args.out, keep=files)
+    check_outside("--out", args.out, args.checkpoint)
     detector = load_detector(args.checkpoint, backend=args.backend)
     record = {
         "checkpoint": str(args.checkpoint),

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fcos_lidar_jax.files import check_writable
+from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 
 def check_at_least(args: object, least: int, *options: str) -> None:
@@ -46,3 +47,19 @@ def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
         if out.resolve() == other.resolve() or (out.exists() and other.exists() and out.samefile(other)):
             raise ValueError(f"{option}: {out}: the same file as {other}, expected another one")
     check_writable(out)
+
+
+def check_outside(option: str, out: Path | None, checkpoint: Path) -> None:
+    """Refuse to write into the detector that is used: into a checkpoint's folder, or over an exported file.
+
+    Args:
+        option: as it is typed.
+        out: its value; None where it was not given.
+        checkpoint: a path or a name, see :func:`find_checkpoint`.
+
+    Raises:
+        ValueError: naming the option and the place.
+    """
+    found = find_checkpoint(checkpoint).resolve()
+    if out is not None and found in (out.resolve(), *out.resolve().parents):
+        raise ValueError(f"{option}: {out}: found a place in the checkpoint, expected one elsewhere")

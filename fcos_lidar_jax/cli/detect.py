@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder, check_outside
 from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import about_z, before_turning, read_list, turned
@@ -19,7 +19,6 @@ from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.trainer import predict
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
 
 _CLEAR = 0.2  # Boxes of this score and more are counted on the screen.
@@ -34,7 +33,7 @@ class Detect:
     """
 
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]]
-    """Point files, one cloud each (.pcd.bin, .bin, .npy, .npz or .pcd), or folders of them."""
+    """Point files, one cloud each (.pcd.bin, .bin, .npy, .npz, .pcd or .feather), or folders of them."""
     checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")]
     """Trained detector: a checkpoint; a run, which stands for its last one, RUN/best for its best; or
     `hdl32e` or `quickstart`, which come with the package."""
@@ -79,9 +78,8 @@ def run(args: Detect) -> None:
         check_out_file("--page", args.page, keep=(*files, *sweeps, args.out))
     if args.pictures is not None:
         check_out_folder(args.pictures, "--pictures")
-    for option, out in (("--out", args.out), ("--page", args.page or args.out)):
-        if find_checkpoint(args.checkpoint).resolve() in out.resolve().parents:
-            raise ValueError(f"{option}: {out}: found a place in the checkpoint, expected one elsewhere")
+    for option, out in (("--out", args.out), ("--page", args.page), ("--pictures", args.pictures)):
+        check_outside(option, out, args.checkpoint)
     detector = load_detector(args.checkpoint, backend=args.backend)
     projection = detector.config.projection
     clouds = CloudFiles(

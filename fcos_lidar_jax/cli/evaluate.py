@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder, check_outside
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -119,6 +119,8 @@ def _check(args: Evaluate) -> None:
     check_at_least(args, 1, "batch_size")
     check_at_least(args, 0, "bootstrap")
     check_out_folder(args.out)
+    if args.checkpoint is not None:
+        check_outside("--out", args.out, args.checkpoint)
     given = [] if args.results is None else [args.results]
     truth = [] if args.ground_truth is None else [args.ground_truth]
     for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE):

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_out_file
+from fcos_lidar_jax.cli.checks import check_out_file, check_outside
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.export import PLATFORMS, Size, export_detector, load_exported
@@ -43,8 +43,7 @@ def run(args: Export) -> None:
     """Export and write."""
     found = find_checkpoint(args.checkpoint)
     check_out_file("--out", args.out, keep=())
-    if found.resolve() in args.out.resolve().parents:
-        raise ValueError(f"--out: {args.out}: found a place in the checkpoint, expected one elsewhere")
+    check_outside("--out", args.out, args.checkpoint)
     if args.network_only != (args.format == "onnx"):
         raise ValueError("export: expected --network-only and --format onnx together: the rest has no ONNX form")
     (_export_network if args.network_only else _export_program)(args, found)

@@ -13,12 +13,12 @@ import jax
 import numpy as np
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
 from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
 from fcos_lidar_jax.data.drives import Drive, folder_drive
 from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
 from fcos_lidar_jax.data.nuscenes.reader import NuScenes
-from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.inference import Backend, load_detector
@@ -55,7 +55,11 @@ class Stream:
     data_root: Path | None = None  # Instead of a folder: a data set in the layout of nuScenes.
     scene: str | None = None  # Its scene.
     version: str | None = None  # Its folder of tables; may be left out where there is one.
+    index: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Its index, where `fcos-lidar prepare --index` put it elsewhere."""
     keyframes: bool = False  # Only the scene's keyframes.
+    allow_missing_sweeps: bool = False  # Pass over sweeps of the scene whose file is missing.
+    follow_links: bool = False  # Read files to which links lead outside of DATA_ROOT.
     page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
     """Also write a page that shows the drive: one file for any browser, which asks for nothing else."""
     rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
@@ -209,7 +213,10 @@ def _check(args: Stream) -> None:
     is_ros = args.source is not None and is_ros_bag(args.source)
     foreign: dict[str, str] = {}  # an option, and what alone it is for
     if args.source is not None:
-        foreign |= dict.fromkeys(("version", "keyframes"), "--data-root")
+        of_scenes = "version", "index", "keyframes", "allow_missing_sweeps", "follow_links"
+        foreign |= dict.fromkeys(of_scenes, "--data-root")
+    elif args.max_file_points != MAX_POINTS:
+        raise ValueError("--max-file-points: expected with a folder or a recording alone")
     if args.source is None or is_ros or _is_log(args):
         foreign |= dict.fromkeys(("columns", "dtype"), "a folder of point files")
     if not is_ros:
@@ -217,8 +224,12 @@ def _check(args: Stream) -> None:
     if args.source is None or args.odometry is not None:
         foreign["poses"] = "a folder of point files, or a recording of ROS without --odometry,"
     if given := [name for name in foreign if getattr(args, name)]:
-        raise ValueError(f"--{given[0]}: expected with {foreign[given[0]]} alone")
+        raise ValueError(f"--{given[0].replace('_', '-')}: expected with {foreign[given[0]]} alone")
     keep = [path for path in (args.source, args.poses) if path is not None and path.is_file()]
+    if args.source is not None and args.source.is_dir():
+        keep += [path for path in args.source.rglob("*") if path.name.lower().endswith(ENDINGS)]
+    for option, out in (("--out", args.out), ("--page", args.page), ("--rrd", args.rrd)):
+        check_outside(option, out, args.checkpoint)
     check_out_file("--out", args.out, keep=keep)
     if args.page is not None:
         check_out_file("--page", args.page, keep=[*keep, args.out])
@@ -249,7 +260,9 @@ def _open(args: Stream, sensor: Sensor) -> Drive:
     assert args.scene is not None
     version = find_layout(args.data_root, "nuscenes", args.version).version
     assert version is not None
-    return Drive(NuScenes(args.data_root, version).drive(args.scene, keyframes=args.keyframes))
+    allowed = {"allow_missing_sweeps": args.allow_missing_sweeps, "follow_links": args.follow_links}
+    data = NuScenes(args.data_root, version, index=args.index, **allowed)
+    return Drive(data.drive(args.scene, keyframes=args.keyframes))
 
 
 def _record(found: Found, classes: tuple[str, ...], min_score: float, drive: Drive) -> dict[str, Any]:

@@ -47,7 +47,11 @@ def run(args: Synthesize) -> None:
     if args.streets not in STREETS:
         raise ValueError(f"--streets: {unknown_name(args.streets, STREETS)}")
     check_out_folder(args.out)
-    fields = args.scenes, args.seed, args.keyframes, load_sensor(args.sensor), args.rolling_shutter, args.version
+    sensor = load_sensor(args.sensor)
+    if sensor.row_source == "laser":
+        found = f"{sensor.name}, whose rows come from laser numbers"
+        raise ValueError(f"--sensor: got {found}, expected one without: the layout of nuScenes has none")
+    fields = args.scenes, args.seed, args.keyframes, sensor, args.rolling_shutter, args.version
     order = DatasetSpec(*fields, STREETS[args.streets])
     sweeps = args.scenes * ((args.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1)
     progress = Progress("sweeps", sweeps)

@@ -65,7 +65,7 @@ class TurnedClouds(FramesOf):
 
 
 def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Point files, and those in folders, sorted within each folder.
+    """Point files, and those in folders, sorted within each folder; hidden files there are left out.
 
     Raises:
         ValueError: a folder without a point file.
@@ -75,7 +75,8 @@ def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:
         if not path.is_dir():
             found.append(path)
             continue
-        files = sorted(p for p in path.iterdir() if p.is_file() and p.name.lower().endswith(ENDINGS))
+        shown = (p for p in path.iterdir() if not p.name.startswith("."))
+        files = sorted(p for p in shown if p.is_file() and p.name.lower().endswith(ENDINGS))
         if not files:
             raise ValueError(f"{path}: no point file in it, expected {', '.join(ENDINGS)}")
         found += files

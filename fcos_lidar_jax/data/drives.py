@@ -1,6 +1,8 @@
 """Drives: the sweeps of one sensor in the order of time, with their poses where these are known."""
 
 import dataclasses
+import itertools
+import re
 from collections.abc import Iterable, Iterator
 from decimal import Decimal
 from pathlib import Path
@@ -111,7 +113,10 @@ def folder_drive(
 
 def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list[np.ndarray]]:
     """The clouds in the order of a JSON list, with times and poses."""
-    known = {(poses.parent / entry.file).resolve(): entry for entry in read_entries(poses)}
+    listed = read_entries(poses)
+    known = {(poses.parent / entry.file).resolve(): entry for entry in listed}
+    if len(known) < len(listed):
+        raise ValueError(f"{poses}: got {len(listed)} entries for {len(known)} clouds, expected each once")
     by_place = {file.resolve(): file for file in files}
     for place, file in by_place.items():
         if place not in known:
@@ -131,10 +136,25 @@ def _posed(files: list[Path], path: Path) -> tuple[list[Path], list[int], list[n
                 f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one a cloud, or "
                 f"clouds whose names are times (seconds with a decimal point, or nanoseconds)"
             )
+        for before, after in itertools.pairwise(files):
+            if _in_parts(before.name) > _in_parts(after.name):
+                raise ValueError(
+                    f"{path}: poses are given to clouds in the order of their names: got {before.name} before "
+                    f"{after.name}, expected numbers of one length, or FILE.json"
+                )
         return files, track.times_us.tolist(), list(pose_matrix(track.rotations, track.translations))
     timed = sorted((time, file) for time, file in zip(times, files, strict=True) if time is not None)
     matrices = [track.at(time, f"{path}: {file}") for time, file in timed]
     return [file for _, file in timed], [time for time, _ in timed], matrices
+
+
+def _in_parts(name: str) -> list[str | int]:
+    """A name by which numbers of different lengths are sorted as numbers.
+
+    >>> _in_parts("sweep_9.npy") < _in_parts("sweep_10.npy")
+    True
+    """
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def _time_of(file: Path) -> int | None:

@@ -140,7 +140,9 @@ class FolderFrames(FrameSet):
         return None if current is None else current.timestamp_us
 
     def fingerprint(self) -> str:
-        files = [*self._clouds.values(), *self._boxes.values(), *self._sweeps.values()]
+        listed = (file.parent / sweep.file for file in self._sweeps.values() for sweep in read_list(file))
+        older = {*map(_normalized, listed)} - {*map(_normalized, self._clouds.values())}
+        files = [*self._clouds.values(), *self._boxes.values(), *self._sweeps.values(), *older]
         files += [file for name in ("sensor.json", "classes.json") if (file := self.root / name).exists()]
         reading = self.names, self.sensor, self.num_sweeps, self.remove_close, self.close_m
         return files_fingerprint(files, self.root, reading)
@@ -213,6 +215,10 @@ def _list_files(root: Path, folder: str, endings: tuple[str, ...], inside: Path 
             raise ValueError(f"{file}: a second file named {name} beside {files[name].name}, expected one")
         files[name] = file
     return files
+
+
+def _normalized(file: Path) -> Path:
+    return Path(os.path.normpath(file))
 
 
 def _expect_file(file: Path, inside: Path | None, where: str) -> None:

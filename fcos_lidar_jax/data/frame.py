@@ -1,6 +1,7 @@
 """Annotated clouds, and what a data set of them offers."""
 
 import dataclasses
+import os
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Protocol
@@ -191,10 +192,10 @@ def files_fingerprint(files: Iterable[Path], root: Path, reading: object) -> str
     """Checksum of files by name, size and time of their last change, and of how they are read.
 
     Args:
-        root: names are relative to it, so that a data set may be moved as a whole.
+        root: names are relative to it, also those of files outside, so that a data set may be moved as a whole.
         reading: options of the reader, distinguished by ``repr``.
     """
-    states = [(str(file.relative_to(root)), *_size_and_time(file)) for file in sorted(files)]
+    states = [(os.path.relpath(file, root), *_size_and_time(file)) for file in sorted(files)]
     return checksum(repr((states, reading)).encode())
 
 

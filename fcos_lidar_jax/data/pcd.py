@@ -5,9 +5,10 @@ import re
 
 import numpy as np
 
-_COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "intensity", "time_lag")}
-_COLUMNS["laser"] = ("laser_number", "laser", "ring")
-"""Column -> the field names it goes by, the most telling first. Other fields are skipped."""
+COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "time_lag")}
+COLUMNS["intensity"] = ("intensity", "reflectivity")
+COLUMNS["laser"] = ("laser_number", "laser", "ring", "line", "channel")
+"""Column -> the field names it goes by among drivers, the most telling first. Other fields are skipped."""
 _KINDS = {"F": ("f", "248"), "I": ("i", "1248"), "U": ("u", "1248")}
 """TYPE -> NumPy's letter, and the sizes it comes in."""
 _SPACE, _PART_BYTES = re.compile(rb"\s"), 2**20
@@ -48,7 +49,7 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
         raise ValueError(f"DATA: got {form!r}, expected {', '.join(_FORMS)}")
     chosen: dict[str, int] = {}
     names = [field.name for field in fields]
-    for column, aliases in _COLUMNS.items():
+    for column, aliases in COLUMNS.items():
         found = next((a for a in aliases if a in names), None)
         if found is not None:
             chosen[column] = names.index(found)

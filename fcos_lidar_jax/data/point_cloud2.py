@@ -4,13 +4,11 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.data.pcd import COLUMNS
 from fcos_lidar_jax.data.point_files import assemble_points
 from fcos_lidar_jax.sensors import Sensor
 
-_COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in "xyz"}
-_COLUMNS["intensity"] = ("intensity", "reflectivity")
-_COLUMNS["laser"] = ("ring", "laser_number", "laser", "line", "channel")
-"""Column -> the field names it goes by among drivers, the most telling first. Other fields are skipped."""
+_COLUMNS = {column: names for column, names in COLUMNS.items() if column != "time_lag"}
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Datatype of a field -> NumPy's name."""
 

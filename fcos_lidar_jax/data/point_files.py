@@ -1,5 +1,6 @@
 """Point clouds from files: raw nuScenes and KITTI, NumPy, PCD, Feather of Argoverse 2."""
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -37,17 +38,16 @@ def read_points(
 ) -> np.ndarray:
     """The points of a file.
 
-    ``.pcd.bin``: float32 x 5, the fifth the ring (nuScenes). ``.bin``: float32 x 4 (KITTI). Other raw layouts, in
-    files of any name, by ``columns`` and ``dtype``; a fifth column is then the time lag, but in a ``.pcd.bin`` it
-    stays the ring.
-    ``.npy`` and ``.npz`` (one array, or one named ``points``): N x 3 to 6. ``.pcd``: by its header. ``.feather``
-    (Argoverse 2): columns x, y, z, intensity, laser_number.
+    ``.pcd.bin`` (nuScenes): float32 x 5, the fourth the intensity of 0-255, the fifth the ring. ``.bin`` (KITTI):
+    float32 x 4. Other raw layouts, in files of any name, by ``columns`` and ``dtype``; a fifth column is then the
+    time lag, but in a ``.pcd.bin`` it stays the ring. ``.npy`` and ``.npz`` (one array, or one named ``points``):
+    N x 3 to 6. ``.pcd``: by its header. ``.feather`` (Argoverse 2): columns x, y, z, intensity, laser_number.
 
     A size cannot tell four from five columns, so a raw file is also refused when its values do not look like
     metres, or when another layout fits them clearly better.
 
     Args:
-        sensor: scales the intensity and says whether a laser number is needed.
+        sensor: scales the intensity, but that of ``.pcd.bin``, and says whether a laser number is needed.
         columns: values a point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
         max_points: a larger cloud is refused, by its header or its size and so before it takes memory.
@@ -94,6 +94,7 @@ def read_points(
     rows = _read_raw(path, content, columns, dtype)
     if kind != ".pcd.bin":
         return points_from_array(rows, sensor, str(path))
+    sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # The format's intensities are 0-255, as nuScenes'.
     return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
@@ -117,7 +118,8 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
     if array.ndim != 2 or array.shape[1] not in _RAW_COLUMNS:
         raise ValueError(f"{where}: shape: got {array.shape}, expected N x 3, 4, 5 or 6")
     lag = array[:, 4] if array.shape[1] > 4 else np.zeros(0)
-    if len(lag) and np.isfinite(lag).all() and lag.max() > 1 and not (lag % 1).any():
+    lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
+    if len(lag) and lag.max() > 1 and not (lag % 1).any():
         raise ValueError(
             f"{where}: fifth column: got whole numbers up to {lag.max():g}, which look like a ring, expected the "
             "time lag in seconds: leave the column out, or put 0 into it and the ring into a sixth"

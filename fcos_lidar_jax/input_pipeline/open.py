@@ -96,14 +96,15 @@ def default_split(
     Args:
         layout: of the data set.
         purpose: what it is for.
-        required: where the data have one other split alone, take that; where they have several, refuse to choose.
+        required: where the data have one other split alone, take that, unless it is for the other purpose by its
+            name; where they have several, refuse to choose.
         splits: JSON file of own splits.
 
     Returns:
         a name, or None where the data have no splits, and, if it is not required, where they have no such split.
 
     Raises:
-        ValueError: several splits, none of that name, and one is required.
+        ValueError: one is required, and the splits are several or for the other purpose.
     """
     name = f"mini_{purpose}" if (layout.version or "").endswith("mini") else purpose
     names = _split_names(layout, splits)
@@ -111,7 +112,7 @@ def default_split(
         return name
     if not required or not names:
         return None
-    if len(names) > 1:
+    if len(names) > 1 or names[0] in ("train", "val", "mini_train", "mini_val"):
         raise ValueError(f"{layout.root}: split: got splits {', '.join(names)}, none is {name}: name one")
     return names[0]
 
@@ -182,7 +183,7 @@ def open_frames(
     layout = find_layout(root, format, version)
     refused = {"index": index, "allow_missing_sweeps": allow_missing_sweeps or None}
     if layout.format != "folder":
-        refused["splits"] = splits
+        refused |= {"splits": splits, "follow_links": follow_links or None}
     for name, value in refused.items():
         if value is not None and layout.format != "nuscenes":
             raise ValueError(f"{name}: got {value}, expected none: {layout.root} is of format {layout.format}")

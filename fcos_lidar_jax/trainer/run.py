@@ -167,6 +167,7 @@ def train(
     is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
     check_run(run.folder, run.spec, resume=resume)
     given = weights if resume else _given_weights(run.detector, weights)  # needed where no checkpoint is yet
+    mismatch = sensor_mismatch(frames.frame(0).points, frames.sensor)  # read before the folder becomes a run's
     with _claimed(run, resume=resume):
         optimizer = make_optimizer(config.optimizer, steps)
         start = _start(run, optimizer, seed, resume, given)
@@ -177,8 +178,8 @@ def train(
         step = jit_step(make_train_step(run.detector, optimizer), mesh)
         metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
         if is_main_process:
-            if line := sensor_mismatch(frames.frame(0).points, frames.sensor):
-                print(f"warning: {frames.name(0)}: {line}", file=sys.stderr, flush=True)
+            if mismatch:
+                print(f"warning: {frames.name(0)}: {mismatch}", file=sys.stderr, flush=True)
             print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
 
         def report(number: int, record: Record) -> None:

@@ -201,6 +201,14 @@ BAD = {
         "detect HOME/none.npy --out HOME/checkpoint/boxes.json",
         "--out: .*found a place in the checkpoint",
     ),
+    "pictures into a checkpoint": (
+        "detect HOME/none.npy --pictures HOME/checkpoint/pictures",
+        "--pictures: .*found a place in the checkpoint",
+    ),
+    "synthesize for laser numbers": (
+        "synthesize --scenes 1 --sensor argoverse2",
+        "--sensor: got argoverse2, whose rows come from laser numbers",
+    ),
     "detect below a file": (
         "detect HOME/none.npy --out HOME/good.npy/x",
         "good.npy: found a file, expected a fol",

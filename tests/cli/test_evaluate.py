@@ -263,6 +263,10 @@ MISTAKES = {
         "--results HOME/results.json --ground-truth HOME/results_nusc.json --out HOME",
         "--out: .*results_nusc.json: the same file as",
     ),
+    "out into the checkpoint": (
+        f"--data-root HOME --version {VERSION} --checkpoint HOME/checkpoint --out HOME/checkpoint/scores",
+        "--out: .*found a place in the checkpoint",
+    ),
     "file for a folder": (f"--results x {TRUTH} --out HOME/truth.json", "--out: .*found a file"),
 }
 

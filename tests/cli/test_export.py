@@ -148,6 +148,18 @@ def test_what_is_not_as_it_was_written_gets_one_line(home, tmp_path, capsys, nam
     assert_one_line_error(capsys, [*words, "--out", str(tmp_path / "a.json")], f"bad.fcos: {message}")
 
 
+@pytest.mark.parametrize(
+    "command_line", ["detect HOME/cloud.npy", "stream HOME/cloud.npy", "benchmark HOME/cloud.npy"]
+)
+def test_no_command_writes_over_the_detector_that_it_uses(home, capsys, command_line):
+    content = (home / "detector.fcos").read_bytes()
+    words = command_line.replace("HOME", str(home)).split()
+    detector = str(home / "detector.fcos")
+    message = "--out: .* found a place in the checkpoint"
+    assert_one_line_error(capsys, [*words, "--checkpoint", detector, "--out", detector], message)
+    assert (home / "detector.fcos").read_bytes() == content
+
+
 WRONG = {
     "--points 0": "points: got 0, expected at least 1, or any",
     "--batch 0": "batch: got 0, expected at least 1, or any",

@@ -165,6 +165,16 @@ MISTAKES = {
     "score": ("HOME/drive --min-score 2", "--min-score: got 2, expected"),
     "angle": ("HOME/drive --yaw-deg nan", "--yaw-deg: got nan, expected an angle"),
     "no folder": ("HOME/nowhere", "nowhere: no such file or folder"),
+    "out into a cloud": ("HOME/drive --out HOME/drive/1.000000.npy", "--out: .*the same file as"),
+    "out into the checkpoint": (
+        "HOME/drive --out HOME/checkpoint/checkpoint.json",
+        "--out: .*found a place in the checkpoint",
+    ),
+    "points of a scene": (
+        "--data-root HOME --scene a --max-file-points 5",
+        "--max-file-points: expected with a folder or a recording alone",
+    ),
+    "links of a folder": ("HOME/drive --follow-links", "--follow-links: expected with --data-root alone"),
     "page into poses": (
         "HOME/drive --poses HOME/poses.txt --page HOME/poses.txt",
         "--page: .*the same file as .*poses.txt",
@@ -178,6 +188,8 @@ def test_mistakes_are_one_line(home, tmp_path, capsys, case):
     args = ["stream", *text.replace("HOME", str(home)).split(), "--checkpoint", str(home / "checkpoint")]
     out = tmp_path / "boxes.jsonl"
     out.write_text("an earlier result")
-    assert_one_line_error(capsys, [*args, "--out", str(out)], message)
+    before = {file: file.read_bytes() for file in home.rglob("*") if file.is_file()}
+    assert_one_line_error(capsys, args if "--out" in args else [*args, "--out", str(out)], message)
+    assert all(file.read_bytes() == content for file, content in before.items())
     # Lost with the first line of the new one.
     assert (out.read_text() == "an earlier result") == (case != "time going back")

@@ -1,5 +1,7 @@
 """Drives: poses of lines, and the scenes of nuScenes."""
 
+import json
+
 import numpy as np
 import pytest
 from made_nuscenes import BETWEEN, KEYFRAMES, VERSION, make_tables, write
@@ -55,6 +57,25 @@ def test_other_names_have_a_line_each(poses):
         folder_drive(poses / "clouds", TINY, poses / "poses.txt")
 
 
+def test_names_whose_order_is_not_that_of_their_numbers_get_no_pose_by_it(poses):
+    for name in ("sweep_9", "sweep_10"):
+        np.save(poses / "clouds" / f"{name}.npy", CLOUD)
+    with refused("got sweep_10.npy before sweep_9.npy, expected numbers of one length"):
+        folder_drive(poses / "clouds", TINY, poses / "poses.txt")
+    (poses / "clouds" / "sweep_9.npy").rename(poses / "clouds" / "sweep_09.npy")
+    np.save(poses / "clouds" / "._sweep_09.npy", CLOUD)  # as macOS leaves them on other file systems
+    sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
+    assert [sweep.name[-6:] for sweep in sweeps] == ["09.npy", "10.npy"]
+
+
+def test_a_cloud_that_is_listed_twice_is_refused(poses):
+    np.save(poses / "clouds" / "a.npy", CLOUD)
+    entry = {"file": "clouds/a.npy", "sensor_to_world": np.eye(4).tolist()}
+    (poses / "poses.json").write_text(json.dumps([entry | {"timestamp_us": i} for i in range(2)]))
+    with refused("poses.json: got 2 entries for 1 clouds, expected each once"):
+        folder_drive(poses / "clouds", TINY, poses / "poses.json")
+
+
 @pytest.mark.parametrize(
     "line", ["x 0 0 0 0 0 0 1", "1 0 0 0 0 0 1", "1 0 0 nan 0 0 0 1", "nan 0 0 0 0 0 0 1", "1e999 0 0 0 0 0 0 1"]
 )
@@ -78,6 +99,21 @@ def test_a_scene_is_all_its_sweeps_or_its_keyframes(tmp_path):
         np.testing.assert_array_equal(fused, data.sweeps(token, 3))
     with refused("scene: got 'scene-7', expected"):
         data.drive("scene-7")
+
+
+def test_a_scene_may_lack_sweeps_but_not_keyframes(tmp_path):
+    root = write(tmp_path, *make_tables())
+    number = len(list(NuScenes(root, VERSION).drive("scene-1")))
+    data = NuScenes(root, VERSION)
+    (root / list(data.drive("scene-1"))[1].name).unlink()
+    with refused("no such file, expected a sweep that sample_data.json names"):
+        list(data.drive("scene-1"))
+    assert len(list(NuScenes(root, VERSION, allow_missing_sweeps=True).drive("scene-1"))) == number - 1
+    scenes = root / VERSION / "scene.json"
+    rows = json.loads(scenes.read_text())
+    scenes.write_text(json.dumps([*rows, rows[0] | {"token": "9" * 32, "name": "scene-9"}]))
+    with refused("sample.json: scene scene-9: found no keyframe, expected one"):
+        NuScenes(root, VERSION).drive("scene-9")
 
 
 def test_rows_beyond_all_numbers_become_infinite_without_a_warning():

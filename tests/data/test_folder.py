@@ -156,6 +156,12 @@ def test_sweeps_are_fused_up_to_a_number(root, sweeps, num_sweeps, lags):
     assert frame.num_points.tolist() == [2]
 
 
+def test_the_fingerprint_is_of_older_sweeps_too(root, sweeps):
+    before = FolderFrames(root).fingerprint()
+    np.save(root / "older" / "1.npy", np.array([[8, 1, -1, 30], [9, 1, -1, 30]]))
+    assert FolderFrames(root).fingerprint() != before
+
+
 def test_a_list_of_sweeps_gives_pose_and_time_and_one_sweep_needs_no_other(root, sweeps):
     (root / "older" / "1.npy").unlink()
     frames = FolderFrames(root, num_sweeps=1)

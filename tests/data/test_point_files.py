@@ -92,6 +92,25 @@ def test_every_intensity_is_scaled(tmp_path, points, name):
     np.testing.assert_array_equal(read[:, :3], points[:, :3])
 
 
+def test_the_intensities_of_nuscenes_files_are_never_scaled(tmp_path, points):
+    rows = nuscenes_rows(points)
+    read = read_points(save(tmp_path / "a.pcd.bin", rows), KITTI_HDL64E)
+    np.testing.assert_array_equal(read[:, :4], rows[:, :4])
+
+
+def test_a_ring_is_noticed_beside_missing_returns(tmp_path, points):
+    rows = nuscenes_rows(points)
+    rows[7] = np.nan
+    with refused("a.npy: fifth column: got whole numbers up to 31, which look"):
+        read_points(save(tmp_path / "a.npy", rows), NUSCENES_HDL32E)
+
+
+def test_a_pcd_file_may_call_its_intensity_reflectivity(tmp_path):
+    head = pcd_header("ascii", 1, "x y z reflectivity line", "F F F F U", "4 4 4 4 1", "1 1 1 1 1")
+    path = save(tmp_path / "a.pcd", head + b"8 1 -1 30 5\n")
+    assert read_points(path, ARGOVERSE2).tolist() == [[8, 1, -1, 30, 0, 5]]
+
+
 @pytest.mark.parametrize("columns", [3, 4, 5])
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
 def test_other_raw_layouts_by_columns_and_dtype(tmp_path, points, columns, dtype):

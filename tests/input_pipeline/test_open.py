@@ -173,6 +173,10 @@ def test_default_splits(roots, tmp_path):
     own = root / VERSION / "splits.json"
     own.write_text('{"only": ["scene-0"]}')
     assert (split(root, "train"), split(root, "val"), split(root, "val", required=False)) == ("only", "only", None)
+    own.write_text('{"train": ["scene-0"]}')
+    with pytest.raises(ValueError, match="got splits train, none is val: name one"):
+        split(root, "val")  # what was trained on is not evaluated unasked
+    assert split(root, "val", required=False) is None
     (tmp_path / "own.json").write_text('{"train": ["scene-1"], "other": []}')
     assert split(root, "train", splits=tmp_path / "own.json") == "train"
     own.unlink()

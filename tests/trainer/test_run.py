@@ -298,6 +298,17 @@ def test_frames_whose_boxes_have_no_point_are_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_first_frame_that_cannot_be_read_leaves_no_run(tmp_path):
+    class Broken(GivenFrames):
+        def frame(self, index):
+            raise ValueError("clouds/0.npy: empty file")
+
+    frames = Broken((FRAMES.frame(0),), FRAMES.sensor, FRAMES.classes)
+    with pytest.raises(ValueError, match=r"clouds/0.npy: empty file"):
+        train_tiny(tmp_path / "run", frames=frames)
+    assert not (tmp_path / "run").exists()
+
+
 def test_what_is_no_run_or_another_one_is_refused(begun, tmp_path):
     with pytest.raises(ValueError, match="holds a run, expected --resume or another folder"):
         train_tiny(begun)

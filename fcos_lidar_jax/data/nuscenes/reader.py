@@ -56,7 +56,7 @@ class NuScenes:
         version: the folder of the tables, such as ``v1.0-trainval``.
         index: of ``prepare``; by default ``ROOT/.fcos_lidar/VERSION``.
         allow_missing_sweeps: older sweeps whose file is missing are left out instead of refused;
-            :meth:`missing_sweeps` counts them. The current sweep is never left out.
+            :meth:`missing_sweeps` counts them. The current sweep is never left out, but by :meth:`drive`.
         follow_links: read files to which links lead outside of the root.
 
     Raises:
@@ -174,11 +174,15 @@ class NuScenes:
         if scene not in names:
             raise ValueError(f"{self.tables}: scene: {unknown_name(scene, names)}")
         rows = self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
+        if not rows:
+            raise ValueError(f"{self.tables / 'sample.json'}: scene {scene}: found no keyframe, expected one")
         if not keyframes:
             following = {int(before): row for row, before in enumerate(self.index.sweep_previous) if before >= 0}
             while rows[-1] in following:
                 rows.append(following[rows[-1]])
             rows = self._chain_of(rows[-1], len(self.index.sweep_file))[::-1]
+        if self.allow_missing_sweeps:
+            rows = [row for row in rows if os.path.isfile(self._path(row))]
         times = self.index.sweep_time_us
         poses = map(self._sensor_to_global, rows)
         return (
