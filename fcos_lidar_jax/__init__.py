@@ -5,6 +5,8 @@
 >>> detector = fcos.load_detector("quickstart")
 >>> detector(np.ones((100, 4), np.float32)).boxes.shape
 (500, 9)
+
+Training, prediction and evaluation in many frames are in :mod:`fcos_lidar_jax.trainer`.
 """
 
 from importlib import import_module

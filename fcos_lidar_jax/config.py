@@ -1,4 +1,4 @@
-"""Frozen configurations with the paper's values as defaults, and the presets.
+"""Frozen configurations with the paper's values as defaults.
 
 Fields marked "reading" settle what the paper leaves open; ``docs/assumptions.md`` lists them all.
 Variants are made with :func:`dataclasses.replace`; every configuration is hashable and validated.
@@ -329,7 +329,7 @@ class Config:
     augment: AugmentConfig | None = AugmentConfig()  # Augmentation of a training step; None for none.
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
     pillars: PillarConfig | None = None
-    """Where given, the detector is CenterPoint, and ``model`` and the rounds of ``projection`` have no say."""
+    """Where given, the detector is CenterPoint, and ``model`` and the rounds of ``projection`` are ignored."""
 
     def __post_init__(self) -> None:
         _check_least(self, 1, "num_sweeps", "max_points", "max_boxes")

@@ -27,6 +27,7 @@ _UNSEEN = {
     "hdl32e": "with classes as frequent as in cities and half the objects of the training's",
     "quickstart": "streets of the same kind",
 }
+_AXES = "x right, y ahead, z up from the sensor, in metres"
 _WEAK_AP, _WEAK_BOXES = 0.05, 10
 """Classes with fewer boxes say nothing; those with less AP are listed as hardly found."""
 
@@ -55,7 +56,7 @@ def write_card(name: str, results: Path, training: Mapping[str, Any] | None = No
     record = training or read_json(file, dict[str, Any])
     if record.get("hash", weights) != weights:
         raise ValueError(f"{file}: hash: got {record['hash']}, expected that of the weights: {weights}")
-    lines = [*_about(name, record), *_figures(results / "transfer.json", weights)]
+    lines = [*_about(name, record), *_figures(results / "transfer.json", weights), *_training(name, record)]
     path = folder / "README.md"
     atomic_write(path, lambda file: file.write_text("\n".join(lines) + "\n", encoding="utf-8"))
     return path
@@ -64,24 +65,32 @@ def write_card(name: str, results: Path, training: Mapping[str, Any] | None = No
 def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     detector, trained = load_trained(SHIPPED / name), record["training"]
     parameters = count_parameters(detector.variables["params"])["total"]
-    low, high = record["interval"]["low"], record["interval"]["high"]
     yield f"# {name}\n"
     yield f"Preset `{trained['preset']}` for the sensor `{detector.sensor.name}`: {parameters:,} parameters,"
-    yield f"{record['bytes'] / 2**20:.1f} MiB as float16. Classes: {', '.join(detector.classes)}.\n"
-    yield "## Trained on\n"
+    yield f"{record['bytes'] / 2**20:.1f} MiB as float16, under the licence of the package.\n"
+    yield "## What it is for\n"
+    yield f"It takes one sweep of that sensor: {_AXES}, and intensities of 0 to 255. It finds boxes of"
+    yield f"{', '.join(label.replace('_', ' ') for label in detector.classes)}.\n"
+    yield "It is a start for a training and a means to try the program, not a product: trained on simulated"
+    yield "streets alone, it misses and invents objects, as the tables show. Another sensor needs other weights.\n"
+    yield "## What it finds\n"
+    low, high = record["interval"]["low"], record["interval"]["high"]
+    scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
+    yield f"On {record['unseen_frames']} unseen simulated frames, {_UNSEEN[name]}: {scored}.\n"
+
+
+def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
+    trained = record["training"]
+    yield "\n## Trained on\n"
     yield "Simulated streets alone, never real ones, each frame another street:\n"
     for leg in (*record["earlier"], trained):
         done = f"{leg['frames_seen']:,} frames, step {leg['steps']:,} of {leg['steps_planned']:,}"
         hours = f"{leg['seconds_of_steps'] / 3600:.1f} hours of steps"
         yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {hours}"
-    scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
-        yield f"\nWhere one began with {name}, that is what the trainings before it had made."
-    yield ""
-    yield f"On {record['unseen_frames']} unseen frames, {_UNSEEN[name]}: {scored}.\n"
+        yield f"\nA training from {name} began with the weights of the one before."
+    yield f"\nMade by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
-    yield f"Made by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`.\n"
-    yield "## What it finds\n"
 
 
 def _curve(legs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -91,11 +100,10 @@ def _curve(legs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     points = [(n + seen, score) for n, leg in zip(begins, legs, strict=True) for seen, score in leg["curve"]]
     if not points:
         return
-    yield "During the training, on a few unseen frames, the same each time; where the learning rate rises anew,"
+    yield "\nDuring the training, on a few unseen frames, the same each time; where the learning rate rises again,"
     yield "the score may fall at first:\n"
     yield "| frames seen in all | mAP |\n|---|---|"
     yield from (f"| {seen:,} | {score:.3f} |" for seen, score in points)
-    yield ""
 
 
 def _figures(file: Path, weights: str) -> Iterator[str]:
@@ -105,7 +113,7 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
         yield f"Not measured yet with these weights: {command} does."
         return
     yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, as {command} measured it; boxes in"
-    yield "brackets. The intervals are of keyframes drawn anew, and too narrow: keyframes of a scene are alike."
+    yield "brackets. The intervals are of keyframes drawn again, and too narrow: keyframes of a scene are alike."
     for name, part in record.items():
         if isinstance(part, dict) and "all" in part:
             yield from _part(name, part)
@@ -121,7 +129,8 @@ def _part(name: str, part: Mapping[str, Any]) -> Iterator[str]:
         if found := part.get(key):
             scores.append(f"{key} {found['score']:.3f} ({_text(found['interval'])})")
     source = "simulated drives" if name == "simulated" else f"real, {name}"
-    yield f"\n### {source[0].upper()}{source[1:]}: {part['keyframes']} keyframes\n"
+    number = f"{part['keyframes']} keyframe{'s' if part['keyframes'] > 1 else ''}"
+    yield f"\n### {source[0].upper()}{source[1:]}: {number}\n"
     yield f"{', '.join(scores)}.\n"
     yield f"| class | {' | '.join(_BANDS)} |\n|---|{'---|' * len(_BANDS)}"
     aps, truths = part["all"]["AP"], part["all"]["truths"]

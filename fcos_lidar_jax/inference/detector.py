@@ -25,7 +25,7 @@ from fcos_lidar_jax.types import Detections
 
 @dataclasses.dataclass(frozen=True)
 class CloudDetector(abc.ABC):
-    """What finds boxes in clouds of a sensor, whether from a checkpoint or from an exported file.
+    """A detector that maps a point cloud to boxes, whether from a checkpoint or from an exported file.
 
     >>> from fcos_lidar_jax.inference import load_detector
     >>> detector = load_detector("quickstart")
@@ -50,7 +50,7 @@ class CloudDetector(abc.ABC):
     @property
     @abc.abstractmethod
     def fingerprint(self) -> str:
-        """Differs for other weights."""
+        """Of the program and its weights: other weights have another one."""
 
     @abc.abstractmethod
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
@@ -67,14 +67,15 @@ class CloudDetector(abc.ABC):
     def __call__(self, points: np.ndarray | str | Path) -> Detections:
         """Boxes in one cloud of any length; compiled once.
 
-        A cloud that is hardly of the detector's sensor gets a warning of one line.
+        Warns in one line where the cloud does not look like one of the detector's sensor.
 
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6], x, y, z
                 in metres, intensity, time lag in seconds, laser number, as it takes them from an array file.
 
         Returns:
-            NumPy arrays, padded to ``config.inference.max_detections`` boxes.
+            NumPy arrays, the best score first, padded to ``config.inference.max_detections`` boxes; ``valid`` says
+            which are none of the padding.
 
         Raises:
             ValueError: another shape or type, or a fifth column that is a ring and no time lag.

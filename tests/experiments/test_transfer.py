@@ -187,7 +187,7 @@ def test_a_card_counts_the_frames_of_all_trainings(shipped, tmp_path):
     _, record = shipped
     legs = [{**record["training"], "frames_seen": n, "curve": [[n - 1, n / 10]]} for n in (3, 5)]
     card = model_card.write_card("hdl32e", tmp_path, {**record, "earlier": legs[:1], "training": legs[1]})
-    assert "| frames seen in all | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n\n" in card.read_text()
+    assert "| frames seen in all | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n" in card.read_text()
 
 
 def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
