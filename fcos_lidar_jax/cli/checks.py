@@ -60,6 +60,10 @@ def check_outside(option: str, out: Path | None, checkpoint: Path) -> None:
     Raises:
         ValueError: naming the option and the place.
     """
-    found = find_checkpoint(checkpoint).resolve()
-    if out is not None and found in (out.resolve(), *out.resolve().parents):
+    if out is None:
+        return
+    place = out.resolve()
+    if find_checkpoint(checkpoint).resolve() in (place, *place.parents):
         raise ValueError(f"{option}: {out}: found a place in the checkpoint, expected one elsewhere")
+    if place == checkpoint.resolve() and not checkpoint.exists():  # It would stand for the detector the next time.
+        raise ValueError(f"{option}: {out}: found the name of the checkpoint, expected another one")

@@ -30,7 +30,7 @@ _FORMAT = 3
 _OLD_FORMAT = 2
 LATER_FIELDS = {"model": {"remat": False}, "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"}}
 """Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
-DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
+_DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
 _CARD = "README.md"
 _ROOM_FOR_NAMES = 2**20  # Bytes on disk for what describes the arrays.
 
@@ -107,7 +107,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
         }
         description["hash"] = checksum(_canonical(description))
         with naming(folder):
-            (beside / DESCRIPTION).write_text(json.dumps(description, indent=1), encoding="utf-8")
+            (beside / _DESCRIPTION).write_text(json.dumps(description, indent=1), encoding="utf-8")
         os.chmod(beside, 0o755)
         old = beside.with_name(beside.name + ".old")
         if folder.exists():
@@ -130,8 +130,8 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     """
     folder = Path(folder).absolute()
     description = _verify(folder)
-    config = config_from_json(description["config"], f"{folder / DESCRIPTION}: config")
-    sensor = sensor_from_json(description["sensor"], f"{folder / DESCRIPTION}: sensor")
+    config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
+    sensor = sensor_from_json(description["sensor"], f"{folder / _DESCRIPTION}: sensor")
     expected = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
     variables = _load_arrays(folder / _VARIABLES, expected, config)
     return Checkpoint(
@@ -149,7 +149,7 @@ def load_state(folder: str | Path, like: TrainState) -> TrainState:
     description = _verify(folder)
     if not (folder / _STATE).is_dir():
         raise CheckpointError(f"{folder}: found a detector, expected a training state beside it")
-    config = config_from_json(description["config"], f"{folder / DESCRIPTION}: config")
+    config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     loaded = _load_arrays(folder / _STATE, jax.eval_shape(_as_arrays, like), config)
     state = jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _by_name(like, ".")])
     return dataclasses.replace(state, key=jax.random.wrap_key_data(state.key))
@@ -230,7 +230,7 @@ def _hashes(folder: Path) -> dict[str, str]:
     return {
         file.relative_to(folder).as_posix(): checksum(file.read_bytes())
         for file in sorted(folder.rglob("*"))
-        if file.is_file() and file not in (folder / DESCRIPTION, folder / _CARD)
+        if file.is_file() and file not in (folder / _DESCRIPTION, folder / _CARD)
     }
 
 
@@ -257,9 +257,9 @@ def read_description(folder: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it is not one, or not as it was written.
     """
-    file = folder / DESCRIPTION
+    file = folder / _DESCRIPTION
     if not file.is_file():
-        raise CheckpointError(f"{folder}: no {DESCRIPTION} in it, expected a checkpoint folder")
+        raise CheckpointError(f"{folder}: no {_DESCRIPTION} in it, expected a checkpoint folder")
     try:
         description = read_json(file)
     except ValueError as error:

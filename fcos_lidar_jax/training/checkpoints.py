@@ -6,7 +6,6 @@ from importlib.resources import files
 from pathlib import Path
 
 from fcos_lidar_jax.training.checkpoint import (
-    DESCRIPTION,
     Checkpoint,
     CheckpointError,
     load_checkpoint,
@@ -82,8 +81,8 @@ def find_checkpoint(folder: Path) -> Path:
     """The checkpoint that a path or a name stands for.
 
     A checkpoint's folder stands for itself, a run's for its last checkpoint, ``RUN/best`` for the one that scored
-    best while it was trained; or it is the name of weights that come with the package, unless a folder of that
-    name holds a checkpoint or a run.
+    best while it was trained; or it is the name of weights that come with the package, where there is no
+    folder of that name.
 
     >>> find_checkpoint(Path("nowhere"))
     PosixPath('nowhere')
@@ -92,10 +91,8 @@ def find_checkpoint(folder: Path) -> Path:
         shipped = shipped_checkpoints()
         run_best = best_of(Checkpoints(folder.parent / CHECKPOINTS).paths()) if folder.name == BEST else None
         return run_best or shipped.get(str(folder), folder)
-    if paths := Checkpoints(folder / CHECKPOINTS).paths():
-        return paths[-1]
-    empty = folder.is_dir() and not any((folder / name).exists() for name in (DESCRIPTION, CHECKPOINTS))
-    return shipped_checkpoints().get(str(folder), folder) if empty else folder
+    paths = Checkpoints(folder / CHECKPOINTS).paths()
+    return paths[-1] if paths else folder
 
 
 def shipped_checkpoints() -> dict[str, Path]:

@@ -267,6 +267,10 @@ MISTAKES = {
         f"--data-root HOME --version {VERSION} --checkpoint HOME/checkpoint --out HOME/checkpoint/scores",
         "--out: .*found a place in the checkpoint",
     ),
+    "out of the detector's name": (
+        f"--data-root HOME --version {VERSION} --checkpoint quickstart --out quickstart",
+        "--out: quickstart: found the name of the checkpoint, expected another one",
+    ),
     "file for a folder": (f"--results x {TRUTH} --out HOME/truth.json", "--out: .*found a file"),
 }
 

@@ -135,16 +135,6 @@ def test_a_run_stands_for_its_last_or_its_best_and_a_checkpoint_for_itself(copy)
     assert find_checkpoint(run) == run
 
 
-def test_a_folder_without_a_checkpoint_does_not_hide_the_shipped_weights(copy, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    shipped = find_checkpoint(Path("quickstart"))
-    Path("quickstart").mkdir()
-    Path("quickstart", "metrics_summary.json").write_text("{}")
-    assert find_checkpoint(Path("quickstart")) == shipped
-    shutil.copytree(copy.folder / "00000006", "quickstart", dirs_exist_ok=True)
-    assert find_checkpoint(Path("quickstart")) == Path("quickstart")
-
-
 def test_a_damaged_description_does_not_hide_the_best_of_the_others(copy):
     (copy.folder / "00000002" / "checkpoint.json").write_text("{")
     assert best_of(copy.paths()) == copy.folder / "00000006"
