@@ -2,18 +2,37 @@
 
 The ten numbers: centre minus point (3), log of l, w, h (3), sin and cos of the yaw relative to the point's
 azimuth (2), velocity (2).
+
+Two of them are horizontal vectors: the offset of the centre and the velocity. The paper gives both along the axes
+of the LiDAR frame, ``axes="lidar"``. With ``axes="ray"`` the first axis is the direction of the point's azimuth,
+as in LaserNet (Meyer et al., CVPR 2019) and RangeDet (Fan et al., ICCV 2021): a vehicle that is moved around the
+sensor then keeps all ten numbers, as it keeps its appearance in the range image.
 """
+
+from typing import Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.geometry import atan2, wrap_angle
 
+Axes = Literal["lidar", "ray"]
+
 LOG_SIZE_LIMIT = 5.0  # Log sizes are clipped to plus and minus this: an untrained exponent must not overflow.
 
 
+def _turn(vectors: Array, sin: Array, cos: Array) -> Array:
+    """Horizontal vectors ``[..., 2]``, turned counter-clockwise."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
 def encode(
-    boxes: Float32[Array, "*l 9"], points: Float32[Array, "*l 3"], azimuth_rad: Float32[Array, "*l"]
+    boxes: Float32[Array, "*l 9"],
+    points: Float32[Array, "*l 3"],
+    azimuth_rad: Float32[Array, "*l"],
+    *,
+    axes: Axes = "lidar",
 ) -> Float32[Array, "*l 10"]:
     """Regression targets of boxes as seen from points.
 
@@ -21,19 +40,25 @@ def encode(
         boxes: ``x, y, z, l, w, h, yaw, vx, vy``.
         points: the locations' 3D points, metres.
         azimuth_rad: their azimuth.
+        axes: of centre offset and velocity, see the module (static).
 
     >>> box = jnp.array([2, 0, 0, 1, 1, 1, 0.5, 3, 0], jnp.float32)
     >>> encode(box, jnp.array([1.0, 0, 0]), jnp.float32(0.5)).tolist()
     [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0, 0.0]
     """
     yaw = boxes[..., 6] - azimuth_rad
+    offset, velocity = boxes[..., :2] - points[..., :2], boxes[..., 7:9]
+    if axes == "ray":
+        back = -jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
+        offset, velocity = _turn(offset, *back), _turn(velocity, *back)
     return jnp.concatenate(
         [
-            boxes[..., :3] - points,
+            offset,
+            boxes[..., 2:3] - points[..., 2:],
             jnp.log(jnp.maximum(boxes[..., 3:6], jnp.exp(-LOG_SIZE_LIMIT))),
             jnp.sin(yaw)[..., None],
             jnp.cos(yaw)[..., None],
-            boxes[..., 7:9],
+            velocity,
         ],
         axis=-1,
     )
@@ -51,8 +76,17 @@ def _size(regression: Array) -> Array:
     return jnp.exp(jnp.clip(regression[..., 3:6], -LOG_SIZE_LIMIT, LOG_SIZE_LIMIT))
 
 
+def _centre(regression: Array, points: Array, sin: Array, cos: Array, axes: Axes) -> Array:
+    offset = _turn(regression[..., :2], sin, cos) if axes == "ray" else regression[..., :2]
+    return jnp.concatenate([offset, regression[..., 2:3]], axis=-1) + points
+
+
 def decode_oriented(
-    regression: Float32[Array, "*l 10"], points: Float32[Array, "*l 3"], azimuth_rad: Float32[Array, "*l"]
+    regression: Float32[Array, "*l 10"],
+    points: Float32[Array, "*l 3"],
+    azimuth_rad: Float32[Array, "*l"],
+    *,
+    axes: Axes = "lidar",
 ) -> Float32[Array, "*l 8"]:
     """Predicted boxes as ``x, y, z, l, w, h, cos yaw, sin yaw``: differentiable, without an inverse tangent.
 
@@ -63,11 +97,16 @@ def decode_oriented(
     sin, cos = _unit(regression[..., 6], regression[..., 7])
     base_sin, base_cos = jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
     heading = jnp.stack([base_cos * cos - base_sin * sin, base_sin * cos + base_cos * sin], axis=-1)
-    return jnp.concatenate([regression[..., :3] + points, _size(regression), heading], axis=-1)
+    centre = _centre(regression, points, base_sin, base_cos, axes)
+    return jnp.concatenate([centre, _size(regression), heading], axis=-1)
 
 
 def decode(
-    regression: Float32[Array, "*l 10"], points: Float32[Array, "*l 3"], azimuth_rad: Float32[Array, "*l"]
+    regression: Float32[Array, "*l 10"],
+    points: Float32[Array, "*l 3"],
+    azimuth_rad: Float32[Array, "*l"],
+    *,
+    axes: Axes = "lidar",
 ) -> Float32[Array, "*l 9"]:
     """Predicted boxes ``x, y, z, l, w, h, yaw, vx, vy`` from the ten numbers; the inverse of :func:`encode`.
 
@@ -77,5 +116,7 @@ def decode(
     True
     """
     yaw = wrap_angle(atan2(regression[..., 6], regression[..., 7]) + azimuth_rad)
-    parts = [regression[..., :3] + points, _size(regression), yaw[..., None], regression[..., 8:10]]
+    ray = jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
+    velocity = _turn(regression[..., 8:10], *ray) if axes == "ray" else regression[..., 8:10]
+    parts = [_centre(regression, points, *ray, axes), _size(regression), yaw[..., None], velocity]
     return jnp.concatenate(parts, axis=-1)

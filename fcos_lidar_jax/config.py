@@ -108,6 +108,9 @@ class ModelConfig:
     head_channels: int = 64  # Channels of both towers (128 for the test set).
     head_convs: int = 4  # 3x3 convolutions a tower.
     tied_heads: bool = False  # Share the heads between the levels (table 6).
+    regression_axes: Literal["lidar", "ray"] = "lidar"
+    """Axes of the predicted centre offset and velocity: those of the LiDAR frame, as in equation 2, or, not in the
+    paper, the direction of the point's azimuth and the one to its left, see :mod:`fcos_lidar_jax.coding`."""
     background_prior: float = 0.99  # Reading: the background's probability at the start.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Reading: subtracted from the nine channels in the preprocessing."""

@@ -96,6 +96,7 @@ COMPACT = dataclasses.replace(
         NUSCENES.model,
         row_upscale=1,
         circular_width=True,
+        regression_axes="ray",
         stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3)),
         backbone_blocks=(2, 3, 3, 2),
         backbone_widths=(16, 48, 64, 64),

@@ -5,10 +5,12 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from fcos_lidar_jax.coding import decode, decode_oriented, encode
 
-jitted = functools.cache(jax.jit)
+jitted = functools.cache(functools.partial(jax.jit, static_argnames="axes"))
+both_axes = pytest.mark.parametrize("axes", ["lidar", "ray"])
 
 
 def samples(number=200):
@@ -29,32 +31,63 @@ def test_encoding_is_equation_2():
     np.testing.assert_allclose(jitted(encode)(boxes, points, azimuth), np.concatenate(expected, 1), atol=2e-5)
 
 
-def test_decoding_inverts_encoding():
+def test_along_the_ray_offset_and_velocity_are_those_of_a_turned_frame():
+    boxes, points, azimuth = samples()
+    found = np.asarray(jitted(encode)(boxes, points, azimuth, axes="ray"))
+    for numbers, box, point, angle in zip(found, boxes, points, azimuth.astype(float), strict=True):
+        axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        np.testing.assert_allclose(numbers[:2], axes @ (box[:2] - point[:2]), atol=2e-5)
+        np.testing.assert_allclose(numbers[8:], axes @ box[7:], atol=2e-5)
+    unchanged = np.asarray(jitted(encode)(boxes, points, azimuth))[:, 2:8]
+    np.testing.assert_array_equal(found[:, 2:8], unchanged)
+
+
+def test_along_the_ray_the_numbers_are_the_same_all_around_the_sensor():
+    boxes, points, azimuth = samples()
+    boxes[:, 7:] += 5
+    turned, angle = [a.copy() for a in (boxes, points)], 1.2
+    matrix = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for vectors in (turned[0][:, :2], turned[0][:, 7:], turned[1][:, :2]):
+        vectors[:] = vectors @ matrix.T
+    turned[0][:, 6] += angle
+    here, there = (
+        {axes: np.asarray(jitted(encode)(*given, axes=axes)) for axes in ("lidar", "ray")}
+        for given in ((boxes, points, azimuth), (*turned, azimuth + np.float32(angle)))
+    )
+    np.testing.assert_allclose(there["ray"], here["ray"], atol=1e-4)
+    assert np.abs(there["lidar"] - here["lidar"]).max() > 1
+
+
+@both_axes
+def test_decoding_inverts_encoding(axes):
     boxes, points, azimuth = map(jnp.asarray, samples())
-    numbers = jitted(encode)(boxes, points, azimuth)
-    back = np.asarray(jitted(decode)(numbers, points, azimuth))
+    numbers = jitted(encode)(boxes, points, azimuth, axes=axes)
+    back = np.asarray(jitted(decode)(numbers, points, azimuth, axes=axes))
     np.testing.assert_allclose(back, boxes, atol=5e-5, rtol=1e-5)
     assert (back[:, 6] >= -np.pi).all()
     assert (back[:, 6] < np.pi).all()
     scaled = numbers * jnp.array([1] * 6 + [3, 3, 1, 1])
-    oriented = np.asarray(jitted(decode_oriented)(scaled, points, azimuth))
+    oriented = np.asarray(jitted(decode_oriented)(scaled, points, azimuth, axes=axes))
     np.testing.assert_allclose(oriented[:, :6], boxes[:, :6], atol=5e-5, rtol=1e-5)
     np.testing.assert_allclose(oriented[:, 6], np.cos(boxes[:, 6]), atol=1e-5)
     np.testing.assert_allclose(oriented[:, 7], np.sin(boxes[:, 6]), atol=1e-5)
 
 
-def test_unknown_velocity_stays_unknown_and_nothing_else_does():
+@both_axes
+def test_unknown_velocity_stays_unknown_and_nothing_else_does(axes):
     boxes, points, azimuth = samples()
     boxes[:3, 7:] = np.nan
-    unknown = np.isnan(jitted(encode)(boxes, points, azimuth))
+    unknown = np.isnan(jitted(encode)(boxes, points, azimuth, axes=axes))
     assert unknown[:3, 8:].all()
     assert unknown.sum() == 6
 
 
-def test_degenerate_predictions_decode_to_finite_boxes_with_finite_gradients():
-    total = jax.jit(
-        jax.value_and_grad(lambda numbers: decode_oriented(numbers, jnp.zeros(3), jnp.float32(0.3)).sum())
-    )
+@both_axes
+def test_degenerate_predictions_decode_to_finite_boxes_with_finite_gradients(axes):
+    def of(numbers):
+        return decode_oriented(numbers, jnp.zeros(3), jnp.float32(0.3), axes=axes).sum()
+
+    total = jax.jit(jax.value_and_grad(of))
     for heading in (0.0, 1e-30, 1e30):
         value, gradient = total(jnp.array([0, 0, 0, 1e4, -1e4, 0, heading, heading, 0, 0], jnp.float32))
         assert np.isfinite(value)
@@ -65,10 +98,12 @@ def test_degenerate_predictions_decode_to_finite_boxes_with_finite_gradients():
     np.testing.assert_allclose(size, [np.exp(5), np.exp(-5)], rtol=1e-5)
 
 
-def test_same_under_jit_and_vmap():
+@both_axes
+def test_same_under_jit_and_vmap(axes):
     boxes, points, azimuth = map(jnp.asarray, samples())
-    numbers = jitted(encode)(boxes, points, azimuth)
+    numbers = jitted(encode)(boxes, points, azimuth, axes=axes)
     for function, args in ((encode, (boxes, points, azimuth)), (decode, (numbers, points, azimuth))):
-        plain = function(*args)
-        np.testing.assert_allclose(jitted(function)(*args), plain, atol=1e-5)
-        np.testing.assert_allclose(jax.jit(jax.vmap(function))(*args), plain, atol=1e-5)
+        plain = function(*args, axes=axes)
+        np.testing.assert_allclose(jitted(function)(*args, axes=axes), plain, atol=1e-5)
+        of_one = functools.partial(function, axes=axes)
+        np.testing.assert_allclose(jax.jit(jax.vmap(of_one))(*args), plain, atol=1e-5)

@@ -48,7 +48,11 @@ def test_presets_are_the_papers():
 
 
 @pytest.mark.parametrize(
-    ("preset", "own"), [(QUICKSTART, ()), (COMPACT, (("model", "circular_width"), ("inference", "merge_iou")))]
+    ("preset", "own"),
+    [
+        (QUICKSTART, ()),
+        (COMPACT, (("model", "circular_width"), ("model", "regression_axes"), ("inference", "merge_iou"))),
+    ],
 )
 def test_small_presets_differ_in_numbers_only(preset, own):
     def kinds(value):

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from fcos_lidar_jax.augment import flip_x, flip_y
 from fcos_lidar_jax.centres import decode_centres
-from fcos_lidar_jax.coding import decode
+from fcos_lidar_jax.coding import Axes, decode
 from fcos_lidar_jax.config import Config, InferenceConfig
 from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
 from fcos_lidar_jax.models import Detector
@@ -30,7 +30,12 @@ _MIRRORS = {"none": ("",), "x": ("", "x"), "y": ("", "y"), "xy": ("", "x", "y", 
 
 
 def select_candidates(
-    outputs: Outputs, locations: Locations, *, config: InferenceConfig, layout: ImageLayout
+    outputs: Outputs,
+    locations: Locations,
+    *,
+    config: InferenceConfig,
+    layout: ImageLayout,
+    axes: Axes = "lidar",
 ) -> tuple[Array, Array, Array, Array]:
     """The best (location, class) pairs of every level, decoded.
 
@@ -40,6 +45,7 @@ def select_candidates(
     Args:
         outputs, locations: of one sample.
         config, layout: thresholds, counts and sizes (static).
+        axes: of the regression, see :mod:`fcos_lidar_jax.coding` (static).
 
     Returns:
         boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c].
@@ -67,13 +73,18 @@ def select_candidates(
     score, pair = (jnp.concatenate(values) for values in zip(*kept, strict=True))
     location, label = pair // num_classes, (pair % num_classes).astype(jnp.int32)
     regression = outputs.regression[location, :, label]
-    boxes = decode(regression, locations.points[location], locations.azimuth_rad[location])
+    boxes = decode(regression, locations.points[location], locations.azimuth_rad[location], axes=axes)
     valid = score >= 0
     return boxes, jnp.where(valid, score, 0.0), label, valid
 
 
 def postprocess(
-    outputs: Outputs, locations: Locations, *, config: InferenceConfig, layout: ImageLayout
+    outputs: Outputs,
+    locations: Locations,
+    *,
+    config: InferenceConfig,
+    layout: ImageLayout,
+    axes: Axes = "lidar",
 ) -> tuple[Array, Array, Array, Array]:
     """Candidates, class-wise rotated NMS, the best boxes; arguments as in :func:`select_candidates`.
 
@@ -89,7 +100,8 @@ def postprocess(
     >>> valid.tolist()  # of three times the same box
     [True, False, False, False, False]
     """
-    return suppress(*select_candidates(outputs, locations, config=config, layout=layout), config)
+    candidates = select_candidates(outputs, locations, config=config, layout=layout, axes=axes)
+    return suppress(*candidates, config)
 
 
 def centre_candidates(outputs: CentreOutputs, *, config: Config, grid: Grid) -> tuple[Array, Array, Array, Array]:
@@ -168,6 +180,7 @@ def make_stages(detector: Detector) -> DetectStages:
             return centre_candidates(outputs, config=config, grid=cells)
     else:
         layout, options = image_layout(sensor, config.model), dataclasses.asdict(config.projection)
+        choices: dict[str, Any] = {"config": config.inference, "axes": config.model.regression_axes}
         prepare = functools.partial(
             project_points,
             sensor=image_sensor(sensor, config.model),
@@ -175,7 +188,7 @@ def make_stages(detector: Detector) -> DetectStages:
         )
 
         def candidates(outputs: Any, image: Any) -> tuple[Array, Array, Array, Array]:
-            return select_candidates(outputs, locate(image, layout), config=config.inference, layout=layout)
+            return select_candidates(outputs, locate(image, layout), layout=layout, **choices)
 
     def network(variables: Any, image: Any) -> Any:
         return _of_one(detector, variables, image if config.pillars is not None else image.features)

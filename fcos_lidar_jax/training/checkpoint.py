@@ -28,7 +28,10 @@ from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
 _OLD_FORMAT = 2
-LATER_FIELDS = {"model": {"remat": False}, "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"}}
+LATER_FIELDS = {
+    "model": {"remat": False, "regression_axes": "lidar"},
+    "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
+}
 """Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
 _DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
 _CARD = "README.md"

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from fcos_lidar_jax import losses
 from fcos_lidar_jax.assignment import assign, owners
-from fcos_lidar_jax.coding import decode_oriented, encode
+from fcos_lidar_jax.coding import Axes, decode_oriented, encode
 from fcos_lidar_jax.config import Config, LossConfig
 from fcos_lidar_jax.iou import oriented, oriented_iou_3d
 from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
@@ -43,6 +43,7 @@ def sample_losses(
     *,
     config: LossConfig,
     layout: ImageLayout,
+    axes: Axes = "lidar",
 ) -> tuple[dict[str, tuple[Array, Array]], Targets, Metrics]:
     """Assignment and losses of one sample (paper, section 3.4).
 
@@ -51,6 +52,7 @@ def sample_losses(
         boxes: f32[m, 9]; NaN velocities are unknown.
         labels, box_valid: i32[m] and bool[m].
         config, layout: weights and choices, and sizes (static).
+        axes: of the regression, see :mod:`fcos_lidar_jax.coding` (static).
 
     Returns:
         the four losses as (sum, count), the targets, and counts to be summed over the batch.
@@ -65,7 +67,7 @@ def sample_losses(
     iou_logit = jnp.take_along_axis(outputs.iou_logits, label[:, None], axis=1)[:, 0]
     # What has no owner gets a harmless box, so that nothing overflows on the way to being masked.
     box = jnp.where((owner >= 0)[:, None], box, jnp.array([0, 0, 0, 1, 1, 1, 0, 0, 0], jnp.float32))
-    predicted = decode_oriented(regression, locations.points, locations.azimuth_rad)
+    predicted = decode_oriented(regression, locations.points, locations.azimuth_rad, axes=axes)
     truth = oriented(box)
     iou = oriented_iou_3d(lax.stop_gradient(predicted), truth)
     cost = losses.cross_entropy(lax.stop_gradient(outputs.logits), label)
@@ -75,7 +77,7 @@ def sample_losses(
     with jax.named_scope("losses"):
         label, target = (
             jnp.where(positive, label, background),
-            encode(box, locations.points, locations.azimuth_rad),
+            encode(box, locations.points, locations.azimuth_rad, axes=axes),
         )
         parts = {
             "classification": losses.classification_loss(outputs.logits, label, locations.occupied),
@@ -113,7 +115,8 @@ def make_sums(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Metrics, 
         prioritize_current=config.projection.prioritize_current,
     )
     layout = image_layout(sensor, config.model)
-    losses_of = functools.partial(sample_losses, config=config.loss, layout=layout)
+    options: dict[str, Any] = {"config": config.loss, "layout": layout, "axes": config.model.regression_axes}
+    losses_of = functools.partial(sample_losses, **options)
 
     def sums(params: Any, batch_stats: Any, batch: Batch) -> tuple[Metrics, tuple[Any, Metrics, Metrics]]:
         with jax.named_scope("mrv"):

@@ -12,8 +12,8 @@ from tiny_run import CONFIG, SENSOR, TINY_CONFIG, bits, untrained, weights
 from fcos_lidar_jax.coding import decode
 from fcos_lidar_jax.config import AugmentConfig, InferenceConfig
 from fcos_lidar_jax.inference import TrainedDetector, make_detect, postprocess, select_candidates
-from fcos_lidar_jax.locations import ImageLayout, locate
-from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.locations import ImageLayout, image_layout, locate
+from fcos_lidar_jax.models import Detector, build_detector
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -54,12 +54,12 @@ def candidates_by_loops(outputs, locations, config):
     return found
 
 
-@pytest.mark.parametrize("iou_exponent", [1.0, 0.5, 0.0])
-def test_candidates_are_the_best_pairs_of_each_level(scene, iou_exponent):
+@pytest.mark.parametrize(("iou_exponent", "axes"), [(1.0, "lidar"), (0.5, "ray"), (0.0, "lidar")])
+def test_candidates_are_the_best_pairs_of_each_level(scene, iou_exponent, axes):
     outputs, locations = scene
     config = InferenceConfig(min_probability=0.2, candidates_per_level=150, iou_exponent=iou_exponent)
     boxes, scores, labels, valid = map(
-        np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT)
+        np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT, axes=axes)
     )
     expected = candidates_by_loops(outputs, jax.device_get(locations), config)
     assert valid.sum() == len(expected) > 300
@@ -68,7 +68,7 @@ def test_candidates_are_the_best_pairs_of_each_level(scene, iou_exponent):
     assert len(order ^ {(round(-s, 5), k) for s, _, k in expected}) <= 0.02 * len(expected)  # last-digit rounding
     best = int(np.argmax(np.where(valid, scores, -1)))
     _, l, k = min(expected)
-    one = decode(outputs.regression[l, :, k], locations.points[l], locations.azimuth_rad[l])
+    one = decode(outputs.regression[l, :, k], locations.points[l], locations.azimuth_rad[l], axes=axes)
     np.testing.assert_allclose(boxes[best], one, atol=1e-5)
     assert not scores[~valid].any()
 
@@ -117,6 +117,29 @@ def test_a_trained_detector_takes_a_file_as_its_points_and_tells_another_sensors
     assert bits(detector(tmp_path / "cloud.npy")) == bits(detector(str(tmp_path / "cloud.npy"))) == bits(found)
     with pytest.warns(UserWarning, match=r"^points hardly of sensor 'tiny' .*; expect poor detections$"):
         detector(make_frame(0, NUSCENES_HDL32E).points)
+
+
+@pytest.mark.parametrize("axes", ["lidar", "ray"])
+def test_the_centre_is_offset_along_the_axes_of_the_configuration(axes):
+    """A network that says the same everywhere: one class, the centre one metre along the first axis."""
+    model = dataclasses.replace(TINY_CONFIG.model, regression_axes=axes)
+    inference = InferenceConfig(iou_threshold=1.0, max_detections=200)
+    config = dataclasses.replace(TINY_CONFIG, model=model, inference=inference)
+    number, kinds = image_layout(TINY, model).num_locations, len(config.classes)
+
+    def apply(_variables, _features, train):
+        logits = jnp.where(jnp.arange(kinds + 1) == 2, 5.0, -5.0)
+        one = jnp.zeros((1, number, 10, kinds)).at[..., 0, :].set(1.0)
+        return Outputs(jnp.tile(logits, (1, number, 1)), one, jnp.zeros((1, number, kinds))), {}
+
+    points = make_frame(0, TINY).points
+    found = make_detect(Detector(lambda _key: {}, apply, config, TINY))({}, points, np.ones(len(points), bool))
+    boxes = np.asarray(found.boxes, np.float64)
+    assert found.valid.all()
+    distance = np.hypot(*boxes[:, :2].T)[:, None]
+    expected = boxes[:, :2] - (boxes[:, :2] / distance if axes == "ray" else np.array([1.0, 0.0]))
+    off = np.abs(points[None, :, :2] - expected[:, None]).max(axis=2).min(axis=1)
+    np.testing.assert_allclose(off, 0, atol=1e-4)
 
 
 def test_other_post_processing_keeps_the_weights_and_the_other_fields():

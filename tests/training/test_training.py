@@ -274,7 +274,8 @@ def test_neither_micro_batches_nor_empty_samples_change_the_gradient_or_the_box_
         np.testing.assert_allclose(four_times[f"loss/{part}"], once[f"loss/{part}"], rtol=1e-4)
 
 
-def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over():
+@pytest.mark.parametrize("axes", ["lidar", "ray"])
+def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
     """Cross-entropy by the positives, L1 over candidates by those: in NumPy, values and gradients of each
     prediction, in one batch and in micro-batches."""
     choices = dataclasses.replace(
@@ -285,7 +286,7 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over():
     layout = image_layout(TINY, CONFIG.model)
     expected = {name: np.zeros(leaf.shape) for name, leaf in params.items()}
     losses, positives, candidates = {"classification": 0.0, "l1": 0.0}, 0, 0
-    targets_of = jax.jit(lambda *sample: sample_losses(*sample, config=choices, layout=layout)[1])
+    targets_of = jax.jit(lambda *sample: sample_losses(*sample, config=choices, layout=layout, axes=axes)[1])
     for points, valid, boxes, labels, box_valid in zip(*jax.tree.leaves(batch), strict=True):
         image = project_points(points, valid, TINY, num_rounds=CONFIG.projection.num_rounds)
         outputs, _ = detector.apply({"params": params}, image.features[None], train=True)
@@ -293,7 +294,8 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over():
         targets = targets_of(outputs, image, boxes, labels, box_valid)
         locations = locate(image, layout)
         size = 1 + 0.01 * np.asarray(image.features).mean()
-        encoded = np.asarray(encode(boxes[targets.owner], locations.points, locations.azimuth_rad))
+        seen = boxes[targets.owner], locations.points, locations.azimuth_rad
+        encoded = np.asarray(encode(*seen, axes=axes))
         owner, positive, labels = (np.asarray(a) for a in (targets.owner, targets.positive, labels))
         logits, regression = (np.asarray(a, np.float64) for a in (outputs.logits, outputs.regression))
         for l in np.flatnonzero(locations.occupied):
@@ -312,7 +314,10 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over():
     assert candidates > 2 * positives > 20
     told = []
     for accumulate in (1, 2):
-        config = dataclasses.replace(with_optimizer(batch_size=4, accumulate=accumulate), loss=choices)
+        model = dataclasses.replace(CONFIG.model, regression_axes=axes)
+        config = dataclasses.replace(
+            with_optimizer(batch_size=4, accumulate=accumulate), loss=choices, model=model
+        )
         gradient, _, metrics = jax.jit(make_gradient(detector._replace(config=config)))(params, {}, batch)
         assert (int(metrics["positives"]), int(metrics["candidates"])) == (positives, candidates)
         np.testing.assert_allclose(metrics["loss/classification"], losses["classification"] / positives, rtol=1e-4)
