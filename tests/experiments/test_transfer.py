@@ -12,13 +12,15 @@ from refusal import refused
 from tiny_run import TINY_CONFIG, untrained
 
 from experiments.real_frames import SPANS_M, scores_by_range, within
-from experiments.studies import model_card, shipped_weights, transfer
+from experiments.studies import model_card, regression_axes, shipped_weights, transfer
 from experiments.studies.shipped_weights import earlier_trainings, half_precision
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError
+from fcos_lidar_jax.training.checkpoints import find_checkpoint
+from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Detections
 
 CONFIG = dataclasses.replace(TINY_CONFIG, sensor="tiny")
@@ -195,3 +197,17 @@ def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
     (package / "hdl32e" / "notes.md").write_text("more")
     with pytest.raises(CheckpointError, match=r"notes\.md: found a file that is not of the checkpoint"):
         load_checkpoint(package / "hdl32e")
+
+
+def test_trainings_with_both_axes_are_compared_on_the_same_frames(tmp_path, monkeypatch):
+    monkeypatch.setitem(shipped_weights.CONFIGS, "hdl32e", CONFIG)
+    args = regression_axes.Args(steps=2, test_frames=2, work=tmp_path)
+    record = regression_axes.measure(args)
+    assert {"ray_2_0", "lidar_2_0"} == {folder.name for folder in tmp_path.iterdir()}
+    for axes in ("lidar", "ray"):
+        config = load_checkpoint(find_checkpoint(tmp_path / f"{axes}_2_0")).config
+        assert config == dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, regression_axes=axes))
+        last = [r["positive_iou"] for r in read_metrics(tmp_path / f"{axes}_2_0") if r["step"] == 2]
+        assert record[axes]["IoU of the last positives"] == round(last[0], 4)
+    assert record["difference"] == pytest.approx(record["ray"]["mAP"] - record["lidar"]["mAP"], abs=2e-4)
+    assert record["interval"][0] <= record["difference"] <= record["interval"][1]
