@@ -61,7 +61,8 @@ def figures(evaluation: Evaluation, run: Path, steps: int) -> dict[str, Any]:
 
 def measure(args: Args) -> dict[str, Any]:
     """Train what is missing, evaluate, compare."""
-    evaluations, record = {}, {"steps": args.steps, "test_frames": args.test_frames}
+    evaluations: dict[str, Evaluation] = {}
+    record: dict[str, Any] = {"steps": args.steps, "test_frames": args.test_frames}
     for axes in AXES:
         config = change(model__regression_axes=axes)(CONFIGS["hdl32e"])
         shown, unseen = streets(config, steps=args.steps, seed=args.seed)

@@ -307,9 +307,9 @@ def _given_weights(detector: Detector, weights: str | Path | Variables | None) -
     expected = jax.eval_shape(detector.init, jax.random.key(0))
     check_arrays(folder, expected, checkpoint.variables, whose="the network that is to be trained")
     # Arrays of the same shapes may still mean something else.
-    models = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
+    given, wanted = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
     if jax.process_index() == 0:
-        for name, (theirs, ours) in _differences(*models, "model"):
+        for name, (theirs, ours) in _differences(given, wanted, "model"):
             print(
                 f"{folder}: weights of {name} {theirs!r}, to be trained with {ours!r}", file=sys.stderr, flush=True
             )

@@ -54,6 +54,14 @@ def finished(tmp_path_factory, traces):
     return folder, state, len(traces)
 
 
+def test_weights_of_another_coding_are_told(finished, tmp_path, capsys):
+    model = dataclasses.replace(CONFIG.model, regression_axes="ray")
+    for config in (CONFIG, dataclasses.replace(CONFIG, model=model)):
+        train_tiny(tmp_path / config.model.regression_axes, config=config, steps=1, weights=finished[0])
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if "weights of" in line]
+    assert told.endswith("weights of model.regression_axes 'lidar', to be trained with 'ray'")
+
+
 def test_the_step_is_compiled_once(finished):
     _, state, traces = finished
     assert int(state.step) == STEPS
