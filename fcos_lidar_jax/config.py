@@ -11,6 +11,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
 
+_RANGE_VIEW_LOSSES = ("top_q", "regress_on", "iou_loss", "iou_weight", "iou_prediction_weight")
+"""Fields of :class:`LossConfig` that CenterPoint has no use for."""
+
 
 def _check(condition: bool, field: str, got: object, expected: str) -> None:
     if not condition:
@@ -74,7 +77,7 @@ class StemConfig:
     """Reading: every branch has its own 1x1 merge, or one is shared."""
 
     def __post_init__(self) -> None:
-        _check_least(self, 1, "num_convs")
+        _check_least(self, 1, "num_convs", "channels_per_type", "out_channels")
         several = len(self.dilations) >= 1 and min(self.dilations) >= 1
         _check(several, "dilations", self.dilations, "one or more integers of at least 1")
         possible = self.group_rounds or self.groups == "types"
@@ -118,9 +121,12 @@ class ModelConfig:
     """Reading: the nine channels are divided by it."""
 
     def __post_init__(self) -> None:
-        _check_least(self, 1, "row_upscale", "head_convs")
-        _check(len(self.backbone_blocks) == 4, "backbone_blocks", self.backbone_blocks, "four stages")
-        _check(len(self.backbone_widths) == 4, "backbone_widths", self.backbone_widths, "four stages")
+        _check_least(self, 1, "row_upscale", "head_convs", "fpn_channels", "head_channels")
+        for name in ("backbone_blocks", "backbone_widths"):
+            stages = getattr(self, name)
+            _check(len(stages) == 4 and min(stages) >= 1, name, stages, "four stages of at least 1")
+        groups = max(1, min(32, self.head_channels // 2))  # Of the towers' group norms, see models.layers.
+        _check(self.head_channels % groups == 0, "head_channels", self.head_channels, f"a multiple of {groups}")
         prior = self.background_prior
         _check(0 < prior < 1, "background_prior", prior, "a probability between 0 and 1")
         _check(len(self.channel_mean) == 9, "channel_mean", self.channel_mean, "nine numbers")
@@ -247,7 +253,7 @@ class AugmentConfig:
             _check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
         _check_least(self, 0, "max_rotation_rad")
         low, high = self.scale_range
-        _check(0 < low <= high, "scale_range", self.scale_range, "(low, high) with 0 < low <= high")
+        _check(0 < low <= high < math.inf, "scale_range", self.scale_range, "finite (low, high), 0 < low <= high")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -293,9 +299,14 @@ class OptimizerConfig:
     epochs: int = 40  # Passes over the training set.
 
     def __post_init__(self) -> None:
-        _check(self.peak_learning_rate > 0, "peak_learning_rate", self.peak_learning_rate, "above 0")
+        for name in ("peak_learning_rate", "initial_divisor", "final_divisor", "max_gradient_norm"):
+            value = getattr(self, name)
+            _check(0 < value < math.inf, name, value, "finite, above 0")
+        _check(0 <= self.weight_decay < math.inf, "weight_decay", self.weight_decay, "finite, 0 or more")
+        _check(0 <= self.b2 < 1, "b2", self.b2, "within [0, 1)")
+        low, high = self.b1_range
+        _check(0 < low <= high < 1, "b1_range", self.b1_range, "(low, high) with 0 < low <= high < 1")
         _check(0 < self.warmup_fraction < 1, "warmup_fraction", self.warmup_fraction, "between 0 and 1")
-        _check(self.max_gradient_norm > 0, "max_gradient_norm", self.max_gradient_norm, "above 0")
         _check_least(self, 1, "batch_size", "epochs")
         divides = self.accumulate >= 1 and self.batch_size % self.accumulate == 0
         _check(divides, "accumulate", self.accumulate, f"a divisor of the batch size {self.batch_size}")
@@ -352,6 +363,9 @@ class Config:
             one_each = len(groups) in (0, len(names))
             _check(one_each, "pillars.groups", groups, f"{len(names)} values, one a class, or none")
             _check(self.model == ModelConfig(), "model", "choices", "none: pillars takes its place")
+            for name in _RANGE_VIEW_LOSSES:
+                own, default = getattr(self.loss, name), getattr(LossConfig(), name)
+                _check(own == default, f"loss.{name}", own, f"{default!r} with pillars, which do not use it")
             exponent = self.inference.iou_exponent
             _check(exponent == 1, "inference.iou_exponent", exponent, "1 with pillars, which predict no IoU")
 

@@ -103,7 +103,8 @@ def pad_image(features: Float32[Array, "*b h w c r"], layout: ImageLayout) -> Fl
     extra = layout.width - layout.columns
     below = [(0, 0)] * image.ndim
     if layout.full_turn:
-        image = jnp.concatenate([image, image[..., :extra, :, :]], axis=-3) if extra else image
+        whole, rest = divmod(layout.width, layout.columns)
+        image = jnp.concatenate([image] * whole + [image[..., :rest, :, :]], axis=-3) if extra else image
     else:
         below[-3] = (0, extra)
     below[-4] = (0, layout.height - layout.rows * layout.row_upscale)

@@ -24,6 +24,7 @@ LAYOUTS = [
     ImageLayout(32, 1086, 2),
     ImageLayout(10, 70, 3),
     ImageLayout(16, 70, 1, full_turn=False),
+    ImageLayout(16, 10, 1),
 ]
 
 

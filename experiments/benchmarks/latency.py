@@ -132,7 +132,7 @@ def form_times(config: Config, sensor: Sensor, variables: Variables, cloud: Clou
     stages = Stages(config, sensor)
     image = stages.project(*jax.device_put((cloud.points, cloud.valid)))
     seen, outputs = stages.preprocess(image.features[None]), stages.outputs(variables, image)
-    select = functools.partial(select_candidates, config=choices, layout=layout)
+    select = functools.partial(select_candidates, config=choices, layout=layout, axes=model.regression_axes)
     boxes, scores, labels, valid = jax.jit(lambda o, i: select(o, locate(i, layout)))(outputs, image)
     own = {kind: tree["stem"] for kind, tree in variables.items()}
 

@@ -12,6 +12,7 @@ import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
 from fcos_lidar_jax.data.nuscenes.tables import TableError
@@ -36,12 +37,14 @@ class Prepare:
     """Split whose objects are cut out; default: train, or mini_train for a version that ends in mini; all frames
     where the data have no splits. A nuScenes version without annotations gets an index alone."""
     num_sweeps: int = NUSCENES.num_sweeps  # Sweeps an object's points are taken from, where the data have sweeps.
+    min_points: int = CopyPasteConfig().min_points
+    """Points, of all its sweeps, that an object needs; a training may ask for more by copy_paste.min_points."""
     workers: int = 1  # Processes that cut objects.
 
 
 def run(args: Prepare) -> None:
     """Make index and database, and print what there is now."""
-    check_at_least(args, 1, "workers", "num_sweeps")
+    check_at_least(args, 1, "workers", "num_sweeps", "min_points")
     layout, began = args.data.layout(), time.monotonic()
     if layout.format == "simulated":
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
@@ -65,7 +68,8 @@ def _prepare(args: Prepare, layout: Layout, folder: Path) -> dict[str, Any]:
     frames = args.data.open_whole(split, num_sweeps=args.num_sweeps)
     progress = Progress("frames", len(frames))
     objects = objects_folder(folder, split)
-    database = prepare_database(frames, objects, workers=args.workers, report=lambda done, _: progress.show(done))
+    options = {"min_points": args.min_points, "workers": args.workers}
+    database = prepare_database(frames, objects, **options, report=lambda done, _: progress.show(done))
     return record | {"train_split": split, "frames": len(frames), "objects": len(database)}
 
 

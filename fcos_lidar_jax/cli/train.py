@@ -126,7 +126,8 @@ def run(args: Train) -> None:
                 check_run(args.out, resume=args.resume)  # another process may have been faster
             objects = None
             if config.copy_paste is not None:
-                objects = _own_database(args, frames) if own else _database(args, config, layout, split)
+                least = config.copy_paste.min_points
+                objects = _own_database(args, frames, least) if own else _database(args, config, layout, split)
             state = train(
                 config,
                 frames,
@@ -153,6 +154,11 @@ def _check(args: Train) -> None:
     check_at_least(args, 0, "threads", "workers", "seed")
     if args.seed >= 2**63:
         raise ValueError(f"--seed: got {args.seed}, expected less than 2**63")
+    if args.val_split == "none":
+        for name in ("val_samples", "evaluate_every"):
+            if (given := getattr(args, name)) is not None:
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option}: got {given!r} with --val-split none, which evaluates nothing")
     given = [option is not None for option in (args.coordinator, args.num_processes, args.process_index)]
     if any(given) and not all(given):
         raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
@@ -191,11 +197,11 @@ def _database(args: Train, config: Config, layout: Layout, split: str | None) ->
     return database.open_database(folder)
 
 
-def _own_database(args: Train, frames: FrameSet) -> database.GroundTruthDatabase:
+def _own_database(args: Train, frames: FrameSet, min_points: int) -> database.GroundTruthDatabase:
     """Objects of these frames alone, cut in the run's folder, which is locked."""
     folder = args.out / "objects"
     if jax.process_index() == 0:  # one cuts, the others find it done
-        database.prepare_database(frames, folder)
+        database.prepare_database(frames, folder, min_points=min_points)
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices("objects")
     return database.open_database(folder)

@@ -86,7 +86,8 @@ class Argoverse2Frames(FrameSet):
         return Frame(points, *self._boxes(index), num_close)
 
     def labels(self, index: int) -> np.ndarray:
-        return self._boxes(index)[1]
+        _, labels, num_points = self._boxes(index)
+        return labels[num_points > 0]
 
     def name(self, index: int) -> str:
         """The log's name and the sweep's time in nanoseconds."""

@@ -63,7 +63,8 @@ class FrameSet(Protocol):
         ...
 
     def labels(self, index: int) -> np.ndarray:
-        """i32[m]: labels of the frame's boxes; without reading its points where the set can."""
+        """i32[m]: labels of the frame's boxes, without those that are known to hold no point; where the set can,
+        without reading the points."""
         return self.frame(index).labels
 
     def name(self, index: int) -> str:

@@ -35,7 +35,7 @@ def select_candidates(
     *,
     config: InferenceConfig,
     layout: ImageLayout,
-    axes: Axes = "lidar",
+    axes: Axes,
 ) -> tuple[Array, Array, Array, Array]:
     """The best (location, class) pairs of every level, decoded.
 
@@ -55,7 +55,8 @@ def select_candidates(
     >>> first = jnp.arange(l) == 0  # alone has a point
     >>> seen = Locations(jnp.zeros((l, 3)), jnp.zeros(l), jnp.zeros(l, int), first)
     >>> outputs = Outputs(jnp.zeros((l, 2)), jnp.zeros((l, 10, 1)), jnp.zeros((l, 1)))
-    >>> boxes, scores, labels, valid = select_candidates(outputs, seen, config=InferenceConfig(), layout=layout)
+    >>> choices = {"config": InferenceConfig(), "layout": layout, "axes": "lidar"}
+    >>> boxes, scores, labels, valid = select_candidates(outputs, seen, **choices)
     >>> scores[valid].tolist()  # probability 0.5, IoU 0.5
     [0.25]
     """
@@ -84,7 +85,7 @@ def postprocess(
     *,
     config: InferenceConfig,
     layout: ImageLayout,
-    axes: Axes = "lidar",
+    axes: Axes,
 ) -> tuple[Array, Array, Array, Array]:
     """Candidates, class-wise rotated NMS, the best boxes; arguments as in :func:`select_candidates`.
 
@@ -96,7 +97,7 @@ def postprocess(
     >>> seen = Locations(jnp.zeros((l, 3)), jnp.zeros(l), jnp.zeros(l, int), jnp.arange(l) < 3)
     >>> outputs = Outputs(jnp.zeros((l, 2)), jnp.zeros((l, 10, 1)), jnp.zeros((l, 1)))
     >>> few = InferenceConfig(max_detections=5, candidates_per_level=10)
-    >>> boxes, scores, labels, valid = postprocess(outputs, seen, config=few, layout=layout)
+    >>> boxes, scores, labels, valid = postprocess(outputs, seen, config=few, layout=layout, axes="lidar")
     >>> valid.tolist()  # of three times the same box
     [True, False, False, False, False]
     """

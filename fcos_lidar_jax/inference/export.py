@@ -28,7 +28,7 @@ from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, ji
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.projection import remove_close as without_close
 from fcos_lidar_jax.sensors import sensor_from_json, sensor_to_json
-from fcos_lidar_jax.training.checkpoint import CheckpointError
+from fcos_lidar_jax.training.checkpoint import CheckpointError, with_later_fields
 from fcos_lidar_jax.types import Detections
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -196,7 +196,7 @@ def load_exported(file: Path) -> ExportedDetector:
         CheckpointError: as :func:`read_record`, or written for a newer JAX.
     """
     record, program = _read(file)
-    config = config_from_json(record["config"], f"{file}: config")
+    config = config_from_json(with_later_fields(record["config"]), f"{file}: config")
     sensor = sensor_from_json(record["sensor"], f"{file}: sensor")
     try:
         exported = export.deserialize(bytearray(program))

@@ -26,6 +26,7 @@ from fcos_lidar_jax.files import atomic_write, folder_lock, read_json
 from fcos_lidar_jax.inference.cloud import sensor_mismatch
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts
+from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Detector, Variables, build_detector
@@ -34,6 +35,7 @@ from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.trainer.prediction import evaluate, predict
 from fcos_lidar_jax.training.checkpoint import (
     Checkpoint,
+    CheckpointError,
     NonFiniteStateError,
     check_arrays,
     load_checkpoint,
@@ -148,28 +150,34 @@ def train(
     frames = MappedFrames(frames, config.classes)
     tests = None if tests is None else MappedFrames(tests, config.classes)
     mesh = make_mesh(devices)
-    check_counts(frames)
-    check_batch_size(config.optimizer.batch_size, mesh)
-    # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
-    spec = {
-        "config": config_to_json(config),
-        "sensor": sensor_to_json(frames.sensor),
-        "steps": steps,
-        "seed": seed,
-        "frames": len(frames),
-        "data": frames.fingerprint(),
-        "objects": None if objects is None else objects.manifest.source,
-        "ground_truth_database": None if objects is None else objects.fingerprint(),
-        "weights": str(weights) if isinstance(weights, str | Path) else None,
-    }
-    spec, detector = json.loads(json.dumps(spec)), build_detector(config, frames.sensor)
-    run = _Run(Path(out), detector, schedule, steps, tests, devices, spec)
     is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
-    check_run(run.folder, run.spec, resume=resume)
-    given = weights if resume else _given_weights(run.detector, weights)  # needed where no checkpoint is yet
-    mismatch = sensor_mismatch(frames.frame(0).points, frames.sensor)  # read before the folder becomes a run's
-    with _claimed(run, resume=resume):
+    with _agreed():  # What can be refused is refused before the folder becomes a run's.
+        if not len(frames):
+            raise ValueError("training frames: got none, expected at least one")
+        check_counts(frames)
+        check_batch_size(config.optimizer.batch_size, mesh)
+        # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
+        spec = {
+            "config": config_to_json(config),
+            "sensor": sensor_to_json(frames.sensor),
+            "steps": steps,
+            "seed": seed,
+            "frames": len(frames),
+            "data": frames.fingerprint(),
+            "objects": None if objects is None else objects.manifest.source,
+            "ground_truth_database": None if objects is None else objects.fingerprint(),
+            "weights": str(weights) if isinstance(weights, str | Path) else None,
+        }
+        spec, detector = json.loads(json.dumps(spec)), build_detector(config, frames.sensor)
+        run = _Run(Path(out), detector, schedule, steps, tests, devices, spec)
+        check_run(run.folder, run.spec, resume=resume)
+        given = weights if resume else _given_weights(run.detector, weights)  # needed where no checkpoint is yet
         optimizer = make_optimizer(config.optimizer, steps)
+        jax.eval_shape(lambda key: make_state(run.detector, optimizer, key), jax.random.key(seed))
+        if config.copy_paste is not None and objects is not None:
+            make_paste(objects, config)
+        mismatch = sensor_mismatch(frames.frame(0).points, frames.sensor)
+    with _claimed(run, resume=resume):
         start = _start(run, optimizer, seed, resume, given)
         first = int(start.step)
         if first == steps:
@@ -277,6 +285,22 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
 
 
 @contextlib.contextmanager
+def _agreed() -> Iterator[None]:
+    """All processes go on, or none: one that refuses is waited for by the others, which stop too."""
+    error: Exception | None = None
+    try:
+        yield
+    except Exception as failure:
+        error = failure
+    if jax.process_count() > 1:
+        fine = multihost_utils.process_allgather(np.array(error is None))
+        if error is None and not fine.all():
+            error = OSError(f"process {int(np.argmin(fine))}: cannot train, see what it says")
+    if error is not None:
+        raise error
+
+
+@contextlib.contextmanager
 def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
     """Hold the run's folder in the main process; the others continue only when it does."""
     with contextlib.ExitStack() as held:
@@ -304,6 +328,9 @@ def _given_weights(detector: Detector, weights: str | Path | Variables | None) -
         return weights
     folder = find_checkpoint(Path(weights))
     checkpoint = load_checkpoint(folder)
+    theirs, ours = checkpoint.config.classes, detector.config.classes
+    if theirs != ours:
+        raise CheckpointError(f"{folder}: classes: got {theirs}, expected {ours}, which are to be trained")
     expected = jax.eval_shape(detector.init, jax.random.key(0))
     check_arrays(folder, expected, checkpoint.variables, whose="the network that is to be trained")
     # Arrays of the same shapes may still mean something else.

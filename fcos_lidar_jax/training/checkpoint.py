@@ -294,8 +294,8 @@ def _converted(config: dict[str, Any], written: int) -> dict[str, Any]:
 def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     """A configuration's JSON object with the fields that older ones do not have.
 
-    >>> with_later_fields({"model": {}})["model"]
-    {'remat': False}
+    >>> with_later_fields({"model": {"remat": True}})["model"]
+    {'remat': True, 'regression_axes': 'lidar'}
     """
     later = dict[str, Any]()
     for section, fields in LATER_FIELDS.items():

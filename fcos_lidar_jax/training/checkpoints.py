@@ -36,8 +36,9 @@ class Checkpoints:
         save_checkpoint(path, checkpoint, state=state)
         for leftover in self.folder.glob(".*"):  # of saves that were killed
             shutil.rmtree(leftover, ignore_errors=True)
-        paths = self.paths()
-        for old in {*paths[: -self.keep]} - {best_of(paths)}:
+        # Later ones are damaged: the run went back to before them. They would be taken for the newest.
+        paths, passed_over = ([p for p in self.paths() if (p > path) == later] for later in (False, True))
+        for old in {*passed_over, *paths[: -self.keep]} - {best_of(paths)}:
             shutil.rmtree(old)
         return path
 

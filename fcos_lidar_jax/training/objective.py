@@ -43,7 +43,7 @@ def sample_losses(
     *,
     config: LossConfig,
     layout: ImageLayout,
-    axes: Axes = "lidar",
+    axes: Axes,
 ) -> tuple[dict[str, tuple[Array, Array]], Targets, Metrics]:
     """Assignment and losses of one sample (paper, section 3.4).
 

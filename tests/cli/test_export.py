@@ -105,6 +105,17 @@ def test_the_record_is_a_line_of_json(home):
     assert first.decode() == f"fcos-lidar-detector 1 {content}"
 
 
+def test_a_file_of_older_fields_is_read(home, tmp_path):
+    _, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
+    record = json.loads(line)
+    for section, name in (("model", "regression_axes"), ("model", "remat"), ("inference", "flips")):
+        del record["config"][section][name]
+    content = json.dumps(record).encode() + b"\n" + program
+    first = f"fcos-lidar-detector 1 {hashlib.blake2b(content, digest_size=16).hexdigest()}\n".encode()
+    (tmp_path / "older.fcos").write_bytes(first + content)
+    assert load_exported(tmp_path / "older.fcos").config == load_exported(home / "detector.fcos").config
+
+
 def test_the_documents_lines_run_without_this_package(home):
     code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), re.DOTALL)
     hide = "import os, sys; sys.modules['fcos_lidar_jax'] = sys.modules['flax'] = None"

@@ -16,6 +16,7 @@ from commands import assert_one_line_error, child_environment, command, in_use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax import cli
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
@@ -37,13 +38,14 @@ def root(tmp_path_factory) -> Path:
 def train(root: Path, out: Path, *more: str) -> list[str]:
     where = ["--data-root", str(root), "--version", VERSION, "--out", str(out)]
     sensor = ["--sensor", str(root.parent / "sensor.json"), "--max-points", "1024"]
-    often = ["--steps", str(STEPS), "--save-every", "1", "--evaluate-every", "4", "--val-samples", "0:1"]
-    return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often, *more]
+    often = ["--steps", str(STEPS), "--save-every", "1"]
+    tests = [] if "none" in more else ["--evaluate-every", "4", "--val-samples", "0:1"]
+    return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often, *tests, *more]
 
 
 def test_trains_evaluates_and_says_where_the_best_checkpoint_is(root, tmp_path, capsys):
     start, out = root.parent / "start", tmp_path / "run"
-    command(*train(root, out, "--weights", str(start), "--samples", "1:2"))
+    command(*train(root, out, "--weights", str(start), "--samples", "1:2", "--copy-paste.min-points", "3"))
     said = json.loads(capsys.readouterr().out)
     last = str(out / "checkpoints" / "00000004")
     assert said == {"run": str(out), "steps": STEPS, "checkpoint": last, "best": last}
@@ -52,8 +54,8 @@ def test_trains_evaluates_and_says_where_the_best_checkpoint_is(root, tmp_path, 
     lines = read_metrics(out)
     assert [line["step"] for line in lines if "test/mAP" in line] == [4]
     # Objects of the chosen keyframes alone.
-    shards = json.loads((out / "objects" / "manifest.json").read_text())["shards"]
-    assert [shard["name"] for shard in shards] == ["scene-0001"]
+    manifest = json.loads((out / "objects" / "manifest.json").read_text())
+    assert ([shard["name"] for shard in manifest["shards"]], manifest["min_points"]) == (["scene-0001"], 3)
     # Four steps from the given weights, not from random ones: AdamW moves a weight by a rate a step at most.
     trained = load_checkpoint(said["checkpoint"]).variables["params"]
     moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), trained, weights()["params"])
@@ -96,7 +98,7 @@ def wait_for_a_step(process: subprocess.Popen[str], out: Path, beyond: int = 0) 
 def long(root: Path) -> list[str]:
     """Options of a run that is to be stopped."""
     more = ["--weights", str(root.parent / "start"), "--no-copy-paste", "--steps", "2000", "--val-split", "none"]
-    return [*more, "--save-every", "2000", "--evaluate-every", "2000"]
+    return [*more, "--save-every", "2000"]
 
 
 def stop(process: subprocess.Popen[str], number: int, out: Path, beyond: int = 0) -> tuple[int, str, int]:
@@ -187,6 +189,22 @@ BAD = {
     "weights of another network": (
         "--weights HOME/start --model.fpn-channels 16",
         r"start: params/.*: got \(.*8.*\), expected \(.*16.*\): the arrays are not of the network",
+    ),
+    "weights of other classes": (
+        "--no-copy-paste --weights HOME/start --classes " + " ".join(NUSCENES_CLASSES[::-1]),
+        r"start: classes: got \('car',.*\), expected \('barrier',.*\), which are to be trained",
+    ),
+    "evaluation of nothing": (
+        "--val-split none --evaluate-every 4",
+        "--evaluate-every: got 4 with --val-split none, which evaluates nothing",
+    ),
+    "test samples of nothing": (
+        "--val-split none --val-samples 0:1",
+        "--val-samples: got '0:1' with --val-split none, which evaluates nothing",
+    ),
+    "objects of more points": (
+        "--copy-paste.min-points 3",
+        "copy_paste.min_points: got 3, expected at least the database's 5",
     ),
     "sensor": ("--sensor sonar", "sonar: no such sensor"),
     "more sweeps than prepared": ("--num-sweeps 2", "cut from other frames than those of split 'train'"),

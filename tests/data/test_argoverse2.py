@@ -104,6 +104,13 @@ def test_boxes_come_in_the_ego_vehicles_frame_with_the_velocity_of_their_track(r
     assert [array.dtype for array in arrays] == ["f4", "f4", "i4", "i4"]
 
 
+def test_labels_are_those_of_boxes_with_a_point(root):
+    write_boxes(root / "train" / "log-a", [row(0, "seen"), row(0, "hidden", "BICYCLE", count=0)])
+    frames = Argoverse2Frames(root)
+    assert frames.frame(0).num_points.tolist() == [7, 0]
+    assert [frames.classes[label] for label in frames.labels(0)] == ["REGULAR_VEHICLE"]
+
+
 def test_yaw_is_the_heading_and_wraps(root):
     yaws = [np.pi, -np.pi, 3.5, -7.0]
     log = root / "train" / "log-a"

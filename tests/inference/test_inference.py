@@ -77,11 +77,11 @@ def test_postprocessing_is_class_wise_greedy_nms_of_the_candidates(scene):
     outputs, locations = scene
     config = InferenceConfig(min_probability=0.2, candidates_per_level=60, max_detections=40)
     boxes, scores, labels, valid = map(
-        np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT)
+        np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT, axes="lidar")
     )
     expected = oracles.nms(boxes, scores, valid, labels, 0.2, 40)
     found, found_scores, found_labels, used = map(
-        np.asarray, postprocess(outputs, locations, config=config, layout=LAYOUT)
+        np.asarray, postprocess(outputs, locations, config=config, layout=LAYOUT, axes="lidar")
     )
     assert used.sum() == len(expected)
     np.testing.assert_array_equal(found[used], boxes[expected])

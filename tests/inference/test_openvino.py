@@ -34,13 +34,19 @@ def fast(trained):
     return with_openvino(trained, precision="float32")
 
 
-def test_boxes_are_those_of_xla_but_for_rounding(trained, fast):
+@pytest.mark.parametrize("axes", ["lidar", "ray"])
+def test_boxes_are_those_of_xla_but_for_rounding(trained, axes):
+    model = dataclasses.replace(TINY_CONFIG.model, regression_axes=axes)
+    config = dataclasses.replace(TINY_CONFIG, model=model)
+    here = TrainedDetector(build_detector(config, TINY), trained.variables)
+    there = with_openvino(here, precision="float32")
     for seed in range(3):
         points = make_frame(seed, TINY).points
-        ours, found = trained(points), fast(points)
+        ours, found = here(points), there(points)
         assert found.valid.any()
         np.testing.assert_array_equal(found.valid, ours.valid)
         np.testing.assert_allclose(found.scores, ours.scores, atol=1e-4)
+        np.testing.assert_allclose(found.boxes, ours.boxes, atol=1e-3)
         assert found.num_dropped == ours.num_dropped
 
 

@@ -62,11 +62,13 @@ def weights():
 
 
 def untrained(config: Config, sensor: Sensor):
-    """Small random kernels without a bias towards the background, so that there are boxes everywhere."""
+    """Random kernels that keep the size of what they get, without a bias towards the background: what the network
+    says differs from place to place, and there are boxes everywhere."""
 
     def fill(path, leaf):
-        if path[-1].key == "kernel":
-            return np.random.default_rng(leaf.size).normal(0, 0.05, leaf.shape).astype(leaf.dtype)
+        if leaf.ndim > 1:
+            deviation = (2 / np.prod(leaf.shape[:-1])) ** 0.5
+            return np.random.default_rng(leaf.size).normal(0, deviation, leaf.shape).astype(leaf.dtype)
         return np.full(leaf.shape, float(path[-1].key in ("scale", "var")), leaf.dtype)
 
     shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))

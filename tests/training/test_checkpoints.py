@@ -88,6 +88,17 @@ def test_a_damaged_one_is_passed_over_with_a_warning(copy, capsys):
     assert all(line.endswith("going back to the checkpoint before") for line in warnings)
 
 
+@pytest.mark.parametrize("keep", [1, 2])
+def test_after_a_damaged_one_new_saves_stay_and_it_goes(copy, keep):
+    """The run went on from step 4; the damaged checkpoint is neither the newest nor the best."""
+    copy.keep = keep
+    damage(copy.folder / "00000006")
+    save(copy, 5, 0.2)
+    assert steps(copy) == ([2, 5] if keep == 1 else [2, 4, 5])
+    assert find_checkpoint(copy.folder.parent) == copy.folder / "00000005"
+    assert find_checkpoint(copy.folder.parent / "best") == copy.folder / "00000002"
+
+
 def test_where_all_are_damaged_nothing_is_begun_anew(copy):
     for path in copy.paths():
         damage(path)
