@@ -66,10 +66,12 @@ def untrained(config: Config, sensor: Sensor):
     says differs from place to place, and there are boxes everywhere."""
 
     def fill(path, leaf):
+        rng = np.random.default_rng(leaf.size)
         if leaf.ndim > 1:
-            deviation = (2 / np.prod(leaf.shape[:-1])) ** 0.5
-            return np.random.default_rng(leaf.size).normal(0, deviation, leaf.shape).astype(leaf.dtype)
-        return np.full(leaf.shape, float(path[-1].key in ("scale", "var")), leaf.dtype)
+            return rng.normal(0, (2 / np.prod(leaf.shape[:-1])) ** 0.5, leaf.shape).astype(leaf.dtype)
+        # No two alike: XLA moves a constant factor into a kernel that is constant, which rounds otherwise.
+        centre = float(path[-1].key in ("scale", "var"))
+        return rng.uniform(centre - 0.1, centre + 0.1, leaf.shape).astype(leaf.dtype)
 
     shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
     return jax.tree_util.tree_map_with_path(fill, shapes)
