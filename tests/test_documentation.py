@@ -27,7 +27,7 @@ PAGES = [
 ]
 RUN_ELSEWHERE = {  # pages that have a test of their own, which goes on from what they make
     "own_data.md": "cli/test_own_data.py",
-    "export.md": "cli/test_export.py",
+    "export.md": "inference/test_export.py",
 }
 CORE = (
     *("sensors", "types", "config", "presets", "geometry", "projection", "locations"),
