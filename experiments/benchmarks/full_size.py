@@ -107,7 +107,8 @@ def measure(args: Args) -> dict[str, Any]:
     pyramid = stages.fpn(variables, levels)
     outputs = stages.outputs(variables, image)
     truth = batch.boxes[0], batch.labels[0], batch.box_valid[0]
-    objective = functools.partial(sample_losses, config=config.loss, layout=layout)
+    axes = config.model.regression_axes
+    objective = functools.partial(sample_losses, config=config.loss, layout=layout, axes=axes)
     losses, assignment = (jax.jit(lambda o, i, part=part: objective(o, i, *truth)[part]) for part in (0, 1))
     # A trained detector is sure of little: as many candidates as the threshold lets through is the worst case.
     eager = dataclasses.replace(outputs, logits=outputs.logits.at[:, -1].add(-4.0))

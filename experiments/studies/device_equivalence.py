@@ -76,7 +76,9 @@ def _targets_of(detector: Detector, state: TrainState, batch: Batch) -> tuple[ja
     image = jax.vmap(lambda p, v: project_points(p, v, SENSOR, num_rounds=1))(batch.points, batch.valid)
     variables = {"params": state.params, "batch_stats": state.batch_stats}
     outputs, _ = detector.apply(variables, image.features, train=True)
-    assign = functools.partial(sample_losses, config=CONFIG.loss, layout=image_layout(SENSOR, CONFIG.model))
+    model = CONFIG.model
+    options: dict[str, Any] = {"layout": image_layout(SENSOR, model), "axes": model.regression_axes}
+    assign = functools.partial(sample_losses, config=CONFIG.loss, **options)
     targets = jax.vmap(assign)(outputs, image, batch.boxes, batch.labels, batch.box_valid)[1]
     return targets.owner, targets.positive, targets.num_positive
 
