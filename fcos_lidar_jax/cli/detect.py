@@ -1,7 +1,10 @@
 """``fcos-lidar detect``: point files to boxes."""
 
+import contextlib
 import dataclasses
+import itertools
 import json
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,15 +13,19 @@ import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder, check_outside
 from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
+from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import about_z, before_turning, read_list, turned
-from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference import Backend, load_detector
+from fcos_lidar_jax.evaluation.resume_log import ResumeLog
+from fcos_lidar_jax.files import atomic_write, file_lock
+from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
 from fcos_lidar_jax.inference.cloud import expect_points
 from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.trainer import predict
+from fcos_lidar_jax.trainer.results import detections_fingerprint
+from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
 
 _CLEAR = 0.2  # Boxes of this score and more are counted on the screen.
@@ -30,6 +37,9 @@ class Detect:
 
     A box is [x, y, z, l, w, h, yaw, vx, vy]: centre, length along the heading, width, height in metres, yaw in
     radians counter-clockwise from +x, velocity in m/s, all in the frame of the points.
+
+    Ctrl-C, or a kill, loses a few clouds: the same command resumes, also where files were added or removed since.
+    A file that is given twice is detected in once.
     """
 
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]]
@@ -63,7 +73,25 @@ class Detect:
 
 
 def run(args: Detect) -> None:
-    """Detect in all files, then write."""
+    """Detect in all files, then write; what is done is kept beside the output until then."""
+    inputs = _check(args)
+    detector = load_detector(args.checkpoint, backend=args.backend)
+    clouds = _clouds(args, inputs, detector)
+    states = [  # Pictures are numbered.
+        files_fingerprint([file, *parts], Path("/"), (str(file), args.pictures and number))
+        for number, (file, parts) in enumerate(inputs.items())
+    ]
+    with _resume_log(args, detector) as log:
+        _detect(args, detector, clouds, states, log)
+        results = [json.loads(entries)[0] for _, entries in log.entries(states)]
+        text = json.dumps({"files": results}, indent=1)
+        atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))
+        if args.page is not None:
+            _write_page(args, clouds, detector, results)
+
+
+def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
+    """Refuse what cannot be done; the inputs, each with the other files that it names."""
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected point files or --sweeps, one of the two")
     check_at_least(args, 1, "batch_size", "max_file_points")
@@ -71,19 +99,26 @@ def run(args: Detect) -> None:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
     if not np.isfinite(args.yaw_deg):
         raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
-    files = find_clouds(args.files) if args.sweeps is None else (args.sweeps,)
-    sweeps = () if args.sweeps is None else (args.sweeps.parent / each.file for each in read_list(args.sweeps))
-    check_out_file("--out", args.out, keep=(*files, *sweeps))
+    if args.sweeps is None:
+        inputs: dict[Path, tuple[Path, ...]] = dict.fromkeys(find_clouds(args.files), ())
+    else:
+        inputs = {args.sweeps: tuple(args.sweeps.parent / each.file for each in read_list(args.sweeps))}
+    read = [*inputs, *itertools.chain.from_iterable(inputs.values())]
+    for written in (args.out, _log_file(args)):
+        check_out_file("--out", written, keep=read)
     if args.page is not None:
-        check_out_file("--page", args.page, keep=(*files, *sweeps, args.out))
+        check_out_file("--page", args.page, keep=(*read, args.out))
     if args.pictures is not None:
         check_out_folder(args.pictures, "--pictures")
     for option, out in (("--out", args.out), ("--page", args.page), ("--pictures", args.pictures)):
         check_outside(option, out, args.checkpoint)
-    detector = load_detector(args.checkpoint, backend=args.backend)
+    return inputs
+
+
+def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector) -> CloudFiles:
     projection = detector.config.projection
-    clouds = CloudFiles(
-        files,
+    return CloudFiles(
+        tuple(files),
         before_turning(detector.sensor, np.deg2rad(args.yaw_deg)),
         args.remove_close or projection.remove_close,
         projection.close_m,
@@ -91,37 +126,82 @@ def run(args: Detect) -> None:
         dtype=args.dtype,
         max_points=args.max_file_points,
     )
+
+
+def _log_file(args: Detect) -> Path:
+    return args.out.with_name(f"{args.out.stem}.resume_log")
+
+
+@contextlib.contextmanager
+def _resume_log(args: Detect, detector: CloudDetector) -> Iterator[ResumeLog]:
+    """Records of the files that an interrupted call of these options has done; gone when all are written."""
+    file, pictures = _log_file(args), None if args.pictures is None else str(args.pictures.absolute())
+    options = args.remove_close, args.columns, args.dtype, args.yaw_deg, args.min_score, args.batch_size, pictures
+    with file_lock(file) as held:
+        if not held:
+            raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")
+        with ResumeLog(file, detections_fingerprint(detector, *options)) as log:
+            try:
+                yield log
+            except BaseException:
+                if len(log):  # It is worth being kept.
+                    raise
+                file.unlink(missing_ok=True)
+                raise
+        file.unlink(missing_ok=True)
+
+
+def _detect(
+    args: Detect, detector: CloudDetector, clouds: CloudFiles, states: Sequence[str], log: ResumeLog
+) -> None:
+    """Detect in the files that are not in the log by the name of their present state, and draw them."""
+    todo = [index for index, state in enumerate(states) if state not in log]
     progress, back = Progress("files", len(clouds)), about_z(-np.deg2rad(args.yaw_deg))
-    results, frames = list[dict[str, Any]](), list[PageFrame]()
+    if done := len(states) - len(todo):
+        progress.show(done, "detected before")
     seen = TurnedClouds(clouds, np.deg2rad(args.yaw_deg)) if args.yaw_deg else clouds
-    for prediction in predict(detector, seen, batch_size=args.batch_size):
-        file, found, cloud = clouds.files[prediction.index], prediction.detections, prediction.cloud
+    predictions = predict(detector, seen, indices=todo, batch_size=args.batch_size)
+    for number, prediction in enumerate(predictions, done + 1):
+        index, found, cloud = prediction.index, prediction.detections, prediction.cloud
         assert prediction.frame is not None
-        points = prediction.frame.points
+        assert cloud is not None
+        file, points = clouds.files[index], prediction.frame.points
         if args.yaw_deg:
             points = turned(points, back)
             found = dataclasses.replace(found, boxes=to_world(np.asarray(found.boxes), back).astype(np.float32))
-        assert cloud is not None
         expect_points(file, cloud, int(found.num_dropped), detector.sensor)
+        if args.pictures is not None:
+            name = f"{index + 1:04d}_{file.name}"
+            _draw(args.pictures / f"{name}.png", points, found, detector, max(args.min_score, 0.1))
         boxes = as_records(found, detector.classes, min_score=args.min_score)
         dropped = int(found.num_dropped) + cloud.num_removed
         record = {"file": str(file), "num_points": cloud.num_points, "num_dropped": dropped}
         record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
-        results.append(record | {"boxes": boxes})
-        if args.page is not None:
-            shown = confident(found, args.min_score)
-            frames.append(page_frame(points, shown, name=file.name))
-        if args.pictures is not None:
-            from fcos_lidar_jax.visualization.bev import draw_bev
-
-            args.pictures.mkdir(parents=True, exist_ok=True)
-            path, least = args.pictures / f"{len(results):04d}_{file.name}.png", max(args.min_score, 0.1)
-            shown, limit_m = confident(found, least), detector.sensor.limit_xy_m
-            title = f"{path.stem}: boxes of score {least:g} and more"
-            draw_bev(points, path, detections=shown, limit_m=limit_m, classes=detector.classes, title=title)
+        log.add(states[index], [record | {"boxes": boxes}])
         clear = sum(box["score"] >= _CLEAR for box in boxes)
-        progress.show(len(results), f"{file}: {len(boxes)} boxes, {clear} of score {_CLEAR} and more")
-    text = json.dumps({"files": results}, indent=1)
-    atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))
-    if args.page is not None:
-        write_page(args.page, frames, classes=detector.classes, title=f"Boxes of {args.checkpoint.name}")
+        progress.show(number, f"{file}: {len(boxes)} boxes, {clear} of score {_CLEAR} and more")
+
+
+def _draw(path: Path, points: np.ndarray, found: Detections, detector: CloudDetector, least: float) -> None:
+    from fcos_lidar_jax.visualization.bev import draw_bev
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    limit_m, title = detector.sensor.limit_xy_m, f"{path.stem}: boxes of score {least:g} and more"
+    shown = confident(found, least)
+    draw_bev(points, path, detections=shown, limit_m=limit_m, classes=detector.classes, title=title)
+
+
+def _write_page(
+    args: Detect, clouds: CloudFiles, detector: CloudDetector, results: Sequence[dict[str, Any]]
+) -> None:
+    """The page, of the files as they are read again, for an interrupted call may have detected in some."""
+    assert args.page is not None
+    frames = list[PageFrame]()
+    for index, result in enumerate(results):
+        boxes = np.array([box["box"] for box in result["boxes"]], np.float32).reshape(-1, 9)
+        labels = np.array([detector.classes.index(box["label"]) for box in result["boxes"]], np.int32)
+        scores = np.array([box["score"] for box in result["boxes"]], np.float32)
+        frames.append(
+            page_frame(clouds.frame(index).points, (boxes, labels, scores), name=clouds.files[index].name)
+        )
+    write_page(args.page, frames, classes=detector.classes, title=f"Boxes of {args.checkpoint.name}")

@@ -58,8 +58,13 @@ def write_predictions(
     return removed
 
 
-def _fingerprint(detector: CloudDetector, frames: FrameSet, batch_size: int) -> str:
-    """What detections follow from: weights, configuration, sensor, frames, and how many are computed at once."""
-    described = config_to_json(detector.config), sensor_to_json(detector.sensor), frames.fingerprint(), batch_size
-    described = detector.fingerprint, *described, frames.clouds_fingerprint(range(len(frames)))
+def detections_fingerprint(detector: CloudDetector, *others: object) -> str:
+    """Checksum of what detections follow from: weights, configuration, sensor, and other things, as JSON."""
+    described = detector.fingerprint, config_to_json(detector.config), sensor_to_json(detector.sensor), *others
     return checksum(json.dumps(described, sort_keys=True).encode())
+
+
+def _fingerprint(detector: CloudDetector, frames: FrameSet, batch_size: int) -> str:
+    """That of the detections in frames, of which so many are computed at once."""
+    seen = frames.fingerprint(), frames.clouds_fingerprint(range(len(frames)))
+    return detections_fingerprint(detector, *seen, batch_size)

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -15,6 +16,8 @@ from tiny_run import TINY_CONFIG, bits, untrained
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import demo, main
+from fcos_lidar_jax.cli import detect as detect_command
+from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -104,6 +107,61 @@ def test_detect_turns_clouds_for_the_detector_and_boxes_back(home, tmp_path):
         np.testing.assert_allclose(found, expected, atol=2e-3)
     [frame] = page_content(page)["frames"]
     assert frame["boxes"] == [box["box"] for box in ahead]
+
+
+@pytest.mark.parametrize("look", [[], ["--page", "page.html", "--pictures", "pictures"]], ids=["plain", "look"])
+def test_a_stopped_detect_resumes(home, tmp_path, capsys, monkeypatch, look):
+    """What is done is not detected again; another option, or another file of that name, is."""
+    monkeypatch.chdir(tmp_path)
+    clouds = [shutil.copy(home / "good.npy", tmp_path / f"{name}.npy") for name in "abcd"]
+    detect = ["detect", *clouds, "--checkpoint", home / "checkpoint", *look]
+    command(*detect, "--out whole.json")
+    shutil.move(clouds[3], tmp_path / "away.npy")
+    capsys.readouterr()
+    assert_one_line_error(capsys, [*map(str, detect), "--out", "boxes.json"], "d.npy: no such file")
+    assert not (tmp_path / "boxes.json").exists()
+    done = len((tmp_path / "boxes.resume_log").read_text().splitlines()) - 1
+    assert 1 <= done <= 3
+    shutil.move(tmp_path / "away.npy", clouds[3])
+    monkeypatch.setattr(detect_command, "predict", predicted := Mock(wraps=detect_command.predict))
+    command(*detect, "--out boxes.json")
+    assert f"{done}/4  detected before" in capsys.readouterr().err
+    assert predicted.call_args.kwargs["indices"] == list(range(done, 4))
+    assert (tmp_path / "boxes.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
+    assert not (tmp_path / "boxes.resume_log").exists()
+    if look:
+        frames = page_content(tmp_path / "page.html")["frames"]
+        assert [frame["name"] for frame in frames] == ["a.npy", "b.npy", "c.npy", "d.npy"]
+        assert len(list((tmp_path / "pictures").iterdir())) == 4
+
+
+@pytest.mark.parametrize("other", [["--min-score", "0.3"], ["--yaw-deg", "90"], ["--remove-close", "none"], []])
+def test_detect_resumes_only_what_would_be_the_same(home, tmp_path, capsys, other):
+    clouds = [shutil.copy(home / "good.npy", tmp_path / f"{name}.npy") for name in "abc"]
+    words = [
+        "detect",
+        *clouds,
+        tmp_path / "d.npy",
+        "--checkpoint",
+        home / "checkpoint",
+        "--out",
+        tmp_path / "x.json",
+    ]
+    assert_one_line_error(capsys, [*map(str, words)], "d.npy: no such file")
+    if not other:
+        for cloud in clouds:
+            shutil.copy(home / "nan.npy", cloud)
+    words.remove(tmp_path / "d.npy")
+    command(*words, *other)
+    assert "detected before" not in capsys.readouterr().err
+    dropped = {file["num_dropped"] for file in json.loads((tmp_path / "x.json").read_text())["files"]}
+    assert len(dropped) == 1
+
+
+def test_two_detections_into_a_file_are_refused(home, tmp_path, capsys):
+    with file_lock(tmp_path / "x.resume_log"):
+        words = ["detect", home / "good.npy", "--checkpoint", home / "checkpoint", "--out", tmp_path / "x.json"]
+        assert_one_line_error(capsys, [*map(str, words)], "x.json: in use: another process is detecting")
 
 
 def test_a_file_name_is_no_formula(home, tmp_path):
