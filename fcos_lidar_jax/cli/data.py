@@ -23,7 +23,8 @@ class DataOptions:
     version: str | None = None
     """nuScenes: folder of the tables, such as v1.0-trainval; may be left out where there is one."""
     index: Path | None = None
-    """nuScenes: where fcos-lidar prepare puts the index; default: DATA_ROOT/.fcos_lidar/VERSION."""
+    """Where fcos-lidar prepare puts the objects and, for nuScenes, the index; default: DATA_ROOT/.fcos_lidar, for
+    nuScenes DATA_ROOT/.fcos_lidar/VERSION."""
     splits: Path | None = None
     """JSON file with own splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
     class_map: Path | None = None  # JSON file {name in the data: name to use, or null for objects to leave out}.
@@ -86,7 +87,7 @@ class DataOptions:
             sensor=None if layout.format == "folder" else sensor,
             num_sweeps=num_sweeps,
             class_map=read_class_map(self.class_map),
-            index=self.index,
+            index=self.index if layout.format == "nuscenes" else None,
             splits=self.splits,
             allow_missing_sweeps=self.allow_missing_sweeps,
             follow_links=self.follow_links,

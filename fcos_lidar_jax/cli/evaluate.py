@@ -37,6 +37,8 @@ from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.evaluation_report import PAGE, Example, clear_report, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 
+_DETECTIONS = {True: "results_nusc.json", False: "detections.json"}  # By whether the benchmark's metric is meant.
+
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
@@ -88,8 +90,7 @@ def run(args: Evaluate) -> None:
         compared = _compared(args, detector, sensor)
         if detector is None:  # nothing is written before the files are read and found good
             locked.enter_context(folder_lock(args.out, "evaluating"))
-        file = args.out / "results_nusc.json"
-        given = args.results if compared.metric.benchmark else None
+        file, given = args.out / _DETECTIONS[compared.metric.benchmark], args.results
         if given is not None and not (file.exists() and file.samefile(given)):
             atomic_write(file, lambda path: shutil.copyfile(given, path))
         clear_report(args.out)  # of other numbers
@@ -100,7 +101,7 @@ def run(args: Evaluate) -> None:
         )
         if args.report:
             _report(args, compared, evaluation, sensor)
-    for line in warnings(evaluation, len(compared.predictions)):
+    for line in warnings(evaluation, len(compared.predictions), compared.truth):
         print(line, file=sys.stderr)
     print(describe(evaluation, intervals))
     print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
@@ -125,7 +126,7 @@ def _check(args: Evaluate) -> None:
     truth = [] if args.ground_truth is None else [args.ground_truth]
     for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE):
         check_out_file("--out", args.out / name, keep=[*given, *truth])
-    for name in ("results_nusc.json", "detections.json"):  # may be evaluated again where they are
+    for name in _DETECTIONS.values():  # may be evaluated again where they are
         check_out_file("--out", args.out / name, keep=truth)
 
 
@@ -147,6 +148,9 @@ def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) ->
         return _official(args, truth, None, of=str(args.ground_truth), name=args.ground_truth.name)
     layout = args.data.layout()
     split = args.split or args.data.split("val")
+    if args.split is None and split not in (None, "val", "mini_val"):
+        line = f"no split val: {split}, the only one, is evaluated, which train takes too"
+        print(f"{layout.root}: {line}; scores of frames that were trained on are too high", file=sys.stderr)
     name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), layout.version, split)))
     if _by_the_benchmark(args, layout, detector):
         frames = _keyframes(args, layout, detector, sensor, split)
@@ -159,7 +163,7 @@ def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) ->
     if split is None and args.samples is None:
         line = f"no splits: all {len(frames)} frames are evaluated"
         print(f"{layout.root}: {line}; scores of frames that were trained on are too high", file=sys.stderr)
-    file = args.out / "detections.json"
+    file = args.out / _DETECTIONS[False]
     if args.results is None:
 
         def records(_: int, found: Detections) -> list[dict[str, Any]]:
@@ -168,7 +172,7 @@ def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) ->
         _detect(args, detector, frames, file, records, partial(write_detections, classes=detector.classes))
     names = [frames.name(index) for index in range(len(frames))]
     found = read_detections(args.results or file, names, detector.classes)
-    predictions, truth = frame_columns(found, (frames.frame(i) for i in range(len(frames))))
+    predictions, truth = frame_columns(found, (frames.frame(i) for i in range(len(frames))), names)
     metric = metric_of(detector.classes, tuple(detector.config.ranges_m.values()))
     return _Compared(name, predictions, truth, metric, {}, frames)
 
@@ -182,7 +186,7 @@ def _by_the_benchmark(args: Evaluate, layout: Layout, detector: CloudDetector | 
 
 def _official(args: Evaluate, truth: GroundTruth, frames: FrameSet | None, *, of: str, name: str) -> _Compared:
     """The official results file, given or just written, against the truth that stands in ``of``."""
-    results = read_results(args.results or args.out / "results_nusc.json", truth.tokens, of=of)
+    results = read_results(args.results or args.out / _DETECTIONS[True], truth.tokens, of=of)
     for line in results.warnings:
         print(f"warning: {line}", file=sys.stderr)
     return _Compared(name, results.boxes, truth, NUSCENES_METRIC, results.meta, frames)
@@ -197,6 +201,8 @@ def _keyframes(
     if args.samples is not None:
         tokens = [tokens[i] for i in parse_ranges(args.samples, len(tokens))]
     config = NUSCENES_SINGLE if detector is None else detector.config
+    if detector is not None and (missing := data.missing_sweeps(tokens, config.num_sweeps)):
+        print(f"{missing} sweep files of split {split!r} are missing", file=sys.stderr)
     close = config.projection
     return NuScenesFrames(data, tuple(tokens), config.num_sweeps, close.remove_close, close.close_m, sensor)
 
@@ -206,7 +212,7 @@ def _detect_keyframes(args: Evaluate, detector: CloudDetector, frames: NuScenesF
         token = frames.tokens[index]
         return result_entries(found, token, frames.nuscenes.sensor_to_global(token), detector.classes)
 
-    _detect(args, detector, frames, args.out / "results_nusc.json", entries, write_results)
+    _detect(args, detector, frames, args.out / _DETECTIONS[True], entries, write_results)
 
 
 def _detect(

@@ -108,6 +108,8 @@ def run(args: Train) -> None:
     if split is None and args.samples is None and tests is None and jax.process_index() == 0:
         line = f"no splits: all {len(frames)} frames are trained on, none is left to evaluate on"
         print(f"{layout.root}: {line}", file=sys.stderr)
+    if tests is not None and jax.process_index() == 0:
+        _tell_of_overlap(frames, tests)
     if layout.format == "simulated":
         _check_simulated(len(frames), config)
     an_epoch = steps_per_epoch(frames, config)
@@ -195,6 +197,14 @@ def _database(args: Train, config: Config, layout: Layout, split: str | None) ->
             f"{config.num_sweeps}, expected these: run fcos-lidar prepare again"
         )
     return database.open_database(folder)
+
+
+def _tell_of_overlap(frames: FrameSet, tests: FrameSet) -> None:
+    """Print how many frames are both trained and evaluated on."""
+    names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
+    if shared := len(names & tested):
+        line = f"{shared} of the {len(tests)} frames to evaluate on are trained on too: scores will be too high"
+        print(line, file=sys.stderr)
 
 
 def _own_database(args: Train, frames: FrameSet, min_points: int) -> database.GroundTruthDatabase:

@@ -18,6 +18,7 @@ from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.sensors import PRESETS, Sensor, sensor_from_json
 
 SPLITS = "splits.json"
+_MAX_LAGS = 100  # Nobody fuses as many sweeps.
 _Speed = Annotated[float, msgspec.Meta(ge=-LIMITS["vx"], le=LIMITS["vx"])]  # no NaN: an unknown one is null
 
 
@@ -156,6 +157,7 @@ class FolderFrames(FrameSet):
         cloud, listed = self._clouds[name], self._sweeps.get(name)
         if listed is None or self.num_sweeps == 1:
             points = point_files.read_points(cloud, self.sensor)
+            _expect_sweeps(points[:, 4], cloud)
             return drop_close(points, self.sensor, mode=mode, close_m=close_m)
         files = [sweep.file for sweep in read_list(listed)]
         for i, file in enumerate(files):
@@ -196,6 +198,14 @@ class FolderFrames(FrameSet):
             return tuple(own), {}
         found = {own.get(r.label, r.label) for f in self._boxes.values() for r in read_json(f, _Annotation).boxes}
         return tuple(sorted(name for name in found if name is not None)), own
+
+
+def _expect_sweeps(lags: np.ndarray, cloud: Path) -> None:
+    """Refuse the offsets of single points in a turn: points with a time lag are of older sweeps."""
+    different = len(np.unique(lags[np.isfinite(lags)]))
+    if different > _MAX_LAGS:
+        found = f"got {different} different time lags, which look like offsets within a turn"
+        raise ValueError(f"{cloud}: fifth column: {found}, expected one a sweep, 0 for the current one")
 
 
 def _list_files(root: Path, folder: str, endings: tuple[str, ...], inside: Path | None) -> dict[str, Path]:

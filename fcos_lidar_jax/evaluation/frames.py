@@ -46,14 +46,19 @@ def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric
     return evaluate(*frame_columns(found, frames), metric)
 
 
-def frame_columns(found: Iterable[Detections], frames: Iterable[Frame]) -> tuple[BoxColumns, GroundTruth]:
-    """Detections and truth of frames as columns, with the sensors' frames as the global one."""
+def frame_columns(
+    found: Iterable[Detections], frames: Iterable[Frame], names: Sequence[str] = ()
+) -> tuple[BoxColumns, GroundTruth]:
+    """Detections and truth of frames as columns, with the sensors' frames as the global one.
+
+    The samples are called by the names; by default they are numbered.
+    """
     predictions, truths = [NO_BOXES], [NO_BOXES]
     for sample, (d, frame) in enumerate(zip(found, frames, strict=True)):
         boxes, labels, scores = confident(d, 0.0)
         predictions.append(_columns(sample, boxes, label=labels, score=scores))
         truths.append(_columns(sample, frame.boxes, label=frame.labels, num_points=frame.num_points))
-    tokens = tuple(map(str, range(len(truths) - 1)))
+    tokens = tuple(names or map(str, range(len(truths) - 1)))
     ego, rack_axes = np.zeros((len(tokens), 3)), np.zeros((0, 3, 3))
     return join(predictions), GroundTruth(tokens, ego, join(truths), NO_BOXES, rack_axes)
 

@@ -131,8 +131,7 @@ def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxCo
     Left out is what lies at or beyond its class's range, what holds not a single LiDAR or radar point, and
     bicycles and motorcycles whose centre is in a bicycle rack, boundary included.
     """
-    offset = boxes.translation[:, :2] - truth.ego_translation[boxes.sample, :2]
-    near = np.sqrt((offset**2).sum(axis=1)) < np.array(metric.class_ranges_m, float)[boxes.label]
+    near = within_range(boxes, truth, metric)
     boxes, racks = boxes.take(near & (boxes.num_points != 0)), truth.racks
     cycles = np.flatnonzero(np.isin(metric.classes, ("bicycle", "motorcycle"))[boxes.label])
     own = boxes.take(cycles)
@@ -142,6 +141,12 @@ def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxCo
     local = np.matmul(offset[:, None], truth.rack_axes[pairs.truth])[:, 0]
     inside = (np.abs(local) <= racks.size[pairs.truth][:, [1, 0, 2]] / 2).all(axis=1)
     return boxes.take(~np.isin(np.arange(len(boxes)), cycles[pairs.detection[inside]]))
+
+
+def within_range(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> np.ndarray:
+    """bool[n]: whether a box is nearer to the ego vehicle, or to the sensor of frames, than its class's range."""
+    offset = boxes.translation[:, :2] - truth.ego_translation[boxes.sample, :2]
+    return np.sqrt((offset**2).sum(axis=1)) < np.array(metric.class_ranges_m, float)[boxes.label]
 
 
 def class_curves(ranking: Ranking) -> Curves:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
+from fcos_lidar_jax.evaluation.boxes import GroundTruth
 from fcos_lidar_jax.evaluation.matching import TP_ERRORS
-from fcos_lidar_jax.evaluation.metrics import DISTANCES_M, Evaluation, evaluate
+from fcos_lidar_jax.evaluation.metrics import DISTANCES_M, Evaluation, Metric, evaluate, within_range
 from fcos_lidar_jax.evaluation.results import read_results
 from fcos_lidar_jax.evaluation.truth import read_truth
 from fcos_lidar_jax.files import atomic_write
@@ -110,10 +111,12 @@ def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None)
     return "\n".join(filter(None, lines))
 
 
-def warnings(evaluation: Evaluation, num_found: int) -> list[str]:
-    """What the scores must not be mistaken for: a line for missing truth, and one for missing detections.
+def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None = None) -> list[str]:
+    """What the scores must not be mistaken for: lines for truth and for detections that are missing.
 
-    ``num_found`` boxes were to be evaluated, before the filters.
+    Args:
+        num_found: boxes that were to be evaluated, before the filters.
+        truth: before the filters. Truth that is too far to count gets a line, unless the benchmark says so.
     """
     benchmark, lines = evaluation.metric.benchmark, []
     rankings = zip(evaluation.metric.classes, evaluation.rankings, strict=True)
@@ -124,8 +127,20 @@ def warnings(evaluation: Evaluation, num_found: int) -> list[str]:
     elif absent:
         rule = "AP 0 and errors 1, as in the benchmark" if benchmark else "left out of the means"
         lines.append(f"no ground truth counts of {', '.join(absent)}: {rule}")
+    if truth is not None and not benchmark:
+        lines += _beyond_range(truth, evaluation.metric)
     if not num_found:
         lines.append("the results hold not a single box: every AP is 0 and every error 1")
     elif not len(evaluation.predictions):
         lines.append("no box of the results is within the range of its class: every AP is 0")
     return lines
+
+
+def _beyond_range(truth: GroundTruth, metric: Metric) -> list[str]:
+    """A line for boxes with points that their class's range leaves out, if there are some."""
+    far = ~within_range(truth.boxes, truth, metric) & (truth.boxes.num_points != 0)
+    labels = np.unique(truth.boxes.label[far])
+    if not len(labels):
+        return []
+    ranges = ", ".join(f"{metric.classes[label]} {metric.class_ranges_m[label]:g} m" for label in labels)
+    return [f"{far.sum()} boxes of the truth are beyond the range of their class and do not count: {ranges}"]

@@ -6,8 +6,10 @@ The folder of own data is that of tests/cli/test_own_data.py.
 import contextlib
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import get_args
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -160,6 +162,53 @@ def test_data_without_splits_are_told_where_all_frames_serve_both_ends(tmp_path,
             with pytest.raises(AssertionError):  # stopped
                 command(args, tmp_path / name / args[:5])
             assert (f"{root}: no splits: {said}" in capsys.readouterr().err) != splits
+
+
+def test_frames_that_are_trained_and_evaluated_on_are_told(tmp_path, capsys, monkeypatch):
+    root = tmp_path / "data"
+    make_folder(root, train=2, val=1, sensor=fcos.load_sensor("short_range"))
+    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
+    data = f"--class-map {tmp_path}/map.json --data-root {root}"
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("fcos_lidar_jax.cli.evaluate.write_predictions", Mock(side_effect=KeyboardInterrupt))
+
+    def said(splits, line):
+        (root / "splits.json").write_text(json.dumps(splits))
+        with pytest.raises(AssertionError):  # stopped
+            command(line, data, "--out", tmp_path / "out")
+        return capsys.readouterr().err
+
+    a, b, c = (f"{i:03d}" for i in range(3))
+    training, evaluation = "train quickstart --no-copy-paste", "evaluate --checkpoint quickstart"
+    told = "of the 2 frames to evaluate on are trained on too"
+    assert f"1 {told}" in said({"train": [a, b], "val": [b, c]}, training)
+    assert "trained on too" not in said({"train": [a], "val": [b, c]}, training)
+    assert f"2 {told}" in said({"all": [a, b, c]}, f"{training} --val-split all --val-samples 1:3")
+    assert f"{root}: no split val: all, the only one" in said({"all": [a, b, c]}, evaluation)
+    for splits, line in (({"train": [a], "val": [b, c]}, evaluation), ({"all": [a]}, f"{evaluation} --split all")):
+        assert "no split val" not in said(splits, line)
+
+
+def test_own_data_may_be_prepared_elsewhere_and_detections_are_those_evaluated(tmp_path, capsys):
+    """As for data on a disk that cannot be written to; and the report names the frames."""
+    root, index = tmp_path / "data", tmp_path / "prepared"
+    make_folder(root, train=2, val=2, sensor=fcos.load_sensor("short_range"))
+    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
+    data = f"--class-map {tmp_path}/map.json --data-root {root} --index {index}"
+    command("prepare", data)
+    assert not (root / ".fcos_lidar").exists()
+    command("train quickstart", data, "--out", tmp_path / "run", *NETWORK_OPTIONS, "--steps 2 --fade-epochs 0")
+    for name in ("a", "b"):
+        command("evaluate", data, "--checkpoint quickstart --out", tmp_path / name)
+    for line in ("The worst sample", "The best sample"):
+        assert re.search(rf"{line}.*00[23]", (tmp_path / "a" / "report.html").read_text())
+    record = json.loads((tmp_path / "b" / "detections.json").read_text())
+    record["frames"][0]["boxes"] = []
+    (tmp_path / "given.json").write_text(json.dumps(record))
+    command(
+        "evaluate", data, "--checkpoint quickstart --results", tmp_path / "given.json", "--out", tmp_path / "b"
+    )
+    assert (tmp_path / "b" / "detections.json").read_bytes() == (tmp_path / "given.json").read_bytes()
 
 
 def test_training_on_another_sensors_clouds_is_told_before_the_step_is_compiled(tmp_path, capsys, monkeypatch):

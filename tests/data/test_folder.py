@@ -258,6 +258,16 @@ def test_bad_sweep_files_get_one_line(root, sweeps, index, name, message):
         read_all(root)
 
 
+def test_offsets_within_a_turn_are_no_time_lags(root):
+    """They would make all points but the first those of older sweeps, which do not count as a box's own."""
+    points = np.tile(np.load(root / "clouds" / "b.npy"), (40, 1))
+    np.save(root / "clouds" / "b.npy", np.column_stack([points, np.linspace(0, 0.1, 160)]))
+    with refused("fifth column: got 160 different time lags, which look like", root / "clouds/b.npy"):
+        FolderFrames(root).frame(1)
+    np.save(root / "clouds" / "b.npy", np.column_stack([points, np.repeat([0, 0.05, 0.1, np.nan], 40)]))
+    assert len(FolderFrames(root, remove_close="none").frame(1).points) == 160
+
+
 def test_bad_arguments_and_sensor_files_are_named(root):
     with refused("num_sweeps: got 0"):
         FolderFrames(root, num_sweeps=0)

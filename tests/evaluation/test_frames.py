@@ -113,6 +113,26 @@ def test_properties_go_by_name_and_not_by_order():
     assert shuffled["nd_score"] == pytest.approx(straight["nd_score"], abs=1e-12)
 
 
+def test_truth_that_is_too_far_to_count_is_told():
+    found, truths = made(OWN, [0, 1])
+    near, all_of_it = metric_of(OWN, (5.0,) * len(OWN)), metric_of(OWN, (1000.0,) * len(OWN))
+    predictions, truth = frame_columns(found, truths, names := [f"frame {i}" for i in range(len(truths))])
+    counted = {each: evaluate(predictions, truth, each) for each in (near, all_of_it)}
+    assert counted[near].tokens == tuple(names)
+    far = sum(
+        np.hypot(*box[:2]) >= 5 and points != 0
+        for frame in truths
+        for box, points in zip(frame.boxes, frame.num_points, strict=True)
+    )
+    told = {each: [line for line in warnings(counted[each], 9, truth) if "beyond" in line] for each in counted}
+    named = ", ".join(f"{name} 5 m" for name in OWN[:2])
+    assert told[near] == [
+        f"{far} boxes of the truth are beyond the range of their class and do not count: {named}"
+    ]
+    assert told[all_of_it] == []
+    assert len(counted[near].truth) + far == len(counted[all_of_it].truth)
+
+
 def test_the_benchmarks_sums_over_frames_count_absent_classes_and_attributes():
     """What studies on simulated frames report beside the metric by centre distance."""
     classes = NUSCENES_METRIC.classes
