@@ -54,6 +54,16 @@ def test_every_number_is_the_official_one(task, tmp_path):
     assert_equal(evaluate_detections(results, truth_of(tables)), theirs)
 
 
+def test_an_attribute_of_another_class_is_a_wrong_one_as_in_the_official_evaluation(tmp_path):
+    tables, results = make_task(seed=40)
+    boxes = [box for found in results["results"].values() for box in found]
+    rng = np.random.default_rng(0)
+    for box in boxes:
+        box["attribute_name"] = str(rng.choice(["", "vehicle.parked", "pedestrian.moving", "cycle.with_rider"]))
+    root = write_task(tmp_path / "root", tables, results)
+    assert_equal(*summaries(root, root / "results.json", tmp_path))
+
+
 @pytest.mark.real_data
 def test_every_number_is_the_official_one_on_a_real_scene(real_data, tmp_path):
     """The real annotations, moved and turned at random, as detections."""
