@@ -77,17 +77,12 @@ def run(args: Detect) -> None:
     inputs = _check(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
     clouds = _clouds(args, inputs, detector)
-    states = [  # Pictures are numbered.
-        files_fingerprint([file, *parts], Path("/"), (str(file), args.pictures and number))
-        for number, (file, parts) in enumerate(inputs.items())
-    ]
+    states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
     with _resume_log(args, detector) as log:
         _detect(args, detector, clouds, states, log)
-        results = [json.loads(entries)[0] for _, entries in log.entries(states)]
-        text = json.dumps({"files": results}, indent=1)
-        atomic_write(args.out, lambda path: path.write_text(text, encoding="utf-8"))
+        atomic_write(args.out, lambda path: _write_results(path, log.entries(states)))
         if args.page is not None:
-            _write_page(args, clouds, detector, results)
+            _write_page(args, clouds, detector, (json.loads(entry)[0] for _, entry in log.entries(states)))
 
 
 def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
@@ -99,15 +94,21 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
     if not np.isfinite(args.yaw_deg):
         raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
+    for file in args.files:
+        if file.suffix.lower() == ".json":
+            raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
+    if args.sweeps is not None and args.sweeps.suffix != ".json":
+        raise ValueError(f"--sweeps: {args.sweeps}: expected a file that ends in .json")
     if args.sweeps is None:
         inputs: dict[Path, tuple[Path, ...]] = dict.fromkeys(find_clouds(args.files), ())
     else:
         inputs = {args.sweeps: tuple(args.sweeps.parent / each.file for each in read_list(args.sweeps))}
     read = [*inputs, *itertools.chain.from_iterable(inputs.values())]
-    for written in (args.out, _log_file(args)):
-        check_out_file("--out", written, keep=read)
+    log = _log_file(args)
+    check_out_file("--out", args.out, keep=read)
+    check_out_file("--out", log, keep=read)
     if args.page is not None:
-        check_out_file("--page", args.page, keep=(*read, args.out))
+        check_out_file("--page", args.page, keep=(*read, args.out, log))
     if args.pictures is not None:
         check_out_folder(args.pictures, "--pictures")
     for option, out in (("--out", args.out), ("--page", args.page), ("--pictures", args.pictures)):
@@ -129,14 +130,14 @@ def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector) -> Clo
 
 
 def _log_file(args: Detect) -> Path:
-    return args.out.with_name(f"{args.out.stem}.resume_log")
+    return args.out.with_name(f".{args.out.name}.resume_log")
 
 
 @contextlib.contextmanager
 def _resume_log(args: Detect, detector: CloudDetector) -> Iterator[ResumeLog]:
     """Records of the files that an interrupted call of these options has done; gone when all are written."""
-    file, pictures = _log_file(args), None if args.pictures is None else str(args.pictures.absolute())
-    options = args.remove_close, args.columns, args.dtype, args.yaw_deg, args.min_score, args.batch_size, pictures
+    file = _log_file(args)
+    options = args.remove_close, args.columns, args.dtype, args.yaw_deg, args.min_score, args.batch_size
     with file_lock(file) as held:
         if not held:
             raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")
@@ -144,9 +145,8 @@ def _resume_log(args: Detect, detector: CloudDetector) -> Iterator[ResumeLog]:
             try:
                 yield log
             except BaseException:
-                if len(log):  # It is worth being kept.
-                    raise
-                file.unlink(missing_ok=True)
+                if not file.stat().st_size:
+                    file.unlink()
                 raise
         file.unlink(missing_ok=True)
 
@@ -155,7 +155,12 @@ def _detect(
     args: Detect, detector: CloudDetector, clouds: CloudFiles, states: Sequence[str], log: ResumeLog
 ) -> None:
     """Detect in the files that are not in the log by the name of their present state, and draw them."""
-    todo = [index for index, state in enumerate(states) if state not in log]
+    pictures = [_picture(args, index, file) for index, file in enumerate(clouds.files)]
+    todo = [
+        index
+        for index, (state, picture) in enumerate(zip(states, pictures, strict=True))
+        if state not in log or (picture is not None and not picture.exists())
+    ]
     progress, back = Progress("files", len(clouds)), about_z(-np.deg2rad(args.yaw_deg))
     if done := len(states) - len(todo):
         progress.show(done, "detected before")
@@ -170,9 +175,8 @@ def _detect(
             points = turned(points, back)
             found = dataclasses.replace(found, boxes=to_world(np.asarray(found.boxes), back).astype(np.float32))
         expect_points(file, cloud, int(found.num_dropped), detector.sensor)
-        if args.pictures is not None:
-            name = f"{index + 1:04d}_{file.name}"
-            _draw(args.pictures / f"{name}.png", points, found, detector, max(args.min_score, 0.1))
+        if (picture := pictures[index]) is not None:
+            _draw(picture, points, found, detector, max(args.min_score, 0.1))
         boxes = as_records(found, detector.classes, min_score=args.min_score)
         dropped = int(found.num_dropped) + cloud.num_removed
         record = {"file": str(file), "num_points": cloud.num_points, "num_dropped": dropped}
@@ -180,6 +184,10 @@ def _detect(
         log.add(states[index], [record | {"boxes": boxes}])
         clear = sum(box["score"] >= _CLEAR for box in boxes)
         progress.show(number, f"{file}: {len(boxes)} boxes, {clear} of score {_CLEAR} and more")
+
+
+def _picture(args: Detect, index: int, file: Path) -> Path | None:
+    return None if args.pictures is None else args.pictures / f"{index + 1:04d}_{file.name}.png"
 
 
 def _draw(path: Path, points: np.ndarray, found: Detections, detector: CloudDetector, least: float) -> None:
@@ -191,8 +199,17 @@ def _draw(path: Path, points: np.ndarray, found: Detections, detector: CloudDete
     draw_bev(points, path, detections=shown, limit_m=limit_m, classes=detector.classes, title=title)
 
 
+def _write_results(path: Path, results: Iterable[tuple[str, bytes]]) -> None:
+    """A line a file, of which only one is in memory; an entry of the log is a list of one record."""
+    with path.open("wb") as file:
+        file.write(b'{"files": [')
+        for number, (_, entry) in enumerate(results):
+            file.write((b",\n" if number else b"\n") + entry[1:-1])
+        file.write(b"\n]}\n")
+
+
 def _write_page(
-    args: Detect, clouds: CloudFiles, detector: CloudDetector, results: Sequence[dict[str, Any]]
+    args: Detect, clouds: CloudFiles, detector: CloudDetector, results: Iterable[dict[str, Any]]
 ) -> None:
     """The page, of the files as they are read again, for an interrupted call may have detected in some."""
     assert args.page is not None
@@ -204,4 +221,5 @@ def _write_page(
         frames.append(
             page_frame(clouds.frame(index).points, (boxes, labels, scores), name=clouds.files[index].name)
         )
-    write_page(args.page, frames, classes=detector.classes, title=f"Boxes of {args.checkpoint.name}")
+    shown: dict[str, Any] = {"min_score": args.min_score} if args.min_score else {}
+    write_page(args.page, frames, classes=detector.classes, title=f"Boxes of {args.checkpoint.name}", **shown)

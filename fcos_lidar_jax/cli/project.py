@@ -28,7 +28,7 @@ class Project:
     """
 
     file: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FILE")]]
-    """Point file: .pcd.bin, .bin, .npy, .npz or .pcd."""
+    """Point file: .pcd.bin, .bin, .npy, .npz, .pcd or .feather."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.npz")]  # Where the range image goes.
     png: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None  # Also draw the image, round by round.
     sensor: str = "nuscenes_hdl32e"  # Sensor preset, or a sensor file.

@@ -5,7 +5,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenes
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
-from fcos_lidar_jax.inference import Backend, load_detector
+from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
 from fcos_lidar_jax.inference.cloud import sensor_mismatch
 from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.inference.stream import Found, detect_stream
@@ -57,7 +57,7 @@ class Stream:
     version: str | None = None  # Its folder of tables; may be left out where there is one.
     index: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Its index, where `fcos-lidar prepare --index` put it elsewhere."""
-    keyframes: bool = False  # Only the scene's keyframes.
+    keyframes: bool = False  # Detect in the scene's keyframes alone; the sweeps between are fused where need be.
     allow_missing_sweeps: bool = False  # Pass over sweeps of the scene whose file is missing.
     follow_links: bool = False  # Read files to which links lead outside of DATA_ROOT.
     page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
@@ -80,7 +80,7 @@ def run(args: Stream) -> None:
     """Detect, write a line a sweep, and the page at the end."""
     _check(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
-    drive = _open(args, detector.sensor)
+    drive, at_us = _open(args, detector)
     if args.track and not drive.posed:
         raise ValueError("--track: found no poses, expected --poses FILE, or --odometry of a recording of ROS")
     if not drive.posed:
@@ -93,7 +93,8 @@ def run(args: Stream) -> None:
         _write_lines(args.out) as write_line,
         _Timing() as timing,
     ):
-        sweeps, how = timing.read(_announcing(drive.sweeps)), {"yaw_rad": np.deg2rad(args.yaw_deg)}
+        sweeps = timing.read(_announcing(drive.sweeps))
+        how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": at_us}
         if not drive.posed:
             how["num_sweeps"] = 1
         for found in timing.detect(detect_stream(sweeps, detector, **how)):
@@ -157,7 +158,7 @@ class _Timing(contextlib.AbstractContextManager):
 
     def __init__(self) -> None:
         self._reading, self._to_boxes, self._writing = list[float](), list[float](), list[float]()
-        self._programs, self._until = 0, list[int]()
+        self._read, self._programs, self._until = list[float](), 0, list[int]()
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def __exit__(self, *error: object) -> None:
@@ -167,10 +168,12 @@ class _Timing(contextlib.AbstractContextManager):
         self._programs += event.endswith("/backend_compile_duration")
 
     def read(self, sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
-        return _timed(sweeps, self._reading, [])
+        return _timed(sweeps, self._read, [])
 
     def detect(self, stream: Iterable[Found]) -> Iterator[Found]:
         for found in _timed(stream, self._to_boxes, self._writing):
+            self._reading.append(sum(self._read))  # Also of sweeps that are only fused.
+            self._read.clear()
             yield found
             self._until.append(self._programs)
 
@@ -245,24 +248,31 @@ def _is_log(args: Stream) -> bool:
     return args.poses is None and source is not None and (is_kitti_raw(source) or is_argoverse2_log(source))
 
 
-def _open(args: Stream, sensor: Sensor) -> Drive:
+def _open(args: Stream, detector: CloudDetector) -> tuple[Drive, Collection[int] | None]:
+    """The drive, and the times of the sweeps to detect in; None for all."""
     if args.source is not None:
-        if is_ros_bag(args.source):
-            how = {"topic": args.topic, "odometry": args.odometry, "poses": args.poses}
-            return ros_bag_drive(args.source, sensor, **how, max_points=args.max_file_points)
-        if args.poses is None and is_kitti_raw(args.source):
-            return kitti_raw_drive(args.source, sensor, max_points=args.max_file_points)
-        if args.poses is None and is_argoverse2_log(args.source):
-            return argoverse2_drive(args.source, sensor, max_points=args.max_file_points)
-        layout: dict[str, Any] = {"columns": args.columns, "dtype": args.dtype}
-        return folder_drive(args.source, sensor, args.poses, max_points=args.max_file_points, **layout)
+        return _open_source(args, args.source, detector.sensor), None
     assert args.data_root is not None
     assert args.scene is not None
     version = find_layout(args.data_root, "nuscenes", args.version).version
     assert version is not None
     allowed = {"allow_missing_sweeps": args.allow_missing_sweeps, "follow_links": args.follow_links}
     data = NuScenes(args.data_root, version, index=args.index, **allowed)
-    return Drive(data.drive(args.scene, keyframes=args.keyframes))
+    alone = args.keyframes and detector.config.num_sweeps == 1
+    at_us = data.keyframe_times_us(args.scene) if args.keyframes else None
+    return Drive(data.drive(args.scene, keyframes=alone)), at_us
+
+
+def _open_source(args: Stream, source: Path, sensor: Sensor) -> Drive:
+    if is_ros_bag(source):
+        how = {"topic": args.topic, "odometry": args.odometry, "poses": args.poses}
+        return ros_bag_drive(source, sensor, **how, max_points=args.max_file_points)
+    if args.poses is None and is_kitti_raw(source):
+        return kitti_raw_drive(source, sensor, max_points=args.max_file_points)
+    if args.poses is None and is_argoverse2_log(source):
+        return argoverse2_drive(source, sensor, max_points=args.max_file_points)
+    layout: dict[str, Any] = {"columns": args.columns, "dtype": args.dtype}
+    return folder_drive(source, sensor, args.poses, max_points=args.max_file_points, **layout)
 
 
 def _record(found: Found, classes: tuple[str, ...], min_score: float, drive: Drive) -> dict[str, Any]:

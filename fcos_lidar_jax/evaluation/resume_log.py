@@ -10,7 +10,7 @@ class ResumeLog:
     """Entries of the samples that are done, one line each, in a file that is only appended to.
 
     A line that an interruption truncated, or that is damaged, is dropped with all behind it. The first line is the
-    fingerprint of detector and data: a file with another one is begun anew.
+    fingerprint of detector and data: a file with another one is begun anew, but not before the first entry.
 
     Args:
         path: of the file.
@@ -30,9 +30,9 @@ class ResumeLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = path.open("a+b")
         self._stream.seek(0)
-        first, end = json.dumps(fingerprint).encode() + b"\n", 0
-        if self._stream.readline() == first:
-            end = len(first)
+        self._first, end = json.dumps(fingerprint).encode() + b"\n", 0
+        if self._stream.readline() == self._first:
+            end = len(self._first)
             for line in self._stream:
                 name, separator, entries = line.partition(b"\t")
                 try:
@@ -43,10 +43,9 @@ class ResumeLog:
                     break
                 self.places[token] = end + len(name) + 1, len(entries) - 1
                 end += len(line)
-        self._stream.truncate(end)
-        self._stream.seek(end)
-        if not end:
-            self._stream.write(first)
+        self._begun = end > 0
+        if self._begun:
+            self._stream.truncate(end)
 
     def __contains__(self, token: str) -> bool:
         return token in self.places
@@ -56,6 +55,10 @@ class ResumeLog:
 
     def add(self, token: str, entries: list[dict[str, Any]]) -> None:
         """Append the entries of a sample."""
+        if not self._begun:
+            self._stream.truncate(0)
+            self._stream.write(self._first)
+            self._begun = True
         name, text = json.dumps(token).encode(), json.dumps(entries).encode()
         start = self._stream.seek(0, 2) + len(name) + 1
         self._stream.write(b"%s\t%s\n" % (name, text))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
@@ -23,7 +23,12 @@ class Found:
 
 
 def detect_stream(
-    sweeps: Iterable[Sweep], detector: CloudDetector, *, num_sweeps: int | None = None, yaw_rad: float = 0.0
+    sweeps: Iterable[Sweep],
+    detector: CloudDetector,
+    *,
+    num_sweeps: int | None = None,
+    at_us: Collection[int] | None = None,
+    yaw_rad: float = 0.0,
 ) -> Iterator[Found]:
     """Boxes in every sweep as it comes, with the sweeps before it fused into its frame.
 
@@ -34,6 +39,7 @@ def detect_stream(
         detector: compiled once, for the first sweep.
         num_sweeps: of the window, the current one included; default: as the detector was trained. 1 where poses
             are not known.
+        at_us: times of the sweeps to detect in; the others are only fused into later ones. Default: all.
         yaw_rad: by which sweeps are turned about z for the detector, and boxes back: pi / 2 for a sensor whose x
             axis points ahead and a detector of one whose y axis does. A detector finds less in clouds that are
             turned as its training's never were.
@@ -60,6 +66,9 @@ def detect_stream(
                 f"sweep before, {before.name}"
             )
         window.appendleft(sweep)
+        before = sweep
+        if at_us is not None and sweep.time_us not in at_us:
+            continue
         points, num_close = fuse_sweeps(
             window, unturned, remove_close=projection.remove_close, close_m=projection.close_m
         )
@@ -71,4 +80,3 @@ def detect_stream(
         if yaw_rad:
             found = dataclasses.replace(found, boxes=to_world(np.asarray(found.boxes), turn.T).astype(np.float32))
         yield Found(sweep, cloud, found)
-        before = sweep

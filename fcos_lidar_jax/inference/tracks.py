@@ -6,6 +6,7 @@ import numpy as np
 
 MAX_DISTANCE_M = 2.0  # Between a box and where its track is expected.
 MAX_UNSEEN_S = 1.5  # After which a track ends.
+_CLOCK_S = 0.05  # By which sweeps may be early or late.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +33,8 @@ def track(
 ) -> tuple[Tracks, np.ndarray]:
     """Greedy matching of boxes to tracks of their class, the nearest pair first.
 
-    A track is expected where its velocity has brought it. Boxes without a track begin one, the best score first.
+    A track is expected where its velocity has brought it, and ends ``max_unseen_s`` after its last box. Boxes
+    without a track begin one, the best score first.
     The order of the boxes does not matter.
 
     Args:
@@ -51,6 +53,9 @@ def track(
     >>> ids.tolist(), track(tracks, moved, np.zeros(1, int), np.ones(1), 0.5)[1].tolist()
     ([0], [0])
     """
+    alive = tracks.unseen_s + dt <= max_unseen_s + _CLOCK_S
+    fields = tracks.ids, tracks.labels, tracks.centres, tracks.velocities, tracks.unseen_s
+    tracks = Tracks(*(field[alive] for field in fields), next_id=tracks.next_id)
     order = np.lexsort((*boxes.T, labels, -scores))
     boxes, labels = np.asarray(boxes, np.float64)[order], labels[order]
     expected = tracks.centres + dt * tracks.velocities
@@ -64,13 +69,12 @@ def track(
             ids[box], free[old] = tracks.ids[old], False
     new = ids < 0
     ids[new] = tracks.next_id + np.arange(new.sum())
-    kept = free & (tracks.unseen_s + dt <= max_unseen_s)
     after = Tracks(
-        np.concatenate([ids, tracks.ids[kept]]),
-        np.concatenate([labels, tracks.labels[kept]]),
-        np.concatenate([boxes[:, :2], expected[kept]]),
-        np.concatenate([np.nan_to_num(boxes[:, 7:9]), tracks.velocities[kept]]),
-        np.concatenate([np.zeros(len(boxes)), tracks.unseen_s[kept] + dt]),
+        np.concatenate([ids, tracks.ids[free]]),
+        np.concatenate([labels, tracks.labels[free]]),
+        np.concatenate([boxes[:, :2], expected[free]]),
+        np.concatenate([np.nan_to_num(boxes[:, 7:9]), tracks.velocities[free]]),
+        np.concatenate([np.zeros(len(boxes)), tracks.unseen_s[free] + dt]),
         tracks.next_id + int(new.sum()),
     )
     return after, ids[np.argsort(order)]

@@ -120,19 +120,58 @@ def test_a_stopped_detect_resumes(home, tmp_path, capsys, monkeypatch, look):
     capsys.readouterr()
     assert_one_line_error(capsys, [*map(str, detect), "--out", "boxes.json"], "d.npy: no such file")
     assert not (tmp_path / "boxes.json").exists()
-    done = len((tmp_path / "boxes.resume_log").read_text().splitlines()) - 1
+    log = tmp_path / ".boxes.json.resume_log"
+    done = len(log.read_text().splitlines()) - 1
     assert 1 <= done <= 3
+    # A mistake with other options, which begins no log of its own, loses nothing.
+    other = "--min-score", "0.5", "--out", "boxes.json"
+    assert_one_line_error(capsys, ["detect", "d.npy", "--checkpoint", str(home / "checkpoint"), *other], "no such")
+    assert len(log.read_text().splitlines()) == 1 + done
     shutil.move(tmp_path / "away.npy", clouds[3])
     monkeypatch.setattr(detect_command, "predict", predicted := Mock(wraps=detect_command.predict))
     command(*detect, "--out boxes.json")
     assert f"{done}/4  detected before" in capsys.readouterr().err
     assert predicted.call_args.kwargs["indices"] == list(range(done, 4))
     assert (tmp_path / "boxes.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
-    assert not (tmp_path / "boxes.resume_log").exists()
+    assert not log.exists()
     if look:
-        frames = page_content(tmp_path / "page.html")["frames"]
-        assert [frame["name"] for frame in frames] == ["a.npy", "b.npy", "c.npy", "d.npy"]
+        page = page_content(tmp_path / "page.html")
+        assert [frame["name"] for frame in page["frames"]] == ["a.npy", "b.npy", "c.npy", "d.npy"]
+        assert page["score"] == 0.3
         assert len(list((tmp_path / "pictures").iterdir())) == 4
+
+
+def test_a_resumed_detect_draws_what_has_no_picture(home, tmp_path, capsys):
+    for name in "abc":
+        shutil.copy(home / "good.npy", tmp_path / f"{name}.npy")
+    options = (
+        "--checkpoint",
+        home / "checkpoint",
+        "--out",
+        tmp_path / "x.json",
+        "--pictures",
+        tmp_path / "pictures",
+    )
+    files = [tmp_path / f"{name}.npy" for name in "abc"]
+    assert_one_line_error(capsys, [*map(str, ["detect", *files, tmp_path / "d.npy", *options])], "d.npy: no such")
+    shutil.rmtree(tmp_path / "pictures")
+    command("detect", *files, *options, "--min-score 0 --page", tmp_path / "page.html")
+    names = sorted(picture.name for picture in (tmp_path / "pictures").iterdir())
+    assert names == ["0001_a.npy.png", "0002_b.npy.png", "0003_c.npy.png"]
+
+
+@pytest.mark.parametrize("name", ["x.resume_log", "x", "x.json"])
+def test_any_name_will_do_for_the_boxes(home, tmp_path, name):
+    command("detect", home / "good.npy", "--checkpoint", home / "checkpoint", "--out", tmp_path / name)
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    assert len(json.loads((tmp_path / name).read_text())["files"]) == 1
+
+
+def test_a_page_shows_at_first_what_was_asked_for(home, tmp_path):
+    page = tmp_path / "page.html"
+    options = "--min-score 0.25 --page", page, "--out", tmp_path / "x.json"
+    command("detect", home / "good.npy", "--checkpoint", home / "checkpoint", *options)
+    assert page_content(page)["score"] == 0.25
 
 
 @pytest.mark.parametrize("other", [["--min-score", "0.3"], ["--yaw-deg", "90"], ["--remove-close", "none"], []])
@@ -159,7 +198,7 @@ def test_detect_resumes_only_what_would_be_the_same(home, tmp_path, capsys, othe
 
 
 def test_two_detections_into_a_file_are_refused(home, tmp_path, capsys):
-    with file_lock(tmp_path / "x.resume_log"):
+    with file_lock(tmp_path / ".x.json.resume_log"):
         words = ["detect", home / "good.npy", "--checkpoint", home / "checkpoint", "--out", tmp_path / "x.json"]
         assert_one_line_error(capsys, [*map(str, words)], "x.json: in use: another process is detecting")
 
@@ -223,6 +262,12 @@ BAD = {
     "no input": ("detect", "expected point files or --sweeps"),
     "bad columns": ("detect HOME/empty.bin --columns 9", "columns: got 9"),
     "columns of npy": ("detect HOME/good.npy --columns 5", "are for raw .bin files"),
+    "list of sweeps": ("detect HOME/s.json", "s.json: expected a point file, or --sweeps before a list of sweeps"),
+    "sweeps of no list": ("detect --sweeps HOME/good.npy", "good.npy: expected a file that ends in .json"),
+    "page on the log": (
+        "detect HOME/good.npy --out OUT --page OUT/../.out.resume_log",
+        "--page: .*the same file as",
+    ),
     "missing sweeps": ("detect --sweeps HOME/s.json", "s.json: no such file"),
     "no checkpoint": (
         "detect HOME/good.npy --checkpoint HOME/none",

@@ -12,7 +12,7 @@ from tiny_run import TINY_CONFIG, untrained
 from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.cli import stream as cli_stream
 from fcos_lidar_jax.inference.stream import detect_stream
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
@@ -71,6 +71,22 @@ def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path):
         }
         assert line["timestamp_us"] == listed[index]["timestamp_us"]
         assert line["file"] == str(home / listed[index]["file"])
+
+
+def test_keyframes_are_detected_in_with_the_sweeps_between(home, tmp_path, capsys):
+    (tmp_path / "sensor.json").write_text(json.dumps(sensor_to_json(TINY)))
+    data = f"--data-root {tmp_path}/data --scene {{scene}} --checkpoint {home}/checkpoint"
+    command(f"synthesize --out {tmp_path}/data --scenes 1 --keyframes 3 --sensor {tmp_path}/sensor.json")
+    [scenes] = (tmp_path / "data").glob("*/scene.json")
+    data = data.format(scene=json.loads(scenes.read_text())[0]["name"])
+    command("stream", data, "--out", tmp_path / "all.jsonl")
+    capsys.readouterr()
+    command("stream", data, "--keyframes --out", tmp_path / "some.jsonl")
+    assert "3 sweeps: " in capsys.readouterr().err
+    every, some = (tmp_path / f"{name}.jsonl" for name in ("all", "some"))
+    lines = some.read_text().splitlines()
+    assert len(lines) == 3
+    assert set(lines) < set(every.read_text().splitlines())
 
 
 def test_lines_of_poses_give_the_same_to_their_last_digits(home, tmp_path):

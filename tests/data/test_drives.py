@@ -101,6 +101,19 @@ def test_a_scene_is_all_its_sweeps_or_its_keyframes(tmp_path):
         data.drive("scene-7")
 
 
+def test_the_times_of_keyframes_are_theirs(tmp_path):
+    data = NuScenes(write(tmp_path, *make_tables()), VERSION)
+    assert data.keyframe_times_us("scene-1") == {k.time_us for k in data.drive("scene-1", keyframes=True)}
+
+
+def test_a_scene_without_a_file_is_refused(tmp_path):
+    root = write(tmp_path, *make_tables())
+    for sweep in list(NuScenes(root, VERSION).drive("scene-1")):
+        (root / sweep.name).unlink()
+    with refused("scene scene-1: found no file of "):
+        NuScenes(root, VERSION, allow_missing_sweeps=True).drive("scene-1")
+
+
 def test_a_scene_may_lack_sweeps_but_not_keyframes(tmp_path):
     root = write(tmp_path, *make_tables())
     number = len(list(NuScenes(root, VERSION).drive("scene-1")))

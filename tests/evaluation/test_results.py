@@ -250,3 +250,10 @@ def test_a_resume_log_survives_interruptions(tmp_path):
         assert file.read_bytes() == whole
     with ResumeLog(file, "another") as resume_log:
         assert len(resume_log) == 0
+    with ResumeLog(file, "one") as resume_log:  # The other one has added nothing.
+        assert list(resume_log.places) == ["a", "b"]
+    with ResumeLog(file, "another") as resume_log:
+        resume_log.add("c", [])
+        assert list(resume_log.entries(["c"])) == [("c", b"[]")]
+    with ResumeLog(file, "one") as resume_log:
+        assert len(resume_log) == 0

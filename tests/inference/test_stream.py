@@ -56,6 +56,15 @@ def test_a_window_of_one_sweep_forgets_the_others(detector):
         assert bits(each.detections) == bits(alone.detections)
 
 
+def test_sweeps_between_are_fused_where_only_some_are_detected_in(detector):
+    sweeps = list(drive(5))
+    whole, at = list(detect_stream(sweeps, detector)), {sweeps[2].time_us, sweeps[3].time_us}
+    some = list(detect_stream(sweeps, detector, at_us=at))
+    assert [each.sweep.time_us for each in some] == sorted(at)
+    for each, expected in zip(some, whole[2:4], strict=True):
+        assert bits((each.cloud.points, each.detections)) == bits((expected.cloud.points, expected.detections))
+
+
 def test_sweeps_of_other_axes_are_turned_and_boxes_back(detector):
     """The same drive with x ahead and y to the left instead of y ahead and x to the right."""
     turn = np.diag([0.0, 0, 1, 1])

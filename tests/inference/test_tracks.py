@@ -57,13 +57,20 @@ def test_the_order_of_noisy_boxes_changes_nothing():
 def test_a_hidden_object_comes_back_under_its_name_and_a_lost_one_under_another():
     box, label, score = np.array([[0.0, 0, 0, 4, 2, 1, 0, 10, 0]]), np.zeros(1, int), np.ones(1)
     none = np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)
-    for hidden, name in ((3, 0), (4, 1)):
+    for hidden, name in ((2, 0), (3, 1)):
         tracks, _ = track(Tracks(), box, label, score, 0)
         for _ in range(hidden):
             tracks, ids = track(tracks, *none, 0.5)
             assert ids.shape == (0,)
         _, ids = track(tracks, moved(box, 0.5 * (hidden + 1)), label, score, 0.5)
         assert ids.tolist() == [name]
+
+
+@pytest.mark.parametrize(("gap", "name"), [(1.5, 0), (1.54, 0), (1.6, 1), (100.0, 1)])
+def test_a_gap_in_the_recording_ends_tracks_too(gap, name):
+    box, label, score = np.array([[0.0, 0, 0, 4, 2, 1, 0, 0, 0]]), np.zeros(1, int), np.ones(1)
+    tracks, _ = track(Tracks(), box, label, score, 0)
+    assert track(tracks, box, label, score, gap)[1].tolist() == [name]
 
 
 @pytest.mark.parametrize(("shift", "other", "name"), [(1.9, 0, 0), (2.1, 0, 1), (0, 1, 1)])

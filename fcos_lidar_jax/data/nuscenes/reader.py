@@ -170,25 +170,40 @@ class NuScenes:
         Raises:
             ValueError: no such scene, with the names that there are.
         """
-        names = self.index.scene_name.astype(str).tolist()
-        if scene not in names:
-            raise ValueError(f"{self.tables}: scene: {unknown_name(scene, names)}")
-        rows = self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
-        if not rows:
-            raise ValueError(f"{self.tables / 'sample.json'}: scene {scene}: found no keyframe, expected one")
+        rows = self._keyframe_rows(scene)
         if not keyframes:
             following = {int(before): row for row, before in enumerate(self.index.sweep_previous) if before >= 0}
             while rows[-1] in following:
                 rows.append(following[rows[-1]])
             rows = self._chain_of(rows[-1], len(self.index.sweep_file))[::-1]
         if self.allow_missing_sweeps:
-            rows = [row for row in rows if os.path.isfile(self._path(row))]
+            there = [row for row in rows if os.path.isfile(self._path(row))]
+            if not there:
+                raise ValueError(f"{self.root}: scene {scene}: found no file of {len(rows)} sweeps, expected some")
+            rows = there
         times = self.index.sweep_time_us
         poses = map(self._sensor_to_global, rows)
         return (
             Sweep(self._read(row), pose, int(times[row]), str(self._path(row)))
             for row, pose in zip(rows, poses, strict=True)
         )
+
+    def keyframe_times_us(self, scene: str) -> frozenset[int]:
+        """When the keyframes of a scene were taken.
+
+        Raises:
+            ValueError: as :meth:`drive`.
+        """
+        return frozenset(self.index.sweep_time_us[self._keyframe_rows(scene)].tolist())
+
+    def _keyframe_rows(self, scene: str) -> list[int]:
+        names = self.index.scene_name.astype(str).tolist()
+        if scene not in names:
+            raise ValueError(f"{self.tables}: scene: {unknown_name(scene, names)}")
+        rows = self.index.sample_sweep[self.index.sample_scene == names.index(scene)].tolist()
+        if not rows:
+            raise ValueError(f"{self.tables / 'sample.json'}: scene {scene}: found no keyframe, expected one")
+        return rows
 
     def boxes(self, sample_token: str) -> Boxes:
         """The boxes of the ten classes in the keyframe's LiDAR frame, those without points included.
