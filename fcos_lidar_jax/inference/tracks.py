@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 MAX_DISTANCE_M = 2.0  # Between a box and where its track is expected.
-MAX_UNSEEN_S = 1.5  # After which a track ends.
+MAX_UNSEEN_S = 2.0  # After which a track ends.
 _CLOCK_S = 0.05  # By which sweeps may be early or late.
 
 
