@@ -10,11 +10,13 @@ scene-0523 are there to choose by, the odd ones to report. ``--seeds 0 1 2`` sho
 chance.
 
 The same command resumes a stopped study and keeps the cells that are done; ``--only NAME ...`` does some of them.
-Cost: 20 minutes a cell of 1200 steps on two CPU cores.
+The table of all that are done is written beside the figures, as Markdown. Cost: 20 minutes a cell of 1200 steps on
+two CPU cores.
 """
 
 import dataclasses
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from experiments.runs import detections, trained
 from experiments.script import run_script, save
 from experiments.studies.real_scene import CONFIG
 from fcos_lidar_jax.config import AugmentConfig
+from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, city_frames
 from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
@@ -55,6 +58,37 @@ def mixed(base: Streets, other: Streets, group: str) -> Streets:
     """
     name = f"{base.name}, {group} of {other.name}"
     return dataclasses.replace(base, name=name, **{field: getattr(other, field) for field in GROUPS[group]})
+
+
+COLUMNS = {
+    "unseen streets, mAP": ("unseen streets", None),
+    "scene-0523 even, mAP": ("scene-0523, even", None),
+    "car": ("scene-0523, even", "car"),
+    "scene-0523 odd, mAP": ("scene-0523, odd", None),
+    "car ": ("scene-0523, odd", "car"),
+    "scene-0103, car": ("scene-0103", "car"),
+    "pedestrian": ("scene-0103", "pedestrian"),
+}
+"""Column of the table -> frames, and the class, None for the mAP."""
+
+
+def as_markdown(record: Mapping[str, Any]) -> str:
+    """A row for each kind of streets, in the order of :data:`CELLS`: scores in percent, means over the seeds."""
+    lines = [
+        "| streets | seeds | " + " | ".join(map(str.strip, COLUMNS)) + " |",
+        "|---" * (len(COLUMNS) + 2) + "|",
+    ]
+    for name in CELLS:
+        cells = [cell["scores"] for label, cell in record.items() if label.startswith(f"{name}, ")]
+        if cells:
+            texts = [f"{100 * _mean(cells, test, label):.1f}" for test, label in COLUMNS.values()]
+            lines.append(" | ".join([f"| {name}", str(len(cells)), *texts]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _mean(cells: Sequence[Any], test: str, label: str | None) -> float:
+    scores = [cell[test]["all"] for cell in cells]
+    return sum(s["mAP"] if label is None else s["AP"][label] for s in scores) / len(scores)
 
 
 CELLS = (
@@ -99,6 +133,9 @@ def main(args: Args) -> None:
             every = {test: by_span["all"] for test, by_span in scores.items()}
             short = {test: {"mAP": s["mAP"], "car": s["AP"]["car"]} for test, s in every.items()}
             save(record, args.out, f"{cell}: {json.dumps(short)}")
+    text = as_markdown(record)
+    atomic_write(args.out.with_suffix(".md"), lambda file: file.write_text(text, encoding="utf-8"))
+    print(text)
 
 
 if __name__ == "__main__":

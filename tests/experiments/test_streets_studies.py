@@ -7,7 +7,7 @@ import pytest
 from numpy.random import default_rng
 
 from experiments.real_frames import scores_by_range
-from experiments.studies.street_ablations import CELLS, GROUPS, mixed
+from experiments.studies.street_ablations import CELLS, COLUMNS, GROUPS, as_markdown, mixed
 from experiments.sweep_statistics import sweep_statistics
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E as SENSOR
@@ -65,6 +65,18 @@ def test_scores_by_range_see_what_lies_there():
     assert scores["20-40 m"]["AP"] == {"car": 0}
     assert scores["all"]["truths"] == {"car": 2}
     assert 0.3 < scores["all"]["AP"]["car"] < 0.6
+
+
+def test_the_table_of_the_ablations_has_the_means_over_seeds():
+    def cell(value):
+        scores = {"all": {"mAP": value, "AP": {"car": 2 * value, "pedestrian": 3 * value}}}
+        return {"scores": {test: scores for test, _ in COLUMNS.values()}}
+
+    record = {"plain, 9 steps, seed 0": cell(0.1), "plain, 9 steps, seed 1": cell(0.2), "device": "cpu"}
+    lines = as_markdown(record | {"city, 9 steps, seed 0": cell(0.01)}).splitlines()
+    assert lines[2] == "| plain | 2 | 15.0 | 15.0 | 30.0 | 15.0 | 30.0 | 30.0 | 45.0 |"
+    assert lines[3].startswith("| city | 1 | 1.0 | 1.0 | 2.0 |")
+    assert len(lines) == 4
 
 
 def test_every_difference_of_the_streets_is_in_one_group():
