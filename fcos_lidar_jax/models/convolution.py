@@ -19,6 +19,9 @@ Kernel = Float[Array, "_ _ _ _"]
 LARGE = 1 << 24
 """Multiply-adds an image from which another form of the weight gradient is worth compiling."""
 
+LOOP = 16
+"""How many times as many are needed for a loop over rows, which XLA compiles anew for each layer."""
+
 
 def convolve(
     x: Image, kernel: Kernel, *, stride: int = 1, dilation: int = 1, groups: int = 1, circular: bool = False
@@ -49,7 +52,7 @@ def convolve(
     if stride > 1 or groups > 1:
         return product(x, kernel)
     by_rows = functools.partial(_by_rows, sizes=kernel.shape[:2], dilation=dilation, padding=(high, wide))
-    return _linear(product, by_rows, x, kernel)
+    return _linear(product, by_rows, x, kernel, LOOP * LARGE)
 
 
 def pointwise(x: Image, kernel: Float[Array, "_ _"], *, dtype: DTypeLike | None = None) -> Image:
@@ -59,16 +62,18 @@ def pointwise(x: Image, kernel: Float[Array, "_ _"], *, dtype: DTypeLike | None 
     [2.0, 2.0, 2.0, 2.0]
     """
     kernel = kernel.astype(x.dtype)
-    return _linear(functools.partial(_of_pixels, dtype=dtype), _flat, x, kernel)
+    return _linear(functools.partial(_of_pixels, dtype=dtype), _flat, x, kernel, LARGE)
 
 
 def _of_pixels(x: Image, kernel: Array, dtype: DTypeLike | None) -> Image:
     return jnp.einsum("bhwc,co->bhwo", x, kernel, preferred_element_type=dtype)
 
 
-def _linear(product: Callable[..., Image], on_cpu: Callable[..., Array], x: Image, kernel: Array) -> Image:
-    """``product(x, kernel)``, whose weight gradient on CPU is ``on_cpu(x, g)`` where the image is large."""
-    large = x.shape[1] * x.shape[2] * kernel.size >= LARGE
+def _linear(
+    product: Callable[..., Image], on_cpu: Callable[..., Array], x: Image, kernel: Array, least: float
+) -> Image:
+    """``product(x, kernel)``, whose weight gradient on CPU is ``on_cpu(x, g)`` from ``least`` multiply-adds on."""
+    large = x.shape[1] * x.shape[2] * kernel.size >= least
     return _with_weight_gradient(product, on_cpu, x, kernel) if large else product(x, kernel)
 
 
