@@ -12,7 +12,7 @@ from refusal import refused
 from tiny_run import TINY_CONFIG, untrained
 
 from experiments.real_frames import SPANS_M, scores_by_range, within
-from experiments.studies import model_card, regression_axes, shipped_weights, transfer
+from experiments.studies import compact_additions, model_card, shipped_weights, transfer
 from experiments.studies.shipped_weights import earlier_trainings, half_precision
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
@@ -199,15 +199,39 @@ def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
         load_checkpoint(package / "hdl32e")
 
 
-def test_trainings_with_both_axes_are_compared_on_the_same_frames(tmp_path, monkeypatch):
-    monkeypatch.setitem(shipped_weights.CONFIGS, "hdl32e", CONFIG)
-    args = regression_axes.Args(steps=2, test_frames=2, work=tmp_path)
-    record = regression_axes.measure(args)
-    assert {"ray_2_0", "lidar_2_0"} == {folder.name for folder in tmp_path.iterdir()}
-    for axes in ("lidar", "ray"):
-        config = load_checkpoint(find_checkpoint(tmp_path / f"{axes}_2_0")).config
-        assert config == dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, regression_axes=axes))
-        last = [r["positive_iou"] for r in read_metrics(tmp_path / f"{axes}_2_0") if r["step"] == 2]
-        assert record[axes]["IoU of the last positives"] == round(last[0], 4)
-    assert record["difference"] == pytest.approx(record["ray"]["mAP"] - record["lidar"]["mAP"], abs=2e-4)
-    assert record["interval"][0] <= record["difference"] <= record["interval"][1]
+def test_compact_is_compared_with_trainings_that_lack_one_of_its_additions(tmp_path, monkeypatch):
+    both = dataclasses.replace(CONFIG.model, regression_axes="ray", circular_width=True)
+    base = dataclasses.replace(CONFIG, model=both)
+    monkeypatch.setitem(shipped_weights.CONFIGS, "hdl32e", base)
+    args = compact_additions.Args(steps=2, test_frames=2, repeats=1, work=tmp_path)
+    record = compact_additions.measure(args)
+    lacking = {
+        "compact": {},
+        "LiDAR axes": {"regression_axes": "lidar"},
+        "zero padding": {"circular_width": False},
+    }
+    for name, fields in lacking.items():
+        run, own = tmp_path / f"{name.replace(' ', '_').lower()}_2_0", record[name]
+        wanted = dataclasses.replace(base, model=dataclasses.replace(both, **fields))
+        assert load_checkpoint(find_checkpoint(run)).config == wanted
+        last = [r["positive_iou"] for r in read_metrics(run) if r["step"] == 2]
+        assert own["IoU of the last positives"] == round(last[0], 4)
+        assert own["network, ms"] > 0
+        assert own["parameters"] == record["compact"]["parameters"]
+        if fields:
+            assert own["gain of compact"] == pytest.approx(record["compact"]["mAP"] - own["mAP"], abs=2e-4)
+            assert own["interval"][0] <= own["gain of compact"] <= own["interval"][1]
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_recall_towards_the_seam_counts_objects_on_both_of_its_sides():
+    degrees, none = np.radians([179.0, -170.0, 0.0, 160.0]), np.zeros((0, 9), np.float32)
+    boxes = np.zeros((4, 9), np.float32)
+    boxes[:, 0], boxes[:, 1] = 10 * np.cos(degrees), 10 * np.sin(degrees)
+    frame = Frame(np.zeros((0, 5), np.float32), boxes, np.array([0, 1, 0, 0]), np.ones(4, np.int32))
+    near = boxes + np.array([1.9] + 8 * [0.0], np.float32)  # of the first, the second's class being another
+    found = Detections(near, np.ones(4), np.zeros(4, int), np.array([True, True, False, True]), np.int32(0))
+    assert compact_additions.recall_towards(np.pi, [found], [frame]) == (0.5, 2)
+    assert compact_additions.recall_towards(0.0, [found], [frame]) == (0.0, 1)
+    empty = Frame(np.zeros((0, 5), np.float32), none, np.zeros(0, int), np.zeros(0, np.int32))
+    assert compact_additions.recall_towards(0.0, [found], [empty])[1] == 0
