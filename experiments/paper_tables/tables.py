@@ -27,6 +27,7 @@ from experiments.paper_tables.scales import (
     smoke,
 )
 from experiments.statistics import interval
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
 
@@ -243,9 +244,33 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
     lines += ["", f"Differences are to {_references(record)}{drawn}.", *_warnings(record), ""]
     lines += [f"{row['label']}: {line}" for row in record["rows"] for line in row.get("diverged", ())]
+    lines += by_distance(record["rows"])
     if trained:
         lines += [f"Trained by revision {'; '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
+
+
+def by_distance(rows: list[dict[str, Any]]) -> list[str]:
+    """mAP and AP by distance and by class, for the rows whose cells hold them, and how long their steps took."""
+    table, seconds = list[str](), list[str]()
+    for row in rows:
+        cells = [cell for cell in row.get("scores", ()) if cell and "ranges" in cell]
+        for span in cells[0]["ranges"] if cells else ():
+            every = [cell["ranges"][span] for cell in cells]
+            classes = [name for name in NUSCENES_CLASSES if all(name in scores["AP"] for scores in every)]
+            means = {name: 100 * np.mean([scores["AP"][name] for scores in every]) for name in classes}
+            values = [100 * np.mean([scores["mAP"] for scores in every]), *map(means.get, NUSCENES_CLASSES)]
+            table.append("| " + " | ".join([row["label"], span, *(_number(value) for value in values)]) + " |")
+        if cells:
+            taken = np.mean([cell["seconds_of_steps"] for cell in cells]) / 60
+            seconds.append(f"{row['label']} {taken:.0f}")
+    if not table:
+        return []
+    header = ["", "distance", "mAP", *(name.replace("_", " ") for name in NUSCENES_CLASSES)]
+    title = "mAP and AP of the classes by distance from the sensor, means over the seeds:"
+    rule = "|---" * len(header) + "|"
+    said = f"Minutes of the training's steps, on the hardware of the cells: {', '.join(seconds)}."
+    return [title, "", "| " + " | ".join(header) + " |", rule, *table, "", said, ""]
 
 
 def _warnings(record: dict[str, Any]) -> list[str]:

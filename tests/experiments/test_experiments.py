@@ -261,6 +261,19 @@ def test_a_row_without_a_curve_is_left_out_of_the_picture(tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
+def test_scores_by_distance_and_class_are_means_over_the_seeds(tmp_path):
+    spans = [{"all": {"mAP": 0.1, "AP": {"car": 0.2, "bus": 0.4}}}, {"all": {"mAP": 0.3, "AP": {"car": 0.4}}}]
+    cells = [{"ranges": one, "seconds_of_steps": 60 * (i + 1)} for i, one in enumerate(spans)]
+    rows = [{"label": "ours", "scores": [*cells, None]}, {"label": "untrained"}]
+    lines = tables.by_distance(rows)
+    names, values = (line.strip("| ").split(" | ") for line in (lines[2], lines[4]))
+    shown = dict(zip(["", *names], values, strict=True))
+    assert (shown[""], shown["distance"], shown["mAP"]) == ("ours", "all", "20.00")
+    assert (shown["car"], shown["bus"]) == ("30.00", "-")  # a bus is not in the frames of both seeds
+    assert any("ours 2" in line for line in lines[5:])  # minutes, rounded
+    assert tables.by_distance([{"label": "none", "scores": [{"mAP": 0.1}, None]}]) == []
+
+
 def test_a_state_that_is_not_finite_is_a_result_too(tmp_path):
     class Overflows(Pretended):
         def score(self, config, seed, folder):
