@@ -1,7 +1,7 @@
 """The real keyframes as frame sets, and scores by class and by range."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,16 +68,20 @@ def real_frames(data: Path | None, projection: ProjectionConfig) -> dict[str, Fr
 
 
 def scores_by_range(
-    found: Iterable[Detections], frames: Iterable[Frame], *, repeats: int = 0
+    found: Iterable[Detections],
+    frames: Iterable[Frame],
+    *,
+    repeats: int = 0,
+    groups: Sequence[int] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """mAP and AP by class of all boxes, and of those whose centres lie in a span of distances from the sensor.
 
     Truth and detections are divided alike, so a hit across a border counts in neither span. With ``repeats`` sets
-    of frames drawn anew the mAPs have intervals.
+    of frames drawn anew, or of groups of them, the mAPs of more than two frames have intervals.
     """
     found, frames = list(found), list(frames)
     spans = {f"{low}-{high} m": within(found, frames, low, high) for low, high in SPANS_M}
-    return {name: _scores(*boxes, repeats) for name, boxes in {"all": (found, frames), **spans}.items()}
+    return {name: _scores(*boxes, repeats, groups) for name, boxes in {"all": (found, frames), **spans}.items()}
 
 
 def within(
@@ -96,16 +100,22 @@ def within(
     return [dataclasses.replace(d, valid=d.valid & inside(d.boxes)) for d in found], near
 
 
-def _scores(found: list[Detections], frames: list[Frame], repeats: int) -> dict[str, Any]:
+def _scores(
+    found: list[Detections], frames: list[Frame], repeats: int, groups: Sequence[int] | None
+) -> dict[str, Any]:
     evaluation = evaluate_frames(found, frames, metric_of(NUSCENES_CLASSES))
     pairs = zip(NUSCENES_CLASSES, evaluation.rankings, strict=True)
     truths = {name: len(ranking.truth_sample) for name, ranking in pairs}
     aps = {k: round(v, 4) for k, v in evaluation.summary["mean_dist_aps"].items() if truths[k]}
     scores = {"mAP": round(evaluation.summary["mean_ap"], 4), "AP": aps, "truths": {k: truths[k] for k in aps}}
-    return {**scores, "interval": interval_of(evaluation, "mean_ap", repeats)} if repeats and aps else scores
+    if not (repeats and aps and len(frames) > 2):
+        return scores
+    return {**scores, "interval": interval_of(evaluation, "mean_ap", repeats, groups)}
 
 
-def interval_of(evaluation: Evaluation, score: str, repeats: int) -> list[float]:
-    """Low and high end of a score's 95 % interval, over frames drawn anew."""
-    interval = bootstrap(evaluation, repeats=repeats)[score]
+def interval_of(
+    evaluation: Evaluation, score: str, repeats: int, groups: Sequence[int] | None = None
+) -> list[float]:
+    """Low and high end of a score's 95 % interval, over frames drawn anew, or over groups of them."""
+    interval = bootstrap(evaluation, repeats=repeats, groups=groups)[score]
     return [round(interval[end], 4) for end in ("low", "high")]

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.metrics import Evaluation, score
+from fcos_lidar_jax.evaluation.bootstrap import scores_of_draw
+from fcos_lidar_jax.evaluation.metrics import Evaluation
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float] | None:
@@ -26,12 +27,9 @@ def paired_difference(one: Evaluation, other: Evaluation, *, repeats: int = 1000
     """95 % interval of the other's mAP minus the one's, over frames of both drawn anew, the same for both."""
     rng, number, drawn = np.random.default_rng(0), len(one.tokens), []
 
-    def mean_ap(evaluation: Evaluation, copies: np.ndarray) -> float:
-        rankings = [ranking.resampled(copies) for ranking in evaluation.rankings]
-        return score(rankings, evaluation.metric)[1]["mean_ap"]
-
     for _ in range(repeats):
         copies = np.bincount(rng.integers(0, number, number), minlength=number)
-        drawn.append(mean_ap(other, copies) - mean_ap(one, copies))
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
+        ours, theirs = (scores_of_draw(evaluation, copies)["mean_ap"] for evaluation in (one, other))
+        drawn.append(theirs - ours)
+    low, high = np.quantile(drawn, [0.025, 0.975])
     return float(low), float(high)

@@ -7,10 +7,42 @@ from jaxtyping import Array, Float32, Int, PRNGKeyArray, UInt32
 
 from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.geometry import wrap_angle
+from fcos_lidar_jax.sensors import Sensor
 
 Key = PRNGKeyArray | UInt32[Array, "2"]
 Cloud = Float32[Array, "n c"]
 Truth = Float32[Array, "m 9"]
+
+
+def check_augmentation(config: AugmentConfig, sensor: Sensor) -> None:
+    """Refuse what would move most points of a sensor's sector out of it; a full turn may be moved in any way.
+
+    Raises:
+        ValueError: a rotation by more than half of the sector, or a flip that does not map it onto itself.
+
+    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
+    >>> check_augmentation(AugmentConfig(), sector(NUSCENES_HDL32E, 0.0, 272))
+    Traceback (most recent call last):
+    ValueError: ...
+    """
+    if sensor.azimuth_limits_rad is None or sensor.num_columns * sensor.column_rad > 2 * np.pi - sensor.column_rad:
+        return
+    right, left = sensor.azimuth_limits_rad
+    where = f"for the sensor {sensor.name!r}, which covers {np.degrees(left - right):.0f} degrees"
+    most = (left - right) / 2
+    if config.max_rotation_rad > most:
+        raise ValueError(
+            f"augment.max_rotation_rad: got {config.max_rotation_rad:.3g}, expected at most {most:.3g}, half of "
+            f"the sector, {where}"
+        )
+    # A flip of x takes the azimuth a to pi - a, one of y to -a.
+    for name, turn in (("flip_x_probability", np.pi), ("flip_y_probability", 0.0)):
+        off = np.remainder(right + left - turn + np.pi, 2 * np.pi) - np.pi
+        if getattr(config, name) > 0 and abs(off) > 2 * sensor.column_rad:
+            raise ValueError(
+                f"augment.{name}: got {getattr(config, name)}, expected 0 {where} that the flip does not map onto "
+                "themselves"
+            )
 
 
 def flip_x(points: Cloud, boxes: Truth) -> tuple[Cloud, Truth]:

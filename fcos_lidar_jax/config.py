@@ -11,7 +11,10 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
 
-_RANGE_VIEW_LOSSES = ("top_q", "regress_on", "iou_loss", "iou_weight", "iou_prediction_weight")
+_RANGE_VIEW_LOSSES = (
+    *("top_q", "regress_on", "iou_loss", "iou_weight", "iou_prediction_weight"),
+    *("quality", "centreness_m"),
+)
 """Fields of :class:`LossConfig` that CenterPoint has no use for."""
 
 
@@ -114,6 +117,9 @@ class ModelConfig:
     regression_axes: Literal["lidar", "ray"] = "lidar"
     """Axes of the predicted centre offset and velocity: those of the LiDAR frame, as in equation 2, or, not in the
     paper, the direction of the point's azimuth and the one to its left, see :mod:`fcos_lidar_jax.coding`."""
+    meta_kernel: bool = False
+    """Not in the paper: the 3x3 of the backbone's first block weighs its neighbours by their offsets in space, as
+    in RangeDet, see :mod:`fcos_lidar_jax.models.meta_kernel`."""
     background_prior: float = 0.99  # Reading: the background's probability at the start.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Reading: subtracted from the nine channels in the preprocessing."""
@@ -155,7 +161,7 @@ class PillarConfig:
     head_channels: int = 64  # Channels of the convolution that all heads share, and of those of each head.
     groups: tuple[int, ...] = ()
     """The group of each class, counted from 0: each has heads of its own; () for one of all classes."""
-    min_overlap: float = 0.1  # IoU that a box keeps when its centre moves by the radius of its Gaussian.
+    min_overlap: float = 0.1  # Decides the radius of a Gaussian, see fcos_lidar_jax.centres.gaussian_radius.
     min_radius: int = 2  # Least radius of a Gaussian, cells of the heat map.
     centre_prior: float = 0.1  # Probability of a centre at the start, everywhere.
 
@@ -194,12 +200,18 @@ class LossConfig:
     iou_weight: float = 1.0  # Reading: of the IoU loss.
     iou_prediction_weight: float = 1.0  # Reading: of the binary cross-entropy of the predicted IoU.
     velocity_weight: float = 0.2  # Reading: of the two velocity numbers within the L1 loss.
+    quality: Literal["iou", "centreness"] = "iou"
+    """What the factor of the score is trained to be: the rotated 3D IoU, or, not in the paper, how near the
+    predicted centre is, see :func:`fcos_lidar_jax.losses.centreness`."""
+    centreness_m: float = 0.75  # Distance of the centres at which the centreness is 1 / e, metres.
 
     def __post_init__(self) -> None:
         _check_least(self, 1, "top_q")
         for name, value in vars(self).items():
             if name.endswith("_weight"):
                 _check(math.isfinite(value) and value >= 0, name, value, "a finite number of at least 0")
+        width = self.centreness_m
+        _check(math.isfinite(width) and width > 0, "centreness_m", width, "a positive number of metres")
         _check_choices(self)
 
 

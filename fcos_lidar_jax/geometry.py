@@ -2,7 +2,9 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64
+from jaxtyping import Array, Bool, Float, Float64, Int32
+
+from fcos_lidar_jax.sensors import Sensor
 
 # Coefficients of atan(t) / t in t^2 on [0, 1]: minimax in the relative error, 1.2e-9 in exact arithmetic.
 _ATAN = (
@@ -61,6 +63,24 @@ def spherical(xyz: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Arra
     """
     x, y, z = xyz[..., 0], xyz[..., 1], xyz[..., 2]
     return safe_norm(x, y, z), atan2(y, x), atan2(z, safe_norm(x, y))
+
+
+def image_columns(azimuth: Float[Array, "n"], sensor: Sensor) -> tuple[Int32[Array, "n"], Bool[Array, "n"]]:
+    """The image column of each azimuth, clockwise from the left end of what the sensor covers, and whether it is
+    covered.
+
+    >>> from fcos_lidar_jax.sensors import TINY, sector
+    >>> column, inside = image_columns(jnp.array([0.0, 3.0]), sector(TINY, 0.0, 2))
+    >>> column[:1].tolist(), inside.tolist()
+    ([1], [True, False])
+    """
+    behind = np.float32(sensor.first_azimuth_rad) - azimuth
+    if sensor.azimuth_limits_rad is not None:
+        behind = jnp.mod(behind, np.float32(2 * np.pi))
+    column = jnp.floor(behind * np.float32(1 / sensor.column_rad)).astype(jnp.int32)
+    if sensor.azimuth_limits_rad is None:
+        return column % sensor.num_columns, jnp.ones(column.shape, bool)
+    return column, column < sensor.num_columns
 
 
 def wrap_angle(angle: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarray, "*n"]:

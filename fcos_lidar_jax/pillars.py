@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from fcos_lidar_jax.config import PillarConfig
+from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Pillars
 
@@ -108,8 +109,8 @@ def make_pillars(
 ) -> Pillars:
     """The pillar of every point of one cloud and its ten features (PointPillars, section 2.1).
 
-    Drops non-finite rows and those outside of the grid or of the sensor's limits; neither the field of view nor
-    the lasers matter.
+    Drops non-finite rows and those outside of the grid, of the sensor's limits or of the sector that it covers;
+    neither the vertical field of view nor the lasers matter.
 
     Args:
         points: x, y, z (metres), intensity (0-255), time lag (seconds), and columns that are ignored.
@@ -129,6 +130,9 @@ def make_pillars(
         usable &= (
             (jnp.abs(cloud[:, :2]) < sensor.limit_xy_m).all(axis=1) & (cloud[:, 2] > low) & (cloud[:, 2] < high)
         )
+        if sensor.azimuth_limits_rad is not None:
+            _, azimuth, _ = spherical(cloud[:, :3] - np.asarray(sensor.origin_m, np.float32))
+            usable &= image_columns(azimuth, sensor)[1]
         cell, inside = cells_below(cloud[:, :2], grid)
         usable &= inside
         cell = jnp.where(usable, cell, grid.num_cells)

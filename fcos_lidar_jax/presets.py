@@ -122,7 +122,7 @@ stages cost least, so there it is deep: the quickstart's blocks 0.92, its whole 
 the same points for 1.95 times the time. Tied heads save parameters alone: 1.02. The image wraps around: no seam
 behind the vehicle. NMS at 0.1, weighted NMS and the IoU's exponent are not in the paper:
 ``python -m experiments.studies.post_processing`` measures what each adds. Neither are the axes of the regression;
-``python -m experiments.studies.regression_axes`` compares them with the paper's.
+``python -m experiments.studies.compact_additions`` compares them with the paper's.
 """
 
 CENTERPOINT_PILLARS = dataclasses.replace(

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
-from fcos_lidar_jax.geometry import spherical
+from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import RangeImage
 
@@ -89,14 +89,8 @@ def image_cells(
     low, high = sensor.limit_z_m
     usable &= (jnp.abs(x) < sensor.limit_xy_m) & (jnp.abs(y) < sensor.limit_xy_m) & (z > low) & (z < high)
     range_m, azimuth, inclination = spherical(points[:, :3] - np.asarray(sensor.origin_m, np.float32))
-    behind = np.float32(sensor.first_azimuth_rad) - azimuth
-    if sensor.azimuth_limits_rad is not None:
-        behind = jnp.mod(behind, np.float32(2 * np.pi))
-    column = jnp.floor(behind * np.float32(1 / sensor.column_rad)).astype(jnp.int32)
-    if sensor.azimuth_limits_rad is None:
-        column %= sensor.num_columns
-    else:
-        usable &= column < sensor.num_columns
+    column, inside = image_columns(azimuth, sensor)
+    usable &= inside
     row = points[:, 5].astype(jnp.int32) if sensor.row_source == "laser" else _row(inclination, sensor)
     usable &= (row >= 0) & (row < sensor.num_rows)
     cell = jnp.where(usable, row * sensor.num_columns + column, sensor.num_rows * sensor.num_columns)

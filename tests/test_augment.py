@@ -1,13 +1,16 @@
 """Augmentation against explicit matrices on points, corners and velocities."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
 
-from fcos_lidar_jax.augment import augment, flip_x, flip_y, rotate, sample_key, scale
+from fcos_lidar_jax.augment import augment, check_augmentation, flip_x, flip_y, rotate, sample_key, scale
 from fcos_lidar_jax.config import AugmentConfig
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 
 ANGLE = 0.7
 TURN = np.array([[np.cos(ANGLE), -np.sin(ANGLE), 0], [np.sin(ANGLE), np.cos(ANGLE), 0], [0, 0, 1]])
@@ -74,6 +77,25 @@ def test_draws_cover_their_ranges_and_the_sensor_stays():
     reference = np.cross([10, 0, 0], [*(points[60, :2] - np.array(origin[:2])), 0])[2]
     hand = arm[:, 0] * third[:, 1] - arm[:, 1] * third[:, 0]
     assert 0.35 < np.mean(np.sign(hand) != np.sign(reference)) < 0.65
+
+
+def test_what_would_leave_a_sensors_sector_is_refused():
+    ahead, right = (sector(NUSCENES_HDL32E, middle, 272) for middle in (np.pi / 2, 0.0))
+    behind = sector(NUSCENES_HDL32E, -np.pi, 272)  # across the end of the azimuth
+    fine = {"max_rotation_rad": 0.5, "flip_x_probability": 0.0, "flip_y_probability": 0.0}
+    check_augmentation(AugmentConfig(), NUSCENES_HDL32E)
+    whole = dataclasses.replace(NUSCENES_HDL32E, azimuth_limits_rad=(-np.pi, np.pi))
+    check_augmentation(AugmentConfig(), whole)
+    for sensor, allowed, refused in (
+        (ahead, "flip_x_probability", "flip_y_probability"),
+        (right, "flip_y_probability", "flip_x_probability"),
+        (behind, "flip_y_probability", "flip_x_probability"),
+    ):
+        check_augmentation(AugmentConfig(**{**fine, allowed: 0.5}), sensor)
+        with pytest.raises(ValueError, match=rf"augment\.{refused}: got 0.5, expected 0 .*90 degrees"):
+            check_augmentation(AugmentConfig(**{**fine, refused: 0.5}), sensor)
+        with pytest.raises(ValueError, match=r"augment\.max_rotation_rad: got 0.9, expected at most 0.787"):
+            check_augmentation(AugmentConfig(**{**fine, "max_rotation_rad": 0.9}), sensor)
 
 
 def test_unknown_velocities_stay_unknown():

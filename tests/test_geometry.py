@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.geometry import (
     atan2,
+    image_columns,
     points_in_box,
     pose_matrix,
     rotation_matrix,
@@ -16,6 +17,7 @@ from fcos_lidar_jax.geometry import (
     spherical,
     wrap_angle,
 )
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 
 
 def awkward_pairs():
@@ -41,6 +43,21 @@ def test_gradients_of_angles_and_norms_are_those_of_calculus_and_finite_at_zero(
     for function in (atan2, safe_norm):
         at_zero = jax.grad(function, argnums=(0, 1))(jnp.float32(0), jnp.float32(0))
         assert np.isfinite(np.asarray(at_zero)).all()
+
+
+def test_columns_of_a_sector_are_those_of_the_turn_that_it_is_cut_from():
+    azimuth = np.linspace(-np.pi, np.pi, 20001)[:-1].astype(np.float32)
+    whole, everywhere = image_columns(jnp.asarray(azimuth), NUSCENES_HDL32E)
+    assert everywhere.all()
+    exact = np.floor((np.pi - azimuth.astype(np.float64)) / (2 * np.pi) * 1086).astype(int) % 1086
+    assert (np.asarray(whole) == exact).mean() > 0.999
+    # Columns 100 to 371 of the turn.
+    ahead = sector(NUSCENES_HDL32E, np.pi - (100 + 272 / 2) * NUSCENES_HDL32E.column_rad, 272)
+    column, inside = jax.jit(image_columns, static_argnums=1)(jnp.asarray(azimuth), ahead)
+    expected = (exact >= 100) & (exact < 372)
+    assert (np.asarray(inside) == expected).mean() > 0.999
+    both = np.asarray(inside) & expected
+    assert (np.asarray(column)[both] == exact[both] - 100).mean() > 0.99
 
 
 def test_spherical_inverts_to_the_point():

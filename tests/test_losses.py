@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import pytest
 
 from fcos_lidar_jax.config import LossConfig
 from fcos_lidar_jax.iou import oriented
-from fcos_lidar_jax.losses import classification_loss, combine, iou_loss, iou_prediction_loss, l1_loss
+from fcos_lidar_jax.losses import centreness, classification_loss, combine, iou_loss, iou_prediction_loss, l1_loss
 
 NUMBER = 50
 KINDS = ("iou", "log_iou", "giou", "diou")
@@ -101,6 +102,21 @@ def test_masked_out_rubbish_does_not_reach_the_gradient():
     box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]] * NUMBER))
     for kind in KINDS:
         assert not np.asarray(iou_gradient(rubbish, box, jnp.zeros(NUMBER, bool), kind)[1]).any()
+
+
+def test_centreness_is_a_gaussian_of_the_distance_in_space_whatever_the_sizes(rng):
+    prediction, target = rng.normal(0, 0.5, (2, NUMBER, 8))
+    found = jax.jit(centreness, static_argnums=2)(f32(prediction), f32(target), 0.75)
+    expected = [
+        math.exp(-(math.dist(a[:3], b[:3]) ** 2) / 0.75**2) for a, b in zip(prediction, target, strict=True)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    each = jax.vmap(lambda a, b: centreness(a[None], b[None], 0.75)[0])(f32(prediction), f32(target))
+    np.testing.assert_allclose(each, found, rtol=1e-6)
+    far = jax.grad(lambda a: centreness(a, f32(target), 0.75).sum())(f32(prediction) + 1e20)
+    same = jax.grad(lambda a: centreness(a, a, 0.75).sum())(f32(prediction))
+    assert np.isfinite(far).all()
+    assert not np.asarray(same).any()
 
 
 def test_iou_prediction_is_the_binary_cross_entropy_and_leaves_the_iou_alone(rng):

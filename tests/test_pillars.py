@@ -18,7 +18,7 @@ from fcos_lidar_jax.pillars import (
     make_pillars,
     pillar_grid,
 )
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 
 GRID = Grid(16, 0.5, (-3.0, -4.0))
 SENSOR = dataclasses.replace(NUSCENES_HDL32E, limit_xy_m=4.5)
@@ -74,6 +74,19 @@ def test_a_laser_column_is_ignored_and_nothing_may_be_there():
     assert not nothing.features.any()
     assert (nothing.cell == GRID.num_cells).all()
     assert int(nothing.num_dropped) == 0
+
+
+def test_points_beside_the_sector_of_a_sensor_are_in_no_pillar():
+    points, valid = cloud()
+    ahead = sector(SENSOR, math.pi / 2, 272)
+    right, left = ahead.azimuth_limits_rad
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    inside = (azimuth > right) & (azimuth < left)
+    expected = make_pillars(points, valid & inside, grid=GRID, sensor=SENSOR)
+    found = make_pillars(points, valid, grid=GRID, sensor=ahead)
+    np.testing.assert_array_equal(found.cell, expected.cell)
+    np.testing.assert_array_equal(found.features, expected.features)
+    assert 10 < (np.asarray(found.cell) < GRID.num_cells).sum() < 0.5 * valid.sum()
 
 
 def test_means_of_many_far_points_are_exact():

@@ -113,7 +113,8 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
         yield f"Not measured yet with these weights: {command} does."
         return
     yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, as {command} measured it; boxes in"
-    yield "brackets. The intervals are of keyframes drawn again, and too narrow: keyframes of a scene are alike."
+    yield "brackets. The intervals are of simulated drives and of real keyframes drawn again; the latter are too"
+    yield "narrow, for keyframes of a scene are alike."
     for name, part in record.items():
         if isinstance(part, dict) and "all" in part:
             yield from _part(name, part)
@@ -124,7 +125,8 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
 
 
 def _part(name: str, part: Mapping[str, Any]) -> Iterator[str]:
-    scores = [f"mAP {part['all']['mAP']:.3f} ({_text(part['all']['interval'])})"]
+    interval = part["all"].get("interval")
+    scores = [f"mAP {part['all']['mAP']:.3f}" + (f" ({_text(interval)})" if interval else "")]
     for key in ("official mAP", "official NDS"):
         if found := part.get(key):
             scores.append(f"{key} {found['score']:.3f} ({_text(found['interval'])})")
@@ -140,7 +142,10 @@ def _part(name: str, part: Mapping[str, Any]) -> Iterator[str]:
         yield f"| {label.replace('_', ' ')} | {' | '.join(shown)} |"
     often = [label for label, boxes in truths.items() if boxes >= _WEAK_BOXES]
     if weak := [label.replace("_", " ") for label in often if aps[label] < _WEAK_AP]:
-        yield f"\nHardly found here (AP below {_WEAK_AP:g}): {', '.join(weak)}."
+        yield (
+            f"\nHardly found here (AP below {_WEAK_AP:g}), of the classes with at least {_WEAK_BOXES} boxes: "
+            f"{', '.join(weak)}."
+        )
 
 
 def _text(interval: Any) -> str:

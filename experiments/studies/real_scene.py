@@ -5,7 +5,7 @@
 FOLDER holds ``nuscenes_scene0523/``. One sweep, the quickstart's network on the full 32x1086 image.
 
 1, 4 and 32 keyframes without augmentation, and the 32 with it; mAP on the training frames themselves, and the
-samples seen. A rung of this ladder that is not learnt is a defect. Those trained on the 32 are tested on the other
+samples seen. One of these steps that is not learnt is a defect. Those trained on the 32 are tested on the other
 keyframes, 3 to 10 (0-based), too: training and test share one scene, and the bootstrap intervals over eight
 keyframes that resemble each other are too narrow. What weights from simulated streets give: ``transfer.py``.
 
@@ -59,7 +59,7 @@ class Args:
     """What to train on, and how long."""
 
     data: Path | None = None  # Folder with nuscenes_scene0523/; default: the environment's FCOS_LIDAR_REAL_DATA.
-    steps: tuple[int, int, int, int] = (300, 800, 1000, 1000)  # Updates of the ladder's rungs.
+    steps: tuple[int, int, int, int] = (300, 800, 1000, 1000)  # Updates of each training.
     only: tuple[str, ...] = ()  # Of the runs, by name; default: all.
     seed: int = 0  # Of all runs.
     runs: Path = Path("outputs/real_scene")  # Folder of the runs.

@@ -8,8 +8,8 @@ FOLDER holds ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_sc
 ``nuscenes_scene0061/`` (one of a third). The simulated keyframes are those of drives that no training has seen, as
 ``fcos-lidar synthesize`` writes them. Average precision is by centre distance, as in nuScenes' benchmark, of all
 boxes that hold a point, within each class's range, and of those at 0-20 and 20-40 m. Means are over the classes
-that occur; the official mAP and NDS of the simulated drives stand beside them. The intervals are of keyframes
-drawn anew, and too narrow: keyframes of a scene resemble each other.
+that occur; the official mAP and NDS of the simulated drives stand beside them. The intervals are of simulated
+drives and of real keyframes drawn anew; the latter are too narrow, for keyframes of a scene resemble each other.
 
 Fine-tuning trains on 32 keyframes of scene-0523 from the checkpoint's weights, at a third of the learning rate,
 and from random ones, with as many steps, and tests on the other eight. The same command resumes it. Cost: five
@@ -81,16 +81,25 @@ def parts(args: Args, detector: TrainedDetector) -> Iterator[tuple[str, FrameSet
         yield from ((name, real[name]) for name in args.only or REAL if name in real)
 
 
+def drives_of(frames: NuScenesFrames) -> list[int]:
+    """The drive of each keyframe, counted from 0."""
+    scenes = [frames.nuscenes.scene_of(token) for token in frames.tokens]
+    numbers = {scene: number for number, scene in enumerate(dict.fromkeys(scenes))}
+    return [numbers[scene] for scene in scenes]
+
+
 def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
     """Scores of a detector on frames, by range; official ones on simulated drives."""
     found, read = detections(detector, frames)
-    record: dict[str, Any] = {"keyframes": len(read), **scores_by_range(found, read, repeats=_SETS)}
+    drives = drives_of(frames) if isinstance(frames, NuScenesFrames) else None
+    scores = scores_by_range(found, read, repeats=_SETS, groups=drives)
+    record: dict[str, Any] = {"keyframes": len(read), **scores}
     if isinstance(frames, NuScenesFrames):
         evaluation = evaluate_keyframes(found, frames.nuscenes, frames.tokens, detector.classes)
         for name, key in (("official mAP", "mean_ap"), ("official NDS", "nd_score")):
             record[name] = {
                 "score": round(evaluation.summary[key], 4),
-                "interval": interval_of(evaluation, key, _SETS),
+                "interval": interval_of(evaluation, key, _SETS, drives),
             }
     return record
 

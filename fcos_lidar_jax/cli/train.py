@@ -23,7 +23,7 @@ from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.trainer.run import Schedule, check_run, train
+from fcos_lidar_jax.trainer.run import NUM_SEEDS, Schedule, check_run, train
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of
 
 _ABOUT = {
@@ -102,6 +102,10 @@ def run(args: Train) -> None:
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
+    if layout.format == "folder" and config.sensor not in (PRESETS[config.name].sensor, frames.sensor.name):
+        raise ValueError(
+            f"--sensor: got {config.sensor!r}, expected none: {layout.root}/sensor.json has {frames.sensor.name!r}"
+        )
     val_split, tests = args.val_split or args.data.split("val", required=False), None
     if val_split != "none" and (val_split or args.val_samples):
         tests = args.data.open(config, split=val_split, samples=args.val_samples, option="--val-samples")
@@ -154,8 +158,8 @@ def run(args: Train) -> None:
 def _check(args: Train) -> None:
     check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep", "num_processes")
     check_at_least(args, 0, "threads", "workers", "seed")
-    if args.seed >= 2**63:
-        raise ValueError(f"--seed: got {args.seed}, expected less than 2**63")
+    if args.seed >= NUM_SEEDS:
+        raise ValueError(f"--seed: got {args.seed}, expected less than 2**32")
     if args.val_split == "none":
         for name in ("val_samples", "evaluate_every"):
             if (given := getattr(args, name)) is not None:
@@ -189,12 +193,18 @@ def _database(args: Train, config: Config, layout: Layout, split: str | None) ->
             "or train with --no-copy-paste"
         )
     source = database.read_manifest(folder).source
+    if config.num_sweeps > database.MAX_SWEEPS:
+        raise ValueError(
+            f"num_sweeps: got {config.num_sweeps}, expected at most {database.MAX_SWEEPS} with pasted objects, or "
+            "--no-copy-paste"
+        )
     # Objects of more sweeps than are fused will do: those too many are left out.
     sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
     if not any(source == args.data.open_whole(split, num_sweeps=n).fingerprint() for n in sweeps):
         raise ValueError(
-            f"{folder}: cut from other frames than those of split {split!r}, or from fewer sweeps than "
-            f"{config.num_sweeps}, expected these: run fcos-lidar prepare again"
+            f"{folder}: cut from other frames than those of split {split!r}, with another --class-map, or from "
+            f"fewer sweeps than {config.num_sweeps}, expected these: run fcos-lidar prepare again, with the same "
+            "options for the data"
         )
     return database.open_database(folder)
 

@@ -68,8 +68,9 @@ def network_graph(detector: TrainedDetector) -> bytes:
     layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
     network = _Network(onnx, detector.variables, circular=model.circular_width)
     image = _preprocessing(network, "features", model, layout)
-    image = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
-    levels = _pyramid(network, _backbone(network, image, model.backbone_blocks))
+    geometry = _geometry(network, image, rounds, model.channel_scale) if model.meta_kernel else None
+    stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
+    levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks, geometry))
     k = len(config.classes)
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
     _heads(network, levels, model, shapes)
@@ -181,6 +182,14 @@ class _Network:
             )
         return x
 
+    def padded(self, x: str) -> str:
+        """With a pixel more on every side: zeros, or wrapped around the width."""
+        if self.circular:
+            last, first = self("Slice", x, [-1], [_END], [3]), self("Slice", x, [0], [1], [3])
+            x = self("Concat", last, x, first, axis=3)
+        wide = 0 if self.circular else 1
+        return self("Pad", x, [0, 0, 1, wide, 0, 0, 1, wide])
+
     def upsample(self, x: str, rows: int, columns: int) -> str:
         """Every row and column repeated."""
         how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
@@ -233,13 +242,42 @@ def _block_diagonal(kernels: Sequence[np.ndarray]) -> np.ndarray:
     return whole
 
 
-def _backbone(network: _Network, x: str, blocks: Sequence[int]) -> list[str]:
+def _geometry(network: _Network, image: str, rounds: int, scale: Sequence[float]) -> tuple[str, str]:
+    """As :func:`fcos_lidar_jax.models.meta_kernel.geometry_of`: points and where they exist."""
+    points = network("Gather", image, [0, rounds, 2 * rounds], axis=1)
+    metres = network("Mul", points, np.array(scale[:3])[:, None, None])
+    return metres, network("Gather", image, [7 * rounds], axis=1)
+
+
+def _meta_kernel(network: _Network, x: str, geometry: tuple[str, str], path: str) -> str:
+    """As :class:`fcos_lidar_jax.models.meta_kernel.MetaKernel`."""
+    points, exists = geometry
+    kernel, (gain, shift) = network.parameter(f"{path}/kernel"), network.batch_norm(f"{path}/norm")
+    hidden, weigh = (network.parameter(f"{path}/{name}")[None, None] for name in ("hidden", "weigh"))
+    placed = network.conv(points, hidden)
+    here = network("Sub", placed, network.parameter(f"{path}/hidden_bias")[:, None, None])
+    around, total = [network.padded(image) for image in (network("Mul", x, exists), placed)], ""
+    for row, column in np.ndindex(3, 3):
+        # The last rows and columns are counted from the end: the graph need not know the size.
+        ends = [_END if tap == 2 else tap - 2 for tap in (row, column)]
+        f, there = (network("Slice", image, [row, column], ends, [2, 3]) for image in around)
+        bias = network.parameter(f"{path}/weigh_bias")
+        weight = network.conv(network("Relu", network("Sub", there, here)), weigh, bias)
+        tap = network.conv(network("Mul", weight, f), kernel[row, column][None, None] * gain)
+        total = network("Add", total, tap) if total else tap
+    return network("Relu", network("Add", network("Mul", total, exists), shift[:, None, None]))
+
+
+def _backbone(network: _Network, x: str, blocks: Sequence[int], geometry: tuple[str, str] | None) -> list[str]:
     x, levels = network.conv_norm(x, "backbone/first"), []
     for stage, (count, stride) in enumerate(zip(blocks, STAGE_STRIDES, strict=True)):
         for block in range(count):
             path, step = f"backbone/stage{stage}_block{block}", stride if block == 0 else 1
             y = network.conv_norm(x, f"{path}/reduce")
-            y = network.conv_norm(y, f"{path}/spatial", stride=step)
+            if geometry is None or stage or block:
+                y = network.conv_norm(y, f"{path}/spatial", stride=step)
+            else:
+                y = _meta_kernel(network, y, geometry, f"{path}/meta_kernel")
             y = network.conv_norm(y, f"{path}/expand", relu=False)
             if block == 0:
                 x = network.conv_norm(x, f"{path}/shortcut", stride=step, relu=False)

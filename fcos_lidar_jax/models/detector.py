@@ -16,6 +16,7 @@ from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
 from fcos_lidar_jax.models.layers import Image, recomputed
 from fcos_lidar_jax.models.lidar_net import Backbone
+from fcos_lidar_jax.models.meta_kernel import geometry_of
 from fcos_lidar_jax.models.modality import Stem
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Outputs
@@ -68,7 +69,8 @@ class Network(nn.Module):
         with jax.named_scope("stem"):
             x = (recomputed(self.stem) if self.config.remat else self.stem)(image, train=train)
         with jax.named_scope("backbone"):
-            levels = self.backbone(x, train=train)
+            geometry = geometry_of(image, self.config.channel_scale) if self.config.meta_kernel else None
+            levels = self.backbone(x, geometry, train=train)
         with jax.named_scope("fpn"):
             levels = self.fpn(levels)
         with jax.named_scope("heads"):

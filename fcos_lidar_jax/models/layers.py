@@ -126,8 +126,8 @@ class ConvNorm(nn.Module):
 def recomputed(module: nn.Module) -> Callable[..., Image]:
     """The module with the same parameters and results; the backward pass computes its activations again."""
 
-    def call(image: Image, *, train: bool) -> Image:
-        return nn.remat(lambda module, x: module(x, train=train))(module, image)
+    def call(*given: Any, train: bool) -> Image:
+        return nn.remat(lambda module, *given: module(*given, train=train))(module, *given)
 
     return call
 

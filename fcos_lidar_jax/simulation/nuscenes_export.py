@@ -83,9 +83,16 @@ def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
         return wanted
     found = read_json(file, dict[str, Any])
     for name, value in wanted.items():
-        if found.get(name) != value:
-            got, expected = (v.get("name") if isinstance(v, dict) else v for v in (value, found.get(name)))
-            raise ValueError(f"{root}: {name}: got {got}, but the data set there was begun with {expected}")
+        before = found.get(name)
+        if isinstance(value, dict) and isinstance(before, dict):
+            fields = ("name", *sorted(value.keys() | before.keys()))
+            differing = [field for field in fields if value.get(field) != before.get(field)]
+            if differing:
+                field = differing[0]
+                name = name if field == "name" else f"{name}.{field}"
+                value, before = value.get(field), before.get(field)
+        if before != value:
+            raise ValueError(f"{root}: {name}: got {value}, but the data set there was begun with {before}")
     return wanted
 
 

@@ -19,6 +19,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.classes import MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet
@@ -39,6 +40,7 @@ from fcos_lidar_jax.training.checkpoint import (
     NonFiniteStateError,
     check_arrays,
     load_checkpoint,
+    read_description,
     with_later_fields,
 )
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, find_checkpoint
@@ -51,7 +53,8 @@ from fcos_lidar_jax.training.step import detection_variables, make_state, make_t
 from fcos_lidar_jax.types import TrainState
 
 _NUM_PICTURES = 2  # Test frames that are drawn at an evaluation.
-_LATER_FIELDS = ("ground_truth_database",)  # that the specification did not have at first
+_LATER_FIELDS = ("ground_truth_database", "tests")  # that the specification did not have at first
+NUM_SEEDS = 2**32  # JAX keeps 32 bits of a seed: larger ones would be others' again.
 RUN_SPEC = "run.json"  # Name of the file in a run's folder that says what the run is.
 
 Hook = Callable[[int, Record], None]  # Called with (steps done, metrics of the last of them) after every step.
@@ -70,6 +73,12 @@ class Schedule:
     """Steps between two evaluations; each saves a checkpoint, too; default: a tenth of the run."""
     keep: int = 2  # Newest checkpoints that are kept, beside the best.
 
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is not None and (type(value) is not int or value < 1):
+                raise ValueError(f"schedule.{field.name}: got {value!r}, expected an integer of at least 1")
+
 
 @dataclasses.dataclass(frozen=True)
 class _Run:
@@ -82,6 +91,11 @@ class _Run:
     tests: FrameSet | None
     devices: Sequence[Any] | None
     spec: dict[str, Any]
+
+    def scored(self, step: int) -> bool:
+        """Whether the checkpoint of a step has a score."""
+        found = [path for path in self.checkpoints.paths() if int(path.name) == step]
+        return bool(found) and read_description(found[0]).get("score") is not None
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -134,7 +148,8 @@ def train(
         the last state.
 
     Raises:
-        ValueError: the folder holds another run, no class is shared, or devices and batch do not fit.
+        ValueError: the folder holds another run, no class is shared, devices and batch do not fit, steps or seed
+            are out of range, or the augmentation leaves the sector that the sensor covers.
         OSError: another process trains in the folder, or it cannot be written.
         NonFiniteLossError, NonFiniteStateError: the last checkpoint is from before.
         KeyboardInterrupt: after Ctrl-C, when all is saved.
@@ -152,10 +167,16 @@ def train(
     mesh = make_mesh(devices)
     is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
     with _agreed():  # What can be refused is refused before the folder becomes a run's.
+        if type(steps) is not int or steps < 1:
+            raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
+        if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
+            raise ValueError(f"seed: got {seed!r}, expected an integer from 0 to {NUM_SEEDS - 1}")
         if not len(frames):
             raise ValueError("training frames: got none, expected at least one")
         check_counts(frames)
         check_batch_size(config.optimizer.batch_size, mesh)
+        if config.augment is not None:
+            check_augmentation(config.augment, frames.sensor)
         # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
         spec = {
             "config": config_to_json(config),
@@ -164,6 +185,7 @@ def train(
             "seed": seed,
             "frames": len(frames),
             "data": frames.fingerprint(),
+            "tests": None if tests is None else tests.fingerprint(),
             "objects": None if objects is None else objects.manifest.source,
             "ground_truth_database": None if objects is None else objects.fingerprint(),
             "weights": str(weights) if isinstance(weights, str | Path) else None,
@@ -177,10 +199,12 @@ def train(
         if config.copy_paste is not None and objects is not None:
             make_paste(objects, config)
         mismatch = sensor_mismatch(frames.frame(0).points, frames.sensor)
+        single = config.num_sweeps > 1 and _of_one_sweep(frames)
     with _claimed(run, resume=resume):
         start = _start(run, optimizer, seed, resume, given)
         first = int(start.step)
-        if first == steps:
+        owed = resume and run.evaluates_at(first) and not run.scored(first)  # stopped during the evaluation
+        if first == steps and not owed:
             print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
             return start
         step = jit_step(make_train_step(run.detector, optimizer), mesh)
@@ -188,6 +212,13 @@ def train(
         if is_main_process:
             if mismatch:
                 print(f"warning: {frames.name(0)}: {mismatch}", file=sys.stderr, flush=True)
+            if single:
+                print(
+                    f"warning: num_sweeps: got {config.num_sweeps}, but the frames hold one sweep each: expected "
+                    "1, for `stream` will fuse as many, which the detector has not seen",
+                    file=sys.stderr,
+                    flush=True,
+                )
             print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
 
         def report(number: int, record: Record) -> None:
@@ -197,11 +228,15 @@ def train(
             for hook in hooks:
                 hook(number, record)
 
-        def pause(number: int, state: TrainState) -> None:
-            score = _evaluate(run, number, state, metrics) if run.evaluates_at(number) else None
+        def save(state: TrainState, score: float | None) -> None:
             if metrics is not None:
                 metrics.flush()
                 _save(run, state, score)
+
+        def pause(number: int, state: TrainState) -> None:
+            save(state, None)  # What is done is safe before an evaluation, which may take long.
+            if run.evaluates_at(number):
+                save(state, _evaluate(run, number, state, metrics))
 
         processes = {"process_index": jax.process_index(), "num_processes": jax.process_count()}
         helpers = {"threads": threads, "workers": workers, **processes}
@@ -216,6 +251,9 @@ def train(
                 return request.signal is not None
 
             try:
+                if owed:
+                    state = replicate(start, mesh)
+                    save(state, _evaluate(run, first, state, metrics))
                 state = fit(
                     step,
                     replicate(start, mesh),
@@ -245,6 +283,12 @@ def train(
             raise KeyboardInterrupt
         raise SystemExit(128 + signal.SIGTERM)
     return state
+
+
+def _of_one_sweep(frames: FrameSet) -> bool:
+    """Whether none of some frames, spread over the set, has points of an older sweep."""
+    looked_at = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
+    return all(len(np.unique(frames.frame(int(i)).points[:, 4])) <= 1 for i in looked_at)
 
 
 def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:

@@ -29,7 +29,8 @@ from fcos_lidar_jax.types import TrainState
 _FORMAT = 3
 _OLD_FORMAT = 2
 LATER_FIELDS = {
-    "model": {"remat": False, "regression_axes": "lidar"},
+    "model": {"remat": False, "regression_axes": "lidar", "meta_kernel": False},
+    "loss": {"quality": "iou", "centreness_m": 0.75},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
 }
 """Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
@@ -295,7 +296,7 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     """A configuration's JSON object with the fields that older ones do not have.
 
     >>> with_later_fields({"model": {"remat": True}})["model"]
-    {'remat': True, 'regression_axes': 'lidar'}
+    {'remat': True, 'regression_axes': 'lidar', 'meta_kernel': False}
     """
     later = dict[str, Any]()
     for section, fields in LATER_FIELDS.items():

@@ -74,6 +74,7 @@ def sample_losses(
     targets = assign(owner, cost, iou, num_boxes=boxes.shape[0], top_q=config.top_q)
     positive = targets.positive
     regressed = positive if config.regress_on == "positives" else owner >= 0
+    quality = iou if config.quality == "iou" else losses.centreness(predicted, truth, config.centreness_m)
     with jax.named_scope("losses"):
         label, target = (
             jnp.where(positive, label, background),
@@ -83,7 +84,7 @@ def sample_losses(
             "classification": losses.classification_loss(outputs.logits, label, locations.occupied),
             "l1": losses.l1_loss(regression, target, regressed, velocity_weight=config.velocity_weight),
             "iou": losses.iou_loss(predicted, truth, regressed, kind=config.iou_loss),
-            "iou_prediction": losses.iou_prediction_loss(iou_logit, iou, regressed),
+            "iou_prediction": losses.iou_prediction_loss(iou_logit, quality, regressed),
         }
     levels = jnp.split(positive, np.cumsum(layout.level_sizes)[:-1])
     cells = jnp.zeros(layout.rows * layout.columns + 1, bool)

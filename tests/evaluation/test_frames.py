@@ -1,6 +1,7 @@
 """Metrics of other classes than the benchmark's: plain loops as oracle, files read back, the report of them."""
 
 import dataclasses
+import itertools
 import json
 import re
 
@@ -9,6 +10,7 @@ import pytest
 from made_evaluation import make_task, random_boxes, truth_of
 from metrics_oracle import assert_numbers, score_frames
 
+from experiments.statistics import paired_difference
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
@@ -168,11 +170,41 @@ def test_without_truth_there_is_no_score_and_no_interval_breaks(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert "average precision (AP) by matching distance. This is not the nuScenes benchmark" in page
     assert "<td>–</td>" in page
-    # Of two frames one has truth: a set of the other alone has no score, and does not count.
+    # Of two frames one has truth: a set of the other alone says nothing about it.
     half = evaluate_frames(found, [truths[0], empty[1]], metric_of(OWN))
     drawn = bootstrap(half, repeats=40)
     assert set(drawn) == {"repeats", "seed", "level", "mean_ap"}
     assert 0 < drawn["mean_ap"]["low"] <= half.summary["mean_ap"] <= drawn["mean_ap"]["high"]
+
+
+def test_an_interval_is_over_the_same_classes_in_every_draw():
+    """One class is found alike in all frames; another, never found, is in two frames alone."""
+    found, truths = made(OWN, [0], frames=12)
+    rare = dataclasses.replace(truths[0], labels=np.ones_like(truths[0].labels))
+    missed = dataclasses.replace(found[0], valid=np.zeros_like(found[0].valid))
+    evaluation = evaluate_frames([*found, missed, missed], [*truths, rare, rare], metric_of(OWN))
+    assert [*evaluation.summary["mean_dist_aps"].values()][1] == 0
+    drawn = bootstrap(evaluation, repeats=60)["mean_ap"]
+    alone = evaluation.summary["mean_dist_aps"][OWN[0]]
+    assert drawn["high"] < 0.75 * alone  # and not the AP of the one class, in draws without the other
+    other = evaluate_frames([*found, missed, missed], [*truths, rare, rare], metric_of(OWN))
+    assert paired_difference(evaluation, other, repeats=20) == (0, 0)
+
+
+def test_groups_of_samples_are_drawn_as_a_whole():
+    found, truths = made(OWN, [0, 1], frames=6)
+    groups = [0, 0, 1, 1, 2, 2]
+    evaluation = evaluate_frames(found, truths, metric_of(OWN))
+    drawn = bootstrap(evaluation, repeats=50, groups=groups)["mean_ap"]
+    possible = []
+    for chosen in itertools.product(range(3), repeat=3):
+        rows = [row for group in chosen for row in (2 * group, 2 * group + 1)]
+        again = evaluate_frames([found[r] for r in rows], [truths[r] for r in rows], metric_of(OWN))
+        possible.append(again.summary["mean_ap"])
+    assert min(possible) - 1e-9 <= drawn["low"] < drawn["high"] <= max(possible) + 1e-9
+    assert drawn != bootstrap(evaluation, repeats=50)["mean_ap"]
+    one = bootstrap(evaluation, repeats=5, groups=[0] * 6)["mean_ap"]
+    assert one["low"] == one["high"] == pytest.approx(evaluation.summary["mean_ap"])
 
 
 def test_scores_are_named_as_what_they_are():

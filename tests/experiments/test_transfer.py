@@ -199,29 +199,35 @@ def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
         load_checkpoint(package / "hdl32e")
 
 
-def test_compact_is_compared_with_trainings_that_lack_one_of_its_additions(tmp_path, monkeypatch):
-    both = dataclasses.replace(CONFIG.model, regression_axes="ray", circular_width=True)
-    base = dataclasses.replace(CONFIG, model=both)
+def test_compact_is_compared_with_trainings_that_differ_in_one_addition(tmp_path, monkeypatch):
+    model = dataclasses.replace(CONFIG.model, regression_axes="ray", circular_width=True)
+    base = dataclasses.replace(CONFIG, model=model)
+    made = {name: changed(base) for name, changed in compact_additions.VARIANTS.items()}
+    assert made.pop("compact") == base
+    fields = ("regression_axes", "circular_width", "meta_kernel", "quality")
+    differing = [
+        [f for f in fields if getattr(base.model, f, None) != getattr(other.model, f, None)]
+        + [f for f in fields if getattr(base.loss, f, None) != getattr(other.loss, f, None)]
+        for other in made.values()
+    ]
+    assert differing == [[field] for field in fields]
+
+    chosen = {name: compact_additions.VARIANTS[name] for name in ("compact", "zero padding")}
+    monkeypatch.setattr(compact_additions, "VARIANTS", chosen)
     monkeypatch.setitem(shipped_weights.CONFIGS, "hdl32e", base)
     args = compact_additions.Args(steps=2, test_frames=2, repeats=1, work=tmp_path)
     record = compact_additions.measure(args)
-    lacking = {
-        "compact": {},
-        "LiDAR axes": {"regression_axes": "lidar"},
-        "zero padding": {"circular_width": False},
-    }
-    for name, fields in lacking.items():
-        run, own = tmp_path / f"{name.replace(' ', '_').lower()}_2_0", record[name]
-        wanted = dataclasses.replace(base, model=dataclasses.replace(both, **fields))
-        assert load_checkpoint(find_checkpoint(run)).config == wanted
+    for name in chosen:
+        run, own = tmp_path / f"{name.replace(' ', '_')}_2_0", record[name]
         last = [r["positive_iou"] for r in read_metrics(run) if r["step"] == 2]
         assert own["IoU of the last positives"] == round(last[0], 4)
         assert own["network, ms"] > 0
         assert own["parameters"] == record["compact"]["parameters"]
-        if fields:
-            assert own["gain of compact"] == pytest.approx(record["compact"]["mAP"] - own["mAP"], abs=2e-4)
-            assert own["interval"][0] <= own["gain of compact"] <= own["interval"][1]
-    assert len(list(tmp_path.iterdir())) == 3
+    config = load_checkpoint(find_checkpoint(tmp_path / "zero_padding_2_0")).config
+    assert config == chosen["zero padding"](base) != base
+    own = record["zero padding"]
+    assert own["difference"] == pytest.approx(own["mAP"] - record["compact"]["mAP"], abs=2e-4)
+    assert own["interval"][0] <= own["difference"] <= own["interval"][1]
 
 
 def test_recall_towards_the_seam_counts_objects_on_both_of_its_sides():

@@ -109,7 +109,8 @@ def test_the_record_is_a_line_of_json(home):
 def test_a_file_of_older_fields_is_read(home, tmp_path):
     _, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
     record = json.loads(line)
-    for section, name in (("model", "regression_axes"), ("model", "remat"), ("inference", "flips")):
+    later = ("model", "regression_axes"), ("model", "remat"), ("loss", "quality"), ("inference", "flips")
+    for section, name in later:
         del record["config"][section][name]
     content = json.dumps(record).encode() + b"\n" + program
     first = f"fcos-lidar-detector 1 {hashlib.blake2b(content, digest_size=16).hexdigest()}\n".encode()

@@ -46,6 +46,11 @@ CASES = {
         with_model(CONFIG, circular_width=True, row_upscale=3, remat=True),
         ODD,
     ),
+    "Meta-Kernel, two rounds, padded columns": (with_model(with_stem(), meta_kernel=True), ODD),
+    "Meta-Kernel, circular, doubled rows": (
+        with_model(CONFIG, meta_kernel=True, circular_width=True, row_upscale=2),
+        SENSOR,
+    ),
 }
 
 

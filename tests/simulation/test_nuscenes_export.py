@@ -20,7 +20,7 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import inside_box
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.files import folder_lock
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, sensor_to_json
 
 VERSION = "v1.0-synthetic"
 ORDER = ["--scenes", "3", "--keyframes", "2", "--sensor", "tiny", "--seed", "4"]
@@ -318,7 +318,7 @@ def test_bad_options_get_one_line(options, message, tmp_path, capsys):
     assert not (tmp_path / "new").exists()
 
 
-def test_another_order_in_the_same_folder_is_refused(made, capsys):
+def test_another_order_in_the_same_folder_is_refused(made, tmp_path, capsys):
     before = contents(made)
     changed = {"seed": ("5", "4"), "scenes": ("4", "3"), "keyframes": ("4", "2"), "version": ("v2", VERSION)}
     changed |= {"sensor": (NUSCENES_HDL32E.name, "tiny"), "rolling_shutter": ("False", "True")}
@@ -326,6 +326,9 @@ def test_another_order_in_the_same_folder_is_refused(made, capsys):
     for name, (got, begun) in changed.items():
         line = refusal(capsys, made, *(["--no-rolling-shutter"] if got == "False" else [f"--{name}", got]))
         assert f"{name}: got {got}, but the data set there was begun with {begun}" in line
+    (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
+    line = refusal(capsys, made, "--sensor", str(tmp_path / "near.json"))
+    assert f"sensor.limit_xy_m: got 9.0, but the data set there was begun with {TINY.limit_xy_m}" in line
     assert contents(made) == before
 
 

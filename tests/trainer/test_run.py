@@ -206,7 +206,7 @@ def test_killed_in_a_save_and_resumed_it_ends_in_the_same_bits(finished, tmp_pat
 
 
 def test_killed_before_its_first_checkpoint_it_begins_with_the_given_weights(finished, begun):
-    assert bits(train_tiny(begun, resume=True, weights=weights())) == bits(finished[1])
+    assert bits(train_tiny(begun, evaluate=2, tests=TESTS, resume=True, weights=weights())) == bits(finished[1])
 
 
 FULL = """
@@ -329,6 +329,62 @@ def test_what_is_no_run_or_another_one_is_refused(begun, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="found a file, expected a folder"):
         train_tiny(tmp_path / "file")
+
+
+def test_what_was_done_before_an_evaluation_survives_it(finished, tmp_path, monkeypatch):
+    """Killed in the evaluation after step 2: that step is saved, and evaluated when the run is resumed."""
+    folder, evaluate = tmp_path / "run", runs._evaluate
+
+    def killed(*_):
+        raise SystemExit(137)
+
+    monkeypatch.setattr(runs, "_evaluate", killed)
+    with pytest.raises(SystemExit):
+        train_tiny(folder, evaluate=2, tests=TESTS, weights=weights())
+    saved = max((folder / "checkpoints").iterdir())
+    assert saved.name == "00000002"
+    assert load_checkpoint(saved).score is None
+    evaluated = []
+
+    def noted(run, number, *rest):
+        evaluated.append(number)
+        return evaluate(run, number, *rest)
+
+    monkeypatch.setattr(runs, "_evaluate", noted)
+    state = train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+    assert evaluated == list(range(2, STEPS + 1, 2))
+    assert bits(state) == bits(finished[1])
+    resumed, whole = ([r["test/mAP"] for r in read_metrics(f) if "test/mAP" in r] for f in (folder, finished[0]))
+    assert resumed == whole
+    last = max((folder / "checkpoints").iterdir())
+    description = json.loads((last / "checkpoint.json").read_text())
+    assert description["score"] == load_checkpoint(last).score is not None
+    train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+    assert evaluated == list(range(2, STEPS + 1, 2))  # a finished run owes nothing
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps: got 0, expected an integer of at least 1"),
+        ({"steps": 2.5}, "steps: got 2.5, expected an integer"),
+        ({"seed": 2**32}, "seed: got 4294967296, expected an integer from 0 to 4294967295"),
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused_before_there_is_a_run(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        runs.train(CONFIG, FRAMES, tmp_path / "run", **{"steps": 1, **options})
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(ValueError, match=r"schedule\.keep: got 0, expected an integer of at least 1"):
+        runs.Schedule(keep=0)
+
+
+def test_one_sweep_where_several_are_configured_is_told(tmp_path, capsys):
+    several = dataclasses.replace(CONFIG, num_sweeps=3)
+    train_tiny(tmp_path / "run", config=several, steps=1)
+    assert "warning: num_sweeps: got 3, but the frames hold one sweep each: expected 1" in capsys.readouterr().err
+    train_tiny(tmp_path / "one", steps=1)
+    assert "num_sweeps" not in capsys.readouterr().err
 
 
 def test_with_damaged_checkpoints_alone_the_run_is_not_begun_anew(finished, tmp_path):

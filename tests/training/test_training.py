@@ -329,6 +329,33 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), *told)
 
 
+def test_the_scores_factor_is_trained_to_be_the_iou_or_the_centreness():
+    """Predictions are the truth, half a metre too high: one centreness for all, the IoU by the heights."""
+    detector, batch = toy_detector(), jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], four_frames())
+    params, layout = detector.init(jax.random.key(0))["params"], image_layout(TINY, CONFIG.model)
+    image = project_points(batch.points, batch.valid, TINY, num_rounds=CONFIG.projection.num_rounds)
+    outputs, _ = detector.apply({"params": params}, image.features[None], train=True)
+    outputs, locations = jax.tree.map(lambda leaf: leaf[0], outputs), locate(image, layout)
+    owner = location_owners(image, locations, batch.boxes, batch.box_valid)
+    box = np.asarray(batch.boxes)[np.asarray(owner)]
+    exact = np.nan_to_num(encode(jnp.asarray(box), locations.points, locations.azimuth_rad, axes="lidar"))
+    exact[:, 2] += 0.5
+    regression = jnp.asarray(np.repeat(exact[..., None], outputs.regression.shape[-1], axis=2))
+    outputs = dataclasses.replace(outputs, regression=regression)
+    inside = np.asarray(owner) >= 0
+    label = np.asarray(batch.labels)[np.asarray(owner)]
+    logits = np.take_along_axis(np.asarray(outputs.iou_logits, np.float64), label[:, None], axis=1)[:, 0]
+    overlap = np.maximum(box[:, 5] - 0.5, 0) / (box[:, 5] + 0.5)
+    for quality, wanted in (("centreness", np.exp(-((0.5 / 0.75) ** 2))), ("iou", overlap)):
+        choices = dataclasses.replace(CONFIG.loss, regress_on="candidates", quality=quality)
+        sample = outputs, image, batch.boxes, batch.labels, batch.box_valid
+        parts, _, _ = sample_losses(*sample, config=choices, layout=layout, axes="lidar")
+        total, count = parts["iou_prediction"]
+        expected = (np.log1p(np.exp(logits)) - wanted * logits)[inside].sum()
+        np.testing.assert_allclose(total, expected, rtol=1e-3)
+        assert int(count) == inside.sum() > 10
+
+
 ZERO = {"params": {"w": jnp.float32(0)}, "batch_stats": {}}
 
 
