@@ -205,7 +205,8 @@ def training_lines(results: Path) -> Iterator[str]:
                     said, decides = verdict(gains, paper)
                     mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
                     ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
-                    what = f"{scale.name}, {len(gains)} seeds, {samples:,} samples"
+                    seeds = f"{len(gains)} seed{'s' if len(gains) > 1 else ''}"
+                    what = f"{scale.name}, {seeds}, {samples:,} samples"
                     yield f"| {claim} | {paper:+.2f} | {ours} | {what} | {said} | {decides} |"
             if not run:
                 yield f"| {claim} | {paper:+.2f} | | | not run | |"

@@ -319,7 +319,7 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     found = read_json(file, dict[str, Any], what="the specification of a run")
     if spec is None:
         return []
-    missing = [name for name in _LATER_FIELDS if name not in found]
+    missing = [name for name in _LATER_FIELDS if name in spec and name not in found]
     found |= {name: spec[name] for name in missing}
     if isinstance(config := found.get("config"), dict):
         found["config"] = with_later_fields(config)

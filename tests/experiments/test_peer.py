@@ -13,18 +13,24 @@ from experiments.paper_tables.tables import Args
 from experiments.studies import centerpoint
 from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_detect
+from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
 from fcos_lidar_jax.types import Detections
 
 
 def test_both_detectors_share_all_but_themselves(tmp_path):
-    base = quarter(tmp_path).base
+    scale = quarter(tmp_path)
+    base = scale.base
     peer, ours, longer = (row.change(base) for row in centerpoint.ROWS)
     assert ours == base
     assert peer.pillars == CENTERPOINT_COMPACT.pillars
-    inference = dataclasses.replace(peer.inference, iou_exponent=base.inference.iou_exponent)
-    assert dataclasses.replace(peer, pillars=None, model=base.model, loss=base.loss, inference=inference) == base
+    inference = dataclasses.replace(base.inference, iou_exponent=1.0, candidates_per_level=4450)
+    assert peer.inference == inference
+    sizes = image_layout(scale.sensor, base.model).level_sizes  # (location, class) pairs of the range view
+    assert sum(min(base.inference.candidates_per_level, len(base.classes) * size) for size in sizes) == 4450
+    shared = {"model": base.model, "loss": base.loss, "inference": base.inference}
+    assert dataclasses.replace(peer, pillars=None, **shared) == base
     assert (base.optimizer.epochs, longer.optimizer.epochs) == (2, 3)
     assert dataclasses.replace(longer, optimizer=base.optimizer) == base
 
