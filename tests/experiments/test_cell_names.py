@@ -31,7 +31,8 @@ def fields_of(value, path=""):
 
 
 def test_every_committed_cell_is_named_by_what_it_holds():
-    assert len(CELLS) == 45
+    assert len([file for file in CELLS if file.parts[-3] != "sector"]) == 45
+    assert len(CELLS) >= 48  # those of sectors are added as they are trained
     for file in CELLS:
         record = json.loads(file.read_text(encoding="utf-8"))
         config = config_of_cell(record["config"])
