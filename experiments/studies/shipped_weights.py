@@ -2,12 +2,14 @@
 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --export
+    python -m experiments.studies.shipped_weights --name quickstart  # scores what is in the package
 
 ``hdl32e`` is the preset ``compact`` for nuScenes' sensor, ``quickstart`` the preset of that name. Every frame is
 another street. The training runs at low priority and saves every few minutes; the same command resumes it, bit for
 bit, after any kind of stop. ``--export`` trains nothing: it writes the running mean of the weights at the newest
 checkpoint into the package, as float16, scores them on unseen frames, and writes ``experiments/results/NAME.json``
-and their model card; another process may be training meanwhile. Where the folder is lost, ``--warm-start hdl32e
+and their model card; another process may be training meanwhile. Without ``--work`` the weights in the package are
+scored on unseen frames, and nothing else. Where the folder is lost, ``--warm-start hdl32e
 --seed 2`` begins a new one-cycle with the weights in the package, on streets ``seed * steps`` and on; choose a
 seed whose streets none of the trainings before it had.
 
@@ -71,13 +73,13 @@ class Args(Options):
     """Which weights, how long, and where the run is."""
 
     name: Literal["quickstart", "hdl32e"]  # Weights to make.
-    work: Path  # Folder of the training run.
+    work: Path | None = None  # Folder of the training run; default: score the weights in the package.
     steps: int = 20_000  # Of the whole run.
     seed: int = 1  # Of weights and streets; the demo trains with 0.
     warm_start: Path | None = None  # Checkpoint or shipped weights to begin with; default: random ones.
     save_every: int = 150  # Steps between two checkpoints.
     export: bool = False  # Write the present weights into the package instead of training.
-    test_frames: int = 200  # Unseen frames that exported weights are scored on.
+    test_frames: int = 200  # Unseen frames that the weights are scored on.
 
 
 def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, FrameSet]:
@@ -91,7 +93,7 @@ def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, 
     return shown, unseen
 
 
-def train(args: Args) -> dict[str, Any]:
+def train(args: Args, work: Path) -> dict[str, Any]:
     """Begin the run, or go on with it, to the end."""
     os.nice(_NICE)
     config = CONFIGS[args.name]
@@ -99,8 +101,8 @@ def train(args: Args) -> dict[str, Any]:
     schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
     tests = ChosenFrames(unseen, tuple(range(_TESTS_ALONG)))
     length = {"steps": args.steps, "seed": args.seed}
-    trained(args.work, config, frames, **length, tests=tests, schedule=schedule, weights=args.warm_start)
-    return training_record(args.work)
+    trained(work, config, frames, **length, tests=tests, schedule=schedule, weights=args.warm_start)
+    return training_record(work)
 
 
 def training_record(run: Path) -> dict[str, Any]:
@@ -142,37 +144,46 @@ def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
     return dataclasses.replace(checkpoint, config=config)
 
 
-def export(args: Args) -> dict[str, Any]:
-    """Write the weights of the newest checkpoint and their card; returns training and scores."""
+def scores(args: Args) -> dict[str, Any]:
+    """What the weights in the package find in unseen frames."""
     folder = SHIPPED / args.name
-    checkpoint = with_todays_inference(load_checkpoint(find_checkpoint(args.work)), args.name)
-    save_checkpoint(folder, half_precision(checkpoint))
-    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    if size > _MAX_BYTES:
-        raise ValueError(f"{folder}: got {size} bytes, expected at most {_MAX_BYTES}")
     detector = load_trained(folder)
     _, unseen = streets(detector.config, steps=args.steps, seed=args.seed)
     found, frames = detections(detector, ChosenFrames(unseen, tuple(range(args.test_frames))))
     evaluation = evaluate_frames(found, frames, metric_of(detector.classes))
-    training = training_record(args.work)
-    record = {
+    return {
         "name": args.name,
         "hash": read_description(folder)["hash"],
-        "bytes": size,
-        "training": training,
-        "earlier": earlier_trainings(args.name, training, RESULTS),
         "unseen_frames": args.test_frames,
         "mAP": round(evaluation.summary["mean_ap"], 4),
         "interval": bootstrap(evaluation, repeats=1000)["mean_ap"],
         "AP": {name: round(ap, 4) for name, ap in evaluation.summary["mean_dist_aps"].items()},
     }
+
+
+def export(args: Args, work: Path) -> dict[str, Any]:
+    """Write the weights of the newest checkpoint and their card; returns training and scores."""
+    folder = SHIPPED / args.name
+    checkpoint = with_todays_inference(load_checkpoint(find_checkpoint(work)), args.name)
+    save_checkpoint(folder, half_precision(checkpoint))
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    if size > _MAX_BYTES:
+        raise ValueError(f"{folder}: got {size} bytes, expected at most {_MAX_BYTES}")
+    training = training_record(work)
+    earlier = earlier_trainings(args.name, training, RESULTS)
+    record = {"bytes": size, "training": training, "earlier": earlier, **scores(args)}
     write_card(args.name, RESULTS, training=record)
     return record
 
 
 def main(args: Args) -> None:
-    """Train, or export; the record of an export lies where the next one looks for the trainings before it."""
-    record = export(args) if args.export else train(args)
+    """Score, train, or export; the record of an export lies where the next one looks for those before it."""
+    if args.work is None:
+        if args.export:
+            raise ValueError("--work: missing, expected the folder of the training to --export")
+        save(scores(args), args.out)
+        return
+    record = export(args, args.work) if args.export else train(args, args.work)
     save(record, args.out or (RESULTS / f"{args.name}.json" if args.export else None))
 
 

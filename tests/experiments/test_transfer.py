@@ -131,6 +131,20 @@ def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
     assert training["seconds_of_steps"] == 6
 
 
+def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
+    package, record = shipped
+    before = {file: file.read_bytes() for file in package.rglob("*") if file.is_file()}
+    args = shipped_weights.Args(name="hdl32e", test_frames=2, out=tmp_path / "scores.json")
+    shipped_weights.main(args)
+    scored = json.loads(args.out.read_text())
+    names = {"name", "hash", "unseen_frames", "mAP", "interval", "AP"}
+    assert names <= scored.keys()
+    assert {name: scored[name] for name in names} == {name: record[name] for name in names}
+    assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
+    with pytest.raises(ValueError, match="--work: missing"):
+        shipped_weights.main(dataclasses.replace(args, export=True))
+
+
 def test_a_warm_start_remembers_the_trainings_before_it(tmp_path):
     legs = [{"begun_with": b, "seed": s, "steps": 5} for b, s in (("random weights", 1), ("w", 2), ("w", 3))]
     assert earlier_trainings("w", legs[1], tmp_path) == []
