@@ -57,7 +57,7 @@ class ProjectionConfig:
 
     def __post_init__(self) -> None:
         _check(1 <= self.num_rounds <= MAX_ROUNDS, "num_rounds", self.num_rounds, f"1 to {MAX_ROUNDS}")
-        _check(self.close_m > 0, "close_m", self.close_m, "a positive number of metres")
+        _check(0 < self.close_m < math.inf, "close_m", self.close_m, "a positive number of metres")
         _check_choices(self)
 
 
@@ -135,8 +135,9 @@ class ModelConfig:
         _check(self.head_channels % groups == 0, "head_channels", self.head_channels, f"a multiple of {groups}")
         prior = self.background_prior
         _check(0 < prior < 1, "background_prior", prior, "a probability between 0 and 1")
-        _check(len(self.channel_mean) == 9, "channel_mean", self.channel_mean, "nine numbers")
-        nine = len(self.channel_scale) == 9 and min(self.channel_scale) > 0
+        nine = len(self.channel_mean) == 9 and all(map(math.isfinite, self.channel_mean))
+        _check(nine, "channel_mean", self.channel_mean, "nine finite numbers")
+        nine = len(self.channel_scale) == 9 and all(0 < scale < math.inf for scale in self.channel_scale)
         _check(nine, "channel_scale", self.channel_scale, "nine positive numbers")
         _check_choices(self)
 
@@ -166,6 +167,7 @@ class PillarConfig:
     centre_prior: float = 0.1  # Probability of a centre at the start, everywhere.
 
     def __post_init__(self) -> None:
+        _check(0 < self.range_m < math.inf, "range_m", self.range_m, "a positive number of metres")
         _check(0 < self.pillar_m < self.range_m, "pillar_m", self.pillar_m, f"between 0 and {self.range_m} m")
         side = 2 * self.range_m / self.pillar_m
         whole = abs(side - round(side)) < 1e-3 and round(side) % 8 == 0
@@ -263,7 +265,8 @@ class AugmentConfig:
     def __post_init__(self) -> None:
         for name in ("flip_x_probability", "flip_y_probability"):
             _check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
-        _check_least(self, 0, "max_rotation_rad")
+        angle = self.max_rotation_rad
+        _check(0 <= angle < math.inf, "max_rotation_rad", angle, "a finite angle of at least 0")
         low, high = self.scale_range
         _check(0 < low <= high < math.inf, "scale_range", self.scale_range, "finite (low, high), 0 < low <= high")
 

@@ -1,6 +1,7 @@
 """``fcos-lidar train`` on a small simulated data set: from tables to a run, and one line for what goes wrong."""
 
 import json
+import re
 import shutil
 import signal
 import socket
@@ -240,20 +241,31 @@ def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [
-        ("--optimizer.batch-size", "0"),
-        ("--optimizer.accumulate", "3"),
-        ("--model.precision", "float16"),
-        ("--loss.l1-weight", "many"),
-        ("--optimizer.ema-decay", "1"),
-    ],
+    [("--model.precision", "float16"), ("--loss.l1-weight", "many"), ("--optimizer.epochs", "1.5")],
 )
-def test_what_a_configuration_refuses_is_a_usage_error(root, tmp_path, capsys, option, value):
+def test_a_value_of_another_kind_is_a_usage_error(root, tmp_path, capsys, option, value):
     with pytest.raises(SystemExit) as stopped:
         cli.main(train(root, tmp_path / "out", option, value))
     shown = capsys.readouterr()
     assert stopped.value.code == 2
     assert option.split(".")[1].replace("-", "_") in (shown.err + shown.out).replace("-", "_")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--optimizer.batch-size", "0", "got 0, expected at least 1"),
+        ("--optimizer.accumulate", "3", "got 3, expected a divisor of the batch size 2"),
+        ("--optimizer.ema-decay", "1", "got 1.0, expected within [0, 1)"),
+        ("--augment.max-rotation-rad", "inf", "got inf, expected a finite angle of at least 0"),
+        ("--projection.close-m", "inf", "got inf, expected a positive number of metres"),
+        ("--model.stem.channels-per-type", "0", "got 0, expected at least 1"),
+        ("--num-sweeps", "0", "got 0, expected at least 1"),
+    ],
+)
+def test_what_a_configuration_refuses_is_told_in_one_line(root, tmp_path, capsys, option, value, said):
+    assert_one_line_error(capsys, train(root, tmp_path / "out", option, value), re.escape(f"{option}: {said}"))
     assert list(tmp_path.iterdir()) == []
 
 
