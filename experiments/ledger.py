@@ -21,8 +21,8 @@ from typing import Any
 from experiments.paper import PAPER
 from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cell_names import cell_name
-from experiments.paper_tables.scales import Simulated, calm, quarter, simulated
-from experiments.paper_tables.tables import Row, Table
+from experiments.paper_tables.scales import Simulated, quarter
+from experiments.paper_tables.tables import SCORES, Row, Table
 from experiments.script import run_script
 from experiments.statistics import interval
 from fcos_lidar_jax.files import atomic_write, read_json
@@ -162,20 +162,19 @@ def _seeds_needed(gains: list[float], gain: float) -> int:
     return number
 
 
-def gains_of(table: Table, row: Row, scale: Simulated, cells: Path) -> tuple[list[float], int]:
-    """Points of mAP that a row gains over its reference, a seed whose cells are there; samples of a training."""
+def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str = "mAP") -> tuple[list[float], int]:
+    """Points of a score that a row gains over its reference, by seed, where its cells are there; samples seen."""
     config, reference = (r.change(scale.base) for r in (row, table.reference_of(row)))
     described, gains = scale.describe(), list[float]()
     for seed in range(_MOST_SEEDS):
-        scores = [_score(cells / f"{cell_name(c, described, seed)}.json") for c in (config, reference)]
-        if None not in scores:
-            gains.append(100 * (scores[0] - scores[1]))  # type: ignore[operator]
+        one, other = (_scores(cells / f"{cell_name(c, described, seed)}.json") for c in (config, reference))
+        if one and other:
+            gains.append(100 * (one[score] - other[score]))
     return gains, scale.train_frames * config.optimizer.epochs
 
 
-def _score(file: Path) -> float | None:
-    scores = json.loads(file.read_text(encoding="utf-8")).get("scores") if file.is_file() else None
-    return scores and scores["mAP"]
+def _scores(file: Path) -> dict[str, float] | None:
+    return json.loads(file.read_text(encoding="utf-8")).get("scores") if file.is_file() else None
 
 
 def figure_lines(results: Path) -> Iterator[str]:
@@ -189,34 +188,44 @@ def figure_lines(results: Path) -> Iterator[str]:
         yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} | {decides} |"
 
 
-def training_lines(results: Path) -> Iterator[str]:
-    """The rows of the paper's tables with a gain in mAP, a line of Markdown for each scale that was run."""
-    scales = [make(Path("unused")) for make in (simulated, calm, quarter)]
+def claims(score: str) -> Iterator[tuple[str, Table, Row, float]]:
+    """The rows of the paper's tables with a gain in a score: in words, table, row and the paper's gain."""
     for table in TABLES:
         for row in table.rows:
-            label, paper = table.reference_of(row).label, table.paper_difference(row).get("mAP")
-            if row.label == label or paper is None:
-                continue
-            claim, run = f"{table.title}: {row.label} instead of {label}", False
-            for scale in scales:
-                gains, samples = gains_of(table, row, scale, results / "tables" / scale.name / "cells")
-                if gains:
-                    run = True
-                    said, decides = verdict(gains, paper)
-                    mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
-                    ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
-                    seeds = f"{len(gains)} seed{'s' if len(gains) > 1 else ''}"
-                    what = f"{scale.name}, {seeds}, {samples:,} samples"
-                    yield f"| {claim} | {paper:+.2f} | {ours} | {what} | {said} | {decides} |"
-            if not run:
-                yield f"| {claim} | {paper:+.2f} | | | not run | |"
+            label, paper = table.reference_of(row).label, table.paper_difference(row).get(score)
+            if row.label != label and paper is not None:
+                yield f"{table.title}: {row.label} instead of {label}", table, row, paper
+
+
+def training_lines(results: Path, score: str) -> Iterator[str]:
+    """The claims about a score whose rows were trained, a line of Markdown each."""
+    scale = quarter(Path("unused"))
+    for claim, table, row, paper in claims(score):
+        gains, samples = gains_of(table, row, scale, results / "tables" / scale.name / "cells", score)
+        if gains:
+            said, decides = verdict(gains, paper)
+            mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
+            ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
+            seeds = f"{len(gains)} seed{'s' if len(gains) > 1 else ''}"
+            what = f"{scale.name}, {seeds}, {samples:,} samples"
+            yield f"| {claim} | {paper:+.2f} | {ours} | {what} | {said} | {decides} |"
+
+
+def not_trained(results: Path, score: str) -> list[str]:
+    """The claims about a score whose rows were not trained, in words."""
+    scale = quarter(Path("unused"))
+    cells = results / "tables" / scale.name / "cells"
+    return [claim for claim, table, row, _ in claims(score) if not gains_of(table, row, scale, cells)[0]]
 
 
 def as_markdown(results: Path) -> str:
     """The whole ledger."""
     head = "| claim | paper | here | from | verdict | what would decide or turn it |\n|---|---|---|---|---|---|\n"
-    one, other = ("\n".join(lines(results)) for lines in (figure_lines, training_lines))
-    return f"Without training:\n\n{head}{one}\n\nGains in points of mAP:\n\n{head}{other}\n"
+    parts = [f"Without training:\n\n{head}" + "\n".join(figure_lines(results))]
+    parts += [f"Gains in points of {s}:\n\n{head}" + "\n".join(training_lines(results, s)) for s in SCORES]
+    if missing := not_trained(results, "mAP"):
+        parts.append("Not run:\n\n" + "\n".join(f"- {claim}" for claim in missing))
+    return "\n\n".join(parts) + "\n"
 
 
 def with_ledger(document: str, ledger: str) -> str:

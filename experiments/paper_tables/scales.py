@@ -2,11 +2,8 @@
 
 - ``smoke``: a toy network and a few steps on a few simulated frames: that everything runs, in minutes, on two
   cores. Its scores mean nothing.
-- ``simulated``: the quickstart's network on ten sweeps of simulated streets with fast traffic: the ego vehicle at
-  10 to 20 m/s, nearly all objects that can move in motion. One GPU, or a long CPU run.
-- ``calm``: the same in light traffic, to tell what the motion does.
 - ``sector``: the compact network on ten sweeps of a quarter of nuScenes' sensor's turn, at its own resolution and
-  reach, of varied streets in ordinary traffic. One GPU, or hours of two CPU cores a cell.
+  reach, of varied streets in ordinary traffic. Half an hour of one CPU core a cell.
 - ``nuscenes``: the paper's detector on a data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
 """
 
@@ -39,7 +36,7 @@ from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE, TINY, Sensor, sector
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, Sensor, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.lidar import SWEEP_S
 from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
@@ -76,7 +73,6 @@ class Simulated:
     train_frames: int
     test_frames: int
     cache: Path  # Frames are simulated once and kept here.
-    fast_traffic: bool = True  # The ego vehicle drives at 10 to 20 m/s, and nearly all objects that can move do.
     streets: Streets = PLAIN
     num_objects: int = 14  # This and the others as of make_frame.
     reach_m: float = 10.0
@@ -84,17 +80,18 @@ class Simulated:
     looks: int = 0  # Evaluations during a cell's training, on the first test frames: its curve.
 
     def describe(self) -> dict[str, Any]:
-        """What of the scale decides a cell's result, as JSON; in older cells the streets are plain ones."""
-        extent = {name: getattr(self, name) for name in ("num_objects", "reach_m", "min_points")}
-        varied = {} if self.streets == PLAIN else {"streets": dataclasses.asdict(self.streets), **extent}
+        """What of the scale decides a cell's result, as JSON."""
         return {
-            **varied,
             "scale": self.name,
+            "streets": dataclasses.asdict(self.streets),
+            "num_objects": self.num_objects,
+            "reach_m": self.reach_m,
+            "min_points": self.min_points,
             "sensor": describe_sensor(self.sensor),
             "train_frames": self.train_frames,
             "test_frames": self.test_frames,
             "sweeps": self.base.num_sweeps,
-            "hurry": self.fast_traffic,  # as it was called when the first cells got their names
+            "hurry": False,  # No fast traffic; the committed cells have their names from it.
             "close_m": _BONNET_M,
         }
 
@@ -121,14 +118,12 @@ class Simulated:
             self.min_points,
             _BONNET_M,
             sweeps,
-            self.fast_traffic,
-            self.streets,
+            streets=self.streets,
         )
         return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
 
     def _folder(self, what: str, num_sweeps: int) -> Path:
-        calm = "" if self.fast_traffic else "_calm"
-        return self.cache / f"{self.sensor.name}_{what}_{num_sweeps}_sweeps{calm}"
+        return self.cache / f"{self.sensor.name}_{what}_{num_sweeps}_sweeps"
 
     def clouds(self, num_sweeps: int) -> list[np.ndarray]:
         """The first twenty test clouds, f32[n, 5], for figures that need no training."""
@@ -305,18 +300,6 @@ def _scores(summary: dict[str, Any]) -> dict[str, Any]:
     return {"mAP": round(summary["mean_ap"], 5), "NDS": round(summary["nd_score"], 5), "AP": aps}
 
 
-_TEN_SWEEPS = change(
-    name="small",
-    num_sweeps=10,
-    max_points=40_960,
-    copy_paste=None,
-    class_balanced=False,
-    augment=None,
-    projection=dataclasses.replace(NUSCENES.projection, remove_close="all"),
-    # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
-    model__stem=StemConfig(channels_per_type=5, out_channels=16),
-    optimizer__epochs=2,
-)(QUICKSTART)
 small_network = change(
     model__backbone_blocks=(1, 1, 1, 1),
     model__backbone_widths=(8, 8, 8, 8),
@@ -324,26 +307,25 @@ small_network = change(
     model__head_channels=8,
     model__head_convs=1,
 )
-_OF_TOY = InferenceConfig(max_detections=50, candidates_per_level=100)
-_TOY = change(name="toy", max_points=10_240, model__stem__out_channels=8, inference=_OF_TOY)(
-    small_network(_TEN_SWEEPS)
-)
+_TOY = change(
+    name="toy",
+    num_sweeps=10,
+    max_points=10_240,
+    copy_paste=None,
+    class_balanced=False,
+    augment=None,
+    projection=dataclasses.replace(NUSCENES.projection, remove_close="all"),
+    # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
+    model__stem=StemConfig(channels_per_type=5, out_channels=8),
+    inference=InferenceConfig(max_detections=50, candidates_per_level=100),
+    optimizer__epochs=2,
+)(small_network(QUICKSTART))
 
 
 def smoke(cache: Path) -> Simulated:
     """A toy that runs in seconds; its scores mean nothing."""
     sensor = dataclasses.replace(TINY, name="toy", num_columns=64)
     return Simulated("smoke", _TOY, sensor, train_frames=16, test_frames=6, cache=cache)
-
-
-def simulated(cache: Path) -> Simulated:
-    """The quickstart's network on ten sweeps of what is near."""
-    return Simulated("simulated", _TEN_SWEEPS, SHORT_RANGE, train_frames=1200, test_frames=200, cache=cache)
-
-
-def calm(cache: Path) -> Simulated:
-    """As simulated, in light traffic: the ego vehicle slower, fewer objects in motion."""
-    return dataclasses.replace(simulated(cache), name="calm", fast_traffic=False)
 
 
 _SECTOR = change(
@@ -371,4 +353,4 @@ def quarter(cache: Path) -> Simulated:
     extent = {"num_objects": 60, "reach_m": NUSCENES_HDL32E.limit_xy_m, "min_points": 1}
     ahead = sector(NUSCENES_HDL32E, math.pi / 2, 272)
     sizes = {"train_frames": 4000, "test_frames": 400, "cache": cache, "looks": 8}
-    return Simulated("sector", _SECTOR, ahead, **sizes, fast_traffic=False, streets=CITY, **extent)
+    return Simulated("sector", _SECTOR, ahead, **sizes, streets=CITY, **extent)

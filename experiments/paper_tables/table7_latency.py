@@ -1,6 +1,6 @@
 """Table 7: where the time goes from raw sweeps to boxes, one sweep and ten, batch 1.
 
-    python -m experiments.paper_tables.table7_latency --scale simulated  # the paper's preset; 2 cells, three seeds
+    python -m experiments.paper_tables.table7_latency --scale sector  # the paper's preset; 2 cells, three seeds
 
 The times need no training (``--only-figures``) and are those of ``latency.py``, which says how the stages are cut.
 The paper's are of a 3090Ti: on other hardware only the shares compare. Expected of the paper: the projection is a

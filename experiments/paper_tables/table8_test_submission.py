@@ -1,7 +1,7 @@
 """Table 8: the test-set model: wider heads ("c128"), no pasted objects at the end ("fade"), the results file.
 
     python -m experiments.paper_tables.table8_test_submission  # smoke: minutes, a toy
-    python -m experiments.paper_tables.table8_test_submission --scale simulated  # 4 cells, three seeds
+    python -m experiments.paper_tables.table8_test_submission --scale sector  # 4 cells, three seeds
     python -m experiments.paper_tables.table8_test_submission --scale nuscenes --data-root DIR --test-version V
 
 The results file is ``results_nusc.json``, for the server at nuScenes: of the test split at full scale, of a

@@ -21,9 +21,7 @@ from experiments.paper_tables.scales import (
     NuScenesLayout,
     Scale,
     Simulated,
-    calm,
     quarter,
-    simulated,
     smoke,
 )
 from experiments.statistics import interval
@@ -39,9 +37,9 @@ _NOTHING = "the scores mean nothing"
 class Args:
     """At which scale, and where the results go."""
 
-    scale: Literal["smoke", "simulated", "calm", "sector", "nuscenes"] = "smoke"
-    """Minutes on a toy; the quickstart on simulated streets in fast or in light traffic; the compact network on a
-    quarter of nuScenes' sensor's turn; the real thing."""
+    scale: Literal["smoke", "sector", "nuscenes"] = "smoke"
+    """Minutes on a toy; the compact network on simulated streets, a quarter of nuScenes' sensor's turn; the real
+    thing."""
     rows: tuple[str, ...] = ()  # Labels of the rows to train, beside the reference; default: all.
     seeds: tuple[int, ...] = ()  # Of every cell; default: 0 for smoke, else 0, 1 and 2.
     out: Path = Path("outputs/tables")  # Folder of tables and cells; a folder of the scale's name below it.
@@ -119,7 +117,7 @@ class Table:
 
 def simulated_scale(args: Args) -> Simulated | None:
     """The scale that is asked for, if its frames are simulated."""
-    make = {"smoke": smoke, "simulated": simulated, "calm": calm, "sector": quarter}.get(args.scale)
+    make = {"smoke": smoke, "sector": quarter}.get(args.scale)
     return make(args.runs / "frames") if make else None
 
 
@@ -285,11 +283,9 @@ def _training_text(trained_on: dict[str, Any]) -> str:
     """What a row that changes nothing is trained on, and how long."""
     optimizer, precision = trained_on["base"]["optimizer"], trained_on["base"]["model"]["precision"]
     shown = {name: value for name, value in trained_on.items() if isinstance(value, int | float | str)}
-    # What cells call hurry is fast traffic.
     shown |= {
         "scale": None,
-        "hurry": None,
-        "fast_traffic": trained_on.get("hurry"),
+        "hurry": None,  # what cells call fast traffic, which no scale has
         "splits": " and ".join(trained_on.get("splits", ())) or None,
     }
     shown["epochs"] = None if trained_on.get("steps") else optimizer["epochs"]

@@ -87,7 +87,7 @@ TABLE = Table("centerpoint", "CenterPoint and the range view", ROWS, reference=P
 def main(args: Args) -> None:
     """The table."""
     if args.scale == "nuscenes":
-        raise ValueError("--scale: got nuscenes, expected simulated frames: smoke, simulated, calm or sector")
+        raise ValueError("--scale: got nuscenes, expected smoke or sector")
     run_table(TABLE, args)
 
 

@@ -23,11 +23,10 @@ from experiments.paper_tables import table8_test_submission as table8
 from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cell_names import cell_name
 from experiments.paper_tables.grid import run_cell, run_cells
-from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, simulated, smoke
+from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, smoke
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
 from experiments.statistics import interval
-from experiments.studies import more_rounds
 from fcos_lidar_jax.cli import prepare
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.evaluation.results import write_results
@@ -218,9 +217,7 @@ def test_the_sector_is_a_quarter_of_the_sensor_at_its_resolution(tmp_path):
     scale = quarter(tmp_path)
     assert scale.sensor.column_rad == pytest.approx(NUSCENES_HDL32E.column_rad)
     assert (scale.sensor.num_rows, scale.sensor.num_columns) == (32, 272)
-    # The streets are said where they are not plain: cells of the other scales keep their names.
     assert scale.describe()["streets"]["name"] == "city"
-    assert "streets" not in simulated(tmp_path).describe()
     for table in TABLES[:6]:
         for row in table.rows:
             scale.check(row.change(scale.base))
@@ -230,26 +227,6 @@ def test_the_sector_is_a_quarter_of_the_sensor_at_its_resolution(tmp_path):
     right, left = scale.sensor.azimuth_limits_rad
     assert ((azimuth > right - 0.1) & (azimuth < left + 0.1))[current].mean() > 0.97
     assert len(np.unique(frame.points[:, 4])) == 10
-
-
-def test_more_rounds_changes_the_traffic_or_the_epochs_alone(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(more_rounds, "run_table", lambda table, args: asked.append((table.name, args.scale)))
-    for scale in ("simulated", "smoke"):
-        more_rounds.main(Args(scale=scale))
-    names = ("rounds_and_traffic", "rounds_and_length")
-    assert asked == list(zip(names * 2, ("calm", "simulated", "smoke", "smoke"), strict=True))
-    fast, light = (make(tmp_path) for make in (scales.simulated, scales.calm))
-    assert light == dataclasses.replace(fast, name="calm", fast_traffic=False)
-    cached, quiet = (scale.frames("train", 10).frames for scale in (fast, light))
-    assert quiet.frames == dataclasses.replace(cached.frames, fast_traffic=False)
-    assert quiet.folder != cached.folder
-    by_label = {row.label: row.change(fast.base) for row in more_rounds.LENGTH.rows}
-    assert fast.base.optimizer.epochs == 2
-    assert by_label["5 rounds, 3 x epochs"] == change(optimizer__epochs=6)(fast.base)
-    assert by_label["1 round, 3 x epochs"].projection.num_rounds == 1
-    with pytest.raises(ValueError, match="--scale: got nuscenes, expected smoke or simulated"):
-        more_rounds.main(Args(scale="nuscenes"))
 
 
 def test_a_row_without_a_curve_is_left_out_of_the_picture(tmp_path):
@@ -357,7 +334,7 @@ def test_a_simulated_row_that_would_change_nothing_is_refused(tmp_path, fields, 
         (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different ones, none below 0"),
         (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/cloud.f16.bin there"),
         (["--data-root", "nowhere"], "--data-root: is of --scale nuscenes, got --scale smoke"),
-        (["--scale", "calm", "--steps", "5"], "--steps: is of --scale nuscenes, got --scale calm"),
+        (["--scale", "sector", "--steps", "5"], "--steps: is of --scale nuscenes, got --scale sector"),
         (["--scale", "nuscenes"], "--data-root: missing, expected the data set for --scale nuscenes"),
         (["--scale", "nuscenes", "--data-root", "nowhere"], "nowhere: no such folder, expected a data root"),
     ],

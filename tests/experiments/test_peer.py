@@ -52,7 +52,7 @@ def test_the_stages_that_are_timed_are_the_detector(tmp_path):
 
 
 def test_the_peer_refuses_a_data_set():
-    with pytest.raises(ValueError, match="--scale: got nuscenes, expected simulated frames"):
+    with pytest.raises(ValueError, match="--scale: got nuscenes, expected smoke or sector"):
         centerpoint.main(Args(scale="nuscenes"))
 
 
