@@ -9,10 +9,10 @@ compact preset, and predicts no IoU. What favours the range view here: learning 
 ``compact``, which has more parameters (the table says how many), and CenterPoint computes a whole square, of
 which a sector sees a quarter. Its steps take longer for that, and the range view is trained for half as many
 epochs again in a row of its own. The minutes that the steps took stand below the table, beside the scores by
-class and by range. The
-times from a cloud to boxes, in the form of the paper's table 7, need no training (``--only-figures``): they are
-those of random weights, whose candidates are not as many as a trained detector's, so the stage of the boxes is
-not to be compared.
+class and by range; other work may have shared the machine, so what a step costs is timed as well, turn by turn.
+That, and the times from a cloud to boxes in the form of the paper's table 7, need no training
+(``--only-figures``): they are those of random weights, whose candidates are not as many as a trained detector's,
+so the stage of the boxes is not to be compared.
 
 The paper compares itself with CenterPoint in table 7 and has no table of both after equal training.
 """
@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 
+from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
 from experiments.script import run_script
@@ -67,12 +68,14 @@ def stage_calls(config: Config, points: Any, sensor: Any) -> tuple[dict[str, Cal
 
 
 def figures(args: Args) -> dict[str, Any]:
-    """Times of the stages and parameters, by row."""
+    """Times of the stages and of a training step, and parameters, by row."""
     scale = simulated_scale(args)
     assert scale is not None
-    points, calls, columns = scale.clouds(scale.base.num_sweeps)[0], dict[tuple[str, str], Call](), {}
+    frame, calls, columns = scale.frames("test", scale.base.num_sweeps).frame(0), dict[tuple[str, str], Call](), {}
     for row in (OURS, PEER):
-        parts, parameters = stage_calls(row.change(scale.base), points, scale.sensor)
+        config = row.change(scale.base)
+        parts, parameters = stage_calls(config, frame.points, scale.sensor)
+        parts["training step"] = training_steps(config, scale.sensor, [frame])
         calls |= {(row.label, stage): call for stage, call in parts.items()}
         columns[row.label] = {"parameters, thousands": parameters / 1000}
     measured = interleaved(calls, 2 if args.scale == "smoke" else 15)
