@@ -22,7 +22,7 @@ def test_gains_are_differences_of_cells_that_differ_in_the_rounds_alone(score):
     for file in cells.glob("*.json"):
         record = json.loads(file.read_text())
         config = record["config"]
-        other = config["pillars"] or config["model"]["tied_heads"] or config["optimizer"]["epochs"] != 2
+        other = config.get("pillars") or config["model"]["tied_heads"] or config["optimizer"]["epochs"] != 2
         if not other and config["projection"]["prioritize_current"]:
             key = config["num_sweeps"], config["projection"]["num_rounds"], record["seed"]
             found[key] = record["scores"][score]
