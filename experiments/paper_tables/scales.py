@@ -44,7 +44,7 @@ from fcos_lidar_jax.trainer import Schedule
 from fcos_lidar_jax.trainer.results import write_predictions
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
-_LOOKED_AT = 100
+_CURVE_FRAMES = 100  # Test frames of the evaluations during a training.
 _BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, which would leave a trail when sweeps are fused.
 
 
@@ -91,7 +91,7 @@ class Simulated:
             "train_frames": self.train_frames,
             "test_frames": self.test_frames,
             "sweeps": self.base.num_sweeps,
-            "hurry": False,  # No fast traffic; the committed cells have their names from it.
+            "hurry": False,  # A key that the names of the committed cells were hashed with.
             "close_m": _BONNET_M,
         }
 
@@ -145,7 +145,7 @@ class Simulated:
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
         steps, options = config.optimizer.epochs * steps_per_epoch(frames, config), dict[str, Any]()
         if self.looks:
-            along = ChosenFrames(tests, tuple(range(min(_LOOKED_AT, len(tests)))))
+            along = ChosenFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
             options = {"tests": along, "schedule": Schedule(-(-steps // 20), -(-steps // self.looks))}
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
         found, seen = detections(detector, tests)
@@ -183,7 +183,9 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class NuScenesLayout:
-    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen; methods as of :class:`Simulated`.
+    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
+
+    ``describe`` and ``score`` are as of :class:`Simulated`.
 
     Raises:
         ValueError: at construction, where data, index or splits are not there.
@@ -314,7 +316,7 @@ _TOY = change(
     copy_paste=None,
     class_balanced=False,
     augment=None,
-    projection=dataclasses.replace(NUSCENES.projection, remove_close="all"),
+    projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
     # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
     model__stem=StemConfig(channels_per_type=5, out_channels=8),
     inference=InferenceConfig(max_detections=50, candidates_per_level=100),

@@ -1,6 +1,6 @@
 """Table 1: rounds of the multi-round projection, one sweep and ten.
 
-    python -m experiments.paper_tables.table1_mrv_rounds --scale sector  # 8 cells, three seeds
+    python -m experiments.paper_tables.table1_mrv_rounds --scale sector  # 8 rows, 24 cells
 
 The points that 1, 3, 5 and 7 rounds keep, of a real cloud and of the scale's own, and the time of the projection
 need no training: ``--only-figures``.

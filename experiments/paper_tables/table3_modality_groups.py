@@ -1,6 +1,6 @@
 """Table 3: which channels are convolved together.
 
-    python -m experiments.paper_tables.table3_modality_groups --scale sector  # 4 cells, three seeds
+    python -m experiments.paper_tables.table3_modality_groups --scale sector  # 4 rows, 12 cells
 
 The latency of the module by variant needs no training: ``--only-figures``. Expected of the paper: nine groups beat
 one by 0.7 points of mAP at half the time; leaving the rounds ungrouped costs 0.25.

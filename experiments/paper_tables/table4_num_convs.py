@@ -1,6 +1,6 @@
 """Table 4: grouped convolutions a branch.
 
-    python -m experiments.paper_tables.table4_num_convs --scale sector  # 3 cells, three seeds
+    python -m experiments.paper_tables.table4_num_convs --scale sector  # 3 rows, 9 cells
 
 The latency of the module by variant needs no training: ``--only-figures``. Expected of the paper: two beat one by
 1.3 points of mAP, a third does not help.

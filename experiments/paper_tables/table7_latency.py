@@ -1,8 +1,9 @@
 """Table 7: where the time goes from raw sweeps to boxes, one sweep and ten, batch 1.
 
-    python -m experiments.paper_tables.table7_latency --scale sector  # the paper's preset; 2 cells, three seeds
+    python -m experiments.paper_tables.table7_latency --scale sector  # 2 rows, 6 cells
 
-The times need no training (``--only-figures``) and are those of ``latency.py``, which says how the stages are cut.
+The times are the paper's preset's, need no training (``--only-figures``) and are those of ``latency.py``, which
+says how the stages are cut.
 The paper's are of a 3090Ti: on other hardware only the shares compare. Expected of the paper: the projection is a
 fiftieth of the time, and ten sweeps cost no more than one.
 """
@@ -29,7 +30,7 @@ def figures(args: Args) -> dict[str, Any]:
 
 TABLE = Table(
     "table7",
-    "Table 7: latency",
+    "Table 7: one sweep and ten",
     (
         Row("single-frame", change(num_sweeps=1), "FCOS-LiDAR, single"),
         Row("multi-frame", change(), "FCOS-LiDAR, multi"),

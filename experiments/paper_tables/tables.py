@@ -38,8 +38,8 @@ class Args:
     """At which scale, and where the results go."""
 
     scale: Literal["smoke", "sector", "nuscenes"] = "smoke"
-    """Minutes on a toy; the compact network on simulated streets, a quarter of nuScenes' sensor's turn; the real
-    thing."""
+    """Minutes on a toy; the compact network on simulated streets, a quarter of nuScenes' sensor's turn; the
+    paper's detector on nuScenes."""
     rows: tuple[str, ...] = ()  # Labels of the rows to train, beside the reference; default: all.
     seeds: tuple[int, ...] = ()  # Of every cell; default: 0 for smoke, else 0, 1 and 2.
     out: Path = Path("outputs/tables")  # Folder of tables and cells; a folder of the scale's name below it.
@@ -267,7 +267,7 @@ def by_distance(rows: list[dict[str, Any]]) -> list[str]:
     header = ["", "distance", "mAP", *(name.replace("_", " ") for name in NUSCENES_CLASSES)]
     title = "mAP and AP of the classes by distance from the sensor, means over the seeds:"
     rule = "|---" * len(header) + "|"
-    said = f"Minutes of the training's steps, on the hardware of the cells: {', '.join(seconds)}."
+    said = f"Minutes of the training's steps, on machines that may have done other things: {', '.join(seconds)}."
     return [title, "", "| " + " | ".join(header) + " |", rule, *table, "", said, ""]
 
 
@@ -285,7 +285,8 @@ def _training_text(trained_on: dict[str, Any]) -> str:
     shown = {name: value for name, value in trained_on.items() if isinstance(value, int | float | str)}
     shown |= {
         "scale": None,
-        "hurry": None,  # what cells call fast traffic, which no scale has
+        "hurry": None,
+        **{name: trained_on[name]["name"] for name in ("streets", "sensor") if name in trained_on},
         "splits": " and ".join(trained_on.get("splits", ())) or None,
     }
     shown["epochs"] = None if trained_on.get("steps") else optimizer["epochs"]

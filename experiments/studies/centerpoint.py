@@ -1,7 +1,7 @@
 """CenterPoint beside the range view: what both find after the same samples and after the same time.
 
     python -m experiments.studies.centerpoint  # smoke: minutes, a toy
-    python -m experiments.studies.centerpoint --scale sector  # 3 cells, three seeds
+    python -m experiments.studies.centerpoint --scale sector  # 3 rows, 9 cells
 
 Both see the points of the same ten sweeps that lie in the sector, and share trainer, augmentation, optimizer,
 post-processing and evaluation; both may send as many candidates to NMS. CenterPoint has the pillars of its

@@ -54,6 +54,8 @@ def write_card(name: str, results: Path, training: Mapping[str, Any] | None = No
     folder = SHIPPED / name
     file, weights = results / f"{name}.json", read_description(folder)["hash"]
     record = training or read_json(file, dict[str, Any])
+    if "training" not in record:
+        raise ValueError(f"{file}: training: missing, expected what shipped_weights --export wrote of it")
     if record.get("hash", weights) != weights:
         raise ValueError(f"{file}: hash: got {record['hash']}, expected that of the weights: {weights}")
     lines = [*_about(name, record), *_figures(results / "transfer.json", weights), *_training(name, record)]

@@ -9,11 +9,12 @@ another street. The training runs at low priority and saves every few minutes; t
 bit, after any kind of stop. ``--export`` trains nothing: it writes the running mean of the weights at the newest
 checkpoint into the package, as float16, scores them on unseen frames, and writes ``experiments/results/NAME.json``
 and their model card; another process may be training meanwhile. Without ``--work`` the weights in the package are
-scored on unseen frames, and nothing else. Where the folder is lost, ``--warm-start hdl32e
---seed 2`` begins a new one-cycle with the weights in the package, on streets ``seed * steps`` and on; choose a
-seed whose streets none of the trainings before it had.
+scored on unseen frames, and nothing else. Where the folder is lost, ``--work NEW --warm-start hdl32e --seed 2``
+begins a new one-cycle schedule with the weights in the package, on streets ``seed * steps`` and on; choose a seed
+whose streets none of the trainings before it had.
 
-Cost: seconds a step, that is hours, on two CPU cores. Expected: an mAP of at least 0.6 for quickstart.
+Cost: half a second to three seconds a step, that is hours, on two CPU cores. Expected: an mAP of at least 0.6
+for quickstart.
 """
 
 import dataclasses
@@ -61,7 +62,7 @@ CONFIGS = {
     )(_FRESH(COMPACT)),
 }
 EVENER_CITY = dataclasses.replace(CITY, name="city, classes more even", city_classes=0.25)
-"""A tenth of the mean is each class's, however rare; at a city's frequencies most are hardly ever trained."""
+"""Each class is a tenth of the mean, however rare; at a city's frequencies most are hardly ever trained."""
 _MORE_OBJECTS = 120  # Of 60: what a step costs hardly depends on how many there are to learn from.
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
@@ -80,6 +81,9 @@ class Args(Options):
     save_every: int = 150  # Steps between two checkpoints.
     export: bool = False  # Write the present weights into the package instead of training.
     test_frames: int = 200  # Unseen frames that the weights are scored on.
+
+
+_OF_TRAINING = ("steps", "seed", "warm_start", "save_every", "export")  # Options of no use without ``work``.
 
 
 def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, FrameSet]:
@@ -129,6 +133,8 @@ def earlier_trainings(name: str, training: Mapping[str, Any], results: Path) -> 
     if training["begun_with"] != name or not file.exists():
         return []
     before = read_json(file, dict[str, Any])
+    if "training" not in before:
+        raise ValueError(f"{file}: training: missing, expected that of the weights that this one began with")
     return [t for t in (*before["earlier"], before["training"]) if t["seed"] != training["seed"]]
 
 
@@ -163,14 +169,13 @@ def scores(args: Args) -> dict[str, Any]:
 
 def export(args: Args, work: Path) -> dict[str, Any]:
     """Write the weights of the newest checkpoint and their card; returns training and scores."""
-    folder = SHIPPED / args.name
+    folder, training = SHIPPED / args.name, training_record(work)
+    earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(find_checkpoint(work)), args.name)
     save_checkpoint(folder, half_precision(checkpoint))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     if size > _MAX_BYTES:
         raise ValueError(f"{folder}: got {size} bytes, expected at most {_MAX_BYTES}")
-    training = training_record(work)
-    earlier = earlier_trainings(args.name, training, RESULTS)
     record = {"bytes": size, "training": training, "earlier": earlier, **scores(args)}
     write_card(args.name, RESULTS, training=record)
     return record
@@ -179,8 +184,8 @@ def export(args: Args, work: Path) -> dict[str, Any]:
 def main(args: Args) -> None:
     """Score, train, or export; the record of an export lies where the next one looks for those before it."""
     if args.work is None:
-        if args.export:
-            raise ValueError("--work: missing, expected the folder of the training to --export")
+        if given := [name for name in _OF_TRAINING if getattr(args, name) != getattr(Args, name)]:
+            raise ValueError(f"--{given[0].replace('_', '-')}: is of a training, expected its folder in --work")
         save(scores(args), args.out)
         return
     record = export(args, args.work) if args.export else train(args, args.work)

@@ -50,7 +50,7 @@ class Streets:
 
 
 PLAIN = Streets()
-"""Level frames of ten equally frequent classes, few other things: those of the quickstart and of the tables."""
+"""Level frames of ten equally frequent classes, few other things: those of the quickstart."""
 
 CITY = Streets(
     "city",

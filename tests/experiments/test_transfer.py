@@ -141,8 +141,20 @@ def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     assert names <= scored.keys()
     assert {name: scored[name] for name in names} == {name: record[name] for name in names}
     assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
-    with pytest.raises(ValueError, match="--work: missing"):
-        shipped_weights.main(dataclasses.replace(args, export=True))
+    for option in ({"export": True}, {"seed": 7}, {"warm_start": tmp_path}):
+        with pytest.raises(ValueError, match=r"--(export|seed|warm-start): is of a training, expected its folder"):
+            shipped_weights.main(dataclasses.replace(args, **option))
+    # Scores alone are no training to go on from, nor to write a card of; nothing is overwritten.
+    results = tmp_path / "results"
+    args.out.rename(results / "hdl32e.json")
+    (tmp_path / "run/run.json").write_text(json.dumps({"seed": 5, "weights": "hdl32e", "steps": 9}))
+    for again in (
+        lambda: shipped_weights.main(dataclasses.replace(args, work=tmp_path / "run", export=True)),
+        lambda: model_card.write_card("hdl32e", results),
+    ):
+        with pytest.raises(ValueError, match=r"hdl32e\.json: training: missing"):
+            again()
+    assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
 
 
 def test_a_warm_start_remembers_the_trainings_before_it(tmp_path):
