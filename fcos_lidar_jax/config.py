@@ -119,7 +119,7 @@ class ModelConfig:
     paper, the direction of the point's azimuth and the one to its left, see :mod:`fcos_lidar_jax.coding`."""
     meta_kernel: bool = False
     """Not in the paper: the 3x3 of the backbone's first block weighs its neighbours by their offsets in space, as
-    in RangeDet, see :mod:`fcos_lidar_jax.models.meta_kernel`."""
+    in RangeDet, see ``fcos_lidar_jax.models.meta_kernel``."""
     background_prior: float = 0.99  # Reading: the background's probability at the start.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Reading: subtracted from the nine channels in the preprocessing."""
