@@ -161,6 +161,14 @@ def test_links_and_files_that_a_page_names_exist(page):
         assert f"def {name}(" in tests, name
 
 
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=page_name)
+def test_a_page_of_the_site_links_to_documents_that_the_site_has(page):
+    included = re.findall(r'^    "(\S+\.md)": "', (DOCS / "conf.py").read_text(), re.MULTILINE)
+    assert "CONTRIBUTING.md" in included
+    for link in re.findall(r"\]\(\.\./([^)#\s]+)", page.read_text()):
+        assert link in included or ((ROOT / link).is_file() and not link.endswith(".md")), link
+
+
 def places(page: Path) -> set[str]:
     """What links to a document can name, as on GitHub: its headings in small letters, with hyphens for spaces."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
