@@ -1,9 +1,7 @@
 """Readers: every layout comes back as it was, and every bad file gets one line that names it."""
 
-import dataclasses
 import io
 import itertools
-import json
 import tracemalloc
 import zipfile
 
@@ -12,13 +10,9 @@ import pyarrow
 import pyarrow.feather
 import pytest
 from refusal import refused
-from scipy.spatial.transform import Rotation
 
-from fcos_lidar_jax.data.box_geometry import count_inside
-from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.data.sweeps import read_sweeps
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, TINY
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
 
 
@@ -448,151 +442,3 @@ def test_bad_or_missing_laser_numbers_are_refused(tmp_path, value):
     path = save(tmp_path / "b.npy", np.zeros((1, 5), np.float32))
     with refused("b.npy: no laser number"):
         read_points(path, ARGOVERSE2)
-
-
-EYE = np.eye(4).tolist()
-
-
-def entry(file="a.npy", timestamp_us=1, sensor_to_world=EYE):
-    return {"file": file, "timestamp_us": timestamp_us, "sensor_to_world": sensor_to_world}
-
-
-def fuse(folder, entries, sensor=TINY, remove_close="all"):
-    path = folder / "sweeps.json"
-    path.write_text(entries if isinstance(entries, str) else json.dumps(entries))
-    return read_sweeps(path, sensor, remove_close=remove_close, close_m=1.0)
-
-
-def test_sweeps_see_a_fixed_world(tmp_path):
-    """Points fixed in the world land on the same place from every pose; lags are exact microseconds."""
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("z", rng.uniform(-3, 3, (4, 1))).as_matrix()
-    poses[:, :3, 3] = rng.uniform(-1000, 1000, (4, 3))
-    world = poses[0, :3, 3] + rng.uniform(-20, 20, (50, 3))
-    local = [(world - pose[:3, 3]) @ pose[:3, :3] for pose in poses]
-    for i, points in enumerate(local):
-        np.save(tmp_path / f"{i}.npy", points)
-    entries = [entry(f"{i}.npy", 1_532_402_927_647_951 - 49_999 * i, p.tolist()) for i, p in enumerate(poses)]
-    fused, num_close = fuse(tmp_path, entries, NUSCENES_HDL32E, "none")
-    assert num_close == 0
-    for i in range(4):
-        part = fused[50 * i : 50 * (i + 1)]
-        np.testing.assert_allclose(part[:, :3], local[0], atol=2e-4)
-        np.testing.assert_array_equal(part[:, 4], np.float32(0.049999 * i))
-
-
-def test_raw_sweeps_of_another_layout_are_read_as_it_is_said(tmp_path):
-    rows = np.random.default_rng(0).uniform(3, 9, (40, 6))
-    rows.tofile(tmp_path / "a.bin")
-    (tmp_path / "sweeps.json").write_text(json.dumps([entry("a.bin")]))
-    options = {"remove_close": "all", "close_m": 1.0, "columns": 6, "dtype": "float64"}
-    fused, _ = read_sweeps(tmp_path / "sweeps.json", TINY, **options)
-    np.testing.assert_array_equal(fused[:, :4], rows[:, :4].astype(np.float32))
-
-
-@pytest.mark.parametrize(("mode", "counts"), [("all", [1, 1]), ("sweeps", [2, 1]), ("none", [2, 2])])
-def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
-    np.save(tmp_path / "a.npy", np.array([[0.5, 0, 0], [10, 0, 0]]))
-    entries = [entry(timestamp_us=100, sensor_to_world=[[1, 0, 0, 10], *EYE[1:]]), entry(timestamp_us=50)]
-    fused, num_close = fuse(tmp_path, entries, remove_close=mode)
-    assert [int((fused[:, 4] == 0).sum()), int((fused[:, 4] > 0).sum())] == counts
-    assert num_close == 4 - sum(counts)
-    if mode == "all":  # the old sweep's far point now lies at the sensor and stays
-        assert [0, 0, 0] in fused[:, :3].tolist()
-
-
-def test_close_points_lie_around_the_sensors_origin(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([[0.3, 0, 0], [2.3, 0.5, 0], [1.4, 0, 0]]))
-    fused, num_close = fuse(tmp_path, [entry()], dataclasses.replace(TINY, origin_m=(1.4, 0.0, 1.6)))
-    np.testing.assert_array_equal(fused[:, :3], np.array([[0.3, 0, 0]], np.float32))
-    assert num_close == 2
-
-
-BAD_SWEEPS = {
-    "not json": ("{", "not JSON"),
-    "not a list": ({"a": 1}, "$: got {'a': 1}, expected array"),
-    "empty": ([], "$: got [], expected array of length >= 1"),
-    "not an object": ([3], "$[0]: got 3, expected object"),
-    "no pose": ([{"file": "a.npy", "timestamp_us": 1}], "$[0]: Object missing required field `sensor_to_w"),
-    "time": ([entry(timestamp_us=1.5)], "$[0].timestamp_us: got 1.5, expected int"),
-    "true time": ([entry(timestamp_us=True)], "$[0].timestamp_us: got True, expected int"),
-    "file": ([entry(3)], "$[0].file: got 3, expected str"),
-    "far time": ([entry(timestamp_us=10**400)], f"$[0].timestamp_us: got 1{56 * '0'}..., expected int <= 9223"),
-    "far place": ([entry(sensor_to_world=[[10**400, 0, 0, 0], *EYE[1:]])], ".sensor_to_world[0][0]: Number out"),
-    "too far": (
-        [entry(sensor_to_world=[[1, 0, 0, -2e8], *EYE[1:]])],
-        "$[0].sensor_to_world[0][3]: got -200000000.0, expected float >= -100000000.0",
-    ),
-    "NaN": ([entry(sensor_to_world=[[np.nan, 0, 0, 0], *EYE[1:]])], "[0].sensor_to_world[0][0]: got nan, exp"),
-    "shape": ([entry(sensor_to_world=EYE[:3])], f"_world: got {str(EYE)[:57]}..., expected array of length 4"),
-    "text": ([entry(sensor_to_world=[["a"] * 4] * 4)], "$[0].sensor_to_world[0][0]: got 'a', expected float"),
-    "last row": ([entry(sensor_to_world=[*EYE[:3], [1, 1, 1, 1]])], "$[0].sensor_to_world: last row: got (1.0, 1"),
-    "scaled": ([entry(sensor_to_world=np.diag([2, 2, 2, 1.0]).tolist())], "not a rotation"),
-    "mirrored": ([entry(sensor_to_world=np.diag([-1, 1, 1, 1.0]).tolist())], "not a rotation"),
-    "future": ([entry(), entry(timestamp_us=2)], "$[1].timestamp_us: got 2, expected less than the current"),
-}
-
-
-@pytest.mark.parametrize("name", BAD_SWEEPS)
-def test_bad_sweep_lists_get_one_line(tmp_path, name):
-    content, message = BAD_SWEEPS[name]
-    np.save(tmp_path / "a.npy", np.ones((3, 3)))
-    with refused(message, tmp_path / "sweeps.json"):
-        fuse(tmp_path, content)
-
-
-def test_keyframe_folder_gives_points_boxes_and_unknown_velocities(tmp_path, points):
-    save(tmp_path / "a.pcd.bin", nuscenes_rows(points))
-    box = dict(zip("xyzlwh", range(1, 7), strict=True)) | {"yaw": 0.5, "vx": None, "vy": None, "num_lidar_pts": 9}
-    counted = {("num_lidar_pts_at_key_frame" if k == "num_lidar_pts" else k): v for k, v in box.items()}
-
-    def read(content, number=0):
-        (tmp_path / "boxes.json").write_text(content if isinstance(content, str) else json.dumps(content))
-        return read_keyframe(tmp_path, NUSCENES_HDL32E, number)
-
-    def record(*boxes):
-        return {"lidar_file": "a.pcd.bin", "boxes": boxes}
-
-    truck = record({**box, "class": "truck"}, {**box, "class": None})
-    frame = read(truck)
-    np.testing.assert_array_equal(frame.boxes, np.array([[1, 2, 3, 4, 5, 6, 0.5, np.nan, np.nan]], np.float32))
-    assert (frame.labels.tolist(), frame.num_points.tolist(), len(frame.points)) == ([1], [9], len(points))
-    several = [truck, record({**counted, "class": "bus"})]
-    assert [read(several, i).labels.tolist() for i in (0, 1)] == [[1], [2]]
-    with refused("list index out of range"):
-        read(several, 2)
-    for text, message in [("{", "not JSON"), ('{"boxes": []}', "'lidar_file'"), ('{"boxes": 3}', "missing or of")]:
-        with refused(message):
-            read(text)
-    for name, value, message in [
-        ("x", 1e30, "x: got 1e+30, expected at most 10000"),
-        ("h", -2, "h: got -2, expected a size above 0 m"),
-        ("yaw", float("nan"), "yaw: got nan, expected a finite number"),
-        ("vx", float("inf"), "vx: got inf, expected a finite number"),
-        ("vx", 3, "vy: got nan, expected a finite number"),
-        ("z", None, "z: got nan, expected a finite number"),
-    ]:
-        with refused(f"box 1 of the ten classes: {message}"):
-            read(record({**box, "class": "truck"}, {**box, "class": "car", name: value}))
-
-
-@pytest.mark.real_data
-def test_real_keyframe_has_its_boxes(real_data):
-    frame = read_keyframe(real_data / "nuscenes_scene0061", NUSCENES_HDL32E)
-    assert frame.boxes.shape == (68, 9)
-    assert np.isnan(frame.boxes[:, 7]).sum() == 2
-    assert (frame.num_points == 0).sum() == 3
-
-
-@pytest.mark.real_data
-def test_a_list_of_real_keyframes_has_their_boxes_and_points(real_data):
-    """Counts with the yaw alone are near those of the full rotation, which are exact."""
-    counts = []
-    for number, total in ((0, 23), (1, 55)):
-        frame = read_keyframe(real_data / "nuscenes_scene0103", NUSCENES_HDL32E, number)
-        assert len(frame.boxes) <= total
-        counts.append(np.stack([frame.num_points, count_inside(frame.points, frame.boxes)]))
-    annotated, inside = np.concatenate(counts, axis=1)
-    assert len(annotated) > 60
-    assert (annotated == inside).mean() > 0.7

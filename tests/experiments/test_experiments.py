@@ -1,6 +1,5 @@
-"""The runner beneath the tables: cells, intervals, changes; and the example of docs/variant.md."""
+"""The tables: rows, differences, intervals, pictures, and what is refused; the example of docs/variant.md."""
 
-import contextlib
 import dataclasses
 import doctest
 import importlib
@@ -13,51 +12,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_run
+from pretended import Pretended
 from study_tables import study_tables
 
 from experiments.changes import change
 from experiments.paper import PAPER
 from experiments.paper_tables import __main__ as all_tables
-from experiments.paper_tables import grid, scales, table1_mrv_rounds, table2_priority, table6_untied_heads, tables
+from experiments.paper_tables import table1_mrv_rounds, table2_priority, table6_untied_heads, tables
 from experiments.paper_tables import table8_test_submission as table8
-from experiments.paper_tables.cell_names import cell_name
-from experiments.paper_tables.grid import run_cell, run_cells
-from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, smoke
+from experiments.paper_tables.grid import run_cell
+from experiments.paper_tables.scales import smoke
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
 from experiments.statistics import interval
-from fcos_lidar_jax.cli import prepare
-from fcos_lidar_jax.cli.data import DataOptions
-from fcos_lidar_jax.evaluation.results import write_results
-from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
-from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
-from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.training import NonFiniteLossError
-from fcos_lidar_jax.training.checkpoint import NonFiniteStateError
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
-
-
-@dataclasses.dataclass
-class Pretended:
-    """A scale that trains nothing and counts how often it is asked."""
-
-    name: str = "pretended"
-    base: object = QUICKSTART
-    asked: int = 0
-    diverges: tuple = ()
-
-    def describe(self):
-        return {"scale": self.name}
-
-    def score(self, config, seed, folder):
-        self.asked += 1
-        if (config.projection.num_rounds, seed) in self.diverges:
-            raise NonFiniteLossError("step 7: loss/l1 is not finite")
-        score = 0.1 * config.projection.num_rounds + 0.01 * seed
-        return {"mAP": score, "NDS": score / 2, "AP": {}}
 
 
 @pytest.fixture
@@ -81,19 +51,6 @@ def test_a_row_is_told_when_its_training_begins_and_not_when_it_is_known(train_t
     assert capsys.readouterr().err.splitlines() == ["cell 2 of 2: three, seed 0"]
 
 
-def test_a_finished_cell_is_never_run_again(tmp_path):
-    scale, folders = Pretended(), {"results": tmp_path, "runs": tmp_path}
-    three = change(projection__num_rounds=3)(QUICKSTART)
-    first = run_cell(three, scale, 1, **folders)
-    assert run_cell(dataclasses.replace(three, name="other"), scale, 1, **folders) == first
-    assert scale.asked == 1
-    run_cell(three, scale, 2, **folders)
-    assert scale.asked == 2
-    record = json.loads((tmp_path / f"{first['name']}.json").read_text())
-    assert record["config"]["projection"]["num_rounds"] == 3
-    assert {"jax", "git", "device", "seed"} <= set(record)
-
-
 def test_a_table_of_ones_own_has_no_columns_of_the_paper_and_says_what_smoke_is_worth(train_table, tmp_path):
     rows = (Row("one", change(projection__num_rounds=1)), Row("three", change(projection__num_rounds=3)))
     for seeds in ((0,), (0, 1)):
@@ -104,49 +61,6 @@ def test_a_table_of_ones_own_has_no_columns_of_the_paper_and_says_what_smoke_is_
         assert ("Two seeds can agree by chance" in text) == (len(seeds) == 2)
     train_table(table1_mrv_rounds.TABLE)
     assert "mAP, paper | difference, paper" in (tmp_path / "smoke" / "table1.md").read_text()
-
-
-def test_a_cell_names_the_revisions_of_all_who_trained_it(tmp_path, monkeypatch):
-    class Interrupted(Pretended):
-        def score(self, config, seed, folder):
-            if self.asked < 3:
-                self.asked += 1
-                raise KeyboardInterrupt
-            return super().score(config, seed, folder)
-
-    scale, folders = Interrupted(), {"results": tmp_path / "cells", "runs": tmp_path}
-    for revision in ("a1", "a1", "b2"):
-        monkeypatch.setattr(grid, "hardware", lambda revision=revision: {"git": revision})
-        with pytest.raises(KeyboardInterrupt):
-            run_cell(QUICKSTART, scale, 0, **folders)
-    record = run_cell(QUICKSTART, scale, 0, **folders)
-    assert record["git"] == "a1, then b2"
-    assert record == run_cell(QUICKSTART, scale, 0, **folders)
-    assert record["name"] == cell_name(QUICKSTART, scale.describe(), 0)
-
-
-def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch):
-    held, free = (change(projection__num_rounds=n)(QUICKSTART) for n in (3, 5))
-    scale, folders = Pretended(), {"results": tmp_path / "cells", "runs": tmp_path}
-    with contextlib.ExitStack() as other:
-        assert other.enter_context(file_lock(tmp_path / f"{cell_name(held, scale.describe(), 0)}.lock"))
-        assert run_cell(held, scale, 0, **folders) is None
-        # The other ends while this one waits: its cell is free again.
-        monkeypatch.setattr(grid.time, "sleep", lambda _: other.close())
-        records = run_cells([(held, 0), (free, 0)], scale, **folders)
-    assert [record["scores"]["mAP"] for record in records] == pytest.approx([0.3, 0.5])
-    assert scale.asked == 2
-
-
-def test_one_sweep_and_ten_see_the_same_streets(tmp_path):
-    scale = smoke(tmp_path)
-    one, three, ten = (scale.frames("test", n).frame(0) for n in (1, 3, 10))
-    for frame in (one, three):
-        np.testing.assert_array_equal(frame.boxes, ten.boxes)
-        np.testing.assert_array_equal(frame.labels, ten.labels)
-    np.testing.assert_array_equal(one.points, ten.points[ten.points[:, 4] == 0])
-    assert np.unique(three.points[:, 4]).tolist() == np.unique(ten.points[:, 4]).tolist()[:3]
-    assert len(one.points) < len(three.points) < len(ten.points)
 
 
 EXAMPLES = [p.relative_to(EXPERIMENTS.parent) for p in EXPERIMENTS.rglob("*.py") if ">>> " in p.read_text()]
@@ -212,22 +126,6 @@ def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
     assert drawn.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_sector_is_a_quarter_of_the_sensor_at_its_resolution(tmp_path):
-    scale = quarter(tmp_path)
-    assert scale.sensor.column_rad == pytest.approx(NUSCENES_HDL32E.column_rad)
-    assert (scale.sensor.num_rows, scale.sensor.num_columns) == (32, 272)
-    assert scale.describe()["streets"]["name"] == "city"
-    for table in all_tables.TABLES[:6]:
-        for row in table.rows:
-            scale.check(row.change(scale.base))
-    frame = scale.frames("test", 10).frame(0)
-    azimuth = np.arctan2(frame.points[:, 1], frame.points[:, 0])
-    current = frame.points[:, 4] == 0
-    right, left = scale.sensor.azimuth_limits_rad
-    assert ((azimuth > right - 0.1) & (azimuth < left + 0.1))[current].mean() > 0.97
-    assert len(np.unique(frame.points[:, 4])) == 10
-
-
 def test_a_row_without_a_curve_is_left_out_of_the_picture(tmp_path):
     """All of its cells diverged."""
     curve = {"curve": [[100, 0.1], [200, 0.2]]}
@@ -248,15 +146,6 @@ def test_scores_by_distance_and_class_are_means_over_the_seeds(tmp_path):
     assert (shown["car"], shown["bus"]) == ("30.00", "-")  # a bus is not in the frames of both seeds
     assert any("ours 2" in line for line in lines[5:])  # minutes, rounded
     assert tables.by_distance([{"label": "none", "scores": [{"mAP": 0.1}, None]}]) == []
-
-
-def test_a_state_that_is_not_finite_is_a_result_too(tmp_path):
-    class Overflows(Pretended):
-        def score(self, config, seed, folder):
-            raise NonFiniteStateError("checkpoints/00000007: not saved: var: not finite")
-
-    record = run_cell(QUICKSTART, Overflows(), 0, results=tmp_path, runs=tmp_path)
-    assert record["diverged"] == "checkpoints/00000007: not saved: var: not finite"
 
 
 def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_table):
@@ -313,21 +202,6 @@ def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, field
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"num_sweeps": 11}, "num_sweeps: got 11, expected 1 to 10"),
-        ({"sensor": "kitti_hdl64e"}, "sensor: got 'kitti_hdl64e'"),
-        ({"projection__close_m": 2.0}, "projection.close_m: got 2.0, expected 2.1"),
-    ],
-)
-def test_a_simulated_row_that_would_change_nothing_is_refused(tmp_path, fields, message):
-    scale = smoke(tmp_path)
-    scale.check(scale.base)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        scale.check(change(**fields)(scale.base))
-
-
-@pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different ones, none below 0"),
@@ -345,49 +219,6 @@ def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_pa
         run_script(lambda args: run_table(table6_untied_heads.TABLE, args), Args, None)
     assert capsys.readouterr().err == f"table6_untied_heads.py: error: {message}\n"
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path, monkeypatch):
-    splits = tmp_path / "splits.json"
-    splits.write_text('{"mini_train": ["scene-0001"], "mini_val": ["scene-0002"]}')
-    spec = DatasetSpec(2, 1, 3, dataclasses.replace(TINY, name="toy", num_columns=64), False, "v1.0-mini")
-    for root, seed in (("one", 1), ("two", 2)):
-        write_dataset(dataclasses.replace(spec, seed=seed), tmp_path / root, workers=1, report=lambda _: None)
-        prepare.run(prepare.Prepare(DataOptions(tmp_path / root, version="v1.0-mini", splits=splits)))
-    asked, submitted = [], []
-
-    def trained(folder, config, frames, **options):
-        asked.append((folder, config, frames, options))
-        return "the detector"
-
-    def write_submission(detector, frames, file):
-        submitted.append((detector, frames))
-        file.parent.mkdir(parents=True)
-        write_results(file, [(token, b"[]") for token in frames.tokens])
-
-    monkeypatch.setattr(scales, "trained", trained)
-    monkeypatch.setattr(scales, "write_submission", write_submission)
-    options = {"steps": 5, "accumulate": 4, "workers": 2, "precision": "bfloat16"}
-    layout = Layout(tmp_path / "one", "v1.0-mini", splits=splits, **options)
-    scale = NuScenesLayout(layout)
-    assert (scale.base.optimizer.accumulate, scale.base.model.precision) == (4, "bfloat16")
-    config = change(num_sweeps=3)(scale.base)
-    scores = scale.score(config, 3, tmp_path / "run")
-    assert (scores["mAP"], set(scores["AP"].values())) == (0, {0})
-    ((folder, wanted, frames, options),), ((detector, tests),) = asked, submitted
-    assert (folder, wanted, detector) == (tmp_path / "run", config, "the detector")
-    assert (options["steps"], options["seed"], options["workers"]) == (5, 3, 2)
-    assert {frames.scene(i) for i in range(3)} == {"scene-0001"}
-    assert {tests.scene(i) for i in range(3)} == {"scene-0002"}
-    assert (frames.num_sweeps, tests.num_sweeps) == (3, 3)
-    assert len(options["objects"]) > 0, "those that prepare has cut from ten sweeps"
-    # Another data set of the same version is another scale, and has other objects.
-    other = NuScenesLayout(dataclasses.replace(layout, data_root=tmp_path / "two"))
-    assert other.describe()["fingerprints"] != scale.describe()["fingerprints"]
-    with pytest.raises(ValueError, match="cut from other frames"):
-        other.objects(frames)
-    with pytest.raises(ValueError, match="wrong"):
-        NuScenesLayout(dataclasses.replace(layout, val_split="wrong"))
 
 
 def test_every_row_of_the_tables_has_its_paper_figures():

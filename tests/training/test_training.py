@@ -1,14 +1,12 @@
 """The training step: finite, compiled once, exact schedules; a short run learns a simulated frame."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-import tiny_run
 
 from fcos_lidar_jax.coding import encode
 from fcos_lidar_jax.config import OptimizerConfig
@@ -425,56 +423,3 @@ def test_a_learning_rate_beyond_reason_stops_the_run_before_its_numbers_are_kept
     with pytest.raises(NonFiniteLossError, match=r"^step 2: not finite: .*total inf.*; samples: a, b$"):
         fit(step, state, fed(squares[0]), num_steps=STEPS, **options)
     assert paused == [1]
-
-
-@functools.cache
-def forward_and_backward(**model):
-    """Outputs, statistics and gradient of a variant of the tiny network, and the bytes kept for the gradient."""
-    config = dataclasses.replace(tiny_run.CONFIG, model=dataclasses.replace(tiny_run.CONFIG.model, **model))
-    apply, variables = build_detector(config, tiny_run.SENSOR).apply, tiny_run.weights()
-    batch = tiny_run.host_batch()
-    project = jax.vmap(lambda points, valid: project_points(points, valid, tiny_run.SENSOR, num_rounds=1).features)
-    features = jax.jit(project)(batch.points, batch.valid)
-
-    def loss(params):
-        outputs, statistics = apply({**variables, "params": params}, features, train=True)
-        return jnp.square(outputs.logits).mean() + jnp.square(outputs.regression).mean(), (outputs, statistics)
-
-    gradient, (outputs, statistics) = jax.jit(jax.grad(loss, has_aux=True))(variables["params"])
-    kept = jax.eval_shape(lambda params: jax.vjp(loss, params, has_aux=True)[1], variables["params"])
-    found = jax.tree.map(np.asarray, {"outputs": outputs, "statistics": statistics, "gradient": gradient})
-    return found, sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(kept))
-
-
-def test_remat_changes_what_is_kept_for_the_backward_pass_and_nothing_else():
-    """Outputs and statistics are equal to the bit, gradients up to rounding; half as much is kept."""
-    (plain, kept), (remat, kept_less) = forward_and_backward(), forward_and_backward(remat=True)
-    for name in ("outputs", "statistics"):
-        jax.tree.map(np.testing.assert_array_equal, plain[name], remat[name])
-    assert jax.tree.structure(plain["gradient"]) == jax.tree.structure(remat["gradient"])
-    for a, b in zip(jax.tree.leaves(plain["gradient"]), jax.tree.leaves(remat["gradient"]), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(a).max())
-    assert kept_less < 0.6 * kept
-
-
-def test_bfloat16_stays_inside_the_network_and_close_to_float32():
-    """What goes in and comes out is float32, forwards and backwards. A number of eight bits is wrong by 0.2 % in
-    the mean, ten layers of them by less than ten times that. The gradients of random weights are off by more, most
-    in the first layers: those of the whole and of every part point the same way, and are as long."""
-    (exact, _), (rough, _) = forward_and_backward(), forward_and_backward(precision="bfloat16")
-    assert {leaf.dtype.name for leaf in jax.tree.leaves(rough)} == {"float32"}
-
-    def flat(tree):
-        return np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(tree)])
-
-    for name in ("outputs", "statistics"):
-        a, b = flat(exact[name]), flat(rough[name])
-        error = np.linalg.norm(a - b) / np.linalg.norm(a)
-        assert 1e-5 < error < 0.02, (name, error)
-    a, b = flat(exact["gradient"]), flat(rough["gradient"])
-    assert a @ b > 0.9 * np.linalg.norm(a) * np.linalg.norm(b)
-    least = {"stem": 0.8, "backbone": 0.97, "fpn": 0.98, "heads": 0.999}
-    for part, cosine in least.items():
-        a, b = flat(exact["gradient"][part]), flat(rough["gradient"][part])
-        assert a @ b > cosine * np.linalg.norm(a) * np.linalg.norm(b), part
-        assert 0.9 < np.linalg.norm(b) / np.linalg.norm(a) < 1.1, part

@@ -1,0 +1,70 @@
+"""Folders of annotated keyframes: points, boxes and counts as they are there, and every mistake in one line."""
+
+import json
+
+import numpy as np
+import pytest
+from refusal import refused
+
+from fcos_lidar_jax.data.box_geometry import count_inside
+from fcos_lidar_jax.data.keyframe import read_keyframe
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+from fcos_lidar_jax.simulation.frames import make_frame
+
+
+def test_keyframe_folder_gives_points_boxes_and_unknown_velocities(tmp_path):
+    points = make_frame(0, NUSCENES_HDL32E).points[:2000]
+    points[:, 4] = np.arange(len(points)) % 32  # nuScenes' files hold the laser there
+    points.tofile(tmp_path / "a.pcd.bin")
+    box = dict(zip("xyzlwh", range(1, 7), strict=True)) | {"yaw": 0.5, "vx": None, "vy": None, "num_lidar_pts": 9}
+    counted = {("num_lidar_pts_at_key_frame" if k == "num_lidar_pts" else k): v for k, v in box.items()}
+
+    def read(content, number=0):
+        (tmp_path / "boxes.json").write_text(content if isinstance(content, str) else json.dumps(content))
+        return read_keyframe(tmp_path, NUSCENES_HDL32E, number)
+
+    def record(*boxes):
+        return {"lidar_file": "a.pcd.bin", "boxes": boxes}
+
+    truck = record({**box, "class": "truck"}, {**box, "class": None})
+    frame = read(truck)
+    np.testing.assert_array_equal(frame.boxes, np.array([[1, 2, 3, 4, 5, 6, 0.5, np.nan, np.nan]], np.float32))
+    assert (frame.labels.tolist(), frame.num_points.tolist(), len(frame.points)) == ([1], [9], len(points))
+    several = [truck, record({**counted, "class": "bus"})]
+    assert [read(several, i).labels.tolist() for i in (0, 1)] == [[1], [2]]
+    with refused("list index out of range"):
+        read(several, 2)
+    for text, message in [("{", "not JSON"), ('{"boxes": []}', "'lidar_file'"), ('{"boxes": 3}', "missing or of")]:
+        with refused(message):
+            read(text)
+    for name, value, message in [
+        ("x", 1e30, "x: got 1e+30, expected at most 10000"),
+        ("h", -2, "h: got -2, expected a size above 0 m"),
+        ("yaw", float("nan"), "yaw: got nan, expected a finite number"),
+        ("vx", float("inf"), "vx: got inf, expected a finite number"),
+        ("vx", 3, "vy: got nan, expected a finite number"),
+        ("z", None, "z: got nan, expected a finite number"),
+    ]:
+        with refused(f"box 1 of the ten classes: {message}"):
+            read(record({**box, "class": "truck"}, {**box, "class": "car", name: value}))
+
+
+@pytest.mark.real_data
+def test_real_keyframe_has_its_boxes(real_data):
+    frame = read_keyframe(real_data / "nuscenes_scene0061", NUSCENES_HDL32E)
+    assert frame.boxes.shape == (68, 9)
+    assert np.isnan(frame.boxes[:, 7]).sum() == 2
+    assert (frame.num_points == 0).sum() == 3
+
+
+@pytest.mark.real_data
+def test_a_list_of_real_keyframes_has_their_boxes_and_points(real_data):
+    """Counts with the yaw alone are near those of the full rotation, which are exact."""
+    counts = []
+    for number, total in ((0, 23), (1, 55)):
+        frame = read_keyframe(real_data / "nuscenes_scene0103", NUSCENES_HDL32E, number)
+        assert len(frame.boxes) <= total
+        counts.append(np.stack([frame.num_points, count_inside(frame.points, frame.boxes)]))
+    annotated, inside = np.concatenate(counts, axis=1)
+    assert len(annotated) > 60
+    assert (annotated == inside).mean() > 0.7

@@ -1,0 +1,103 @@
+"""Lists of sweeps with their poses: fused in the frame of the newest, and every mistake in one line."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from refusal import refused
+from scipy.spatial.transform import Rotation
+
+from fcos_lidar_jax.data.sweeps import read_sweeps
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
+
+EYE = np.eye(4).tolist()
+
+
+def entry(file="a.npy", timestamp_us=1, sensor_to_world=EYE):
+    return {"file": file, "timestamp_us": timestamp_us, "sensor_to_world": sensor_to_world}
+
+
+def fuse(folder, entries, sensor=TINY, remove_close="all"):
+    path = folder / "sweeps.json"
+    path.write_text(entries if isinstance(entries, str) else json.dumps(entries))
+    return read_sweeps(path, sensor, remove_close=remove_close, close_m=1.0)
+
+
+def test_sweeps_see_a_fixed_world(tmp_path):
+    """Points fixed in the world land on the same place from every pose; lags are exact microseconds."""
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", rng.uniform(-3, 3, (4, 1))).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-1000, 1000, (4, 3))
+    world = poses[0, :3, 3] + rng.uniform(-20, 20, (50, 3))
+    local = [(world - pose[:3, 3]) @ pose[:3, :3] for pose in poses]
+    for i, points in enumerate(local):
+        np.save(tmp_path / f"{i}.npy", points)
+    entries = [entry(f"{i}.npy", 1_532_402_927_647_951 - 49_999 * i, p.tolist()) for i, p in enumerate(poses)]
+    fused, num_close = fuse(tmp_path, entries, NUSCENES_HDL32E, "none")
+    assert num_close == 0
+    for i in range(4):
+        part = fused[50 * i : 50 * (i + 1)]
+        np.testing.assert_allclose(part[:, :3], local[0], atol=2e-4)
+        np.testing.assert_array_equal(part[:, 4], np.float32(0.049999 * i))
+
+
+def test_raw_sweeps_of_another_layout_are_read_as_it_is_said(tmp_path):
+    rows = np.random.default_rng(0).uniform(3, 9, (40, 6))
+    rows.tofile(tmp_path / "a.bin")
+    (tmp_path / "sweeps.json").write_text(json.dumps([entry("a.bin")]))
+    options = {"remove_close": "all", "close_m": 1.0, "columns": 6, "dtype": "float64"}
+    fused, _ = read_sweeps(tmp_path / "sweeps.json", TINY, **options)
+    np.testing.assert_array_equal(fused[:, :4], rows[:, :4].astype(np.float32))
+
+
+@pytest.mark.parametrize(("mode", "counts"), [("all", [1, 1]), ("sweeps", [2, 1]), ("none", [2, 2])])
+def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
+    np.save(tmp_path / "a.npy", np.array([[0.5, 0, 0], [10, 0, 0]]))
+    entries = [entry(timestamp_us=100, sensor_to_world=[[1, 0, 0, 10], *EYE[1:]]), entry(timestamp_us=50)]
+    fused, num_close = fuse(tmp_path, entries, remove_close=mode)
+    assert [int((fused[:, 4] == 0).sum()), int((fused[:, 4] > 0).sum())] == counts
+    assert num_close == 4 - sum(counts)
+    if mode == "all":  # the old sweep's far point now lies at the sensor and stays
+        assert [0, 0, 0] in fused[:, :3].tolist()
+
+
+def test_close_points_lie_around_the_sensors_origin(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[0.3, 0, 0], [2.3, 0.5, 0], [1.4, 0, 0]]))
+    fused, num_close = fuse(tmp_path, [entry()], dataclasses.replace(TINY, origin_m=(1.4, 0.0, 1.6)))
+    np.testing.assert_array_equal(fused[:, :3], np.array([[0.3, 0, 0]], np.float32))
+    assert num_close == 2
+
+
+BAD_SWEEPS = {
+    "not json": ("{", "not JSON"),
+    "not a list": ({"a": 1}, "$: got {'a': 1}, expected array"),
+    "empty": ([], "$: got [], expected array of length >= 1"),
+    "not an object": ([3], "$[0]: got 3, expected object"),
+    "no pose": ([{"file": "a.npy", "timestamp_us": 1}], "$[0]: Object missing required field `sensor_to_w"),
+    "time": ([entry(timestamp_us=1.5)], "$[0].timestamp_us: got 1.5, expected int"),
+    "true time": ([entry(timestamp_us=True)], "$[0].timestamp_us: got True, expected int"),
+    "file": ([entry(3)], "$[0].file: got 3, expected str"),
+    "far time": ([entry(timestamp_us=10**400)], f"$[0].timestamp_us: got 1{56 * '0'}..., expected int <= 9223"),
+    "far place": ([entry(sensor_to_world=[[10**400, 0, 0, 0], *EYE[1:]])], ".sensor_to_world[0][0]: Number out"),
+    "too far": (
+        [entry(sensor_to_world=[[1, 0, 0, -2e8], *EYE[1:]])],
+        "$[0].sensor_to_world[0][3]: got -200000000.0, expected float >= -100000000.0",
+    ),
+    "NaN": ([entry(sensor_to_world=[[np.nan, 0, 0, 0], *EYE[1:]])], "[0].sensor_to_world[0][0]: got nan, exp"),
+    "shape": ([entry(sensor_to_world=EYE[:3])], f"_world: got {str(EYE)[:57]}..., expected array of length 4"),
+    "text": ([entry(sensor_to_world=[["a"] * 4] * 4)], "$[0].sensor_to_world[0][0]: got 'a', expected float"),
+    "last row": ([entry(sensor_to_world=[*EYE[:3], [1, 1, 1, 1]])], "$[0].sensor_to_world: last row: got (1.0, 1"),
+    "scaled": ([entry(sensor_to_world=np.diag([2, 2, 2, 1.0]).tolist())], "not a rotation"),
+    "mirrored": ([entry(sensor_to_world=np.diag([-1, 1, 1, 1.0]).tolist())], "not a rotation"),
+    "future": ([entry(), entry(timestamp_us=2)], "$[1].timestamp_us: got 2, expected less than the current"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_SWEEPS)
+def test_bad_sweep_lists_get_one_line(tmp_path, name):
+    content, message = BAD_SWEEPS[name]
+    np.save(tmp_path / "a.npy", np.ones((3, 3)))
+    with refused(message, tmp_path / "sweeps.json"):
+        fuse(tmp_path, content)

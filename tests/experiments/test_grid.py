@@ -1,0 +1,70 @@
+"""Cells: trained once, by one process, and told of whatever becomes of them."""
+
+import contextlib
+import dataclasses
+import json
+
+import pytest
+from pretended import Pretended
+
+from experiments.changes import change
+from experiments.paper_tables import grid
+from experiments.paper_tables.cell_names import cell_name
+from experiments.paper_tables.grid import run_cell, run_cells
+from fcos_lidar_jax.files import file_lock
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.training.checkpoint import NonFiniteStateError
+
+
+def test_a_finished_cell_is_never_run_again(tmp_path):
+    scale, folders = Pretended(), {"results": tmp_path, "runs": tmp_path}
+    three = change(projection__num_rounds=3)(QUICKSTART)
+    first = run_cell(three, scale, 1, **folders)
+    assert run_cell(dataclasses.replace(three, name="other"), scale, 1, **folders) == first
+    assert scale.asked == 1
+    run_cell(three, scale, 2, **folders)
+    assert scale.asked == 2
+    record = json.loads((tmp_path / f"{first['name']}.json").read_text())
+    assert record["config"]["projection"]["num_rounds"] == 3
+    assert {"jax", "git", "device", "seed"} <= set(record)
+
+
+def test_a_cell_names_the_revisions_of_all_who_trained_it(tmp_path, monkeypatch):
+    class Interrupted(Pretended):
+        def score(self, config, seed, folder):
+            if self.asked < 3:
+                self.asked += 1
+                raise KeyboardInterrupt
+            return super().score(config, seed, folder)
+
+    scale, folders = Interrupted(), {"results": tmp_path / "cells", "runs": tmp_path}
+    for revision in ("a1", "a1", "b2"):
+        monkeypatch.setattr(grid, "hardware", lambda revision=revision: {"git": revision})
+        with pytest.raises(KeyboardInterrupt):
+            run_cell(QUICKSTART, scale, 0, **folders)
+    record = run_cell(QUICKSTART, scale, 0, **folders)
+    assert record["git"] == "a1, then b2"
+    assert record == run_cell(QUICKSTART, scale, 0, **folders)
+    assert record["name"] == cell_name(QUICKSTART, scale.describe(), 0)
+
+
+def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch):
+    held, free = (change(projection__num_rounds=n)(QUICKSTART) for n in (3, 5))
+    scale, folders = Pretended(), {"results": tmp_path / "cells", "runs": tmp_path}
+    with contextlib.ExitStack() as other:
+        assert other.enter_context(file_lock(tmp_path / f"{cell_name(held, scale.describe(), 0)}.lock"))
+        assert run_cell(held, scale, 0, **folders) is None
+        # The other ends while this one waits: its cell is free again.
+        monkeypatch.setattr(grid.time, "sleep", lambda _: other.close())
+        records = run_cells([(held, 0), (free, 0)], scale, **folders)
+    assert [record["scores"]["mAP"] for record in records] == pytest.approx([0.3, 0.5])
+    assert scale.asked == 2
+
+
+def test_a_state_that_is_not_finite_is_a_result_too(tmp_path):
+    class Overflows(Pretended):
+        def score(self, config, seed, folder):
+            raise NonFiniteStateError("checkpoints/00000007: not saved: var: not finite")
+
+    record = run_cell(QUICKSTART, Overflows(), 0, results=tmp_path, runs=tmp_path)
+    assert record["diverged"] == "checkpoints/00000007: not saved: var: not finite"

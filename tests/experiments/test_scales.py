@@ -1,0 +1,103 @@
+"""What the cells of each scale are trained and evaluated on."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from experiments.changes import change
+from experiments.paper_tables import __main__ as all_tables
+from experiments.paper_tables import scales
+from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, smoke
+from fcos_lidar_jax.cli import prepare
+from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.evaluation.results import write_results
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
+from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
+from fcos_lidar_jax.simulation.render import DatasetSpec
+
+
+def test_one_sweep_and_ten_see_the_same_streets(tmp_path):
+    scale = smoke(tmp_path)
+    one, three, ten = (scale.frames("test", n).frame(0) for n in (1, 3, 10))
+    for frame in (one, three):
+        np.testing.assert_array_equal(frame.boxes, ten.boxes)
+        np.testing.assert_array_equal(frame.labels, ten.labels)
+    np.testing.assert_array_equal(one.points, ten.points[ten.points[:, 4] == 0])
+    assert np.unique(three.points[:, 4]).tolist() == np.unique(ten.points[:, 4]).tolist()[:3]
+    assert len(one.points) < len(three.points) < len(ten.points)
+
+
+def test_the_sector_is_a_quarter_of_the_sensor_at_its_resolution(tmp_path):
+    scale = quarter(tmp_path)
+    assert scale.sensor.column_rad == pytest.approx(NUSCENES_HDL32E.column_rad)
+    assert (scale.sensor.num_rows, scale.sensor.num_columns) == (32, 272)
+    assert scale.describe()["streets"]["name"] == "city"
+    for table in all_tables.TABLES[:6]:
+        for row in table.rows:
+            scale.check(row.change(scale.base))
+    frame = scale.frames("test", 10).frame(0)
+    azimuth = np.arctan2(frame.points[:, 1], frame.points[:, 0])
+    current = frame.points[:, 4] == 0
+    right, left = scale.sensor.azimuth_limits_rad
+    assert ((azimuth > right - 0.1) & (azimuth < left + 0.1))[current].mean() > 0.97
+    assert len(np.unique(frame.points[:, 4])) == 10
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"num_sweeps": 11}, "num_sweeps: got 11, expected 1 to 10"),
+        ({"sensor": "kitti_hdl64e"}, "sensor: got 'kitti_hdl64e'"),
+        ({"projection__close_m": 2.0}, "projection.close_m: got 2.0, expected 2.1"),
+    ],
+)
+def test_a_simulated_row_that_would_change_nothing_is_refused(tmp_path, fields, message):
+    scale = smoke(tmp_path)
+    scale.check(scale.base)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        scale.check(change(**fields)(scale.base))
+
+
+def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path, monkeypatch):
+    splits = tmp_path / "splits.json"
+    splits.write_text('{"mini_train": ["scene-0001"], "mini_val": ["scene-0002"]}')
+    spec = DatasetSpec(2, 1, 3, dataclasses.replace(TINY, name="toy", num_columns=64), False, "v1.0-mini")
+    for root, seed in (("one", 1), ("two", 2)):
+        write_dataset(dataclasses.replace(spec, seed=seed), tmp_path / root, workers=1, report=lambda _: None)
+        prepare.run(prepare.Prepare(DataOptions(tmp_path / root, version="v1.0-mini", splits=splits)))
+    asked, submitted = [], []
+
+    def trained(folder, config, frames, **options):
+        asked.append((folder, config, frames, options))
+        return "the detector"
+
+    def write_submission(detector, frames, file):
+        submitted.append((detector, frames))
+        file.parent.mkdir(parents=True)
+        write_results(file, [(token, b"[]") for token in frames.tokens])
+
+    monkeypatch.setattr(scales, "trained", trained)
+    monkeypatch.setattr(scales, "write_submission", write_submission)
+    options = {"steps": 5, "accumulate": 4, "workers": 2, "precision": "bfloat16"}
+    layout = Layout(tmp_path / "one", "v1.0-mini", splits=splits, **options)
+    scale = NuScenesLayout(layout)
+    assert (scale.base.optimizer.accumulate, scale.base.model.precision) == (4, "bfloat16")
+    config = change(num_sweeps=3)(scale.base)
+    scores = scale.score(config, 3, tmp_path / "run")
+    assert (scores["mAP"], set(scores["AP"].values())) == (0, {0})
+    ((folder, wanted, frames, options),), ((detector, tests),) = asked, submitted
+    assert (folder, wanted, detector) == (tmp_path / "run", config, "the detector")
+    assert (options["steps"], options["seed"], options["workers"]) == (5, 3, 2)
+    assert {frames.scene(i) for i in range(3)} == {"scene-0001"}
+    assert {tests.scene(i) for i in range(3)} == {"scene-0002"}
+    assert (frames.num_sweeps, tests.num_sweeps) == (3, 3)
+    assert len(options["objects"]) > 0, "those that prepare has cut from ten sweeps"
+    # Another data set of the same version is another scale, and has other objects.
+    other = NuScenesLayout(dataclasses.replace(layout, data_root=tmp_path / "two"))
+    assert other.describe()["fingerprints"] != scale.describe()["fingerprints"]
+    with pytest.raises(ValueError, match="cut from other frames"):
+        other.objects(frames)
+    with pytest.raises(ValueError, match="wrong"):
+        NuScenesLayout(dataclasses.replace(layout, val_split="wrong"))
