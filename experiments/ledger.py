@@ -173,7 +173,7 @@ def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str =
     """Points of a score that a row gains over its reference, by seed, where its cells are there; samples seen."""
     config, reference = (r.change(scale.base) for r in (row, table.reference_of(row)))
     described, gains = scale.describe(), list[float]()
-    for seed in range(_MOST_SEEDS):
+    for seed in sorted({read_json(file, dict[str, Any])["seed"] for file in cells.glob("*.json")}):
         one, other = (_scores(cells / f"{cell_name(c, described, seed)}.json") for c in (config, reference))
         if one and other:
             gains.append(100 * (one[score] - other[score]))
@@ -218,11 +218,11 @@ def training_lines(results: Path, score: str) -> Iterator[str]:
             yield f"| {claim} | {paper:+.2f} | {ours} | {what} | {said} | {decides} |"
 
 
-def not_trained(results: Path, score: str) -> list[str]:
-    """The claims about a score without a seed whose cells have scores, in words."""
+def not_trained(results: Path) -> list[str]:
+    """The claims without a seed whose cells have scores, in words."""
     scale = quarter(Path("unused"))
     cells = results / "tables" / scale.name / "cells"
-    return [claim for claim, table, row, _ in claims(score) if not gains_of(table, row, scale, cells)[0]]
+    return [claim for claim, table, row, _ in claims("mAP") if not gains_of(table, row, scale, cells)[0]]
 
 
 def as_markdown(results: Path) -> str:
@@ -233,7 +233,7 @@ def as_markdown(results: Path) -> str:
     parts = [f"Without training:\n\n{head}" + "\n".join(figure_lines(results))]
     for score, note in (("mAP", ""), ("NDS", _OUR_NDS)):
         parts.append(f"Gains in points of {score}.{note}\n\n{head}" + "\n".join(training_lines(results, score)))
-    if missing := not_trained(results, "mAP"):
+    if missing := not_trained(results):
         parts.append("Not run, or diverged:\n\n" + "\n".join(f"- {claim}" for claim in missing))
     return "\n\n".join(parts) + "\n"
 

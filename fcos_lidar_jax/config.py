@@ -214,6 +214,8 @@ class LossConfig:
                 _check(math.isfinite(value) and value >= 0, name, value, "a finite number of at least 0")
         width = self.centreness_m
         _check(math.isfinite(width) and width > 0, "centreness_m", width, "a positive number of metres")
+        used = self.quality == "centreness" or width == LossConfig.centreness_m
+        _check(used, "centreness_m", width, f"{LossConfig.centreness_m} unless quality is centreness")
         _check_choices(self)
 
 

@@ -101,6 +101,8 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     """Begin the run, or go on with it, to the end."""
     os.nice(_NICE)
     config = CONFIGS[args.name]
+    # What an export would refuse is refused before hours of training.
+    earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
     frames, unseen = streets(config, steps=args.steps, seed=args.seed)
     schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
     tests = ChosenFrames(unseen, tuple(range(_TESTS_ALONG)))

@@ -22,6 +22,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.changes import change
 from experiments.real_frames import interval_of, real_frames, scores_by_range
 from experiments.runs import detections, trained
@@ -84,8 +86,7 @@ def parts(args: Args, detector: TrainedDetector) -> Iterator[tuple[str, FrameSet
 def drives_of(frames: NuScenesFrames) -> list[int]:
     """The drive of each keyframe, counted from 0."""
     scenes = [frames.nuscenes.scene_of(token) for token in frames.tokens]
-    numbers = {scene: number for number, scene in enumerate(dict.fromkeys(scenes))}
-    return [numbers[scene] for scene in scenes]
+    return np.unique(scenes, return_inverse=True)[1].tolist()
 
 
 def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:

@@ -102,7 +102,8 @@ def run(args: Train) -> None:
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
-    if layout.format == "folder" and config.sensor not in (PRESETS[config.name].sensor, frames.sensor.name):
+    presets = [preset for preset in PRESETS.values() if preset.name == config.name] or PRESETS.values()
+    if layout.format == "folder" and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
         raise ValueError(
             f"--sensor: got {config.sensor!r}, expected none: {layout.root}/sensor.json has {frames.sensor.name!r}"
         )

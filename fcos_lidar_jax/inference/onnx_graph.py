@@ -246,7 +246,8 @@ def _geometry(network: _Network, image: str, rounds: int, scale: Sequence[float]
     """As :func:`fcos_lidar_jax.models.meta_kernel.geometry_of`: points and where they exist."""
     points = network("Gather", image, [0, rounds, 2 * rounds], axis=1)
     metres = network("Mul", points, np.array(scale[:3])[:, None, None])
-    return metres, network("Gather", image, [7 * rounds], axis=1)
+    filled = network("Greater", network("Gather", image, [7 * rounds], axis=1), 0.0)
+    return metres, network("Where", filled, 1.0, 0.0)
 
 
 def _meta_kernel(network: _Network, x: str, geometry: tuple[str, str], path: str) -> str:

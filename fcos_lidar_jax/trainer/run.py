@@ -40,12 +40,11 @@ from fcos_lidar_jax.training.checkpoint import (
     NonFiniteStateError,
     check_arrays,
     load_checkpoint,
-    read_description,
     with_later_fields,
 )
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, find_checkpoint
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
-from fcos_lidar_jax.training.metrics_log import MetricsLog
+from fcos_lidar_jax.training.metrics_log import MetricsLog, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.preemption import stop_requests
 from fcos_lidar_jax.training.sharding import check_batch_size, jit_step, make_mesh, replicate, shard_batch
@@ -92,10 +91,9 @@ class _Run:
     devices: Sequence[Any] | None
     spec: dict[str, Any]
 
-    def scored(self, step: int) -> bool:
-        """Whether the checkpoint of a step has a score."""
-        found = [path for path in self.checkpoints.paths() if int(path.name) == step]
-        return bool(found) and read_description(found[0]).get("score") is not None
+    def owes_evaluation(self, step: int) -> bool:
+        """Whether a run was stopped during the evaluation after a step, whose record is written last."""
+        return step > 0 and self.evaluates_at(step) and step not in evaluated_steps(self.folder)
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -149,7 +147,8 @@ def train(
 
     Raises:
         ValueError: the folder holds another run, no class is shared, devices and batch do not fit, steps or seed
-            are out of range, or the augmentation leaves the sector that the sensor covers.
+            are out of range, or the augmentation does not suit the sector that the sensor covers, see
+            :func:`fcos_lidar_jax.augment.check_augmentation`.
         OSError: another process trains in the folder, or it cannot be written.
         NonFiniteLossError, NonFiniteStateError: the last checkpoint is from before.
         KeyboardInterrupt: after Ctrl-C, when all is saved.
@@ -203,7 +202,7 @@ def train(
     with _claimed(run, resume=resume):
         start = _start(run, optimizer, seed, resume, given)
         first = int(start.step)
-        owed = resume and run.evaluates_at(first) and not run.scored(first)  # stopped during the evaluation
+        owed = run.owes_evaluation(first)
         if first == steps and not owed:
             print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
             return start
@@ -228,15 +227,12 @@ def train(
             for hook in hooks:
                 hook(number, record)
 
-        def save(state: TrainState, score: float | None) -> None:
+        def pause(number: int, state: TrainState) -> None:
             if metrics is not None:
                 metrics.flush()
-                _save(run, state, score)
-
-        def pause(number: int, state: TrainState) -> None:
-            save(state, None)  # What is done is safe before an evaluation, which may take long.
+                _save(run, state, None)  # What is done is safe before an evaluation, which may take long.
             if run.evaluates_at(number):
-                save(state, _evaluate(run, number, state, metrics))
+                _evaluate(run, number, state, metrics)
 
         processes = {"process_index": jax.process_index(), "num_processes": jax.process_count()}
         helpers = {"threads": threads, "workers": workers, **processes}
@@ -251,12 +247,12 @@ def train(
                 return request.signal is not None
 
             try:
+                state = replicate(start, mesh)
                 if owed:
-                    state = replicate(start, mesh)
-                    save(state, _evaluate(run, first, state, metrics))
+                    _evaluate(run, first, state, metrics)
                 state = fit(
                     step,
-                    replicate(start, mesh),
+                    state,
                     (dataclasses.replace(b, batch=shard_batch(b.batch, mesh)) for b in stream),
                     num_steps=steps,
                     report=report,
@@ -400,8 +396,8 @@ def _start(
     return make_state(run.detector, optimizer, key, variables=_given_weights(run.detector, weights))
 
 
-def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | None) -> float | None:
-    """Score on the test frames, which all processes share; None where it is not a number."""
+def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | None) -> None:
+    """Score on the test frames, which all processes share; the main process draws, saves and records."""
     assert run.tests is not None
     trained = TrainedDetector(run.detector, _local_variables(state))
     summary = evaluate(trained, run.tests, devices=run.devices).summary
@@ -409,11 +405,11 @@ def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | N
     first = range(min(_NUM_PICTURES, len(run.tests)))
     shown = list(predict(trained, run.tests, indices=first, devices=run.devices))
     if metrics is not None:
-        values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
-        metrics.write(number, {"test/mAP": score, **values})
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
         draw_predictions(run.folder / "pictures", shown, run.tests, number)
-    return None if math.isnan(score) else score
+        _save(run, state, None if math.isnan(score) else score)
+        values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
+        metrics.write(number, {"test/mAP": score, **values})  # Last: what is recorded is not done again.
 
 
 def _save(run: _Run, state: TrainState, score: float | None) -> None:

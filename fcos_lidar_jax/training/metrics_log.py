@@ -79,3 +79,9 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
             if isinstance(line, dict) and isinstance(line.get("step"), int):
                 lines.append(line)
     return lines
+
+
+def evaluated_steps(folder: Path) -> set[int]:
+    """The steps after which a run was evaluated; none where nothing is recorded yet."""
+    lines = read_metrics(folder) if (folder / _FILE).exists() else []
+    return {line["step"] for line in lines if "test/mAP" in line}

@@ -6,7 +6,8 @@ import shlex
 from pathlib import Path
 
 import numpy as np
-from commands import command
+from commands import assert_one_line_error, command
+from made_folder import CLASSES, make_folder
 from tiny_run import NETWORK_OPTIONS
 
 from fcos_lidar_jax.data.folder import FolderFrames
@@ -52,3 +53,17 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     [found] = json.loads(Path("boxes.json").read_text())["files"]
     relabelled = FolderFrames("my_lidar").frame(35)
     np.testing.assert_allclose(relabelled.boxes, np.array([box["box"] for box in found["boxes"]]).reshape(-1, 9))
+
+
+def test_own_data_have_their_sensor_whatever_the_configuration_is_called(tmp_path, capsys):
+    args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
+    args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--fade-epochs", "4", "--steps", "4"]
+    args += ["--copy-paste.targets", "2", "2", "2"]
+    ignored = r"--sensor: got '\w+', expected none: .*/sensor.json has 'tiny'"
+    for name, sensor, message in (
+        ([], [], "fade_epochs: got 4"),  # refused after the sensor
+        ([], ["--sensor", "kitti_hdl64e"], ignored),
+        (["--name", "mine"], [], "fade_epochs: got 4"),
+        (["--name", "mine"], ["--sensor", "waymo_top"], ignored),
+    ):
+        assert_one_line_error(capsys, [*args, *name, *sensor], message)

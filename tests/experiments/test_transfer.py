@@ -150,10 +150,12 @@ def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     (tmp_path / "run/run.json").write_text(json.dumps({"seed": 5, "weights": "hdl32e", "steps": 9}))
     for again in (
         lambda: shipped_weights.main(dataclasses.replace(args, work=tmp_path / "run", export=True)),
+        lambda: shipped_weights.main(dataclasses.replace(args, work=tmp_path / "new", warm_start=Path("hdl32e"))),
         lambda: model_card.write_card("hdl32e", results),
     ):
         with pytest.raises(ValueError, match=r"hdl32e\.json: training: missing"):
             again()
+    assert not (tmp_path / "new").exists()
     assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
 
 

@@ -46,7 +46,10 @@ CASES = {
         with_model(CONFIG, circular_width=True, row_upscale=3, remat=True),
         ODD,
     ),
-    "Meta-Kernel, two rounds, padded columns": (with_model(with_stem(), meta_kernel=True), ODD),
+    "Meta-Kernel, two rounds, padded columns": (
+        with_model(with_stem(), meta_kernel=True, channel_scale=(12.0, 11.5, 0.9, 8.0, 0.3, 0.2, 20.0, 2.0, 0.16)),
+        ODD,
+    ),
     "Meta-Kernel, circular, doubled rows": (
         with_model(CONFIG, meta_kernel=True, circular_width=True, row_upscale=2),
         SENSOR,

@@ -207,6 +207,12 @@ def test_killed_in_a_save_and_resumed_it_ends_in_the_same_bits(finished, tmp_pat
 
 def test_killed_before_its_first_checkpoint_it_begins_with_the_given_weights(finished, begun):
     assert bits(train_tiny(begun, evaluate=2, tests=TESTS, resume=True, weights=weights())) == bits(finished[1])
+    whole, resumed = (
+        [(line["step"], "test/mAP" in line) for line in read_metrics(f)] for f in (finished[0], begun)
+    )
+    assert resumed == whole  # the given weights are not evaluated
+    whole, resumed = (sorted(p.name for p in (f / "checkpoints").iterdir()) for f in (finished[0], begun))
+    assert resumed == whole
 
 
 FULL = """
@@ -240,6 +246,9 @@ def test_without_a_mean_ap_a_checkpoint_is_saved_without_a_score(tmp_path, capsy
     train_tiny(tmp_path, steps=1, evaluate=1, tests=tests, weights=weights())
     assert "step 1: mAP by centre distance nan" in capsys.readouterr().err
     assert load_checkpoint(tmp_path / "checkpoints" / "00000001").score is None
+    records = read_metrics(tmp_path)
+    train_tiny(tmp_path, steps=1, evaluate=1, tests=tests, resume=True, weights=weights())
+    assert len(read_metrics(tmp_path)) == len(records)  # it is not evaluated once more
 
 
 @pytest.fixture
@@ -361,6 +370,16 @@ def test_what_was_done_before_an_evaluation_survives_it(finished, tmp_path, monk
     assert description["score"] == load_checkpoint(last).score is not None
     train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
     assert evaluated == list(range(2, STEPS + 1, 2))  # a finished run owes nothing
+
+
+def test_killed_before_an_evaluation_is_recorded_it_is_recorded_once(finished, tmp_path):
+    folder = shutil.copytree(finished[0], tmp_path / "run")
+    whole = read_metrics(folder)
+    *kept, last = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    assert "test/mAP" in last
+    (folder / "metrics.jsonl").write_text("".join(kept))
+    train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+    assert read_metrics(folder) == whole
 
 
 @pytest.mark.parametrize(
