@@ -5,6 +5,7 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from fcos_lidar_jax.models.convolution import Image, pointwise
@@ -55,8 +56,9 @@ class MetaKernel(nn.Module):
         weigh = self.param("weigh", _he_normal, (channels, channels))
         weigh_bias = self.param("weigh_bias", nn.initializers.ones, (channels,))
         kernel = self.param("kernel", kernel_init, (3, 3, channels, self.features))
-        # W p_j - W p_i: the first layer is computed once a pixel, not once a neighbour.
-        placed = pointwise(geometry.points, hidden)
+        # W p_j - W p_i: the first layer is computed once a pixel, not once a neighbour. In all of float32, because
+        # the product of places is far larger than the differences: TF32 would be centimetres off at 50 m.
+        placed = jnp.einsum("bhwc,co->bhwo", geometry.points, hidden, precision=lax.Precision.HIGHEST)
         around = [self._padded(image) for image in (x * geometry.exists.astype(x.dtype), placed)]
         total = jnp.zeros((), x.dtype)
         for row in range(3):

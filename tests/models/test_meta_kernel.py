@@ -109,6 +109,16 @@ def test_in_bfloat16_it_differs_by_rounding():
     np.testing.assert_allclose(found.astype(jnp.float32), expected, rtol=0, atol=0.02 * expected.max())
 
 
+def test_places_are_multiplied_in_all_of_float32():
+    """On GPUs and TPUs the default has fewer bits, too few for differences of places."""
+    module, (x, geometry) = MetaKernel(4), given()
+    variables = variables_of(module, x, geometry)
+    lowered = jax.jit(lambda x, g: module.apply(variables, x, g, train=False)).lower(x, geometry).as_text()
+    products = [line for line in lowered.splitlines() if "dot_general" in line]
+    assert sum("HIGHEST" in line for line in products) == 1
+    assert all("x3xf32>, tensor<3x3xf32>" in line for line in products if "HIGHEST" in line)
+
+
 def test_with_remat_the_network_gives_the_same_loss_and_gradients():
     model = dataclasses.replace(CONFIG.model, meta_kernel=True)
     image = np.zeros((1, SENSOR.num_rows, SENSOR.num_columns, 9, CONFIG.projection.num_rounds), np.float32)
