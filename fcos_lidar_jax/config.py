@@ -368,6 +368,10 @@ class Config:
         names = self.classes
         _check(len(names) >= 1 and all(names), "classes", names, "one or more names")
         _check(len(set(names)) == len(names), "classes", names, "different names")
+        stem, rounds = self.model.stem, self.projection.num_rounds
+        enough = stem.group_rounds or stem.channels_per_type >= rounds
+        expected = f"at least the {rounds} rounds, which are convolved apart"
+        _check(enough, "model.stem.channels_per_type", stem.channels_per_type, expected)
         targets = self.copy_paste.targets if self.copy_paste else ()
         for field, values in (("class_ranges_m", self.class_ranges_m), ("copy_paste.targets", targets)):
             _check(len(values) in (0, len(names)), field, values, f"{len(names)} values, one a class, or none")

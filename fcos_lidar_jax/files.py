@@ -158,6 +158,47 @@ def file_lock(path: str | Path, *, wait: bool = False) -> Iterator[bool]:
             yield True
 
 
+@contextlib.contextmanager
+def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
+    """Take the place of a file, line by line: within the context, a function that appends a line without its end.
+
+    Whatever fails, an interruption or a full disk, whole lines alone are in the file.
+
+    Raises:
+        OSError: naming the file: another process writes there, or a line cannot be written.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "a.jsonl"
+    >>> with line_writer(file) as write_line:
+    ...     write_line(b"{}")
+    >>> file.read_bytes()
+    b'{}\\n'
+    """
+    with path.open("ab", buffering=0) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(
+                f"{path}: in use: another process writes there, expected no other process"
+            ) from None
+        file.truncate(0)
+        whole = 0  # Bytes of whole lines.
+
+        def write(line: bytes) -> None:
+            nonlocal whole
+            left = memoryview(line + b"\n")
+            try:
+                with naming(path):
+                    while left:  # One call may write a part.
+                        left = left[file.write(left) :]
+            except BaseException:
+                file.truncate(whole)
+                raise
+            whole += len(line) + 1
+
+        yield write
+
+
 def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     """What a JSON file holds, checked against a type.
 

@@ -123,6 +123,7 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: StemConfig(out_channels=0),
         lambda: LossConfig(l1_weight=-1),
         lambda: LossConfig(iou_loss="l2"),  # type: ignore[arg-type]
+        lambda: Config(model=ModelConfig(stem=StemConfig(group_rounds=False, channels_per_type=4))),  # five rounds
         lambda: LossConfig(centreness_m=2.0),  # of no use: the factor is trained to be the IoU
         lambda: InferenceConfig(iou_threshold=2),
         lambda: InferenceConfig(nms_overlap="4d"),  # type: ignore[arg-type]

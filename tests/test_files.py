@@ -1,6 +1,7 @@
 """Atomic writes and file locks: what other processes see of them."""
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from fcos_lidar_jax.files import atomic_write, file_lock, folder_lock
+from fcos_lidar_jax.files import atomic_write, file_lock, folder_lock, line_writer
 
 
 def test_atomic_write_replaces_a_file_whole(tmp_path):
@@ -108,3 +109,47 @@ def test_a_folder_is_locked_for_other_threads_and_processes_and_again_for_the_on
         with pytest.raises(BlockingIOError) as caught, folder_lock(tmp_path, "x"):
             pass
         assert len(str(caught.value)) < 200 + 2 * len(str(tmp_path)) + 60
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+from fcos_lidar_jax.files import line_writer
+resource.setrlimit(resource.RLIMIT_FSIZE, (1500, 1500))  # writes beyond fail, as they do where there is no room
+with line_writer(Path(sys.argv[1])) as write_line:
+    for _ in range(int(sys.argv[2])):
+        write_line(1000 * b"x")
+"""
+
+
+@pytest.mark.parametrize("lines", [2, 3])
+def test_a_full_disk_leaves_whole_lines_and_is_told(tmp_path, lines):
+    """The second line is the one of which a part finds room."""
+    file = tmp_path / "a.jsonl"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, file, str(lines)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert f"{file}: cannot be written: File too large" in done.stderr
+    assert file.read_bytes() == 1000 * b"x" + b"\n"
+
+
+def test_lines_of_one_file_are_written_by_one_process(tmp_path):
+    file = tmp_path / "a.jsonl"
+    file.write_text("old\n")
+    with line_writer(file) as write_line:
+        write_line(b"1")
+        with pytest.raises(BlockingIOError, match=r"a\.jsonl: in use: another process"), line_writer(file):
+            pass
+        write_line(b"2")
+    assert [json.loads(line) for line in file.read_text().splitlines()] == [1, 2]
+
+
+def test_an_interrupted_line_is_taken_back(tmp_path):
+    file = tmp_path / "a.jsonl"
+    with line_writer(file) as write_line:
+        write_line(b"1")
+        with pytest.raises(TypeError):
+            write_line("text")  # type: ignore[arg-type]
+        write_line(b"2")
+    assert file.read_bytes() == b"1\n2\n"

@@ -34,7 +34,7 @@ import traceback
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -60,7 +60,7 @@ VERSION = "v1.0-synthetic"
 class Args(Options):
     """How often."""
 
-    only: tuple[str, ...] = ()  # Commands; default: all.
+    only: tuple[Literal["synthesize", "prepare", "train", "evaluate"], ...] = ()  # Commands; default: all.
     kills: int = 30  # Of each command but train.
     train_kills: int = 100  # Of train.
     pairs: int = 20  # Of processes in one folder, for each command.

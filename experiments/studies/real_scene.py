@@ -96,6 +96,8 @@ def main(args: Args) -> None:
         "32 frames, augmented": (augmented, every, args.steps[3]),
     }
 
+    if unknown := set(args.only) - set(runs):
+        raise ValueError(f"--only: got {sorted(unknown)[0]!r}, expected some of {', '.join(map(repr, runs))}")
     record = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
     for name in args.only or runs:
         config, shown, steps = runs[name]

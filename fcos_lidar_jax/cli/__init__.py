@@ -60,8 +60,12 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
         code = _CLOSED_PIPE
     except SystemExit as stop:
         code, stopped = 0, stop
-    if not all([_flushed(stream) for stream in (sys.stdout, sys.stderr)]):
+    lost, unread = (_flush(stream) for stream in (sys.stdout, sys.stderr))
+    if isinstance(lost, BrokenPipeError) or isinstance(unread, BrokenPipeError):
         return _CLOSED_PIPE
+    if lost is not None and not code and (stopped is None or not stopped.code):
+        print(f"{program}: error: standard output: cannot be written: {lost.strerror}", file=sys.stderr)
+        return 1
     if stopped is not None:
         raise stopped
     return code
@@ -127,18 +131,18 @@ def _is_unread(stream: TextIO) -> bool:
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
-def _flushed(stream: TextIO) -> bool:
-    """Write what is waiting; False where nobody reads it. What still follows then leads nowhere, in silence."""
+def _flush(stream: TextIO) -> OSError | None:
+    """Write what is waiting; the failure where it cannot be. What still follows then leads nowhere, in silence."""
+    failure = None
     try:
         stream.flush()
-        return True
-    except BrokenPipeError:
-        return False
-    except (OSError, ValueError):  # closed, or a full disk
-        return True
-    finally:
-        if _is_unread(stream):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    except OSError as error:
+        failure = error
+    except ValueError:  # closed
+        return None
+    if failure is not None or _is_unread(stream):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    return failure
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -50,7 +51,7 @@ class Detect:
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]  # Where the JSON goes.
     sweeps: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
     """Instead of files: a list of sweeps to fuse, [{"file", "timestamp_us", "sensor_to_world": 4x4}], the first
-    is the current one."""
+    is the current one, the others follow by age. As many are fused as the detector was trained with."""
     yaw_deg: float = 0.0
     """Turn the clouds by this angle about z for the detector, and the boxes back: 90 where x points ahead and the
     detector is of nuScenes' sensor, whose y axis does (`hdl32e`)."""
@@ -76,6 +77,11 @@ def run(args: Detect) -> None:
     """Detect in all files, then write; what is done is kept beside the output until then."""
     inputs = _check(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
+    most = detector.config.num_sweeps
+    for file, parts in inputs.items():
+        if len(parts) > most:
+            line = f"the first {most} of {len(parts)} sweeps are fused, as many as the detector was trained with"
+            print(f"{file}: {line}", file=sys.stderr)
     clouds = _clouds(args, inputs, detector)
     states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
     with _resume_log(args, detector) as log:
@@ -126,6 +132,7 @@ def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector) -> Clo
         columns=args.columns,
         dtype=args.dtype,
         max_points=args.max_file_points,
+        num_sweeps=detector.config.num_sweeps,
     )
 
 

@@ -79,7 +79,10 @@ def run(args: Evaluate) -> None:
     _check(args)
     detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
     sensor = load_sensor(args.sensor) if detector is None else detector.sensor
-    if args.ground_truth is None and _by_the_benchmark(args, args.data.layout(), detector):
+    layout = None if args.ground_truth is not None else args.data.layout()
+    if layout is not None and layout.format != "nuscenes" and args.data.index is not None:
+        raise ValueError(f"--index: got {args.data.index}, expected none: the format {layout.format} has none")
+    if layout is not None and _by_the_benchmark(args, layout, detector):
         if args.data.class_map is not None:
             raise ValueError("--class-map: expected none with a results file: nuScenes' classes are fixed")
         if detector is not None and args.results is not None:
@@ -99,11 +102,11 @@ def run(args: Evaluate) -> None:
         intervals = write_evaluation(
             args.out, evaluation, compared.meta, repeats=args.bootstrap, report=progress.show
         )
+        for line in warnings(evaluation, len(compared.predictions), compared.truth):
+            print(line, file=sys.stderr)
+        print(describe(evaluation, intervals), flush=True)
         if args.report:
             _report(args, compared, evaluation, sensor)
-    for line in warnings(evaluation, len(compared.predictions), compared.truth):
-        print(line, file=sys.stderr)
-    print(describe(evaluation, intervals))
     print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
 
 
@@ -119,6 +122,10 @@ def _check(args: Evaluate) -> None:
         raise ValueError("evaluate: expected --data-root, or --results with --ground-truth")
     check_at_least(args, 1, "batch_size")
     check_at_least(args, 0, "bootstrap")
+    for name in ("backend", "batch_size"):
+        if args.results is not None and (found := getattr(args, name)) != getattr(Evaluate, name):
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option}: got {found}, expected none with --results: nothing is detected")
     check_out_folder(args.out)
     if args.checkpoint is not None:
         check_outside("--out", args.out, args.checkpoint)
@@ -154,9 +161,15 @@ def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) ->
     name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), layout.version, split)))
     if _by_the_benchmark(args, layout, detector):
         frames = _keyframes(args, layout, detector, sensor, split)
+        truth = split_truth(frames.nuscenes, list(frames.tokens))
         if detector is not None:
             _detect_keyframes(args, detector, frames)
-        return _official(args, split_truth(frames.nuscenes, list(frames.tokens)), frames, of=name, name=name)
+        elif args.report and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
+            # A results file is evaluated with the tables alone.
+            line = f"{missing} files of keyframes are missing: the report shows boxes without points"
+            print(line, file=sys.stderr)
+            return _official(args, truth, None, of=name, name=name)
+        return _official(args, truth, frames, of=name, name=name)
     if detector is None:
         raise ValueError("--results: expected --checkpoint too: its classes are those of detections.json")
     frames = args.data.open(detector.config, split=split, samples=args.samples, sensor=detector.sensor)

@@ -21,6 +21,7 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenes
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
+from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
 from fcos_lidar_jax.inference.cloud import sensor_mismatch
 from fcos_lidar_jax.inference.records import as_records, confident
@@ -128,13 +129,12 @@ def run(args: Stream) -> None:
 def _write_lines(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
     """A function that writes a record as a line. What stood in the file is lost with the first, not before."""
     with contextlib.ExitStack() as stack:
-        lines: list[Any] = []
+        opened: list[Callable[[bytes], None]] = []
 
         def write(record: dict[str, Any]) -> None:
-            if not lines:
-                # Without a buffer: a line is one write, so that interruptions leave whole ones.
-                lines.append(stack.enter_context(path.open("wb", buffering=0)))
-            lines[0].write(json.dumps(record).encode() + b"\n")
+            if not opened:
+                opened.append(stack.enter_context(line_writer(path)))
+            opened[0](json.dumps(record).encode())
 
         yield write
 

@@ -110,6 +110,11 @@ def run(args: Train) -> None:
     val_split, tests = args.val_split or args.data.split("val", required=False), None
     if val_split != "none" and (val_split or args.val_samples):
         tests = args.data.open(config, split=val_split, samples=args.val_samples, option="--val-samples")
+    if tests is None and args.evaluate_every is not None:
+        raise ValueError(
+            f"--evaluate-every: got {args.evaluate_every}, expected --val-split or --val-samples too: "
+            f"{layout.root} has no split to evaluate on"
+        )
     if split is None and args.samples is None and tests is None and jax.process_index() == 0:
         line = f"no splits: all {len(frames)} frames are trained on, none is left to evaluate on"
         print(f"{layout.root}: {line}", file=sys.stderr)

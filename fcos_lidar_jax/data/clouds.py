@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ class CloudFiles(FrameSet):
     columns: int | None = None  # of a raw file of another layout
     dtype: str | None = None  # likewise
     max_points: int = MAX_POINTS  # of a file; a larger one is refused
+    num_sweeps: int | None = None  # of a list, at most so many are fused; None for all
     classes: tuple[str, ...] = ()  # none: there are no boxes
 
     def __len__(self) -> int:
@@ -30,9 +32,10 @@ class CloudFiles(FrameSet):
 
     def frame(self, index: int) -> Frame:
         file, mode, close_m = self.files[index], self.remove_close, self.close_m
-        layout = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
+        layout: dict[str, Any] = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
         if file.suffix == ".json":
-            points, num_close = read_sweeps(file, self.sensor, remove_close=mode, close_m=close_m, **layout)
+            how: dict[str, Any] = {"remove_close": mode, "close_m": close_m, "num_sweeps": self.num_sweeps}
+            points, num_close = read_sweeps(file, self.sensor, **how, **layout)
         else:
             cloud = read_points(file, self.sensor, **layout)
             points, num_close = drop_close(cloud, self.sensor, mode=mode, close_m=close_m)
@@ -46,7 +49,7 @@ class CloudFiles(FrameSet):
         return str(self.files[index])
 
     def fingerprint(self) -> str:
-        reading = self.remove_close, self.close_m, self.columns, self.dtype
+        reading = self.remove_close, self.close_m, self.columns, self.dtype, self.num_sweeps
         return files_fingerprint([file.absolute() for file in self.files], Path("/"), reading)
 
 

@@ -1,6 +1,7 @@
 """Several sweeps fused into the frame of the current one."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -125,17 +126,18 @@ def read_sweeps(
 def read_list(path: Path) -> list[ListedSweep]:
     """The sweeps of a JSON list ``[{"file", "timestamp_us", "sensor_to_world": 4x4}, ...]``.
 
-    The first entry is the current sweep, the others follow by age.
+    The first entry is the current sweep, the others follow by age, the newest first.
 
     Raises:
         ValueError: naming the file, the entry, the field, what was found and what was expected.
     """
     sweeps = read_entries(path)
-    now_us = sweeps[0].timestamp_us
-    for index, sweep in enumerate(sweeps[1:], 1):
-        if sweep.timestamp_us >= now_us:
-            where, found = f"{path}: $[{index}]", sweep.timestamp_us
-            raise ValueError(f"{where}.timestamp_us: got {found}, expected less than the current sweep's {now_us}")
+    for index, (newer, sweep) in enumerate(itertools.pairwise(sweeps), 1):
+        if sweep.timestamp_us >= newer.timestamp_us:
+            expected = f"less than {newer.timestamp_us}, that of the one before: the current sweep first"
+            raise ValueError(
+                f"{path}: $[{index}].timestamp_us: got {sweep.timestamp_us}, expected {expected}, then by age"
+            )
     return sweeps
 
 

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from fcos_lidar_jax.files import naming
+
 
 class ResumeLog:
     """Entries of the samples that are done, one line each, in a file that is only appended to.
@@ -55,14 +57,15 @@ class ResumeLog:
 
     def add(self, token: str, entries: list[dict[str, Any]]) -> None:
         """Append the entries of a sample."""
-        if not self._begun:
-            self._stream.truncate(0)
-            self._stream.write(self._first)
-            self._begun = True
         name, text = json.dumps(token).encode(), json.dumps(entries).encode()
-        start = self._stream.seek(0, 2) + len(name) + 1
-        self._stream.write(b"%s\t%s\n" % (name, text))
-        self._stream.flush()
+        with naming(self.path):
+            if not self._begun:
+                self._stream.truncate(0)
+                self._stream.write(self._first)
+                self._begun = True
+            start = self._stream.seek(0, 2) + len(name) + 1
+            self._stream.write(b"%s\t%s\n" % (name, text))
+            self._stream.flush()
         self.places[token] = start, len(text)
 
     def entries(self, tokens: Sequence[str]) -> Iterator[tuple[str, bytes]]:
@@ -76,4 +79,5 @@ class ResumeLog:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._stream.close()
+        with naming(self.path):
+            self._stream.close()

@@ -104,6 +104,8 @@ class TrainedDetector(CloudDetector):
     """
 
     variables: Variables  # ``params`` and ``batch_stats``.
+    _placed: dict[Mesh, Any] = dataclasses.field(default_factory=dict, init=False, repr=False, compare=False)
+    """The variables on the devices of each mesh: to place them anew for every cloud takes a while."""
 
     @property
     def fingerprint(self) -> str:
@@ -127,10 +129,12 @@ class TrainedDetector(CloudDetector):
         """
         inference = dataclasses.replace(self.config.inference, **fields)
         config = dataclasses.replace(self.config, inference=inference)
-        return TrainedDetector(build_detector(config, self.sensor), self.variables)
+        return dataclasses.replace(self, model=build_detector(config, self.sensor))
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
-        return functools.partial(_split_detect(self.model, mesh, batch_size), replicate(self.variables, mesh))
+        if mesh not in self._placed:
+            self._placed[mesh] = replicate(self.variables, mesh)
+        return functools.partial(_split_detect(self.model, mesh, batch_size), self._placed[mesh])
 
 
 @functools.lru_cache(maxsize=8)

@@ -205,10 +205,13 @@ def _preprocessing(network: _Network, features: str, model: ModelConfig, layout:
     image = network("Transpose", network("Reshape", scaled, [0, 0, 0, -1]), perm=[0, 3, 1, 2])
     if model.row_upscale > 1:
         image = network.upsample(image, model.row_upscale, 1)
-    if extra := layout.width - layout.columns:
-        image = network("Concat", image, network("Slice", image, [0], [extra], [3]), axis=3)
-    if below := layout.height - layout.rows * model.row_upscale:
-        image = network("Pad", image, [0, 0, 0, 0, 0, 0, below, 0])
+    extra, below = layout.width - layout.columns, layout.height - layout.rows * model.row_upscale
+    if layout.full_turn and extra:
+        whole, rest = divmod(layout.width, layout.columns)
+        parts = [image] * whole + ([network("Slice", image, [0], [rest], [3])] if rest else [])
+        image, extra = network("Concat", *parts, axis=3), 0
+    if extra or below:
+        image = network("Pad", image, [0, 0, 0, 0, 0, 0, below, extra])
     return image
 
 

@@ -35,6 +35,12 @@ class OpenVinoDetector(TrainedDetector):
     def fingerprint(self) -> str:
         return f"{super().fingerprint} openvino {cpu_package('openvino').__version__} {self.precision}"
 
+    def with_inference(self, **fields: Any) -> TrainedDetector:
+        """As of any detector; flips are refused."""
+        detector = super().with_inference(**fields)
+        _check_flips(detector.config)
+        return detector
+
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         """As of any detector, but one cloud after the other: a batch changes nothing."""
         stages = stages_of(self.config, self.sensor)
@@ -55,6 +61,11 @@ class OpenVinoDetector(TrainedDetector):
 def stages_of(config: Config, sensor: Sensor) -> Stages:
     """The stages, of which the first and the last are run; compiled once."""
     return Stages(config, sensor)
+
+
+def _check_flips(config: Config) -> None:
+    if config.inference.flips != "none":
+        raise ValueError(f"backend openvino: found inference.flips {config.inference.flips}, expected none")
 
 
 def processor_precision() -> Precision:
@@ -80,10 +91,7 @@ def with_openvino(detector: TrainedDetector, *, precision: Precision | None = No
     if jax.default_backend() != "cpu" or jax.process_count() > 1:
         found = f"{jax.process_count()} processes on {jax.default_backend()}"
         raise ValueError(f"backend openvino: found {found}, expected one on cpu")
-    if detector.config.inference.flips != "none":
-        raise ValueError(
-            f"backend openvino: found inference.flips {detector.config.inference.flips}, expected none"
-        )
+    _check_flips(detector.config)
     graph = network_graph(detector)
     precision = precision or processor_precision()
     openvino = cpu_package("openvino")

@@ -9,10 +9,8 @@ object is read.
 
 import dataclasses
 import multiprocessing
-import os
 import re
 import signal
-import threading
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -29,6 +27,7 @@ from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, checksum
 from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
+from fcos_lidar_jax.input_pipeline.workers import end_with_parent
 
 MAX_SWEEPS = 20  # Sweeps by which an object's points are distinguished.
 
@@ -325,7 +324,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     table = {"rows": np.array(rows, _ROW), "recipe": np.array(job.recipe)}
     points = np.concatenate([np.zeros((0, job.columns), "<f4"), *parts])
     points_file, table_file = _files(job.folder, job.name)
-    atomic_write(points_file, points.tofile)
+    atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # tofile's errors have no number
     atomic_write(table_file, lambda path: np.savez(path, allow_pickle=False, **table))
     return len(job.indices)
 
@@ -354,14 +353,7 @@ _worker_frames: FrameSet | None = None
 def _begin_worker(frames: FrameSet) -> None:
     global _worker_frames
     _worker_frames = frames
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def end_with_parent() -> None:  # which may be killed
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    end_with_parent()
 
 
 def _work(job: _Job) -> int:

@@ -23,6 +23,7 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
+from fcos_lidar_jax.input_pipeline.workers import end_with_parent
 from fcos_lidar_jax.types import HostBatch
 
 _MAX_COLUMNS = 6
@@ -125,17 +126,13 @@ def make_batches(
 
     if not 0 <= first_step <= num_steps:
         raise ValueError(f"first_step: got {first_step}, expected 0 to {num_steps}")
-    for name, value in (("threads", threads), ("workers", workers)):
-        if value < 0:
-            raise ValueError(f"{name}: got {value}, expected at least 0")
+    check_helpers(config, objects, threads=threads, workers=workers, num_processes=num_processes)
     size = config.optimizer.batch_size
     if not 0 <= process_index < num_processes or size % num_processes:
         raise ValueError(
             f"process {process_index} of {num_processes}: expected a number that divides the batch of {size}"
         )
     order = SampleOrder(frames, config, seed=seed)
-    if config.copy_paste is not None and objects is None:
-        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
     rows = range(process_index * size // num_processes, (process_index + 1) * size // num_processes)
     fade_step = num_steps - config.fade_epochs * -(-order.epoch_size // size)
     paste = make_paste(objects, config) if objects is not None and config.copy_paste is not None else None
@@ -163,7 +160,6 @@ def make_batches(
     # Batches are large: one waits ready beside those in work, no more.
     stream = steps.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads + 1))
     if workers:
-        _check_shared_memory(config, workers, num_processes)
         if not flags.FLAGS.is_parsed():  # which grain's worker processes read
             flags.FLAGS.mark_as_parsed()
         stream = stream.mp_prefetch(
@@ -174,10 +170,24 @@ def make_batches(
         yield batches
 
 
+def check_helpers(
+    config: Config, objects: GroundTruthDatabase | None, *, threads: int, workers: int, num_processes: int = 1
+) -> None:
+    """Refuse what :func:`make_batches` cannot prepare batches with, before there is a run; arguments as there."""
+    for name, value in (("threads", threads), ("workers", workers)):
+        if value < 0:
+            raise ValueError(f"{name}: got {value}, expected at least 0")
+    if config.copy_paste is not None and objects is None:
+        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
+    if workers:
+        _check_shared_memory(config, workers, num_processes)
+
+
 def _leave_signals(worker: int, workers: int) -> None:
     """Ctrl-C and SIGTERM reach all processes of a job: they are the main process's to answer."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    end_with_parent()
 
 
 def _check_shared_memory(config: Config, workers: int, num_processes: int) -> None:

@@ -55,6 +55,8 @@ def find_layout(root: str | Path | None, format: Format | None = None, version: 
     if format == "simulated":
         if root is not None:
             raise ValueError(f"data root: got {root}, expected none for simulated frames")
+        if version is not None:
+            raise ValueError(f"version: got {version!r}, expected none for simulated frames")
         return Layout(Path("simulated"), format, None)
     if root is None:
         raise ValueError("data root: missing, expected the folder of a data set")

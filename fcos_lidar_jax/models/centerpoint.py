@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config, PillarConfig
+from fcos_lidar_jax.models.convolution import FULL
 from fcos_lidar_jax.models.heads import Predictions
 from fcos_lidar_jax.models.layers import BatchNorm, Conv, ConvNorm, Image, pieces
 from fcos_lidar_jax.pillars import cell_maxima, pillar_grid
@@ -36,7 +37,8 @@ class PointLayers(nn.Module):
         maxima = x[:, :, 0]
         for i, wide in enumerate(self.channels):
             last = i == len(self.channels) - 1
-            x = Conv(wide if last else wide // 2, 1, name=f"linear{i}")(x)
+            precision = None if i else FULL
+            x = Conv(wide if last else wide // 2, 1, precision=precision, name=f"linear{i}")(x)
             (x,) = BatchNorm(name=f"norm{i}")([x], train=train, where=where)
             x = jax.nn.relu(x)
             maxima = jax.vmap(cell_maxima, (0, 0, None))(x[:, :, 0], cell, number)

@@ -23,8 +23,19 @@ LOOP = 16
 """How many times as many are needed for a loop over rows, which XLA compiles anew for each layer."""
 
 
+FULL = lax.Precision.HIGHEST
+"""Of what sees metres or predicts them: by default GPUs and TPUs multiply float32 with fewer bits."""
+
+
 def convolve(
-    x: Image, kernel: Kernel, *, stride: int = 1, dilation: int = 1, groups: int = 1, circular: bool = False
+    x: Image,
+    kernel: Kernel,
+    *,
+    stride: int = 1,
+    dilation: int = 1,
+    groups: int = 1,
+    circular: bool = False,
+    precision: lax.Precision | None = None,
 ) -> Image:
     """Convolution with ``k // 2 * dilation`` zeros on both sides, or wrapped around the width.
 
@@ -37,7 +48,7 @@ def convolve(
     kernel = kernel.astype(x.dtype)
     high, wide = (size // 2 * dilation for size in kernel.shape[:2])
     if kernel.shape[:2] == (1, 1) and groups == 1:
-        return pointwise(x[:, ::stride, ::stride], kernel[0, 0])
+        return pointwise(x[:, ::stride, ::stride], kernel[0, 0], precision=precision)
     if circular and wide:
         x = jnp.concatenate([x[:, :, -wide:], x, x[:, :, :wide]], axis=2)
         wide = 0
@@ -48,6 +59,7 @@ def convolve(
         rhs_dilation=(dilation, dilation),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
         feature_group_count=groups,
+        precision=precision,
     )
     if stride > 1 or groups > 1:
         return product(x, kernel)
@@ -55,18 +67,25 @@ def convolve(
     return _linear(product, by_rows, x, kernel, LOOP * LARGE)
 
 
-def pointwise(x: Image, kernel: Float[Array, "_ _"], *, dtype: DTypeLike | None = None) -> Image:
+def pointwise(
+    x: Image,
+    kernel: Float[Array, "_ _"],
+    *,
+    dtype: DTypeLike | None = None,
+    precision: lax.Precision | None = None,
+) -> Image:
     """A 1x1 convolution as a matrix product, summed in ``dtype``, by default that of ``x``.
 
     >>> pointwise(jnp.ones((1, 8, 8, 2)), jnp.ones((2, 4)))[0, 0, 0].tolist()
     [2.0, 2.0, 2.0, 2.0]
     """
     kernel = kernel.astype(x.dtype)
-    return _linear(functools.partial(_of_pixels, dtype=dtype), _flat, x, kernel, LARGE)
+    product = functools.partial(_of_pixels, dtype=dtype, precision=precision)
+    return _linear(product, _flat, x, kernel, LARGE)
 
 
-def _of_pixels(x: Image, kernel: Array, dtype: DTypeLike | None) -> Image:
-    return jnp.einsum("bhwc,co->bhwo", x, kernel, preferred_element_type=dtype)
+def _of_pixels(x: Image, kernel: Array, dtype: DTypeLike | None, precision: lax.Precision | None) -> Image:
+    return jnp.einsum("bhwc,co->bhwo", x, kernel, preferred_element_type=dtype, precision=precision)
 
 
 def _linear(

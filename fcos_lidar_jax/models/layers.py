@@ -49,12 +49,13 @@ class Conv(nn.Module):
     stride: int = 1
     use_bias: bool = False
     circular: bool = False
+    precision: lax.Precision | None = None
 
     @nn.compact
     def __call__(self, x: Image) -> Image:
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", kernel_init, shape)
-        y = convolve(x, kernel, stride=self.stride, circular=self.circular)
+        y = convolve(x, kernel, stride=self.stride, circular=self.circular, precision=self.precision)
         if not self.use_bias:
             return y
         return y + self.param("bias", nn.initializers.zeros, (self.features,)).astype(y.dtype)

@@ -5,10 +5,9 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
-from fcos_lidar_jax.models.convolution import Image, pointwise
+from fcos_lidar_jax.models.convolution import FULL, Image, pointwise
 from fcos_lidar_jax.models.layers import BatchNorm, kernel_init, normal
 
 
@@ -56,9 +55,9 @@ class MetaKernel(nn.Module):
         weigh = self.param("weigh", _he_normal, (channels, channels))
         weigh_bias = self.param("weigh_bias", nn.initializers.ones, (channels,))
         kernel = self.param("kernel", kernel_init, (3, 3, channels, self.features))
-        # W p_j - W p_i: the first layer is computed once a pixel, not once a neighbour. In all of float32, because
-        # the product of places is far larger than the differences: TF32 would be centimetres off at 50 m.
-        placed = jnp.einsum("bhwc,co->bhwo", geometry.points, hidden, precision=lax.Precision.HIGHEST)
+        # W p_j - W p_i: the first layer is computed once a pixel, not once a neighbour. The products of places are
+        # far larger than their differences: with fewer bits these would be centimetres off at 50 m.
+        placed = pointwise(geometry.points, hidden, precision=FULL)
         around = [self._padded(image) for image in (x * geometry.exists.astype(x.dtype), placed)]
         total = jnp.zeros((), x.dtype)
         for row in range(3):

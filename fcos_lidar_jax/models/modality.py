@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from fcos_lidar_jax.config import StemConfig
-from fcos_lidar_jax.models.convolution import Image, Kernel, convolve, pointwise
+from fcos_lidar_jax.models.convolution import FULL, Image, Kernel, convolve, pointwise
 from fcos_lidar_jax.models.layers import BatchNorm, kernel_init, pieces
 
 Form = Literal["split", "dense", "grouped"]  # How the stem's convolutions are computed, see :class:`Stem`.
@@ -85,19 +85,21 @@ class ModalityBranch(nn.Module):
                 self.param(f"conv{layer}_group{g}", kernel_init, (3, 3, size, width))
                 for g, (size, width) in enumerate(zip(sizes, widths, strict=True))
             ]
-            parts = [self._convolve(x, kernels[cut]) for x, cut in zip(parts, together, strict=True)]
+            precision = None if layer else FULL
+            parts = [self._convolve(x, kernels[cut], precision) for x, cut in zip(parts, together, strict=True)]
             parts = [jax.nn.relu(x) for x in BatchNorm(name=f"norm{layer}")(parts, train=train)]
             if self.precision == "bfloat16":  # only behind the first layer: metres need more bits
                 parts = [x.astype(jnp.bfloat16) for x in parts]
             sizes = widths
         return list(parts)
 
-    def _convolve(self, x: Image, kernels: Sequence[Kernel]) -> Image:
+    def _convolve(self, x: Image, kernels: Sequence[Kernel], precision: lax.Precision | None) -> Image:
         """One convolution of the groups of channels in ``x``."""
         grouped = self.form == "grouped" and len({kernel.shape for kernel in kernels}) == 1
         kernel = jnp.concatenate(kernels, axis=-1) if grouped else block_diagonal(kernels)
         groups = len(kernels) if grouped else 1
-        return convolve(x, kernel, dilation=self.dilation, groups=groups, circular=self.circular)
+        how = {"dilation": self.dilation, "groups": groups, "circular": self.circular, "precision": precision}
+        return convolve(x, kernel, **how)
 
 
 class Stem(nn.Module):

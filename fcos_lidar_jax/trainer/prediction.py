@@ -140,6 +140,7 @@ def evaluate(
     for prediction in predict(detector, mapped, batch_size=batch_size, devices=devices):
         frame = prediction.frame or mapped.frame(prediction.index)
         found.append(prediction.detections)
-        truths.append(Frame(frame.points[:0], frame.boxes, frame.labels, frame.num_points))
+        none = frame.points[:0].copy()  # Not a view: the clouds of a data set need not fit into memory.
+        truths.append(Frame(none, frame.boxes, frame.labels, frame.num_points))
         progress.show(len(found))
     return evaluate_frames(found, truths, metric_of(detector.classes, tuple(detector.config.ranges_m.values())))

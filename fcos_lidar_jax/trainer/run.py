@@ -29,7 +29,7 @@ from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.input_pipeline.loader import check_helpers, make_batches
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
@@ -174,6 +174,7 @@ def train(
             raise ValueError("training frames: got none, expected at least one")
         check_counts(frames)
         check_batch_size(config.optimizer.batch_size, mesh)
+        check_helpers(config, objects, threads=threads, workers=workers, num_processes=jax.process_count())
         if config.augment is not None:
             check_augmentation(config.augment, frames.sensor)
         # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
@@ -230,7 +231,7 @@ def train(
         def pause(number: int, state: TrainState) -> None:
             if metrics is not None:
                 metrics.flush()
-                _save(run, state, None)  # What is done is safe before an evaluation, which may take long.
+                _save(run, state)  # What is done is safe before an evaluation, which may take long.
             if run.evaluates_at(number):
                 _evaluate(run, number, state, metrics)
 
@@ -263,7 +264,7 @@ def train(
                 )
                 done = int(state.step)
                 if is_main_process and not run.saves_at(done):
-                    _save(run, state, None)
+                    _save(run, state)
             except (NonFiniteLossError, NonFiniteStateError) as error:
                 kept = run.checkpoints.paths()
                 last = f"the last checkpoint is {kept[-1]}" if kept else "there is no checkpoint yet"
@@ -407,15 +408,16 @@ def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | N
     if metrics is not None:
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
         draw_predictions(run.folder / "pictures", shown, run.tests, number)
-        _save(run, state, None if math.isnan(score) else score)
+        if not math.isnan(score):
+            run.checkpoints.score(number, score)
         values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
         metrics.write(number, {"test/mAP": score, **values})  # Last: what is recorded is not done again.
 
 
-def _save(run: _Run, state: TrainState, score: float | None) -> None:
+def _save(run: _Run, state: TrainState) -> None:
     data = json.dumps({name: run.spec[name] for name in ("data", "frames", "weights")}, sort_keys=True)
     config, sensor = run.detector.config, run.detector.sensor
-    checkpoint = Checkpoint(config, sensor, _local_variables(state), int(state.step), data, score)
+    checkpoint = Checkpoint(config, sensor, _local_variables(state), int(state.step), data)
     run.checkpoints.save(checkpoint, state)
 
 

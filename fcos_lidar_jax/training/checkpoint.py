@@ -20,7 +20,7 @@ import numpy as np
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
-from fcos_lidar_jax.files import checksum, naming, read_json
+from fcos_lidar_jax.files import atomic_write, checksum, naming, read_json
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
 from fcos_lidar_jax.training.preemption import after_the_block
@@ -109,17 +109,43 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
             "sensor": sensor_to_json(checkpoint.sensor),
             "files": _hashes(beside),
         }
-        description["hash"] = checksum(_canonical(description))
         with naming(folder):
-            (beside / _DESCRIPTION).write_text(json.dumps(description, indent=1), encoding="utf-8")
+            (beside / _DESCRIPTION).write_text(_with_hash(description), encoding="utf-8")
         os.chmod(beside, 0o755)
-        old = beside.with_name(beside.name + ".old")
+        _exchange(beside, folder)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def _exchange(beside: Path, folder: Path) -> None:
+    """Put a folder in the place of another one, which stays if that fails."""
+    old = beside.with_name(beside.name + ".old")
+    try:
         if folder.exists():
             os.replace(folder, old)
         os.replace(beside, folder)
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
+    except BaseException:
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def save_score(folder: str | Path, score: float) -> None:
+    """Record the score of a checkpoint; its arrays are left alone.
+
+    Raises:
+        CheckpointError: there is no checkpoint.
+        OSError: it cannot be written; the checkpoint is as it was.
+    """
+    file = Path(folder).absolute() / _DESCRIPTION
+    read_description(file.parent)  # Refuses a damaged one.
+    text = _with_hash(read_json(file, dict[str, Any]) | {"score": score})
+    atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _with_hash(description: dict[str, Any]) -> str:
+    return json.dumps({**description, "hash": checksum(_canonical(description))}, indent=1)
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:

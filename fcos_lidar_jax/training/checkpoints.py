@@ -12,6 +12,7 @@ from fcos_lidar_jax.training.checkpoint import (
     load_state,
     read_description,
     save_checkpoint,
+    save_score,
 )
 from fcos_lidar_jax.types import TrainState
 
@@ -36,11 +37,21 @@ class Checkpoints:
         save_checkpoint(path, checkpoint, state=state)
         for leftover in self.folder.glob(".*"):  # of saves that were killed
             shutil.rmtree(leftover, ignore_errors=True)
+        self._remove_others(path)
+        return path
+
+    def score(self, step: int, score: float) -> None:
+        """Record what the checkpoint of a step scored, then remove what is no longer kept."""
+        path = self.folder / f"{step:08d}"
+        save_score(path, score)
+        self._remove_others(path)
+
+    def _remove_others(self, path: Path) -> None:
+        """Keep the best and the newest up to a checkpoint."""
         # Later ones are damaged: the run went back to before them. They would be taken for the newest.
         paths, passed_over = ([p for p in self.paths() if (p > path) == later] for later in (False, True))
         for old in {*passed_over, *paths[: -self.keep]} - {best_of(paths)}:
             shutil.rmtree(old)
-        return path
 
     def paths(self) -> list[Path]:
         """All checkpoints, the oldest first, unread."""

@@ -21,10 +21,11 @@ class StopRequest:
 def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
     """Turn the first Ctrl-C or SIGTERM into a request that the run sees between two steps; the second one ends it.
 
-    To be entered in the main thread; ``active=False`` leaves the signals alone.
+    Outside the main thread, which alone Python tells of signals, and with ``active=False`` they are left alone.
     """
     request = StopRequest()
-    before = {number: signal.getsignal(number) for number in _SIGNALS if active}
+    own = active and threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in _SIGNALS if own}
 
     def ask(number: int, _: FrameType | None) -> None:
         request.signal = number
@@ -48,8 +49,7 @@ def after_the_block() -> Iterator[None]:
     signal interrupts, nothing changes; nor in a cluster, where JAX's preemption service has taken SIGTERM by a
     handler that Python cannot see and could not restore.
     """
-    own = threading.current_thread() is threading.main_thread() and not jax.distributed.is_initialized()
-    with stop_requests(active=own) as request:
+    with stop_requests(active=not jax.distributed.is_initialized()) as request:
         yield
     if request.signal is not None:
         signal.raise_signal(request.signal)

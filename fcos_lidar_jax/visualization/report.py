@@ -84,7 +84,7 @@ def write_report(
 def _text(value: Cell) -> str:
     if isinstance(value, float):
         return "–" if value != value else f"{value:.3f}"
-    return html.escape(str(value))
+    return html.escape(str(value).encode("utf-8", "replace").decode())  # Paths may hold what is no UTF-8.
 
 
 def _figure(caption: str, file: str | Path, *, wide: bool = False) -> str:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 
 import jax
 import numpy as np
@@ -226,6 +227,20 @@ def test_a_class_map_changes_the_truth_that_a_detector_is_compared_with(home, tm
     assert (tmp_path / "out" / "detections.json").exists()
 
 
+def test_results_are_evaluated_with_the_tables_alone(home, by_tables, tmp_path, capsys):
+    """Without a point file, in a folder whose name is no UTF-8; the report has boxes alone."""
+    root = tmp_path / os.fsdecode(b"M\xfcnchen")
+    shutil.copytree(home / VERSION, root / VERSION)
+    options = {**place(home), "data": DataOptions(data_root=root, version=VERSION)}
+    run(Evaluate(out=tmp_path / "out", results=home / "results.json", **options))
+    shown = capsys.readouterr()
+    assert "6 files of keyframes are missing: the report shows boxes without points" in shown.err
+    assert "mAP" in shown.out
+    summary, expected = (read(folder / "metrics_summary.json") for folder in (tmp_path / "out", by_tables))
+    assert summary["mean_ap"] == expected["mean_ap"] > 0
+    assert "M?nchen" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("what", ["checkpoint", "results"])
 def test_a_folder_in_use_is_left_alone(home, tmp_path, what):
     given = {what: home / {"checkpoint": "checkpoint", "results": "results.json"}[what]}
@@ -270,6 +285,19 @@ MISTAKES = {
     "out of the detector's name": (
         f"--data-root HOME --version {VERSION} --checkpoint quickstart --out quickstart",
         "--out: quickstart: found the name of the checkpoint, expected another one",
+    ),
+    "batches of results": (f"--results x {TRUTH} --batch-size 2", "--batch-size: got 2, expected none with --res"),
+    "backend of results": (
+        f"--results x {TRUTH} --backend openvino",
+        "--backend: got openvino, expected none",
+    ),
+    "index of simulated frames": (
+        "--format simulated --checkpoint HOME/checkpoint --index HOME/i",
+        "--index: got .*/i, expected none: the format simulated has none",
+    ),
+    "version of simulated frames": (
+        "--format simulated --checkpoint HOME/checkpoint --version v1",
+        "version: got 'v1', expected none for simulated frames",
     ),
     "file for a folder": (f"--results x {TRUTH} --out HOME/truth.json", "--out: .*found a file"),
 }

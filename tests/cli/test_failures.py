@@ -167,3 +167,21 @@ def test_nobody_reads_the_help_any_more():
     done = subprocess.run(words, env=child_environment(), check=False, **streams)
     os.close(write)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
+
+
+@pytest.mark.parametrize("work", ["lambda: print('found')", "lambda: sys.exit(0)"])
+def test_an_output_on_a_full_disk_is_one_line(tmp_path, work):
+    """What is printed waits until the end, where the disk turns out to be full."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, sys\nfrom fcos_lidar_jax.cli import exit_code\n"
+        f"print('before')\nsys.exit(exit_code('program', {work}))\n"
+    )
+    environment = child_environment()
+    environment.pop("PYTHONUNBUFFERED", None)
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, script], env=environment, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    said = "program: error: standard output: cannot be written: No space left on device\n"
+    assert (done.returncode, done.stderr) == (1, said)

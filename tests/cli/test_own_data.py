@@ -67,3 +67,7 @@ def test_own_data_have_their_sensor_whatever_the_configuration_is_called(tmp_pat
         (["--name", "mine"], ["--sensor", "waymo_top"], ignored),
     ):
         assert_one_line_error(capsys, [*args, *name, *sensor], message)
+    (tmp_path / "data" / "splits.json").unlink()
+    message = "--evaluate-every: got 4, expected --val-split or --val-samples too: .*data has no split to evaluate"
+    assert_one_line_error(capsys, [*args, "--evaluate-every", "4"], message)
+    assert not (tmp_path / "out").exists()

@@ -56,14 +56,17 @@ def stream(home, out, *more):
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path):
+def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path, capsys):
     lines = stream(home, tmp_path / "boxes.jsonl", "--poses", home / "poses.json")
     listed = json.loads((home / "poses.json").read_text())
     assert len(lines) == SWEEPS
     for index, line in enumerate(lines):
         window, out = home / "window.json", tmp_path / "boxes.json"
-        window.write_text(json.dumps(listed[max(0, index - WINDOW + 1) : index + 1][::-1]))
+        window.write_text(json.dumps(listed[: index + 1][::-1]))
+        capsys.readouterr()
         command("detect --sweeps", window, "--checkpoint", home / "checkpoint", "--out", out)
+        said = f"{window}: the first {WINDOW} of {index + 1} sweeps are fused, as many as the detector was trained"
+        assert (said in capsys.readouterr().err) == (index >= WINDOW)
         [expected] = json.loads(out.read_text())["files"]
         assert len(expected["boxes"]) > 0
         assert {name: line[name] for name in expected if name != "file"} == {

@@ -12,6 +12,7 @@ from tiny_run import CONFIG, SENSOR, TINY_CONFIG, bits, untrained, weights
 from fcos_lidar_jax.coding import decode
 from fcos_lidar_jax.config import AugmentConfig, InferenceConfig
 from fcos_lidar_jax.inference import TrainedDetector, make_detect, postprocess, select_candidates
+from fcos_lidar_jax.inference import detector as detectors
 from fcos_lidar_jax.locations import ImageLayout, image_layout, locate
 from fcos_lidar_jax.models import Detector, build_detector
 from fcos_lidar_jax.projection import project_points
@@ -154,6 +155,20 @@ def test_other_post_processing_keeps_the_weights_and_the_other_fields():
     np.testing.assert_array_equal(found.scores, all_found.scores[:3])
     with pytest.raises(ValueError, match=r"^max_detections: got 0"):
         detector.with_inference(max_detections=0)
+
+
+def test_weights_are_placed_on_the_device_once(monkeypatch):
+    detector, placed = TrainedDetector(build_detector(TINY_CONFIG, TINY), untrained(TINY_CONFIG, TINY)), []
+    replicate = detectors.replicate
+    monkeypatch.setattr(detectors, "replicate", lambda *given: placed.append(1) or replicate(*given))
+    first, second = (detector(make_frame(seed, TINY).points) for seed in (0, 0))
+    assert placed == [1]
+    assert bits(first) == bits(second)
+    other = detector.with_inference(max_detections=3)
+    other(make_frame(0, TINY).points)
+    assert placed == [1, 1]
+    assert dataclasses.replace(detector) == detector
+    assert "placed" not in repr(detector)
 
 
 @pytest.mark.parametrize("flips", ["x", "xy"])

@@ -15,6 +15,7 @@ from fcos_lidar_jax.inference.onnx_graph import network_graph
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
+from fcos_lidar_jax.sensors import sector
 
 onnx = pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
 openvino = pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")
@@ -46,6 +47,8 @@ CASES = {
         with_model(CONFIG, circular_width=True, row_upscale=3, remat=True),
         ODD,
     ),
+    "a sector, padded with empty columns": (CONFIG, sector(SENSOR, np.pi / 2, 40)),
+    "a turn that pads itself twice": (CONFIG, dataclasses.replace(SENSOR, num_columns=12)),
     "Meta-Kernel, two rounds, padded columns": (
         with_model(with_stem(), meta_kernel=True, channel_scale=(12.0, 11.5, 0.9, 8.0, 0.3, 0.2, 20.0, 2.0, 0.16)),
         ODD,

@@ -12,6 +12,7 @@ import pytest
 from commands import run_python
 from tiny_run import TINY_CONFIG, bits, untrained
 
+from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.inference import TrainedDetector, load_detector
 from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.openvino import processor_precision, with_openvino
@@ -66,6 +67,16 @@ def test_bfloat16_where_the_processor_has_it(trained):
         pytest.skip("not an x86 processor: its flags are not known")
     expected = "bfloat16" if {"avx512_bf16", "amx_bf16"} & {*flags[0].split()} else "float32"
     assert processor_precision() == with_openvino(trained).precision == expected
+
+
+def test_other_post_processing_stays_in_openvino(fast):
+    fewer, points = fast.with_inference(max_detections=3), make_frame(0, TINY).points
+    assert (type(fewer), fewer.fingerprint) == (type(fast), fast.fingerprint)
+    np.testing.assert_array_equal(fewer(points).scores, fast(points).scores[:3])
+    with pytest.raises(ValueError, match=r"backend openvino: found inference\.flips x, expected none"):
+        dataclasses.replace(
+            fast, model=build_detector(dataclasses.replace(TINY_CONFIG, augment=AugmentConfig()), TINY)
+        ).with_inference(flips="x")
 
 
 def test_another_backend_or_precision_is_another_detector(trained, fast):

@@ -7,6 +7,8 @@ import os
 import re
 import shutil
 import signal
+import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -316,3 +318,28 @@ def test_an_unreadable_file_stops_the_run_with_its_line(threads, workers):
 def test_what_cannot_run_is_refused_before_it_begins(frames, config, options, message):
     with pytest.raises(ValueError, match=message), make_batches(frames, config, seed=0, num_steps=1, **options):
         pass
+
+
+ORPHANED = """
+import multiprocessing, os, signal
+from test_loader import PLAIN, STEPS, ToyFrames, make_batches
+if __name__ == "__main__":
+    with make_batches(ToyFrames(), PLAIN, seed=0, num_steps=STEPS, workers=2) as batches:
+        next(batches)
+        print(*[process.pid for process in multiprocessing.active_children()], flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_workers_end_with_a_main_process_that_is_killed(tmp_path):
+    script = tmp_path / "orphaned.py"
+    script.write_text(ORPHANED)
+    done = run_python(script)
+    assert done.returncode == -signal.SIGKILL
+    left = {int(number) for number in done.stdout.split()}
+    assert len(left) >= 2
+    deadline = time.monotonic() + 30
+    while left and time.monotonic() < deadline:
+        left = {number for number in left if Path(f"/proc/{number}").exists()}
+        time.sleep(0.05)
+    assert not left

@@ -123,3 +123,14 @@ def test_the_neck_is_strided_convolutions():
             expected[i, j] = np.maximum(np.concatenate(row) / np.sqrt(1 + 1e-5), 0)
     np.testing.assert_allclose(found[0], expected, atol=1e-5)
     assert from_channels(jnp.zeros((1, 2, 2, 28)), 2).shape == (1, 4, 4, 7)
+
+
+def test_metres_are_multiplied_and_predicted_in_all_bits_of_float32(scene):
+    apply, variables, make, points, valid = scene
+    program = apply.lower(variables, make(points, valid)).as_text().splitlines()
+    products = [line for line in program if "stablehlo.dot_general" in line]
+    full = [line for line in products if "HIGHEST" in line]
+    assert len(full) == 1 < len(products)
+    assert "x10xf32>, tensor<10x" in full[0]  # the ten features of the points
+    predictions = sum("HIGHEST" in line for line in program if "stablehlo.convolution" in line)
+    assert predictions == 6  # five numbers of a box, and the heat map of all classes

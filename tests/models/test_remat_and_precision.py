@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -63,3 +64,16 @@ def test_bfloat16_stays_inside_the_network_and_close_to_float32():
         a, b = flat(exact["gradient"][part]), flat(rough["gradient"][part])
         assert a @ b > cosine * np.linalg.norm(a) * np.linalg.norm(b), part
         assert 0.9 < np.linalg.norm(b) / np.linalg.norm(a) < 1.1, part
+
+
+def test_what_sees_metres_or_predicts_them_has_all_bits_of_float32_on_every_platform():
+    """On GPUs and TPUs the default has fewer: x at 50 m would come in steps of centimetres or more."""
+    detector = build_detector(tiny_run.CONFIG, tiny_run.SENSOR)
+    variables = jax.eval_shape(detector.init, jax.random.key(0))
+    image = jax.ShapeDtypeStruct((1, tiny_run.SENSOR.num_rows, tiny_run.SENSOR.num_columns, 9, 1), np.float32)
+    program = jax.jit(lambda v, x: detector.apply(v, x, train=False)).lower(variables, image).as_text()
+    lines = [line for line in program.splitlines() if "stablehlo.convolution" in line]
+    kernels = [(re.findall(r"3x3x\d+x(\d+)xf32>\)", line), "HIGHEST" in line) for line in lines]
+    full = sorted(int(found[0]) for found, highest in kernels if highest)
+    assert full == [18, *6 * [32], *6 * [128]]  # the stem's first layer, then logits and numbers of six levels
+    assert sum(not highest for _, highest in kernels) > 20

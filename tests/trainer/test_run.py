@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,8 +18,11 @@ from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
 from fcos_lidar_jax.data.frame import GivenFrames
+from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.input_pipeline.database import prepare_database
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.trainer import evaluate, prediction
 from fcos_lidar_jax.trainer import run as runs
 from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
@@ -412,3 +416,38 @@ def test_with_damaged_checkpoints_alone_the_run_is_not_begun_anew(finished, tmp_
         description.unlink()
     with pytest.raises(CheckpointError, match=r"all \d checkpoints are damaged"):
         train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"config": dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())}, "copy_paste: got no ground-truth"),
+        ({"threads": -1}, "threads: got -1, expected at least 0"),
+        ({"workers": -1}, "workers: got -1, expected at least 0"),
+    ],
+)
+def test_what_cannot_prepare_batches_is_refused_before_there_is_a_run(tmp_path, options, message):
+    options = {"config": CONFIG, "frames": FRAMES, "steps": 1, **options}
+    with pytest.raises(ValueError, match=message):
+        runs.train(out=tmp_path / "run", **options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_outside_the_main_thread_it_trains_as_well(finished, tmp_path):
+    """No signal can be asked for there."""
+    with ThreadPoolExecutor(1) as thread:
+        state = thread.submit(train_tiny, tmp_path / "run", weights=weights()).result()
+    assert bits(state) == bits(finished[1])
+
+
+def test_an_evaluation_keeps_no_cloud(monkeypatch):
+    kept = []
+
+    def evaluate_frames(found, truths, metric):
+        kept.extend(truths)
+
+    monkeypatch.setattr(prediction, "evaluate_frames", evaluate_frames)
+    detector = TrainedDetector(build_detector(CONFIG, FRAMES.sensor), weights())
+    evaluate(detector, TESTS)
+    assert [frame.points.shape for frame in kept] == 2 * [(0, 5)]
+    assert all(frame.points.base is None for frame in kept), "a view of the whole cloud"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,15 @@ import pytest
 from tiny_run import CONFIG, SENSOR, bits
 
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.training import Checkpoint, CheckpointError, detection_variables, make_optimizer, make_state
+from fcos_lidar_jax.training import (
+    Checkpoint,
+    CheckpointError,
+    checkpoint,
+    detection_variables,
+    load_checkpoint,
+    make_optimizer,
+    make_state,
+)
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of, find_checkpoint
 
 
@@ -30,8 +39,7 @@ def state_at(step: int):
 
 def save(checkpoints: Checkpoints, step: int, score: float | None = None) -> None:
     state = state_at(step)
-    checkpoint = Checkpoint(CONFIG, SENSOR, detection_variables(state), step, score=score)
-    checkpoints.save(checkpoint, state)
+    checkpoints.save(Checkpoint(CONFIG, SENSOR, detection_variables(state), step, score=score), state)
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +72,35 @@ def test_keeps_the_newest_ones_and_the_best(tmp_path):
         kept.append(steps(checkpoints))
     # Of equal scores the newest stays.
     assert kept == [[1], [1, 2], [2, 3], [2, 3, 4], [4, 5], [5, 6], [5, 6, 7], [7, 8]]
+
+
+def test_a_score_comes_later_and_leaves_the_arrays_alone(copy):
+    before = {path: path.read_bytes() for path in copy.folder.rglob("*") if path.is_file()}
+    copy.score(6, 0.7)
+    assert best_of(copy.paths()) == copy.folder / "00000006"
+    changed = [path for path in before if path.exists() and path.read_bytes() != before[path]]
+    assert changed == [copy.folder / "00000006" / "checkpoint.json"]
+    assert load_checkpoint(copy.folder / "00000006").score == 0.7
+    assert bits(copy.newest(shapes())[1]) == bits(state_at(6))
+    Checkpoints(copy.folder, keep=1).score(6, 0.8)
+    assert steps(copy) == [6]  # the one of step 2 was the best
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_interrupted_in_the_exchange_of_two_checkpoints_the_old_one_stays(copy, monkeypatch, number):
+    before = {p: p.read_bytes() for p in copy.folder.rglob("*") if p.is_file()}
+    replace, calls = os.replace, []
+
+    def interrupted(source, target):
+        calls.append(target)
+        if len(calls) == number:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr(checkpoint.os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        save(copy, 6, 0.9)
+    assert {p: p.read_bytes() for p in copy.folder.rglob("*") if p.is_file()} == before
 
 
 def test_goes_on_from_the_newest(copy):

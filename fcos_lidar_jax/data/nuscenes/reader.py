@@ -289,7 +289,8 @@ class NuScenes:
     def _read(self, row: int) -> np.ndarray:
         path = self._path(row)
         if not os.path.isfile(path):
-            hint = "" if self.allow_missing_sweeps else "; --allow-missing-sweeps continues with fewer sweeps"
+            needed = self.allow_missing_sweeps or row in self.index.sample_sweep  # Keyframes are never left out.
+            hint = "" if needed else "; --allow-missing-sweeps continues with fewer sweeps"
             raise ValueError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
         if not self.follow_links and not path.resolve().is_relative_to(self._base):
             found = f"resolves to {path.resolve()}, expected a file below {self._base}"

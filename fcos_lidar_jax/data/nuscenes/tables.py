@@ -67,7 +67,6 @@ class Scene(Row):
 
     file = "scene.json"
     name: str
-    first_sample_token: str
 
 
 class Sample(Row):
@@ -76,7 +75,6 @@ class Sample(Row):
     file = "sample.json"
     timestamp: _Time
     scene_token: str
-    next: str
 
 
 class Instance(Row):
