@@ -31,6 +31,16 @@ def _check_least(config: Any, least: int, *fields: str) -> None:
         _check(getattr(config, field) >= least, field, getattr(config, field), f"at least {least}")
 
 
+def _check_hashable(section: Any) -> None:
+    """Programs are compiled once a configuration: it is looked up by its hash, which lists do not have."""
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if dataclasses.is_dataclass(value):
+            _check_hashable(value)
+        else:
+            _check(not isinstance(value, list | dict | set), field.name, value, "a tuple")
+
+
 def _check_choices(config: Any) -> None:
     """Every ``Literal`` field of a configuration holds one of its choices."""
     for name, hint in get_type_hints(type(config)).items():
@@ -363,6 +373,7 @@ class Config:
     """Where given, the detector is CenterPoint, and ``model`` and the rounds of ``projection`` are ignored."""
 
     def __post_init__(self) -> None:
+        _check_hashable(self)
         _check_least(self, 1, "num_sweeps", "max_points", "max_boxes")
         _check_least(self, 0, "fade_epochs")
         names = self.classes

@@ -46,6 +46,9 @@ class Sensor:
     azimuth_limits_rad: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            if isinstance(value := getattr(self, field.name), list | np.ndarray):
+                raise ValueError(f"{field.name}: got {value!r}, expected a tuple")
         table = np.asarray(self.inclinations_rad, np.float64)
         if table.ndim != 1 or table.size < 2:
             raise ValueError(f"inclinations_rad: got {table.size} beams, expected at least 2")

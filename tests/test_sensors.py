@@ -1,5 +1,6 @@
 """Sensors: presets, files, and one line for what cannot be a sensor."""
 
+import dataclasses
 import json
 import math
 
@@ -117,3 +118,9 @@ def test_missing_and_garbled_files(tmp_path):
 
 def test_sensors_are_hashable_and_comparable():
     assert len({TINY, load_sensor("tiny")}) == 1
+
+
+@pytest.mark.parametrize("field", ["inclinations_rad", "origin_m", "limit_z_m"])
+def test_a_list_is_refused_for_a_sensor_is_looked_up_by_its_hash(field):
+    with pytest.raises(ValueError, match=rf"{field}: got \[.*\], expected a tuple"):
+        dataclasses.replace(TINY, **{field: list(getattr(TINY, field))})

@@ -217,8 +217,10 @@ def test_a_file_name_is_no_formula(home, tmp_path):
 def test_detect_fuses_sweeps(home, tmp_path):
     sweep = {"file": str(home / "good.npy"), "sensor_to_world": np.eye(4).tolist()}
     out, sweeps = tmp_path / "boxes.json", tmp_path / "sweeps.json"
-    sweeps.write_text(json.dumps([{**sweep, "timestamp_us": 10**6 - i} for i in range(2)]))
-    command("detect --sweeps", sweeps, "--checkpoint", home / "checkpoint", "--out", out)
+    sweeps.write_text(json.dumps([{**sweep, "timestamp_us": 10**6 - i} for i in range(3)]))
+    several = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
+    save_checkpoint(tmp_path / "several", Checkpoint(several, TINY, untrained(several, TINY), 7))
+    command("detect --sweeps", sweeps, "--checkpoint", tmp_path / "several", "--out", out)
     [result] = json.loads(out.read_text())["files"]
     points = np.load(home / "good.npy")
     close = (np.abs(points[:, :2]) < 1).all(axis=1).sum()
