@@ -354,7 +354,9 @@ def draw_learning(table: Table, record: dict[str, Any], path: Path) -> None:
         mean = np.mean(curves, axis=0)
         axis.plot(mean[:, 0], 100 * mean[:, 1], color=f"C{i}", linewidth=2, label=row["label"])
     axis.set(xlabel="samples seen", ylabel="mAP", ylim=(0, None))
-    axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds)", fontsize=11)
+    number = len(record["seeds"])
+    trained = f"{record['scale']}, {number} seed{'s' if number > 1 else ''}"
+    axis.set_title(f"{table.title} ({trained})", fontsize=11)
     axis.legend(fontsize=9, frameon=False)
     axis.spines[["top", "right"]].set_visible(False)
     save_png(figure, path)
