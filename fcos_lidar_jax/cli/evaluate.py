@@ -79,10 +79,7 @@ def run(args: Evaluate) -> None:
     _check(args)
     detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
     sensor = load_sensor(args.sensor) if detector is None else detector.sensor
-    layout = None if args.ground_truth is not None else args.data.layout()
-    if layout is not None and layout.format != "nuscenes" and args.data.index is not None:
-        raise ValueError(f"--index: got {args.data.index}, expected none: the format {layout.format} has none")
-    if layout is not None and _by_the_benchmark(args, layout, detector):
+    if args.ground_truth is None and _by_the_benchmark(args, args.data.layout(), detector):
         if args.data.class_map is not None:
             raise ValueError("--class-map: expected none with a results file: nuScenes' classes are fixed")
         if detector is not None and args.results is not None:

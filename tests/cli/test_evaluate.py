@@ -291,10 +291,6 @@ MISTAKES = {
         f"--results x {TRUTH} --backend openvino",
         "--backend: got openvino, expected none",
     ),
-    "index of simulated frames": (
-        "--format simulated --checkpoint HOME/checkpoint --index HOME/i",
-        "--index: got .*/i, expected none: the format simulated has none",
-    ),
     "version of simulated frames": (
         "--format simulated --checkpoint HOME/checkpoint --version v1",
         "version: got 'v1', expected none for simulated frames",
