@@ -160,9 +160,9 @@ def file_lock(path: str | Path, *, wait: bool = False) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
-    """Take the place of a file, line by line: within the context, a function that appends a line without its end.
+    """Replace a file line by line: within the context, a function that appends a line, given without its newline.
 
-    Whatever fails, an interruption or a full disk, whole lines alone are in the file.
+    Whatever happens, such as an interruption or a full disk, the file holds only whole lines.
 
     Raises:
         OSError: naming the file: another process writes there, or a line cannot be written.

@@ -60,10 +60,10 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
         code = _CLOSED_PIPE
     except SystemExit as stop:
         code, stopped = 0, stop
-    lost, unread = (_flush(stream) for stream in (sys.stdout, sys.stderr))
-    if isinstance(lost, BrokenPipeError) or isinstance(unread, BrokenPipeError):
+    failures = [_flush(stream) for stream in (sys.stdout, sys.stderr)]
+    if any(isinstance(failure, BrokenPipeError) for failure in failures):
         return _CLOSED_PIPE
-    if lost is not None and not code and (stopped is None or not stopped.code):
+    if (lost := failures[0]) is not None and not code and (stopped is None or not stopped.code):
         print(f"{program}: error: standard output: cannot be written: {lost.strerror}", file=sys.stderr)
         return 1
     if stopped is not None:

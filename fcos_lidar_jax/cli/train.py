@@ -102,6 +102,7 @@ def run(args: Train) -> None:
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
+    # The default sensor is that of the preset, which --name may have renamed.
     presets = [preset for preset in PRESETS.values() if preset.name == config.name] or PRESETS.values()
     if layout.format == "folder" and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
         raise ValueError(

@@ -27,7 +27,7 @@ from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, checksum
 from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
-from fcos_lidar_jax.input_pipeline.workers import end_with_parent
+from fcos_lidar_jax.workers import end_with_parent
 
 MAX_SWEEPS = 20  # Sweeps by which an object's points are distinguished.
 

@@ -23,8 +23,8 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.workers import end_with_parent
 from fcos_lidar_jax.types import HostBatch
+from fcos_lidar_jax.workers import end_with_parent
 
 _MAX_COLUMNS = 6
 _CLASS_BALANCE = 0xCB65  # Keeps these draws apart from others of the same seed.
@@ -126,7 +126,7 @@ def make_batches(
 
     if not 0 <= first_step <= num_steps:
         raise ValueError(f"first_step: got {first_step}, expected 0 to {num_steps}")
-    check_helpers(config, objects, threads=threads, workers=workers, num_processes=num_processes)
+    check_loader_options(config, objects, threads=threads, workers=workers, num_processes=num_processes)
     size = config.optimizer.batch_size
     if not 0 <= process_index < num_processes or size % num_processes:
         raise ValueError(
@@ -170,7 +170,7 @@ def make_batches(
         yield batches
 
 
-def check_helpers(
+def check_loader_options(
     config: Config, objects: GroundTruthDatabase | None, *, threads: int, workers: int, num_processes: int = 1
 ) -> None:
     """Refuse what :func:`make_batches` cannot prepare batches with, before there is a run; arguments as there."""

@@ -24,7 +24,7 @@ LOOP = 16
 
 
 FULL = lax.Precision.HIGHEST
-"""Of what sees metres or predicts them: by default GPUs and TPUs multiply float32 with fewer bits."""
+"""For layers that take positions or predict them: by default GPUs and TPUs round float32 to TF32 or bfloat16."""
 
 
 def convolve(

@@ -55,8 +55,8 @@ class MetaKernel(nn.Module):
         weigh = self.param("weigh", _he_normal, (channels, channels))
         weigh_bias = self.param("weigh_bias", nn.initializers.ones, (channels,))
         kernel = self.param("kernel", kernel_init, (3, 3, channels, self.features))
-        # W p_j - W p_i: the first layer is computed once a pixel, not once a neighbour. The products of places are
-        # far larger than their differences: with fewer bits these would be centimetres off at 50 m.
+        # W p_j - W p_i: the first layer is computed once a pixel, not once a neighbour. The products of
+        # positions are far larger than their differences, which TF32 would round to centimetres at 50 m.
         placed = pointwise(geometry.points, hidden, precision=FULL)
         around = [self._padded(image) for image in (x * geometry.exists.astype(x.dtype), placed)]
         total = jnp.zeros((), x.dtype)

@@ -12,7 +12,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -23,6 +22,7 @@ from fcos_lidar_jax.files import atomic_write, file_checksum, folder_lock, namin
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL, MAP_FILE, fixed_tables, scene_name, sweep_file
 from fcos_lidar_jax.simulation.render import DatasetSpec, render_scene
+from fcos_lidar_jax.workers import end_with_parent
 
 _WORK = ".synthesize"
 _ORDER, _TABLES = f"{_WORK}/order.json", f"{_WORK}/tables.json"  # checksums of the tables
@@ -182,14 +182,7 @@ def _begin_worker(counter: Any) -> None:
     global _counter
     _counter = counter
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interruption is the parent's affair
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
+    end_with_parent()
 
 
 def _write_tables(spec: DatasetSpec, root: Path) -> None:

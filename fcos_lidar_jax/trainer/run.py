@@ -29,7 +29,7 @@ from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import check_helpers, make_batches
+from fcos_lidar_jax.input_pipeline.loader import check_loader_options, make_batches
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
@@ -91,7 +91,7 @@ class _Run:
     devices: Sequence[Any] | None
     spec: dict[str, Any]
 
-    def owes_evaluation(self, step: int) -> bool:
+    def evaluation_pending(self, step: int) -> bool:
         """Whether a run was stopped during the evaluation after a step, whose record is written last."""
         return step > 0 and self.evaluates_at(step) and step not in evaluated_steps(self.folder)
 
@@ -174,7 +174,7 @@ def train(
             raise ValueError("training frames: got none, expected at least one")
         check_counts(frames)
         check_batch_size(config.optimizer.batch_size, mesh)
-        check_helpers(config, objects, threads=threads, workers=workers, num_processes=jax.process_count())
+        check_loader_options(config, objects, threads=threads, workers=workers, num_processes=jax.process_count())
         if config.augment is not None:
             check_augmentation(config.augment, frames.sensor)
         # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
@@ -203,8 +203,8 @@ def train(
     with _claimed(run, resume=resume):
         start = _start(run, optimizer, seed, resume, given)
         first = int(start.step)
-        owed = run.owes_evaluation(first)
-        if first == steps and not owed:
+        pending = run.evaluation_pending(first)
+        if first == steps and not pending:
             print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
             return start
         step = jit_step(make_train_step(run.detector, optimizer), mesh)
@@ -249,7 +249,7 @@ def train(
 
             try:
                 state = replicate(start, mesh)
-                if owed:
+                if pending:
                     _evaluate(run, first, state, metrics)
                 state = fit(
                     step,
@@ -409,7 +409,7 @@ def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | N
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
         draw_predictions(run.folder / "pictures", shown, run.tests, number)
         if not math.isnan(score):
-            run.checkpoints.score(number, score)
+            run.checkpoints.record_score(number, score)
         values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
         metrics.write(number, {"test/mAP": score, **values})  # Last: what is recorded is not done again.
 

@@ -112,13 +112,13 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
         with naming(folder):
             (beside / _DESCRIPTION).write_text(_with_hash(description), encoding="utf-8")
         os.chmod(beside, 0o755)
-        _exchange(beside, folder)
+        _replace_folder(beside, folder)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 
 
-def _exchange(beside: Path, folder: Path) -> None:
-    """Put a folder in the place of another one, which stays if that fails."""
+def _replace_folder(beside: Path, folder: Path) -> None:
+    """Replace a folder by another one; if that fails, the old one stays."""
     old = beside.with_name(beside.name + ".old")
     try:
         if folder.exists():

@@ -37,17 +37,17 @@ class Checkpoints:
         save_checkpoint(path, checkpoint, state=state)
         for leftover in self.folder.glob(".*"):  # of saves that were killed
             shutil.rmtree(leftover, ignore_errors=True)
-        self._remove_others(path)
+        self._prune(path)
         return path
 
-    def score(self, step: int, score: float) -> None:
+    def record_score(self, step: int, score: float) -> None:
         """Record what the checkpoint of a step scored, then remove what is no longer kept."""
         path = self.folder / f"{step:08d}"
         save_score(path, score)
-        self._remove_others(path)
+        self._prune(path)
 
-    def _remove_others(self, path: Path) -> None:
-        """Keep the best and the newest up to a checkpoint."""
+    def _prune(self, path: Path) -> None:
+        """Remove all but the best and the newest up to a checkpoint."""
         # Later ones are damaged: the run went back to before them. They would be taken for the newest.
         paths, passed_over = ([p for p in self.paths() if (p > path) == later] for later in (False, True))
         for old in {*passed_over, *paths[: -self.keep]} - {best_of(paths)}:

@@ -125,7 +125,7 @@ def test_the_neck_is_strided_convolutions():
     assert from_channels(jnp.zeros((1, 2, 2, 28)), 2).shape == (1, 4, 4, 7)
 
 
-def test_metres_are_multiplied_and_predicted_in_all_bits_of_float32(scene):
+def test_points_are_taken_and_boxes_predicted_in_full_float32_precision(scene):
     apply, variables, make, points, valid = scene
     program = apply.lower(variables, make(points, valid)).as_text().splitlines()
     products = [line for line in program if "stablehlo.dot_general" in line]

@@ -109,8 +109,8 @@ def test_in_bfloat16_it_differs_by_rounding():
     np.testing.assert_allclose(found.astype(jnp.float32), expected, rtol=0, atol=0.02 * expected.max())
 
 
-def test_places_are_multiplied_in_all_of_float32():
-    """On GPUs and TPUs the default has fewer bits, too few for differences of places."""
+def test_positions_are_multiplied_in_full_float32_precision():
+    """On GPUs and TPUs the default has fewer bits, too few for differences of positions."""
     module, (x, geometry) = MetaKernel(4), given()
     variables = variables_of(module, x, geometry)
     lowered = jax.jit(lambda x, g: module.apply(variables, x, g, train=False)).lower(x, geometry).as_text()

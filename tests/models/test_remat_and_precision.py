@@ -66,7 +66,7 @@ def test_bfloat16_stays_inside_the_network_and_close_to_float32():
         assert 0.9 < np.linalg.norm(b) / np.linalg.norm(a) < 1.1, part
 
 
-def test_what_sees_metres_or_predicts_them_has_all_bits_of_float32_on_every_platform():
+def test_positions_are_taken_and_predicted_in_full_float32_precision_on_every_platform():
     """On GPUs and TPUs the default has fewer: x at 50 m would come in steps of centimetres or more."""
     detector = build_detector(tiny_run.CONFIG, tiny_run.SENSOR)
     variables = jax.eval_shape(detector.init, jax.random.key(0))

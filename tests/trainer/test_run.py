@@ -18,11 +18,8 @@ from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
 from fcos_lidar_jax.data.frame import GivenFrames
-from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.input_pipeline.database import prepare_database
-from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.trainer import evaluate, prediction
 from fcos_lidar_jax.trainer import run as runs
 from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
@@ -438,16 +435,3 @@ def test_outside_the_main_thread_it_trains_as_well(finished, tmp_path):
     with ThreadPoolExecutor(1) as thread:
         state = thread.submit(train_tiny, tmp_path / "run", weights=weights()).result()
     assert bits(state) == bits(finished[1])
-
-
-def test_an_evaluation_keeps_no_cloud(monkeypatch):
-    kept = []
-
-    def evaluate_frames(found, truths, metric):
-        kept.extend(truths)
-
-    monkeypatch.setattr(prediction, "evaluate_frames", evaluate_frames)
-    detector = TrainedDetector(build_detector(CONFIG, FRAMES.sensor), weights())
-    evaluate(detector, TESTS)
-    assert [frame.points.shape for frame in kept] == 2 * [(0, 5)]
-    assert all(frame.points.base is None for frame in kept), "a view of the whole cloud"

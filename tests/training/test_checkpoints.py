@@ -76,18 +76,18 @@ def test_keeps_the_newest_ones_and_the_best(tmp_path):
 
 def test_a_score_comes_later_and_leaves_the_arrays_alone(copy):
     before = {path: path.read_bytes() for path in copy.folder.rglob("*") if path.is_file()}
-    copy.score(6, 0.7)
+    copy.record_score(6, 0.7)
     assert best_of(copy.paths()) == copy.folder / "00000006"
     changed = [path for path in before if path.exists() and path.read_bytes() != before[path]]
     assert changed == [copy.folder / "00000006" / "checkpoint.json"]
     assert load_checkpoint(copy.folder / "00000006").score == 0.7
     assert bits(copy.newest(shapes())[1]) == bits(state_at(6))
-    Checkpoints(copy.folder, keep=1).score(6, 0.8)
+    Checkpoints(copy.folder, keep=1).record_score(6, 0.8)
     assert steps(copy) == [6]  # the one of step 2 was the best
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_interrupted_in_the_exchange_of_two_checkpoints_the_old_one_stays(copy, monkeypatch, number):
+def test_interrupted_while_a_checkpoint_is_replaced_the_old_one_stays(copy, monkeypatch, number):
     before = {p: p.read_bytes() for p in copy.folder.rglob("*") if p.is_file()}
     replace, calls = os.replace, []
 

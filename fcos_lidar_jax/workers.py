@@ -1,4 +1,4 @@
-"""Worker processes, which must not outlive the process that they work for."""
+"""Worker processes, which must not outlive their parent process."""
 
 import multiprocessing
 import os
@@ -6,7 +6,10 @@ import threading
 
 
 def end_with_parent() -> None:
-    """End this worker process, which calls it, when its parent has ended, which may have been killed."""
+    """Have this worker process exit as soon as its parent has, even where the parent was killed.
+
+    Called in the worker, once.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
 

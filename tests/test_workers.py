@@ -1,0 +1,30 @@
+"""Worker processes exit with their parent, whatever ends it."""
+
+import signal
+import time
+
+from commands import run_python
+
+SCRIPT = """
+import multiprocessing, os, signal, time
+from fcos_lidar_jax.workers import end_with_parent
+def work(ready):
+    end_with_parent()
+    ready.set()
+    time.sleep(60)
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    ready = context.Event()
+    context.Process(target=work, args=(ready,)).start()
+    ready.wait()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_worker_exits_when_its_parent_was_killed(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(SCRIPT)
+    began = time.monotonic()
+    done = run_python(script)  # returns when the worker, too, has closed the outputs
+    assert done.returncode == -signal.SIGKILL
+    assert time.monotonic() - began < 50
