@@ -5,6 +5,8 @@ cheapest become positive; K follows from the boxes they predict. A location has 
 by (owner, cost) and a rank do, without a [boxes, locations] matrix.
 """
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,12 +22,16 @@ def owners(
     present: Bool[Array | np.ndarray, "n"],
     boxes: Float32[Array | np.ndarray, "m c"],
     box_valid: Bool[Array | np.ndarray, "m"],
+    *,
+    form: Literal["loop", "reduction"] | None = None,
 ) -> Int32[Array, "n"]:
     """The box that owns each point: the smallest that holds it, boundary included.
 
     Args:
         points, present: metres; False where there is no point.
         boxes, box_valid: ``x, y, z, l, w, h, yaw, ...``, anything where invalid; False for padding.
+        form: a loop over the boxes, or one reduction over all pairs; the same result (static). None: the loop on
+            a CPU, the reduction elsewhere, decided where the program runs.
 
     Returns:
         box index, -1 for none; equal volumes go to the lower index.
@@ -35,18 +41,45 @@ def owners(
     >>> owners(points, jnp.ones(3, bool), boxes, jnp.ones(2, bool)).tolist()
     [1, 0, -1]
     """
-    points, present, box_valid = jnp.asarray(points), jnp.asarray(present), jnp.asarray(box_valid)
-    solid = jnp.where(box_valid[:, None], boxes, 0.0)
-    volume = solid[:, 3] * solid[:, 4] * solid[:, 5]
+    solid = jnp.where(jnp.asarray(box_valid)[:, None], boxes, 0.0)
+    given = jnp.asarray(points), jnp.asarray(present), solid, jnp.asarray(box_valid)
+    if form is not None:
+        return {"loop": _owners_by_box, "reduction": _owners_by_rank}[form](*given)
+    return lax.platform_dependent(*given, cpu=_owners_by_box, default=_owners_by_rank)
+
+
+def _volume(boxes: Array) -> Array:
+    return boxes[:, 3] * boxes[:, 4] * boxes[:, 5]
+
+
+def _owners_by_box(points: Array, present: Array, boxes: Array, box_valid: Array) -> Array:
+    """One box after the other: a loop, fast where memory is the limit."""
+    volume = _volume(boxes)
 
     def visit(best: tuple[Array, Array], index: Array) -> tuple[tuple[Array, Array], None]:
         least, owner = best
-        inside = points_in_box(points, solid[index]) & present & box_valid[index]
+        inside = points_in_box(points, boxes[index]) & present & box_valid[index]
         better = inside & (volume[index] < least)
         return (jnp.where(better, volume[index], least), jnp.where(better, index, owner)), None
 
     start = (jnp.full(points.shape[0], jnp.inf, points.dtype), jnp.full(points.shape[0], -1, jnp.int32))
     return lax.scan(visit, start, jnp.arange(boxes.shape[0], dtype=jnp.int32))[0][1]
+
+
+def _owners_by_rank(points: Array, present: Array, boxes: Array, box_valid: Array) -> Array:
+    """All boxes at once, from the smallest: one reduction over [points, boxes], which is never written out."""
+    number, volume = boxes.shape[0], _volume(boxes)
+    order = jnp.argsort(volume, stable=True).astype(jnp.int32)
+    boxes, eligible = boxes[order], (box_valid & (volume < jnp.inf))[order]
+    inside = points_in_box(points[:, None], boxes) & present[:, None] & eligible
+    rank = jnp.where(inside, lax.iota(jnp.int32, number), number).min(axis=1, initial=number)
+    return jnp.append(order, jnp.int32(-1))[rank]
+
+
+def _edges(group: Array, num_boxes: int) -> Array:
+    """Where each group begins among sorted groups, i32[num_boxes + 1]; counted, because a search is a loop."""
+    sizes = jnp.zeros(num_boxes + 1, jnp.int32).at[group].add(1)
+    return jnp.cumsum(sizes) - sizes
 
 
 def _by_owner(owner: Array, value: Array, num_boxes: int) -> tuple[Array, Array, Array]:
@@ -67,7 +100,7 @@ def dynamic_k(
     [2, 0]
     """
     group, falling, _ = _by_owner(owner, -iou, num_boxes)
-    edges = jnp.searchsorted(group, jnp.arange(num_boxes + 1, dtype=group.dtype)).astype(jnp.int32)
+    edges = _edges(group, num_boxes)
     first, last = edges[:-1, None], edges[1:, None]
     slot = first + jnp.arange(top_q, dtype=jnp.int32)
     # Gathered to [m, q] and summed along a fixed axis: the rounding cannot depend on the device.
@@ -87,8 +120,7 @@ def cheapest(
     """
     num_boxes, num_locations = num_positive.shape[0], owner.shape[0]
     group, _, index = _by_owner(owner, cost, num_boxes)
-    first = jnp.searchsorted(group, jnp.arange(num_boxes + 1, dtype=group.dtype)).astype(jnp.int32)
-    rank = lax.iota(jnp.int32, num_locations) - first[group]
+    rank = lax.iota(jnp.int32, num_locations) - _edges(group, num_boxes)[group]
     wanted = jnp.concatenate([num_positive, jnp.zeros(1, num_positive.dtype)])
     return jnp.zeros(num_locations, bool).at[index].set(rank < wanted[group])
 

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -53,16 +54,25 @@ def rotated_nms(
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     ranked = jnp.where(usable, scores, -jnp.inf)
     kinds = jnp.zeros(ranked.shape, jnp.int32) if labels is None else jnp.asarray(labels)
-    if form not in ("rows", "matrix", None):
-        raise ValueError(f"form: got {form!r}, expected 'rows', 'matrix' or None")
+    _check_form(form)
     if overlap not in ("bev", "3d"):
         raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
     options = {"threshold": iou_threshold, "max_outputs": max_outputs, "vertical": overlap == "3d"}
     rows, matrix = (functools.partial(suppress, **options) for suppress in (_by_rows, _by_matrix))
     candidates = oriented(boxes), ranked, usable, kinds
+    return _in_form(form, rows, matrix, *candidates)
+
+
+def _check_form(form: str | None) -> None:
+    if form not in ("rows", "matrix", None):
+        raise ValueError(f"form: got {form!r}, expected 'rows', 'matrix' or None")
+
+
+def _in_form(form: str | None, rows: Callable[..., T], matrix: Callable[..., T], *given: Array) -> T:
+    """The result of one form; by default of the one that suits the platform."""
     if form is not None:
-        return (rows if form == "rows" else matrix)(*candidates)
-    return lax.platform_dependent(*candidates, cpu=rows, default=matrix)
+        return (rows if form == "rows" else matrix)(*given)
+    return lax.platform_dependent(*given, cpu=rows, default=matrix)
 
 
 def merge_boxes(
@@ -75,6 +85,7 @@ def merge_boxes(
     labels: Int32[Array | np.ndarray, "n"] | None = None,
     iou_threshold: float,
     overlap: Literal["bev", "3d"] = "bev",
+    form: Literal["rows", "matrix"] | None = None,
 ) -> Float32[Array, "d c"]:
     """Weighted NMS (RangeDet: Fan et al., ICCV 2021): what suppression keeps, improved by what it suppressed.
 
@@ -86,6 +97,8 @@ def merge_boxes(
             averaged, too.
         kept, used: what it returned.
         iou_threshold: a box takes part if IoU > threshold (static).
+        form: one row of IoUs per kept box, or the whole matrix; equal up to rounding (static). None: rows on a
+            CPU, the matrix elsewhere, decided where the program runs.
 
     Returns:
         the merged boxes, zero in unused slots.
@@ -95,30 +108,56 @@ def merge_boxes(
     >>> merge_boxes(boxes, jnp.array([0.8, 0.4]), valid, *best, iou_threshold=0.3)[0, 0].round(3).tolist()
     0.10000000149011612
     """
-    table = jnp.asarray(boxes, jnp.float32)
+    _check_form(form)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
     kinds = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
-    best, best_kinds, number = table[kept], kinds[kept], used.sum()
+    mean = functools.partial(_weighted_mean, threshold=iou_threshold, vertical=overlap == "3d")
+    given = jnp.asarray(boxes, jnp.float32), weights, kinds, usable, kept, used
+    rows, matrix = (functools.partial(merged, mean) for merged in (_merged_in_turn, _merged_at_once))
+    return _in_form(form, rows, matrix, *given)
+
+
+def _weighted_mean(
+    box: Array, kind: Array, candidates: Array, weights: Array, kinds: Array, *, threshold: float, vertical: bool
+) -> Array:
+    """A box, c, improved by the candidates [n, c] that overlap it and are of its kind."""
+    offsets = candidates - box
+    # Elementwise throughout: with an update of the column a GPU would write out [kept, n, c].
+    offsets = jnp.where(lax.iota(jnp.int32, box.shape[0]) == 6, wrap_angle(offsets), offsets)
+    turn = offsets[:, 6]
+    member = _overlaps(oriented(box), oriented(candidates), threshold, vertical)
+    member &= (kinds == kind) & (jnp.abs(turn) <= _MAX_TURN_RAD)
+    weight = jnp.where(member, weights, 0.0)
+    shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
+    total = weight.sum()
+    mean = box + shift / jnp.where(total > 0, total, 1.0)
+    return mean.at[6].set(wrap_angle(mean[6]))
+
+
+def _merged_in_turn(
+    mean: Callable[..., Array], boxes: Array, weights: Array, kinds: Array, usable: Array, kept: Array, used: Array
+) -> Array:
+    """One kept box after the other: as many turns as there are."""
+    best, best_kinds = boxes[kept], kinds[kept]
 
     def of_best(order: Array) -> Array:
-        candidates, strengths, groups = table[order], weights[order], kinds[order]
-        turned = oriented(candidates)
+        few = boxes[order], weights[order], kinds[order]
 
         def merged(slot: Array, result: Array) -> Array:
-            offsets = candidates - best[slot]
-            offsets = offsets.at[:, 6].set(wrap_angle(offsets[:, 6]))
-            member = _overlaps(oriented(best[slot]), turned, iou_threshold, overlap == "3d")
-            member &= (groups == best_kinds[slot]) & (jnp.abs(offsets[:, 6]) <= _MAX_TURN_RAD)
-            weight = jnp.where(member, strengths, 0.0)
-            shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
-            total = weight.sum()
-            mean = best[slot] + shift / jnp.where(total > 0, total, 1.0)
-            return result.at[slot].set(mean.at[6].set(wrap_angle(mean[6])))
+            return result.at[slot].set(mean(best[slot], best_kinds[slot], *few))
 
-        return lax.fori_loop(0, number, merged, jnp.zeros_like(best))
+        return lax.fori_loop(0, used.sum(), merged, jnp.zeros_like(best))
 
     return _with_few(of_best, jnp.argsort(~usable, stable=True), usable)
+
+
+def _merged_at_once(
+    mean: Callable[..., Array], boxes: Array, weights: Array, kinds: Array, usable: Array, kept: Array, used: Array
+) -> Array:
+    """All kept boxes at once: one reduction over [kept, n]."""
+    merged = jax.vmap(mean, (0, 0, None, None, None))(boxes[kept], kinds[kept], boxes, weights, kinds)
+    return jnp.where(used[:, None], merged, 0.0)
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:

@@ -1,11 +1,14 @@
 """Points to a range image by multi-round projection (paper, sections 3.1 and 3.2).
 
 Every round keeps, per cell, the point with the smallest key, by a scatter-min; the losers enter the next
-round. A key is exact and total, so the result depends neither on the device nor on the order in which it
-works: older sweep, then bits of the range, then row of the input.
+round. A key is exact and total: older sweep, then bits of the range, then row of the input. So the winners do not
+depend on the order in which a device works, on batching, on ``jit`` or on the number of devices. They may depend
+on the platform: square roots, divisions and angles of a CPU, a GPU and a TPU can differ in the last bit, which
+moves a point at the edge of a cell or changes which of two equally far points wins.
 """
 
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -124,11 +127,22 @@ def priority_keys(
     return bits | jnp.where(time_lag != 0, jnp.uint32(1 << 31), jnp.uint32(0))
 
 
-def winners(cell: Int32[Array, "n"], keys: Array, *, num_cells: int, num_rounds: int) -> Int32[Array, "s r"]:
+def winners(
+    cell: Int32[Array, "n"],
+    keys: Array,
+    *,
+    num_cells: int,
+    num_rounds: int,
+    form: Literal["scatter", "sort"] | None = None,
+) -> Int32[Array, "s r"]:
     """The point that each cell keeps in each round (paper, section 3.2).
 
-    ``cell`` is ``num_cells`` for points that take no part. Of the ``keys``, uint32, smaller ones are better; equal
-    ones are settled by the lower index.
+    Args:
+        cell: row-major cells, ``num_cells`` for points that take no part.
+        keys: u32[n], smaller ones are better; equal ones are settled by the lower index.
+        num_cells, num_rounds: s and r (static).
+        form: a scatter-min per round, or one sort of all points; the same result (static). None: the sort on TPUs,
+            which have no 64-bit integers, else the scatter.
 
     Returns:
         point index for every cell and round, -1 where nothing is left.
@@ -137,6 +151,17 @@ def winners(cell: Int32[Array, "n"], keys: Array, *, num_cells: int, num_rounds:
     >>> winners(jnp.array([0, 0, 0]), keys, num_cells=1, num_rounds=4).tolist()
     [[1, 2, 0, -1]]
     """
+    if form not in ("scatter", "sort", None):
+        raise ValueError(f"form: got {form!r}, expected 'scatter', 'sort' or None")
+    scatter, sort = (
+        functools.partial(of, num_cells=num_cells, num_rounds=num_rounds) for of in (_by_scatter, _by_sort)
+    )
+    if form is not None:
+        return (scatter if form == "scatter" else sort)(cell, keys)
+    return lax.platform_dependent(cell, keys, tpu=sort, default=scatter)
+
+
+def _by_scatter(cell: Array, keys: Array, *, num_cells: int, num_rounds: int) -> Array:
     # Key and index in one word settle ties in the same scatter. 64 bits are switched on for this alone.
     with jax.enable_x64(True):
         word = (keys.astype(jnp.uint64) << 32) | lax.iota(jnp.uint64, cell.shape[0])
@@ -151,6 +176,16 @@ def winners(cell: Int32[Array, "n"], keys: Array, *, num_cells: int, num_rounds:
         kept = kept.T
         index = (kept & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
         return jnp.where(kept == empty, jnp.int32(-1), index)
+
+
+def _by_sort(cell: Array, keys: Array, *, num_cells: int, num_rounds: int) -> Array:
+    place = lax.iota(jnp.int32, cell.shape[0])
+    cell, _, index = lax.sort((cell, keys, place), num_keys=3)
+    first = lax.cummax(jnp.where(jnp.diff(cell, prepend=-1) != 0, place, 0))  # Of the point's cell.
+    rank = place - first
+    slot = jnp.where((rank < num_rounds) & (cell < num_cells), cell * num_rounds + rank, num_cells * num_rounds)
+    empty = jnp.full(num_cells * num_rounds, -1, jnp.int32)
+    return empty.at[slot].set(index, mode="drop").reshape(num_cells, num_rounds)
 
 
 @functools.partial(jax.jit, static_argnames=("sensor", "num_rounds", "prioritize_current"))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from jax import export
 
 from fcos_lidar_jax.assignment import assign, cheapest, dynamic_k, owners
 
@@ -22,26 +23,45 @@ def i32(x):
 compute = jax.jit(assign, static_argnames=("num_boxes", "top_q"))
 
 
+FORMS = pytest.mark.parametrize("form", ["loop", "reduction"])
+
+
+@FORMS
 @pytest.mark.parametrize("num_boxes", [1, 40, 256])
-def test_owners_equal_loops_with_overlapping_boxes(num_boxes):
+def test_owners_equal_loops_with_overlapping_boxes(num_boxes, form):
     rng = np.random.default_rng(num_boxes)
     boxes = oracles.random_boxes(rng, num_boxes, 4.0).astype(np.float32)
     points = rng.normal(0, 4, (300, 3)).astype(np.float32) * [1, 1, 0.3]
     points = points.astype(np.float32)
     present, valid = rng.random(300) < 0.9, rng.random(num_boxes) < 0.8
-    found = np.asarray(owners(points, present, boxes, valid))
+    found = np.asarray(owners(points, present, boxes, valid, form=form))
     expected = [oracles.owner(p, boxes, valid) if here else -1 for p, here in zip(points, present, strict=True)]
     np.testing.assert_array_equal(found, expected)
     inside = [sum(oracles.inside(p, b) for b in boxes) for p in points]
     assert num_boxes == 1 or max(inside) >= 2
 
 
-def test_owner_boundary_equal_volumes_and_padding():
+@FORMS
+def test_owner_boundary_equal_volumes_and_padding(form):
     boxes = f32([[0, 0, 0, 2, 2, 2, 0], [0.5, 0, 0, 2, 2, 2, 0], [0, 0, 0, np.nan, 1, 1, 0]])
     points = f32([[1, 1, 1], [1.5, 0, 0], [0, 0, 0], [1.6, 0, 0], [0, 0, 0]])
     present = jnp.array([True, True, True, True, False])
-    found = owners(points, present, boxes, jnp.array([True, True, False]))
+    found = owners(points, present, boxes, jnp.array([True, True, False]), form=form)
     assert found.tolist() == [0, 1, 0, -1, -1]
+    endless = f32([[0, 0, 0, np.inf, 2, 2, 0]])
+    assert owners(points, present, endless, jnp.array([True]), form=form).tolist() == [-1] * 5
+
+
+def test_only_a_cpu_loops_over_boxes_and_nothing_searches():
+    given = jnp.zeros((9, 3)), jnp.ones(9, bool), jnp.ones((4, 7)), jnp.ones(4, bool)
+
+    def assigned(*given):
+        owner = owners(*given)
+        return assign(owner, jnp.ones(9), jnp.ones(9), num_boxes=4)
+
+    for platform, loops in (("cpu", 1), ("cuda", 0), ("tpu", 0)):
+        program = export.export(jax.jit(assigned), platforms=(platform,))(*given)
+        assert program.mlir_module().count("stablehlo.while") == loops
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -1,5 +1,7 @@
 """Rotated NMS: both forms keep exactly what Shapely's greedy loop keeps."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,10 +138,11 @@ def merged_by_loops(boxes, scores, valid, labels, kept, threshold, *, vertical):
     return np.array(result)
 
 
+@FORMS
 @pytest.mark.parametrize("overlap", ["bev", "3d"])
-def test_merged_boxes_are_the_weighted_means_of_those_that_overlap(overlap):
+def test_merged_boxes_are_the_weighted_means_of_those_that_overlap(form, overlap):
     """Some of them turned by half a turn, and some across the seam of the angle."""
-    options = {"iou_threshold": 0.3, "overlap": overlap}
+    options = {"iou_threshold": 0.3, "overlap": overlap, "form": form}
     merge = jax.jit(merge_boxes, static_argnames=tuple(options))
     for seed in range(3):
         boxes, scores, valid, labels = clusters(seed)
@@ -177,18 +180,29 @@ def test_merging_does_not_depend_on_unused_slots(slots):
     assert np.abs(np.asarray(expected) - boxes[alone[0]])[np.asarray(used)].max() > 0.05
 
 
-def test_boxes_without_size_or_score_stay_as_they_are_and_gradients_are_finite():
+def test_merging_loops_on_a_cpu_only():
+    boxes, scores, valid, labels = clusters(0)
+    given = boxes, scores, valid, jnp.arange(50), jnp.ones(50, bool)
+    for platform, loops in (("cpu", 1), ("cuda", 0)):
+        merge = jax.jit(lambda *given: merge_boxes(*given, labels=labels, iou_threshold=0.3))
+        program = export.export(merge, platforms=(platform,))(*given)
+        assert program.mlir_module().count("stablehlo.while") == loops
+
+
+@FORMS
+def test_boxes_without_size_or_score_stay_as_they_are_and_gradients_are_finite(form):
     boxes = np.zeros((4, 9), np.float32)
     boxes[:, 0] = [0, 5, 5, 9]
     boxes[1:3, 3:6] = 1
     scores, valid = np.array([0.9, 0.0, 0.0, np.nan], np.float32), np.array([True, True, True, False])
     kept, used = jnp.array([0, 1, 0, 0]), jnp.array([True, True, False, False])
-    found = np.asarray(merge_boxes(boxes, scores, valid, kept, used, iou_threshold=0.3))
+    merge = functools.partial(merge_boxes, iou_threshold=0.3, form=form)
+    found = np.asarray(merge(boxes, scores, valid, kept, used))
     np.testing.assert_array_equal(found[:2], boxes[:2])
     assert not found[2:].any()
 
     def loss(boxes, scores):
-        return jax.vmap(lambda b, s: merge_boxes(b, s, valid, kept, used, iou_threshold=0.3))(boxes, scores).sum()
+        return jax.vmap(lambda b, s: merge(b, s, valid, kept, used))(boxes, scores).sum()
 
     tangents = jnp.ones((2, 4, 9)), jnp.ones((2, 4))
     _, slope = jax.jvp(loss, (np.stack([boxes] * 2), np.stack([np.nan_to_num(scores)] * 2)), tangents)

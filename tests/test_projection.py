@@ -1,14 +1,16 @@
 """Multi-round projection against loops, on random, degenerate and real clouds."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from jax import export
 
-from fcos_lidar_jax.projection import image_cells, project_points, remove_close
+from fcos_lidar_jax.projection import image_cells, project_points, remove_close, winners
 from fcos_lidar_jax.sensors import (
     KITTI_HDL64E,
     NUSCENES_HDL32E,
@@ -116,6 +118,40 @@ def test_rounds_keep_what_the_loops_keep(num_rounds, prioritize_current):
     channels = np.stack([*points[:, :3].T, *map(np.asarray, angles), points[:, 3], np.ones(400), points[:, 4]], 1)
     chosen = np.where(expected[..., None] >= 0, channels[expected], 0)
     np.testing.assert_array_equal(features, chosen.swapaxes(1, 2))
+
+
+@pytest.mark.parametrize("form", ["scatter", "sort"])
+def test_forms_of_the_winners_keep_what_a_sort_per_cell_keeps(form):
+    """With ties, empty cells, points that take no part, and more rounds than points."""
+    rng = np.random.default_rng(0)
+    cell, keys = rng.integers(0, 21, 200).astype(np.int32), rng.integers(0, 9, 200).astype(np.uint32)
+    keys[::7] |= np.uint32(1 << 31)
+    cell[cell == 4] = 5
+    expected = np.full((20, 30), -1)
+    for c in range(20):
+        own = np.flatnonzero(cell == c)
+        ranked = own[np.lexsort((own, keys[own]))][:30]
+        expected[c, : len(ranked)] = ranked
+    options = {"num_cells": 20, "num_rounds": 30, "form": form}
+    found = jax.jit(functools.partial(winners, **options))(cell, keys)
+    np.testing.assert_array_equal(found, expected)
+    batch = jax.vmap(functools.partial(winners, **options))(np.stack([cell, cell[::-1]]), np.stack([keys] * 2))
+    np.testing.assert_array_equal(batch[0], expected)
+    none = winners(jnp.full(3, 20), jnp.zeros(3, jnp.uint32), **options)
+    np.testing.assert_array_equal(none, np.full((20, 30), -1))
+
+
+def test_a_tpu_needs_no_64_bits_and_no_loop():
+    given = jnp.zeros(9, jnp.int32), jnp.zeros(9, jnp.uint32)
+    for platform, wide in (("cpu", True), ("cuda", True), ("tpu", False)):
+        program = jax.jit(functools.partial(winners, num_cells=4, num_rounds=3))
+        text = export.export(program, platforms=(platform,))(*given).mlir_module()
+        assert ("ui64" in text, "stablehlo.while" in text) == (wide, wide)
+
+
+def test_unknown_forms_are_refused():
+    with pytest.raises((ValueError, TypeError), match="form"):
+        winners(jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.uint32), num_cells=1, num_rounds=1, form="heap")
 
 
 @pytest.mark.parametrize("sensor", PRESETS.values(), ids=PRESETS)

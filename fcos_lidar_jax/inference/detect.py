@@ -67,8 +67,7 @@ def select_candidates(
     scores = jnp.where(eligible, probability * quality, -1.0)
     kept, first = [], 0
     for size in layout.level_sizes:
-        level = scores[first : first + size].reshape(-1)
-        best, index = lax.top_k(level, min(config.candidates_per_level, level.shape[0]))
+        best, index = _best_pairs(scores[first : first + size], config.candidates_per_level)
         kept.append((best, index + first * num_classes))
         first += size
     score, pair = (jnp.concatenate(values) for values in zip(*kept, strict=True))
@@ -77,6 +76,18 @@ def select_candidates(
     boxes = decode(regression, locations.points[location], locations.azimuth_rad[location], axes=axes)
     valid = score >= 0
     return boxes, jnp.where(valid, score, 0.0), label, valid
+
+
+def _best_pairs(scores: Array, number: int) -> tuple[Array, Array]:
+    """``lax.top_k`` of the flattened scores f32[l, k], equal ones by index.
+
+    The best pairs are pairs of the locations with the best classes, so only these are sorted.
+    """
+    num_locations, num_classes = scores.shape
+    _, best = lax.top_k(scores.max(axis=1), min(number, num_locations))
+    best = jnp.sort(best)  # Equal scores stay in the order of their index.
+    score, index = lax.top_k(scores[best].reshape(-1), min(number, len(best) * num_classes))
+    return score, best[index // num_classes] * num_classes + index % num_classes
 
 
 def postprocess(

@@ -1,11 +1,14 @@
 """Convolutions, with weight gradients in the form that suits the platform.
 
 XLA's CPU backend is good at values and input gradients, but up to five times slower than matrix products at the
-weight gradients of few channels on large images. On other platforms, and for small images, all is the library's.
+weight gradients of few channels on large images. On GPUs, XLA turns the weight gradient of a dilated convolution
+into a convolution whose kernel is as large as the image, for which cuDNN has no good algorithm: there it is
+computed as the weight gradient of an undilated one. Everything else is the library's.
 """
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +51,7 @@ def convolve(
     kernel = kernel.astype(x.dtype)
     high, wide = (size // 2 * dilation for size in kernel.shape[:2])
     if kernel.shape[:2] == (1, 1) and groups == 1:
-        return pointwise(x[:, ::stride, ::stride], kernel[0, 0], precision=precision)
+        return pointwise(every(x, stride), kernel[0, 0], precision=precision)
     if circular and wide:
         x = jnp.concatenate([x[:, :, -wide:], x, x[:, :, :wide]], axis=2)
         wide = 0
@@ -61,10 +64,29 @@ def convolve(
         feature_group_count=groups,
         precision=precision,
     )
-    if stride > 1 or groups > 1:
-        return product(x, kernel)
-    by_rows = functools.partial(_by_rows, sizes=kernel.shape[:2], dilation=dilation, padding=(high, wide))
-    return _linear(product, by_rows, x, kernel, LOOP * LARGE)
+    how: dict[str, Any] = {"sizes": kernel.shape[:2], "dilation": dilation, "padding": (high, wide)}
+    forms = {}
+    if stride == groups == 1 and _multiply_adds(x, kernel) >= LOOP * LARGE:
+        forms["cpu"] = functools.partial(_by_rows, **how)
+    if stride == 1 and dilation > 1:
+        forms["default"] = functools.partial(_by_phases, **how, groups=groups, precision=precision)
+    return _with_weight_gradient(product, forms, x, kernel)
+
+
+def every(x: Image, stride: int) -> Image:
+    """Every ``stride``-th pixel of both axes, from the first on.
+
+    Reshaped and indexed, not sliced with a stride: XLA aborts on a GPU where it fuses such a slice into a matrix
+    product (``triton_tiling_propagation.cc: Check failed``, seen with jaxlib 0.10.2).
+
+    >>> every(jnp.arange(15.0).reshape(1, 3, 5, 1), 2)[0, :, :, 0].tolist()
+    [[0.0, 2.0, 4.0], [10.0, 12.0, 14.0]]
+    """
+    if stride == 1:
+        return x
+    x = jnp.pad(x, ((0, 0), (0, -x.shape[1] % stride), (0, -x.shape[2] % stride), (0, 0)))
+    b, h, w, c = x.shape
+    return x.reshape(b, h // stride, stride, w // stride, stride, c)[:, :, 0, :, 0]
 
 
 def pointwise(
@@ -81,44 +103,50 @@ def pointwise(
     """
     kernel = kernel.astype(x.dtype)
     product = functools.partial(_of_pixels, dtype=dtype, precision=precision)
-    return _linear(product, _flat, x, kernel, LARGE)
+    forms = {"cpu": _flat} if _multiply_adds(x, kernel) >= LARGE else {}
+    return _with_weight_gradient(product, forms, x, kernel)
 
 
 def _of_pixels(x: Image, kernel: Array, dtype: DTypeLike | None, precision: lax.Precision | None) -> Image:
     return jnp.einsum("bhwc,co->bhwo", x, kernel, preferred_element_type=dtype, precision=precision)
 
 
-def _linear(
-    product: Callable[..., Image], on_cpu: Callable[..., Array], x: Image, kernel: Array, least: float
+def _multiply_adds(x: Image, kernel: Array) -> int:
+    """Of one image, at stride 1."""
+    return x.shape[1] * x.shape[2] * kernel.size
+
+
+def _with_weight_gradient(
+    product: Callable[..., Image], forms: dict[str, Callable[..., Array]], x: Image, kernel: Array
 ) -> Image:
-    """``product(x, kernel)``, whose weight gradient on CPU is ``on_cpu(x, g)`` from ``least`` multiply-adds on."""
-    large = x.shape[1] * x.shape[2] * kernel.size >= least
-    return _with_weight_gradient(product, on_cpu, x, kernel) if large else product(x, kernel)
+    """``product(x, kernel)``, whose weight gradient is ``forms[platform](x, g)``, else the library's."""
+    return _custom(product, tuple(forms.items()), x, kernel) if forms else product(x, kernel)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _with_weight_gradient(product: Callable, on_cpu: Callable, x: Image, kernel: Array) -> Image:
+def _custom(product: Callable, forms: tuple, x: Image, kernel: Array) -> Image:
     return product(x, kernel)
 
 
-def _forward(product: Callable, on_cpu: Callable, x: Image, kernel: Array) -> tuple[Image, tuple[Image, Array]]:
+def _forward(product: Callable, forms: tuple, x: Image, kernel: Array) -> tuple[Image, tuple[Image, Array]]:
     return product(x, kernel), (x, kernel)
 
 
-def _backward(product: Callable, on_cpu: Callable, inputs: tuple[Image, Array], g: Image) -> tuple[Image, Array]:
+def _backward(product: Callable, forms: tuple, inputs: tuple[Image, Array], g: Image) -> tuple[Image, Array]:
     x, kernel = inputs
 
     def library(x: Image, g: Image) -> Array:
         return jax.linear_transpose(lambda kernel: product(x, kernel), kernel)(g)[0]
 
-    def chosen(x: Image, g: Image) -> Array:
-        return on_cpu(x, g).astype(kernel.dtype)
+    def converted(form: Callable[..., Array]) -> Callable[..., Array]:
+        return lambda x, g: form(x, g).astype(kernel.dtype)
 
     (to_x,) = jax.linear_transpose(lambda x: product(x, kernel), x)(g)
-    return to_x, lax.platform_dependent(x, g, cpu=chosen, default=library)
+    by_platform = {"cpu": library, "default": library} | {name: converted(form) for name, form in forms}
+    return to_x, lax.platform_dependent(x, g, **by_platform)
 
 
-_with_weight_gradient.defvjp(_forward, _backward)
+_custom.defvjp(_forward, _backward)
 
 
 def _flat(x: Image, g: Image) -> Float[Array, "_ _"]:
@@ -132,6 +160,41 @@ def _flat(x: Image, g: Image) -> Float[Array, "_ _"]:
 
 def _summed_in(x: Array) -> DTypeLike:
     return jnp.promote_types(x.dtype, jnp.float32)
+
+
+def _by_phases(
+    x: Image,
+    g: Image,
+    *,
+    sizes: tuple[int, ...],
+    dilation: int,
+    padding: tuple[int, int],
+    groups: int,
+    precision: lax.Precision | None,
+) -> Kernel:
+    """Weight gradient at stride 1 as that of an undilated convolution.
+
+    Pixels that are ``dilation`` apart become neighbours in one of ``dilation * dilation`` smaller images.
+    """
+
+    def phases(image: Array) -> Array:
+        image = jnp.pad(image, ((0, 0), *((0, -size % dilation) for size in image.shape[1:3]), (0, 0)))
+        b, h, w, c = image.shape
+        image = image.reshape(b, h // dilation, dilation, w // dilation, dilation, c)
+        return image.transpose(0, 2, 4, 1, 3, 5).reshape(-1, h // dilation, w // dilation, c)
+
+    x, g = phases(x), phases(g)
+    product = functools.partial(
+        lax.conv_general_dilated,
+        x,
+        window_strides=(1, 1),
+        padding=[(size // dilation, size // dilation) for size in padding],
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        feature_group_count=groups,
+        precision=precision,
+    )
+    kernel = jax.ShapeDtypeStruct((*sizes, x.shape[-1] // groups, g.shape[-1]), x.dtype)
+    return jax.linear_transpose(product, kernel)(g)[0]
 
 
 def _by_rows(x: Image, g: Image, *, sizes: tuple[int, ...], dilation: int, padding: tuple[int, int]) -> Kernel:

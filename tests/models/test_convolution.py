@@ -89,6 +89,51 @@ def test_batches_of_gradients_and_gradients_of_batches(case):
     assert_close([found_x[:, 0], found_kernel], [to_x, to_kernel], 1e-5)
 
 
+@pytest.mark.parametrize("groups", [1, 3])
+@pytest.mark.parametrize("circular", [False, True])
+@pytest.mark.parametrize("size", [(3, 3), (5, 3), (3, 1)])
+def test_weight_gradients_by_phases_are_the_librarys(size, circular, groups):
+    """Of sizes that the dilation divides and does not divide, as a GPU computes them."""
+    dilation, rng = 3, np.random.default_rng(0)
+    high, wide = (k // 2 * dilation for k in size)
+    for height, width in ((9, 13), (12, 9), (1, 20)):
+        x, kernel = (
+            jnp.asarray(rng.normal(size=s), "float32") for s in ((2, height, width, 6), (*size, 6 // groups, 9))
+        )
+        x = jnp.pad(x, ((0, 0), (0, 0), (wide, wide), (0, 0)), mode="wrap") if circular else x
+        padding = (high, 0 if circular else wide)
+        product = functools.partial(
+            lax.conv_general_dilated,
+            window_strides=(1, 1),
+            padding=[(p, p) for p in padding],
+            rhs_dilation=(dilation, dilation),
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            feature_group_count=groups,
+        )
+        value, pull_back = jax.vjp(product, x, kernel)
+        g = jnp.asarray(rng.normal(size=value.shape), "float32")
+        options = {"dilation": dilation, "padding": padding, "groups": groups, "precision": None}
+        assert_close([convolution._by_phases(x, g, sizes=size, **options)], [pull_back(g)[1]], 1e-5)
+
+
+def test_on_a_gpu_no_kernel_is_as_large_as_the_image():
+    """The weight gradient of a dilated convolution has a stride there; by phases nothing has."""
+    function, arguments, *_ = example("dilated")
+    strides = {}
+    for platform in ("cpu", "cuda"):
+        program = export.export(jax.jit(gradients(function)), platforms=(platform,))(*arguments)
+        strides[platform] = "stride = [3, 3]" in program.mlir_module()
+    assert strides == {"cpu": False, "cuda": False}  # On a CPU by rows: every image is large here.
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_every_pixel_of_a_stride_is_a_slice(stride):
+    x = jnp.arange(2 * 7 * 10 * 3.0).reshape(2, 7, 10, 3)
+    np.testing.assert_array_equal(convolution.every(x, stride), x[:, ::stride, ::stride])
+    gradient = jax.grad(lambda x: (convolution.every(x, stride) ** 2).sum())(x)
+    np.testing.assert_array_equal(gradient, jax.grad(lambda x: (x[:, ::stride, ::stride] ** 2).sum())(x))
+
+
 @pytest.mark.parametrize("dtype", TOLERANCES)
 def test_pointwise_sums_in_the_type_asked_for(dtype):
     _, (x, kernel, weights), values, (to_x, to_kernel) = example("1x1", dtype)

@@ -92,11 +92,12 @@ def test_the_form_of_the_stem_is_that_of_the_platform_also_in_exported_programs(
         stem = Stem(config, form=form)
         return jax.jit(lambda v, x: stem.apply(v, x, train=True, mutable=["batch_stats"]))
 
-    platforms = [("cpu",), ("cuda",), ("cpu", "cuda")]
+    platforms = [("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda")]
     programs = {p: export.export(of(None), platforms=p)(variables, image) for p in platforms}
-    kernels = {"split": "tensor<3x3x6x24xf32>", "dense": "tensor<3x3x27x108xf32>"}  # two groups, all nine
+    # Two groups, all nine with zeros between them, all nine without.
+    kernels = {"split": "3x3x6x24xf32>", "dense": "3x3x27x108xf32>", "grouped": "feature_group_count = 9"}
     forms = {p: {f for f, k in kernels.items() if k in program.mlir_module()} for p, program in programs.items()}
-    assert forms == {("cpu",): {"split"}, ("cuda",): {"dense"}, ("cpu", "cuda"): {"split", "dense"}}
+    assert [forms[p] for p in platforms] == [{"split"}, {"grouped"}, {"dense"}, {"split", "grouped"}]
     weights = normal(1, 2, 8, 12, 8)
 
     def gradient(form):

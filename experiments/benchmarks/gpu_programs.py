@@ -1,0 +1,395 @@
+"""What does XLA make of the programs for a GPU that is not there? Compiled by its whole pipeline, never run.
+
+    bash .ci/gpu                                                        # fetches XLA's plugin (0.6 GB), then this
+    python -m experiments.benchmarks.gpu_programs --plugin build/gpu    # once it is there
+    python -m experiments.benchmarks.gpu_programs --plugin build/gpu --programs train-nuscenes detect-compact
+    python -m experiments.benchmarks.gpu_programs --plugin build/gpu --all  # every preset
+
+Every program is compiled in a process of its own, so that an abort of XLA costs a line and not the check. A line
+per program: seconds, GFLOP per frame, temporary memory, kernels outside of loops, and the loops with their number
+of iterations (``?`` where the data decide) and the kernels of one. ``slow`` counts weight gradients that became a
+convolution with a kernel as large as the image, for which cuDNN has no good algorithm. Exit code 1 where a program
+does not compile, or exchanges anything between devices but sums.
+
+There are no times: nothing is run, and the kernels are chosen without measuring them. Cost: about a minute per
+training step and 15 seconds per detection on one core.
+"""
+
+import collections
+import dataclasses
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from experiments.script import Options, run_measurement
+
+Card = Literal["h100", "a100"]
+_CARDS = {  # major, cores, shared memory per core and per block, bandwidth, L2, clock, memory, name
+    "h100": (9, 132, 233472, 232448, 3352320000000, 52428800, 1.98, 84929347584, "NVIDIA H100 80GB HBM3"),
+    "a100": (8, 108, 167936, 166912, 2039000000000, 41943040, 1.41, 84929347584, "NVIDIA A100-SXM4-80GB"),
+}
+_TARGET = """
+gpu_device_info {{
+  threads_per_block_limit: 1024
+  threads_per_warp: 32
+  shared_memory_per_block: 49152
+  shared_memory_per_core: {shared}
+  threads_per_core_limit: 2048
+  core_count: {cores}
+  fpus_per_core: 128
+  block_dim_limit_x: 2147483647
+  block_dim_limit_y: 65535
+  block_dim_limit_z: 65535
+  memory_bandwidth: {bandwidth}
+  l2_cache_size: {cache}
+  clock_rate_ghz: {clock}
+  device_memory_size: {memory}
+  shared_memory_per_block_optin: {optin}
+  cuda_compute_capability {{ major: {major} }}
+  registers_per_core_limit: 65536
+  registers_per_block_limit: 65536
+}}
+platform_name: "CUDA"
+dnn_version_info {{ major: 9 minor: 10 }}
+runtime_version {{ major: 12 minor: 9 patch: 0 }}
+device_description_str: "{name}"
+"""
+_NO_KERNEL = {
+    "parameter",
+    "constant",
+    "tuple",
+    "get-tuple-element",
+    "bitcast",
+    "while",
+    "conditional",
+    "call",
+    "iota",
+}
+_EXCHANGES = ("all-gather", "all-to-all", "collective-permute", "reduce-scatter")
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """One program to compile."""
+
+    kind: Literal["train", "detect", "export"]
+    preset: str
+    precision: str = "float32"
+    batch: int = 1
+    remat: bool = False
+    meta_kernel: bool = False
+    card: Card = "h100"
+    devices: int = 1
+
+
+PROGRAMS = {
+    "train-nuscenes": Program("train", "nuscenes", batch=4),
+    "train-nuscenes-bfloat16": Program("train", "nuscenes", "bfloat16", batch=4),
+    "train-nuscenes-remat": Program("train", "nuscenes", batch=4, remat=True),
+    "train-nuscenes-bfloat16-remat": Program("train", "nuscenes", "bfloat16", batch=4, remat=True),
+    "train-nuscenes-8-devices": Program("train", "nuscenes", batch=32, devices=8),
+    "train-kitti": Program("train", "kitti", batch=2),
+    "train-compact": Program("train", "compact", batch=2),
+    "train-compact-bfloat16": Program("train", "compact", "bfloat16", batch=4),
+    "train-compact-a100": Program("train", "compact", batch=2, card="a100"),
+    "train-centerpoint_compact": Program("train", "centerpoint_compact", batch=2),
+    "detect-nuscenes": Program("detect", "nuscenes"),
+    "detect-compact": Program("detect", "compact"),
+    "export-quickstart": Program("export", "quickstart"),
+}
+"""The check: what is compiled without ``--all``."""
+
+
+def all_programs() -> dict[str, Program]:
+    """The check's programs, and the training and detection of every preset in both precisions."""
+    from fcos_lidar_jax.presets import PRESETS
+
+    programs = dict(PROGRAMS)
+    for name, config in PRESETS.items():
+        for precision in ("float32", "bfloat16") if config.pillars is None else ("float32",):
+            for kind, batch in (("train", 1), ("detect", 1)):
+                label = f"{kind}-{name}" + ("" if precision == "float32" else f"-{precision}") + "-1"
+                programs[label] = Program(kind, name, precision, batch)
+    programs["train-compact-meta_kernel"] = Program("train", "compact", batch=2, meta_kernel=True)
+    return programs
+
+
+@dataclasses.dataclass(frozen=True)
+class Args(Options):
+    """What to compile."""
+
+    plugin: Path  # Folder with XLA's plugin for CUDA, as `.ci/gpu` fetches it.
+    programs: tuple[str, ...] = ()  # Names of programs; default: those of the check.
+    all: bool = False  # Every preset too.
+    limit_s: int = 900  # Longest time for one program, seconds.
+    one: str | None = None  # Compile this one in this process and print its record; for the script itself.
+    text: Path | None = None  # With --one: write the compiled program here.
+
+
+def measure(args: Args) -> dict[str, Any]:
+    """Compile the programs one by one and print a line for each."""
+    known = all_programs() if args.all or args.programs else PROGRAMS
+    if unknown := [name for name in args.programs if name not in known]:
+        raise ValueError(f"--programs: got {unknown[0]!r}, expected some of {', '.join(known)}")
+    nvcc = args.plugin.resolve() / "nvidia" / "cuda_nvcc"
+    if not nvcc.is_dir():
+        raise ValueError(f"--plugin: {args.plugin}: no nvidia/cuda_nvcc there: run bash .ci/gpu")
+    flags = f"--xla_gpu_cuda_data_dir={nvcc} --xla_gpu_autotune_level=0"
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(args.plugin.resolve()), os.environ.get("PYTHONPATH")])),
+        "PATH": f"{nvcc / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}",
+        "TF_CPP_MIN_LOG_LEVEL": "2",
+    }
+    records = {}
+    for name in args.programs or known:
+        records[name] = _compiled(name, args, environment)
+        print(_line(name, records[name]), flush=True)
+    failed = [name for name, record in records.items() if record.get("failed") or record.get("exchanges")]
+    if failed:
+        raise ValueError(
+            f"{len(failed)} of {len(records)} programs are not as they should be: {', '.join(failed)}"
+        )
+    return {"programs": records, "run": False}
+
+
+def _compiled(name: str, args: Args, environment: dict[str, str]) -> dict[str, Any]:
+    """The record of one program, compiled in a process of its own."""
+    command = [sys.executable, "-m", "experiments.benchmarks.gpu_programs", "--plugin", str(args.plugin)]
+    try:
+        done = subprocess.run(
+            [*command, "--one", name], capture_output=True, text=True, timeout=args.limit_s, env=environment
+        )
+    except subprocess.TimeoutExpired:
+        return {"failed": f"not compiled after {args.limit_s} s"}
+    if done.returncode == 0:
+        return json.loads(done.stdout.splitlines()[-1])
+    lines = done.stderr.splitlines() or ["nothing said"]
+    why = next((line for line in lines if "Check failed" in line), lines[-1])
+    return {"failed": f"exit code {done.returncode}: {why[-200:]}"}
+
+
+def _line(name: str, record: dict[str, Any]) -> str:
+    if "failed" in record:
+        return f"{name:30} FAILED: {record['failed']}"
+    loops = " ".join(f"{trips or '?'}x{kernels}" for trips, kernels in record["loops"]) or "none"
+    stages = "".join(f" {stage} {gflop:.0f}" for stage, gflop in record.get("stage_gflop", {}).items())
+    return (
+        f"{name:30} {record['seconds']:4.0f} s  {record['gflop_per_frame']:6.0f} GFLOP per frame{stages}  "
+        f"{record['temporary_mib']:6} MiB  {record['kernels']:5} kernels  loops {loops}"
+        + (f"  slow {record['slow']}" if record["slow"] else "")
+        + (f"  exchanges {record['exchanges']}" if record.get("exchanges") else "")
+        + (f"  {record['all_reduces']} all-reduces" if record.get("all_reduces") else "")
+    )
+
+
+def compile_program(program: Program, text: Path | None = None) -> dict[str, Any]:
+    """Compile in this process, whose environment :func:`measure` has made."""
+    import jax
+    from jax.experimental import topologies
+    from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+    jax.devices()  # Finds the plugin too.
+    names = ("major", "cores", "shared", "optin", "bandwidth", "cache", "clock", "memory", "name")
+    target = _TARGET.format(**dict(zip(names, _CARDS[program.card], strict=True)))
+    shape = f"{program.devices}x1x1" if program.devices > 1 else "1x1x1"
+    topology = topologies.get_topology_desc(
+        platform="cuda", topology_name="", target_config=target, topology=shape
+    )
+    mesh = Mesh(topology.devices, ("data",), axis_types=(AxisType.Auto,))
+    everywhere, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("data"))
+    function, given, split, donated = _function(program)
+    shardings = tuple(rows if divided else everywhere for divided in split)
+    jitted = jax.jit(function, in_shardings=shardings, out_shardings=everywhere, donate_argnums=donated)
+    began = time.monotonic()
+    lowered = jitted.lower(*given)
+    compiled = lowered.compile()
+    seconds = time.monotonic() - began
+    module, memory = compiled.as_text(), compiled.memory_analysis()
+    if text is not None:
+        text.write_text(module)
+    kernels, loops = count_kernels(module)
+    found = re.findall(r" (all-reduce|" + "|".join(_EXCHANGES) + r")(?:-start)?\(", module)
+    record = {
+        **dataclasses.asdict(program),
+        "seconds": round(seconds),
+        "gflop_per_frame": round(gflop(lowered) / program.batch, 1),
+        "temporary_mib": memory.temp_size_in_bytes >> 20,
+        "kernels": kernels,
+        "loops": loops,
+        "slow": len(re.findall(r"window=\{size=\d{2,}x\d{3,}.*__cudnn\$convForward", module)),
+        "custom_calls": dict(collections.Counter(re.findall(r'custom_call_target="([^"]+)"', module))),
+    }
+    if program.devices > 1:
+        counts = collections.Counter(found)
+        record["all_reduces"] = counts.pop("all-reduce", 0)
+        record["exchanges"] = dict(counts)
+    if program.kind == "detect":
+        record["stage_gflop"] = _stage_gflop(program, everywhere)
+    return record
+
+
+def gflop(lowered: Any) -> float:
+    """Operations of a program before XLA optimises it, in the form of the platform it was lowered for, by 1e9."""
+    import jax
+    from jaxlib import _jax
+
+    module = lowered.compiler_ir("hlo").get_hlo_module()
+    return _jax.hlo_module_cost_analysis(jax.devices()[0].client, module)["flops"] / 1e9
+
+
+def _configured(program: Program) -> Any:
+    from fcos_lidar_jax.presets import PRESETS
+
+    config = PRESETS[program.preset]
+    model = config.model
+    if config.pillars is None:
+        changes = {"precision": program.precision, "remat": program.remat, "meta_kernel": program.meta_kernel}
+        model = dataclasses.replace(model, **changes)
+    optimizer = dataclasses.replace(config.optimizer, batch_size=program.batch)
+    return dataclasses.replace(config, model=model, optimizer=optimizer)
+
+
+def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...], tuple[int, ...]]:
+    """A function, shapes of its arguments, which of them are split over the devices, and which are donated."""
+    import jax
+    import jax.numpy as jnp
+
+    from fcos_lidar_jax.inference.detect import make_detect
+    from fcos_lidar_jax.inference.export import export_detector, load_exported
+    from fcos_lidar_jax.inference.load import load_trained
+    from fcos_lidar_jax.models import build_detector
+    from fcos_lidar_jax.sensors import load_sensor
+    from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+    from fcos_lidar_jax.types import Batch
+
+    def spec(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(shape, dtype)
+
+    config = _configured(program)
+    sensor = load_sensor(config.sensor)
+    b, n, m, c = program.batch, config.max_points, config.max_boxes, sensor.point_columns
+    if program.kind == "export":
+        file = Path("build", "exported")
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(export_detector(load_trained(program.preset)))
+        exported = load_exported(file).exported
+        clouds = spec(1, n, c), spec(1, n, dtype=jnp.bool_), spec(dtype=jnp.bool_)
+        return exported.call, clouds, (False,) * 3, ()
+    detector = build_detector(config, sensor)
+    optimizer = make_optimizer(config.optimizer, 1000)
+    state = jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(0))
+    if program.kind == "detect":
+        variables = {"params": state.params, "batch_stats": state.batch_stats}
+        return make_detect(detector), (variables, spec(n, c), spec(n, dtype=jnp.bool_)), (False,) * 3, ()
+    truth = spec(b, m, 9), spec(b, m, dtype=jnp.int32), spec(b, m, dtype=jnp.bool_)
+    arrays: Any = (spec(b, n, c), spec(b, n, dtype=jnp.bool_), *truth)
+    return make_train_step(detector, optimizer), (state, Batch(*arrays)), (False, True), (0,)
+
+
+def _stage_gflop(program: Program, sharding: Any) -> dict[str, float]:
+    """GFLOP of each stage of the range view's network, forward, for one frame."""
+    import jax
+
+    from fcos_lidar_jax.inference.stages import Stages
+    from fcos_lidar_jax.models import build_detector
+    from fcos_lidar_jax.sensors import load_sensor
+
+    config = _configured(program)
+    if config.pillars is not None:
+        return {}
+    sensor = load_sensor(config.sensor)
+    stages, found = Stages(config, sensor), {}
+    variables = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
+    shape = jax.ShapeDtypeStruct(
+        (1, sensor.num_rows, sensor.num_columns, 9, config.projection.num_rounds), "float32"
+    )
+    if config.model.circular_width:
+        from fcos_lidar_jax.locations import image_sensor
+
+        columns = image_sensor(sensor, config.model).num_columns
+        shape = jax.ShapeDtypeStruct((*shape.shape[:2], columns, *shape.shape[3:]), "float32")
+    x = jax.eval_shape(stages.preprocess, shape)
+    for name in ("stem", "backbone", "fpn", "heads"):
+        stage = getattr(stages, name)
+        lowered = jax.jit(stage, in_shardings=sharding, out_shardings=sharding).lower(variables, x)
+        found[name] = round(gflop(lowered), 1)
+        x = jax.eval_shape(stage, variables, x)
+    return found
+
+
+def count_kernels(module: str) -> tuple[int, list[tuple[int | None, int]]]:
+    """Kernels of a compiled program outside of its loops, and (iterations, kernels of one) of every loop.
+
+    Iterations are None where the data decide. A loop within a loop is one of the list; its own iterations count.
+
+    >>> text = '''%body (p: s32[]) -> s32[] {
+    ...   %a = s32[] fusion(%p), kind=kLoop
+    ... }
+    ... ENTRY %main (p: s32[]) -> s32[] {
+    ...   %w = s32[] while(%p), condition=%c, body=%body, backend_config={"known_trip_count":{"n":"5"}}
+    ...   ROOT %b = s32[] fusion(%w), kind=kLoop
+    ... }'''
+    >>> count_kernels(text)
+    (1, [(5, 1)])
+    """
+    bodies: dict[str, list[tuple[str, str]]] = {}
+    entry = ""
+    for name, operations in _computations(module):
+        bodies[name.removeprefix("ENTRY ")] = operations
+        entry = name.removeprefix("ENTRY ") if name.startswith("ENTRY ") else entry
+    loops: list[tuple[int | None, int]] = []
+
+    def kernels(name: str) -> int:
+        count = 0
+        for operation, line in bodies.get(name, []):
+            if operation == "while":
+                body, trips = re.search(r"body=(%[\w.\-]+)", line), re.search(r'trip_count":\{"n":"(\d+)"', line)
+                assert body is not None
+                slot = len(loops)
+                loops.append((None, 0))
+                loops[slot] = (int(trips[1]) if trips else None, kernels(body[1]))
+            elif operation == "conditional":
+                branches = re.search(r"branch_computations=\{([^}]*)\}", line)
+                names = branches[1].split(", ") if branches else re.findall(r"_computation=(%[\w.\-]+)", line)
+                count += max(map(kernels, names), default=0)
+            elif operation == "call":
+                called = re.search(r"to_apply=(%[\w.\-]+)", line)
+                count += kernels(called[1]) if called else 0
+            else:
+                count += operation not in _NO_KERNEL
+        return count
+
+    return kernels(entry), loops
+
+
+def _computations(module: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    """Name and (operation, line) of every computation of a module's text."""
+    name, operations = None, []
+    for line in module.splitlines():
+        head = re.match(r"(ENTRY )?(%[\w.\-]+) \(.*\{$", line)
+        if head:
+            name, operations = (head[1] or "") + head[2], []
+        elif line.startswith("}") and name is not None:
+            yield name, operations
+            name = None
+        elif name is not None and (found := re.search(r"= .*? ([a-z][a-z\-]*)\(", line)):
+            operations.append((found[1], line))
+
+
+if __name__ == "__main__":
+    if "--one" in sys.argv:
+        import tyro
+
+        options = tyro.cli(Args)
+        print(json.dumps(compile_program(all_programs()[str(options.one)], options.text)))
+    else:
+        run_measurement(measure, Args, __doc__)
