@@ -27,7 +27,7 @@ LOOP = 16
 
 
 FULL = lax.Precision.HIGHEST
-"""For layers that take positions or predict them: by default GPUs and TPUs round float32 to TF32 or bfloat16."""
+"""For layers that take positions: by default GPUs and TPUs round float32 inputs to TF32 or bfloat16."""
 
 
 def convolve(
