@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import sys
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -15,6 +14,7 @@ from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
@@ -76,19 +76,14 @@ class Train:
     no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without objects of other frames.
     threads: int = 2  # That prepare batches.
     workers: int = 0  # Processes that prepare batches, beside the threads.
-    distributed: bool = False
-    """One of several processes, started by Slurm, Open MPI or a TPU pod, which describe the cluster to JAX."""
-    coordinator: str | None = None
-    """HOST:PORT of process 0, where JAX cannot find it; with --num-processes and --process-index."""
-    num_processes: int | None = None  # In all.
-    process_index: int | None = None  # Which one this is, from 0.
+    processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
+    """Several processes share each batch."""
 
 
 def run(args: Train) -> None:
     """Train, and print where the result is."""
     _check(args)
-    if args.distributed or args.coordinator is not None:
-        jax.distributed.initialize(args.coordinator, args.num_processes, args.process_index)
+    join_processes(args.processes)
     config = dataclasses.replace(
         args.config,
         augment=None if args.no_augment else args.config.augment,
@@ -116,10 +111,9 @@ def run(args: Train) -> None:
             f"--evaluate-every: got {args.evaluate_every}, expected --val-split or --val-samples too: "
             f"{layout.root} has no split to evaluate on"
         )
-    if split is None and args.samples is None and tests is None and jax.process_index() == 0:
-        line = f"no splits: all {len(frames)} frames are trained on, none is left to evaluate on"
-        print(f"{layout.root}: {line}", file=sys.stderr)
-    if tests is not None and jax.process_index() == 0:
+    if split is None and args.samples is None and tests is None:
+        tell(f"{layout.root}: no splits: all {len(frames)} frames are trained on, none is left to evaluate on")
+    if tests is not None:
         _tell_of_overlap(frames, tests)
     if layout.format == "simulated":
         _check_simulated(len(frames), config)
@@ -152,8 +146,8 @@ def run(args: Train) -> None:
                 **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
             )
     except (KeyboardInterrupt, SystemExit):
-        if jax.process_index() == 0 and checkpoints.paths():
-            print("the same command with --resume goes on", file=sys.stderr)
+        if checkpoints.paths():
+            tell("the same command with --resume goes on")
         raise
     if jax.process_index() == 0:
         paths = checkpoints.paths()
@@ -163,7 +157,8 @@ def run(args: Train) -> None:
 
 
 def _check(args: Train) -> None:
-    check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep", "num_processes")
+    check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep")
+    check_processes(args.processes)
     check_at_least(args, 0, "threads", "workers", "seed")
     if args.seed >= NUM_SEEDS:
         raise ValueError(f"--seed: got {args.seed}, expected less than 2**32")
@@ -172,11 +167,6 @@ def _check(args: Train) -> None:
             if (given := getattr(args, name)) is not None:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"{option}: got {given!r} with --val-split none, which evaluates nothing")
-    given = [option is not None for option in (args.coordinator, args.num_processes, args.process_index)]
-    if any(given) and not all(given):
-        raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
-    if args.process_index is not None and not 0 <= args.process_index < (args.num_processes or 0):
-        raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
 
 
 def _check_simulated(number: int, config: Config) -> None:
@@ -220,8 +210,7 @@ def _tell_of_overlap(frames: FrameSet, tests: FrameSet) -> None:
     """Print how many frames are both trained and evaluated on."""
     names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
     if shared := len(names & tested):
-        line = f"{shared} of the {len(tests)} frames to evaluate on are trained on too: scores will be too high"
-        print(line, file=sys.stderr)
+        tell(f"{shared} of the {len(tests)} frames to evaluate on are trained on too: scores will be too high")
 
 
 def _own_database(args: Train, frames: FrameSet, min_points: int) -> database.GroundTruthDatabase:
