@@ -34,7 +34,7 @@ from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.trainer.results import write_predictions
-from fcos_lidar_jax.training.processes import agreed
+from fcos_lidar_jax.training.agreement import agreed
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.evaluation_report import PAGE, Example, clear_report, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page

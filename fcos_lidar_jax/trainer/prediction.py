@@ -18,7 +18,7 @@ from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
-from fcos_lidar_jax.training.processes import agreed
+from fcos_lidar_jax.training.agreement import agreed
 from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
 from fcos_lidar_jax.types import Detections
 

@@ -19,7 +19,7 @@ from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.prediction import Prediction, predict_groups
-from fcos_lidar_jax.training.processes import agreed, check_same
+from fcos_lidar_jax.training.agreement import agreed, check_same
 from fcos_lidar_jax.types import Detections
 
 _REMOVED = ("close", "invalid", "truncated")  # Why points were removed.

@@ -34,6 +34,7 @@ from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.trainer.prediction import evaluate, predict
+from fcos_lidar_jax.training.agreement import agreed
 from fcos_lidar_jax.training.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -47,7 +48,6 @@ from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
 from fcos_lidar_jax.training.metrics_log import MetricsLog, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.preemption import stop_requests
-from fcos_lidar_jax.training.processes import agreed
 from fcos_lidar_jax.training.sharding import check_batch_size, jit_step, make_mesh, replicate, shard_batch
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 from fcos_lidar_jax.types import TrainState

@@ -1,4 +1,4 @@
-"""Several processes that run one program: they continue together, or none does."""
+"""Agreement between processes: they continue together, or none does."""
 
 import contextlib
 from collections.abc import Iterator
