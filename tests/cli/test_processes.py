@@ -266,11 +266,20 @@ def test_sigterm_to_one_stops_both_after_the_same_frames(root, tmp_path):
 
 
 def train(data: Path, out: Path) -> list[str]:
-    """Four steps of batches of two, and an evaluation at the end."""
+    """Four steps of batches of two with objects of these frames alone, and an evaluation at the end."""
     where = ["--data-root", str(data), "--out", str(out), "--weights", str(data.parent / "start")]
-    sensor = ["--sensor", str(data.parent / "sensor.json"), "--max-points", "1024", "--no-copy-paste"]
+    sensor = ["--sensor", str(data.parent / "sensor.json"), "--max-points", "1024", "--samples", "0:6"]
     often = ["--steps", str(STEPS), "--save-every", str(STEPS), "--evaluate-every", str(STEPS)]
     return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often]
+
+
+def test_data_that_one_cannot_open_end_all(root, tmp_path):
+    both = [train(root, tmp_path / "run"), [*train(root, tmp_path / "run"), "--data-root", str(tmp_path / "gone")]]
+    first, second = ended(start_two("coordinator", *both))
+    assert (first[0], second[0]) == (1, 1)
+    assert error_lines(first[2]) == ["fcos-lidar: error: process 1: cannot train, see what it says"]
+    assert "gone: no such folder" in error_lines(second[2])[0]
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture(scope="module")
@@ -292,6 +301,7 @@ def test_two_processes_train_as_one_with_two_devices(root, two_devices, tmp_path
     assert (first[0], second[0]) == (0, 0), first[2] + second[2]
     found = read_metrics(tmp_path / "run")
     assert len(found) == STEPS + 1
+    assert sum(line.get("pasted_objects", 0) for line in found) > 0
     for ours, theirs in zip(found, two_devices, strict=True):
         assert ours.keys() == theirs.keys()
         for name in ours.keys() - _OF_ONE:
