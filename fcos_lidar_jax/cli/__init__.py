@@ -102,6 +102,8 @@ def _explain(error: Exception) -> str | None:
         return (
             f"JAX_PLATFORMS: got {os.environ.get('JAX_PLATFORMS')!r}, expected a platform of this machine: {text}"
         )
+    if isinstance(error, RuntimeError) and "Gloo" in text:  # JAX's connection to other processes, on CPUs
+        return f"another process ended, see what it says: {text}"
     if isinstance(error, ValueError | OSError | ArithmeticError):
         return text or f"{type(error).__name__} without a message"
     return None

@@ -1,10 +1,10 @@
 """The options that name a data set, the same for every command."""
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
+from fcos_lidar_jax.cli.processes import tell
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.classes import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
@@ -68,7 +68,7 @@ class DataOptions:
         mapped = MappedFrames(frames, config.classes)
         if lost := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
             counts = ", ".join(f"{count} {name}" for name, count in lost.items())
-            print(f"boxes of classes that the detector does not have are left out: {counts}", file=sys.stderr)
+            tell(f"boxes of classes that the detector does not have are left out: {counts}")
         return mapped
 
     def open_whole(
@@ -96,7 +96,7 @@ class DataOptions:
         if isinstance(frames, NuScenesFrames):
             missing = frames.nuscenes.missing_sweeps(list(frames.tokens), num_sweeps)
             if missing:
-                print(f"{missing} sweep files of split {split!r} are missing", file=sys.stderr)
+                tell(f"{missing} sweep files of split {split!r} are missing")
         return frames
 
 

@@ -3,18 +3,19 @@
 import contextlib
 import dataclasses
 import shutil
-import sys
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import tyro
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder, check_outside
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -33,6 +34,7 @@ from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.trainer.results import write_predictions
+from fcos_lidar_jax.training.agreement import agreed
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.evaluation_report import PAGE, Example, clear_report, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page
@@ -72,39 +74,29 @@ class Evaluate:
     report: bool = True  # Write report.html with its pictures, and frames.html.
     sensor: str = "nuscenes_hdl32e"
     """Sensor of the range images of a results file: preset or file; a checkpoint knows its own."""
+    processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
+    """Several processes share the detection."""
 
 
 def run(args: Evaluate) -> None:
     """Detect where a detector is given, evaluate, write, and print the scores."""
     _check(args)
-    detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
-    sensor = load_sensor(args.sensor) if detector is None else detector.sensor
-    if args.ground_truth is None and _by_the_benchmark(args, args.data.layout(), detector):
-        if args.data.class_map is not None:
-            raise ValueError("--class-map: expected none with a results file: nuScenes' classes are fixed")
-        if detector is not None and args.results is not None:
-            raise ValueError("--results: got --checkpoint too, expected one of them for nuScenes")
+    join_processes(args.processes)
     with contextlib.ExitStack() as locked:
-        if detector is not None:
+        if args.results is not None:  # nothing is written before the files are read and found good
+            compared = _compare(args, _open(args))
             locked.enter_context(folder_lock(args.out, "evaluating"))
-        compared = _compared(args, detector, sensor)
-        if detector is None:  # nothing is written before the files are read and found good
-            locked.enter_context(folder_lock(args.out, "evaluating"))
-        file, given = args.out / _DETECTIONS[compared.metric.benchmark], args.results
-        if given is not None and not (file.exists() and file.samefile(given)):
-            atomic_write(file, lambda path: shutil.copyfile(given, path))
-        clear_report(args.out)  # of other numbers
-        evaluation = evaluate(compared.predictions, compared.truth, compared.metric)
-        progress = Progress("sets", args.bootstrap)
-        intervals = write_evaluation(
-            args.out, evaluation, compared.meta, repeats=args.bootstrap, report=progress.show
-        )
-        for line in warnings(evaluation, len(compared.predictions), compared.truth):
-            print(line, file=sys.stderr)
-        print(describe(evaluation, intervals), flush=True)
-        if args.report:
-            _report(args, compared, evaluation, sensor)
-    print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
+            _score(args, compared)
+            return
+        with agreed("cannot evaluate"):
+            task = _open(args)
+            is_main_process = jax.process_index() == 0
+            if is_main_process:
+                locked.enter_context(folder_lock(args.out, "evaluating"))
+        _detect(args, task)
+        with agreed("cannot evaluate"):
+            if is_main_process:  # the others wait, for a process that has left would be missed
+                _score(args, _compare(args, task))
 
 
 def _check(args: Evaluate) -> None:
@@ -117,6 +109,11 @@ def _check(args: Evaluate) -> None:
             raise ValueError("--ground-truth: expected no data set with it")
     elif args.data.data_root is None and args.data.format is None:
         raise ValueError("evaluate: expected --data-root, or --results with --ground-truth")
+    check_processes(args.processes)
+    if args.processes.several and args.results is not None:
+        raise ValueError("--results: got several processes, expected one: nothing is detected")
+    if args.processes.several and args.backend != "xla":
+        raise ValueError(f"--backend: got {args.backend} with several processes, expected xla")
     check_at_least(args, 1, "batch_size")
     check_at_least(args, 0, "bootstrap")
     for name in ("backend", "batch_size"):
@@ -135,56 +132,98 @@ def _check(args: Evaluate) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
+class _Task:
+    """What is evaluated, on what."""
+
+    name: str  # of the truth, for the report
+    truth_of: str  # and for messages
+    benchmark: bool  # nuScenes' own metric is meant
+    sensor: Sensor
+    detector: CloudDetector | None
+    frames: FrameSet | None  # None for a file of truth, and where the report is to do without points
+    truth: GroundTruth | None  # of the benchmark
+
+
+@dataclasses.dataclass(frozen=True)
 class _Compared:
     """Predictions, the truth that they are compared with, and how."""
 
-    name: str
+    task: _Task
     predictions: BoxColumns
     truth: GroundTruth
     metric: Metric
     meta: dict[str, object]
-    frames: FrameSet | None
 
 
-def _compared(args: Evaluate, detector: CloudDetector | None, sensor: Sensor) -> _Compared:
+def _open(args: Evaluate) -> _Task:
+    """Open the detector and the data; refuse what does not fit together."""
+    detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
+    sensor = load_sensor(args.sensor) if detector is None else detector.sensor
     if args.ground_truth is not None:
-        truth = read_truth(args.ground_truth)
-        return _official(args, truth, None, of=str(args.ground_truth), name=args.ground_truth.name)
+        truth, file = read_truth(args.ground_truth), args.ground_truth
+        return _Task(file.name, str(file), True, sensor, None, None, truth)
     layout = args.data.layout()
+    benchmark = _by_the_benchmark(args, layout, detector)
+    _check_metric(args, detector, benchmark=benchmark)
     split = args.split or args.data.split("val")
     if args.split is None and split not in (None, "val", "mini_val"):
         line = f"no split val: {split}, the only one, is evaluated, which train takes too"
-        print(f"{layout.root}: {line}; scores of frames that were trained on are too high", file=sys.stderr)
+        tell(f"{layout.root}: {line}; scores of frames that were trained on are too high")
     name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), layout.version, split)))
-    if _by_the_benchmark(args, layout, detector):
-        frames = _keyframes(args, layout, detector, sensor, split)
-        truth = split_truth(frames.nuscenes, list(frames.tokens))
-        if detector is not None:
-            _detect_keyframes(args, detector, frames)
-        elif args.report and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
-            # A results file is evaluated with the tables alone.
-            line = f"{missing} files of keyframes are missing: the report shows boxes without points"
-            print(line, file=sys.stderr)
-            return _official(args, truth, None, of=name, name=name)
-        return _official(args, truth, frames, of=name, name=name)
-    if detector is None:
-        raise ValueError("--results: expected --checkpoint too: its classes are those of detections.json")
-    frames = args.data.open(detector.config, split=split, samples=args.samples, sensor=detector.sensor)
+    task = _Task(name, name, benchmark, sensor, detector, None, None)
+    if benchmark:
+        return _with_keyframes(args, task, layout, split)
+    assert detector is not None
+    frames = args.data.open(detector.config, split=split, samples=args.samples, sensor=sensor)
     if split is None and args.samples is None:
         line = f"no splits: all {len(frames)} frames are evaluated"
-        print(f"{layout.root}: {line}; scores of frames that were trained on are too high", file=sys.stderr)
-    file = args.out / _DETECTIONS[False]
-    if args.results is None:
+        tell(f"{layout.root}: {line}; scores of frames that were trained on are too high")
+    return dataclasses.replace(task, frames=frames)
 
-        def records(_: int, found: Detections) -> list[dict[str, Any]]:
-            return as_records(found, detector.classes)
 
-        _detect(args, detector, frames, file, records, partial(write_detections, classes=detector.classes))
+def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: bool) -> None:
+    """Refuse options that do not go with the metric that the data are evaluated by."""
+    if benchmark and args.data.class_map is not None:
+        raise ValueError("--class-map: expected none with a results file: nuScenes' classes are fixed")
+    if benchmark and detector is not None and args.results is not None:
+        raise ValueError("--results: got --checkpoint too, expected one of them for nuScenes")
+    if not benchmark and detector is None:
+        raise ValueError("--results: expected --checkpoint too: its classes are those of detections.json")
+
+
+def _compare(args: Evaluate, task: _Task) -> _Compared:
+    """Read the detections, given or just written, and the truth."""
+    file = args.results or args.out / _DETECTIONS[task.benchmark]
+    if task.truth is not None:
+        results = read_results(file, task.truth.tokens, of=task.truth_of)
+        for line in results.warnings:
+            tell(f"warning: {line}")
+        return _Compared(task, results.boxes, task.truth, NUSCENES_METRIC, results.meta)
+    detector, frames = task.detector, task.frames
+    assert detector is not None
+    assert frames is not None
     names = [frames.name(index) for index in range(len(frames))]
-    found = read_detections(args.results or file, names, detector.classes)
-    predictions, truth = frame_columns(found, (frames.frame(i) for i in range(len(frames))), names)
+    found = read_detections(file, names, detector.classes)
+    predictions, truth = frame_columns(found, (frames.truth(i) for i in range(len(frames))), names)
     metric = metric_of(detector.classes, tuple(detector.config.ranges_m.values()))
-    return _Compared(name, predictions, truth, metric, {}, frames)
+    return _Compared(task, predictions, truth, metric, {})
+
+
+def _score(args: Evaluate, compared: _Compared) -> None:
+    """Evaluate, write and print."""
+    file, given = args.out / _DETECTIONS[compared.metric.benchmark], args.results
+    if given is not None and not (file.exists() and file.samefile(given)):
+        atomic_write(file, lambda path: shutil.copyfile(given, path))
+    clear_report(args.out)  # of other numbers
+    evaluation = evaluate(compared.predictions, compared.truth, compared.metric)
+    progress = Progress("sets", args.bootstrap)
+    intervals = write_evaluation(args.out, evaluation, compared.meta, repeats=args.bootstrap, report=progress.show)
+    for line in warnings(evaluation, len(compared.predictions), compared.truth):
+        tell(line)
+    print(describe(evaluation, intervals), flush=True)
+    if args.report:
+        _report(args, compared, evaluation)
+    print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
 
 
 def _by_the_benchmark(args: Evaluate, layout: Layout, detector: CloudDetector | None) -> bool:
@@ -194,54 +233,53 @@ def _by_the_benchmark(args: Evaluate, layout: Layout, detector: CloudDetector | 
     return set(detector.classes) <= set(NUSCENES_CLASSES) and args.data.class_map is None
 
 
-def _official(args: Evaluate, truth: GroundTruth, frames: FrameSet | None, *, of: str, name: str) -> _Compared:
-    """The official results file, given or just written, against the truth that stands in ``of``."""
-    results = read_results(args.results or args.out / _DETECTIONS[True], truth.tokens, of=of)
-    for line in results.warnings:
-        print(f"warning: {line}", file=sys.stderr)
-    return _Compared(name, results.boxes, truth, NUSCENES_METRIC, results.meta, frames)
-
-
-def _keyframes(
-    args: Evaluate, layout: Layout, detector: CloudDetector | None, sensor: Sensor, split: str | None
-) -> NuScenesFrames:
+def _with_keyframes(args: Evaluate, task: _Task, layout: Layout, split: str | None) -> _Task:
+    """The task with the keyframes of nuScenes and their truth."""
     allowed = {name: getattr(args.data, name) for name in ("allow_missing_sweeps", "follow_links")}
     data = NuScenes(layout.root, str(layout.version), index=args.data.index, **allowed)
     tokens = data.sample_tokens if split is None else data.split(split, file=args.data.splits)
     if args.samples is not None:
         tokens = [tokens[i] for i in parse_ranges(args.samples, len(tokens))]
-    config = NUSCENES_SINGLE if detector is None else detector.config
-    if detector is not None and (missing := data.missing_sweeps(tokens, config.num_sweeps)):
-        print(f"{missing} sweep files of split {split!r} are missing", file=sys.stderr)
-    close = config.projection
-    return NuScenesFrames(data, tuple(tokens), config.num_sweeps, close.remove_close, close.close_m, sensor)
+    config = NUSCENES_SINGLE if task.detector is None else task.detector.config
+    close = config.projection.remove_close, config.projection.close_m
+    frames = NuScenesFrames(data, tuple(tokens), config.num_sweeps, *close, task.sensor)
+    task = dataclasses.replace(task, truth=split_truth(data, tokens), frames=frames)
+    if task.detector is not None and (missing := data.missing_sweeps(tokens, config.num_sweeps)):
+        tell(f"{missing} sweep files of split {split!r} are missing")
+    # A results file is evaluated with the tables alone.
+    if task.detector is None and args.report and (missing := data.missing_sweeps(tokens, 1)):
+        tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
+        return dataclasses.replace(task, frames=None)
+    return task
 
 
-def _detect_keyframes(args: Evaluate, detector: CloudDetector, frames: NuScenesFrames) -> None:
+def _detect(args: Evaluate, task: _Task) -> None:
+    """Write the detections, and report what was removed of the points but for those on the ego vehicle."""
+    detector, frames = task.detector, task.frames
+    assert detector is not None
+    assert frames is not None
+
     def entries(index: int, found: Detections) -> list[dict[str, Any]]:
+        if not isinstance(frames, NuScenesFrames):
+            return as_records(found, detector.classes)
         token = frames.tokens[index]
         return result_entries(found, token, frames.nuscenes.sensor_to_global(token), detector.classes)
 
-    _detect(args, detector, frames, args.out / _DETECTIONS[True], entries, write_results)
-
-
-def _detect(
-    args: Evaluate, detector: CloudDetector, frames: FrameSet, file: Path, entries: Any, write: Any
-) -> None:
-    """Write the detections, and report what was removed of the points but for those on the ego vehicle."""
-    options = {"entries": entries, "write": write, "batch_size": args.batch_size}
-    removed = write_predictions(detector, frames, file, **options)
+    write = write_results if task.benchmark else partial(write_detections, classes=detector.classes)
+    file, batch = args.out / _DETECTIONS[task.benchmark], {"batch_size": args.batch_size}
+    removed = write_predictions(detector, frames, file, entries=entries, write=write, **batch)
     if removed["truncated"]:
-        print(f"{removed['truncated']} points truncated: more than the detector's max_points", file=sys.stderr)
+        tell(f"{removed['truncated']} points truncated: more than the detector's max_points")
     if removed["invalid"]:
-        print(f"{removed['invalid']} points dropped: not finite, or beyond physical limits", file=sys.stderr)
+        tell(f"{removed['invalid']} points dropped: not finite, or beyond physical limits")
 
 
-def _report(args: Evaluate, compared: _Compared, evaluation: Evaluation, sensor: Sensor) -> None:
+def _report(args: Evaluate, compared: _Compared, evaluation: Evaluation) -> None:
     """The report, and the page that it links to."""
-    title = f"{(args.checkpoint or args.results or Path()).name} on {compared.name}"
+    task = compared.task
+    title = f"{(args.checkpoint or args.results or Path()).name} on {task.name}"
     chosen = choose_examples(evaluation)
-    place = evaluation, compared.frames, compared.truth.ego_translation
+    place = evaluation, task.frames, compared.truth.ego_translation
     frames = [
         page_frame(each.points, each.detections, name=f"{each.kind}: {each.name}", truth=each.truth)
         for each in examples(*place, chosen.extremes, min_score=0, all_sweeps=True)
@@ -254,7 +292,7 @@ def _report(args: Evaluate, compared: _Compared, evaluation: Evaluation, sensor:
         title=title,
         num_samples=len(compared.truth.tokens),
         examples=examples(*place, chosen.rows, min_score=chosen.min_score),
-        sensor=sensor,
+        sensor=task.sensor,
         links=[("Look at the worst and the best frames", PAGE)] if frames else [],
     )
 

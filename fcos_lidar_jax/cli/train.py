@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import sys
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Annotated, Any
 
 import jax
 import tyro
-from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
@@ -24,6 +23,7 @@ from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.trainer.run import NUM_SEEDS, Schedule, check_run, train
+from fcos_lidar_jax.training.agreement import agreed
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of
 
 _ABOUT = {
@@ -41,6 +41,7 @@ _PRESETS: Any = (
     tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT[name])
     for name, preset in PRESETS.items()
 )
+_OBJECTS = "objects"  # Folder in the run's, where objects of single frames are cut.
 _MADE_BEFORE = 2000  # Simulated frames that may be made before the first step: minutes.
 _Preset: Any = reduce(or_, (Annotated[Config, preset] for preset in _PRESETS))
 
@@ -76,19 +77,63 @@ class Train:
     no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without objects of other frames.
     threads: int = 2  # That prepare batches.
     workers: int = 0  # Processes that prepare batches, beside the threads.
-    distributed: bool = False
-    """One of several processes, started by Slurm, Open MPI or a TPU pod, which describe the cluster to JAX."""
-    coordinator: str | None = None
-    """HOST:PORT of process 0, where JAX cannot find it; with --num-processes and --process-index."""
-    num_processes: int | None = None  # In all.
-    process_index: int | None = None  # Which one this is, from 0.
+    processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
+    """Several processes share each batch."""
 
 
 def run(args: Train) -> None:
     """Train, and print where the result is."""
     _check(args)
-    if args.distributed or args.coordinator is not None:
-        jax.distributed.initialize(args.coordinator, args.num_processes, args.process_index)
+    join_processes(args.processes)
+    is_main_process = jax.process_index() == 0
+    with agreed("cannot train"):
+        task = _open(args)
+    checkpoints = Checkpoints(args.out / CHECKPOINTS)
+    try:
+        with contextlib.ExitStack() as held:
+            with agreed("cannot train"):
+                if task.cuts_objects and is_main_process:  # one cuts, the others find it done
+                    held.enter_context(folder_lock(args.out, "training"))
+                    check_run(args.out, resume=args.resume)  # another process may have been faster
+                    _cut_objects(args.out, task)
+            with agreed("cannot train"):
+                objects = _objects(args, task)
+            state = train(
+                task.config,
+                task.frames,
+                args.out,
+                steps=task.steps,
+                tests=task.tests,
+                objects=objects,
+                schedule=Schedule(args.save_every, args.evaluate_every, args.keep),
+                **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
+            )
+    except (KeyboardInterrupt, SystemExit):
+        if checkpoints.paths():
+            tell("the same command with --resume goes on")
+        raise
+    if is_main_process:
+        paths = checkpoints.paths()
+        best = best_of(paths)
+        record = {"run": str(args.out), "steps": int(state.step), "checkpoint": str(paths[-1])}
+        print(json.dumps(record | ({} if best is None else {"best": str(best)})))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """What is trained, on what."""
+
+    config: Config
+    layout: Layout
+    split: str | None
+    frames: FrameSet
+    tests: FrameSet | None
+    steps: int
+    cuts_objects: bool  # Pasted objects are those of these frames alone, cut in the run's folder.
+
+
+def _open(args: Train) -> _Task:
+    """Open the data; refuse what does not fit together."""
     config = dataclasses.replace(
         args.config,
         augment=None if args.no_augment else args.config.augment,
@@ -102,24 +147,11 @@ def run(args: Train) -> None:
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
-    # The default sensor is that of the preset, which --name may have renamed.
-    presets = [preset for preset in PRESETS.values() if preset.name == config.name] or PRESETS.values()
-    if layout.format == "folder" and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
-        raise ValueError(
-            f"--sensor: got {config.sensor!r}, expected none: {layout.root}/sensor.json has {frames.sensor.name!r}"
-        )
-    val_split, tests = args.val_split or args.data.split("val", required=False), None
-    if val_split != "none" and (val_split or args.val_samples):
-        tests = args.data.open(config, split=val_split, samples=args.val_samples, option="--val-samples")
-    if tests is None and args.evaluate_every is not None:
-        raise ValueError(
-            f"--evaluate-every: got {args.evaluate_every}, expected --val-split or --val-samples too: "
-            f"{layout.root} has no split to evaluate on"
-        )
-    if split is None and args.samples is None and tests is None and jax.process_index() == 0:
-        line = f"no splits: all {len(frames)} frames are trained on, none is left to evaluate on"
-        print(f"{layout.root}: {line}", file=sys.stderr)
-    if tests is not None and jax.process_index() == 0:
+    _check_sensor(config, layout, frames)
+    tests = _open_tests(args, config, layout)
+    if split is None and args.samples is None and tests is None:
+        tell(f"{layout.root}: no splits: all {len(frames)} frames are trained on, none is left to evaluate on")
+    if tests is not None:
         _tell_of_overlap(frames, tests)
     if layout.format == "simulated":
         _check_simulated(len(frames), config)
@@ -130,40 +162,35 @@ def run(args: Train) -> None:
             f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
             f"{steps} steps: nothing would ever be pasted"
         )
-    own = args.samples is not None or layout.format == "simulated"  # objects of these frames alone, cut in OUT
-    checkpoints = Checkpoints(args.out / CHECKPOINTS)
-    try:
-        with contextlib.ExitStack() as held:
-            if own and config.copy_paste is not None and jax.process_index() == 0:
-                held.enter_context(folder_lock(args.out, "training"))
-                check_run(args.out, resume=args.resume)  # another process may have been faster
-            objects = None
-            if config.copy_paste is not None:
-                least = config.copy_paste.min_points
-                objects = _own_database(args, frames, least) if own else _database(args, config, layout, split)
-            state = train(
-                config,
-                frames,
-                args.out,
-                steps=steps,
-                tests=tests,
-                objects=objects,
-                schedule=Schedule(args.save_every, args.evaluate_every, args.keep),
-                **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
-            )
-    except (KeyboardInterrupt, SystemExit):
-        if jax.process_index() == 0 and checkpoints.paths():
-            print("the same command with --resume goes on", file=sys.stderr)
-        raise
-    if jax.process_index() == 0:
-        paths = checkpoints.paths()
-        best = best_of(paths)
-        record = {"run": str(args.out), "steps": int(state.step), "checkpoint": str(paths[-1])}
-        print(json.dumps(record | ({} if best is None else {"best": str(best)})))
+    own = args.samples is not None or layout.format == "simulated"
+    return _Task(config, layout, split, frames, tests, steps, own and config.copy_paste is not None)
+
+
+def _check_sensor(config: Config, layout: Layout, frames: FrameSet) -> None:
+    # The default sensor is that of the preset, which --name may have renamed.
+    presets = [preset for preset in PRESETS.values() if preset.name == config.name] or PRESETS.values()
+    if layout.format == "folder" and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
+        raise ValueError(
+            f"--sensor: got {config.sensor!r}, expected none: {layout.root}/sensor.json has {frames.sensor.name!r}"
+        )
+
+
+def _open_tests(args: Train, config: Config, layout: Layout) -> FrameSet | None:
+    """The frames to evaluate on along the way, if there are any."""
+    split, tests = args.val_split or args.data.split("val", required=False), None
+    if split != "none" and (split or args.val_samples):
+        tests = args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
+    if tests is None and args.evaluate_every is not None:
+        raise ValueError(
+            f"--evaluate-every: got {args.evaluate_every}, expected --val-split or --val-samples too: "
+            f"{layout.root} has no split to evaluate on"
+        )
+    return tests
 
 
 def _check(args: Train) -> None:
-    check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep", "num_processes")
+    check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep")
+    check_processes(args.processes)
     check_at_least(args, 0, "threads", "workers", "seed")
     if args.seed >= NUM_SEEDS:
         raise ValueError(f"--seed: got {args.seed}, expected less than 2**32")
@@ -172,11 +199,6 @@ def _check(args: Train) -> None:
             if (given := getattr(args, name)) is not None:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"{option}: got {given!r} with --val-split none, which evaluates nothing")
-    given = [option is not None for option in (args.coordinator, args.num_processes, args.process_index)]
-    if any(given) and not all(given):
-        raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
-    if args.process_index is not None and not 0 <= args.process_index < (args.num_processes or 0):
-        raise ValueError(f"--process-index: got {args.process_index}, expected 0 to {args.num_processes} excluded")
 
 
 def _check_simulated(number: int, config: Config) -> None:
@@ -190,9 +212,20 @@ def _check_simulated(number: int, config: Config) -> None:
         )
 
 
-def _database(args: Train, config: Config, layout: Layout, split: str | None) -> database.GroundTruthDatabase:
-    """The prepared objects of the split."""
-    folder = database.objects_folder(args.data.index or layout.index, split)
+def _cut_objects(out: Path, task: _Task) -> None:
+    """Cut the objects of the training frames alone in the run's folder, which is locked."""
+    assert task.config.copy_paste is not None
+    database.prepare_database(task.frames, out / _OBJECTS, min_points=task.config.copy_paste.min_points)
+
+
+def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
+    """The objects to paste: those just cut, or those prepared of the split."""
+    config, split = task.config, task.split
+    if config.copy_paste is None:
+        return None
+    if task.cuts_objects:
+        return database.open_database(args.out / _OBJECTS)
+    folder = database.objects_folder(args.data.index or task.layout.index, split)
     if not folder.is_dir():
         of = "" if split is None else f" --train-split {split}"
         raise ValueError(
@@ -220,15 +253,4 @@ def _tell_of_overlap(frames: FrameSet, tests: FrameSet) -> None:
     """Print how many frames are both trained and evaluated on."""
     names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
     if shared := len(names & tested):
-        line = f"{shared} of the {len(tests)} frames to evaluate on are trained on too: scores will be too high"
-        print(line, file=sys.stderr)
-
-
-def _own_database(args: Train, frames: FrameSet, min_points: int) -> database.GroundTruthDatabase:
-    """Objects of these frames alone, cut in the run's folder, which is locked."""
-    folder = args.out / "objects"
-    if jax.process_index() == 0:  # one cuts, the others find it done
-        database.prepare_database(frames, folder, min_points=min_points)
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices("objects")
-    return database.open_database(folder)
+        tell(f"{shared} of the {len(tests)} frames to evaluate on are trained on too: scores will be too high")

@@ -12,7 +12,7 @@ from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES
 from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
 from fcos_lidar_jax.data.classes import map_labels, unknown_name
 from fcos_lidar_jax.data.drives import Drive
-from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint
+from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, find_bad_pose, fuse_sweeps
@@ -84,6 +84,10 @@ class Argoverse2Frames(FrameSet):
         sweeps = (Sweep(read_points(self._file(i), self.sensor), self.pose(i), self.time_us(i)) for i in chain)
         points, num_close = fuse_sweeps(sweeps, self.sensor, remove_close=self.remove_close, close_m=self.close_m)
         return Frame(points, *self._boxes(index), num_close)
+
+    def truth(self, index: int) -> Frame:
+        """As of any frame set; the cloud is not read."""
+        return Frame(no_points(self.sensor), *self._boxes(index))
 
     def labels(self, index: int) -> np.ndarray:
         _, labels, num_points = self._boxes(index)

@@ -3,18 +3,19 @@
 import dataclasses
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fcos_lidar_jax import __version__
-from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf
+from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, no_points, without_points
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, read_json
 
 _DESCRIPTION = "frames.json"
-_ARRAYS = ("points", "boxes", "labels", "num_points")
+_TRUTH = ("boxes", "labels", "num_points")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,21 +62,39 @@ class CachedFrames(FramesOf):
 
     def frame(self, index: int) -> Frame:
         """One frame, read from its file; made and written where there is none."""
-        file = self.folder / f"{index:06d}.npz"
+        arrays = self._read(index, (*_TRUTH, "points", "num_close"))
+        if arrays is not None:
+            num_close = int(arrays.pop("num_close"))
+            return Frame(**arrays, num_close=num_close)
+        frame = self.frames.frame(index)
+        arrays = {name: getattr(frame, name) for name in (*_TRUTH, "points", "num_close")}
+        atomic_write(self._file(index), lambda path: np.savez(path, **arrays))
+        return frame
+
+    def truth(self, index: int) -> Frame:
+        """As of any frame set; where there is no file yet, the whole frame is made and written."""
+        arrays = self._read(index, _TRUTH)
+        if arrays is None:
+            return without_points(self.frame(index))
+        boxes, labels, num_points = (arrays[name] for name in _TRUTH)
+        return Frame(no_points(self.sensor), boxes, labels, num_points)
+
+    labels = FrameSet.labels
+
+    def _file(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.npz"
+
+    def _read(self, index: int, names: Sequence[str]) -> dict[str, np.ndarray] | None:
+        """Arrays of a frame's file; None where there is no whole one."""
+        file = self._file(index)
         try:
-            arrays = parse_npz(file.read_bytes(), [*_ARRAYS, "num_close"])
-            return Frame(**{**arrays, "num_close": int(arrays["num_close"])})
+            return parse_npz(file.read_bytes(), names)
         except FileNotFoundError:
-            pass
+            return None
         except Exception as error:  # wrong bytes in an archive raise nearly anything
             reason = str(error).partition("\n")[0] or type(error).__name__
             print(f"warning: {file}: damaged ({reason}): made anew", file=sys.stderr, flush=True)
-        frame = self.frames.frame(index)
-        arrays = {name: getattr(frame, name) for name in (*_ARRAYS, "num_close")}
-        atomic_write(file, lambda path: np.savez(path, **arrays))
-        return frame
-
-    labels = FrameSet.labels
+            return None
 
 
 def _description(frames: FrameSet) -> dict[str, Any]:

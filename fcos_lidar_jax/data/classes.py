@@ -84,7 +84,12 @@ class MappedFrames(FramesOf):
         return map_labels(self.frames.classes, self.wanted, self.class_map)
 
     def frame(self, index: int) -> Frame:
-        frame = self.frames.frame(index)
+        return self._mapped(self.frames.frame(index))
+
+    def truth(self, index: int) -> Frame:
+        return self._mapped(self.frames.truth(index))
+
+    def _mapped(self, frame: Frame) -> Frame:
         kept = (labels := self._table[frame.labels]) >= 0
         rows = {"boxes": frame.boxes[kept], "labels": labels[kept], "num_points": frame.num_points[kept]}
         return dataclasses.replace(frame, **rows)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, drop_close, files_fingerprint
+from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, drop_close, files_fingerprint, no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import about_z, read_sweeps, turned
 from fcos_lidar_jax.files import checksum
@@ -39,8 +39,12 @@ class CloudFiles(FrameSet):
         else:
             cloud = read_points(file, self.sensor, **layout)
             points, num_close = drop_close(cloud, self.sensor, mode=mode, close_m=close_m)
+        return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
+
+    def truth(self, index: int) -> Frame:
+        """No box; nothing is read."""
         none = np.zeros(0, np.int32)
-        return Frame(points, np.zeros((0, 9), np.float32), none, none, num_close)
+        return Frame(no_points(self.sensor), np.zeros((0, 9), np.float32), none, none)
 
     def labels(self, index: int) -> np.ndarray:
         return np.zeros(0, np.int32)

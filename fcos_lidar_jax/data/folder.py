@@ -11,7 +11,14 @@ import numpy as np
 from fcos_lidar_jax.data import point_files
 from fcos_lidar_jax.data.box_geometry import LIMITS, count_inside, find_bad_box
 from fcos_lidar_jax.data.classes import unknown_name
-from fcos_lidar_jax.data.frame import Frame, FrameSet, distinct_names, drop_close, files_fingerprint
+from fcos_lidar_jax.data.frame import (
+    Frame,
+    FrameSet,
+    distinct_names,
+    drop_close,
+    files_fingerprint,
+    without_points,
+)
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
@@ -120,9 +127,11 @@ class FolderFrames(FrameSet):
 
     def frame(self, index: int) -> Frame:
         """One frame, read anew; the points in each box are counted."""
-        boxes, labels = self._annotation(index)
-        points, num_close = self._points(index)
-        return Frame(points, boxes, labels, count_inside(points[points[:, 4] == 0], boxes), num_close)
+        return self._frame(index, self.num_sweeps)
+
+    def truth(self, index: int) -> Frame:
+        """As of any frame set; of the sweeps the current one alone is read, for its points in each box count."""
+        return without_points(self._frame(index, 1))
 
     def labels(self, index: int) -> np.ndarray:
         return self._annotation(index)[1]
@@ -152,7 +161,12 @@ class FolderFrames(FrameSet):
         listed = self._sweeps.get(self.names[index])
         return None if listed is None else read_list(listed)[0]
 
-    def _points(self, index: int) -> tuple[np.ndarray, int]:
+    def _frame(self, index: int, num_sweeps: int) -> Frame:
+        boxes, labels = self._annotation(index)
+        points, num_close = self._points(index, num_sweeps)
+        return Frame(points, boxes, labels, count_inside(points[points[:, 4] == 0], boxes), num_close)
+
+    def _points(self, index: int, num_sweeps: int) -> tuple[np.ndarray, int]:
         name, mode, close_m = self.names[index], self.remove_close, self.close_m
         cloud, listed = self._clouds[name], self._sweeps.get(name)
         if listed is None or self.num_sweeps == 1:
@@ -165,7 +179,7 @@ class FolderFrames(FrameSet):
         if (listed.parent / files[0]).resolve() != cloud.resolve():
             expected = f"the frame's own cloud, '../clouds/{cloud.name}'"
             raise ValueError(f"{listed}: $[0].file: got {files[0]!r}, expected {expected}")
-        return read_sweeps(listed, self.sensor, remove_close=mode, close_m=close_m, num_sweeps=self.num_sweeps)
+        return read_sweeps(listed, self.sensor, remove_close=mode, close_m=close_m, num_sweeps=num_sweeps)
 
     def _annotation(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         file = self._boxes[self.names[index]]

@@ -62,10 +62,21 @@ class FrameSet(Protocol):
         """One frame, read anew: sweeps fused, close points removed, all boxes of the classes."""
         ...
 
+    def truth(self, index: int) -> Frame:
+        """The boxes of :meth:`frame` with their labels and numbers of points, all the same, but without the cloud.
+
+        Where the set can, the points are not read. It cannot where the data do not say how many points a box
+        holds, as in KITTI and folders of own data: they are then counted.
+
+        Returns:
+            a frame of no points, from which none was removed.
+        """
+        return without_points(self.frame(index))
+
     def labels(self, index: int) -> np.ndarray:
         """i32[m]: labels of the frame's boxes, without those that are known to hold no point; where the set can,
         without reading the points."""
-        return self.frame(index).labels
+        return self.truth(index).labels
 
     def name(self, index: int) -> str:
         """What messages and files of results call a frame, in any letters; no two frames have the same name."""
@@ -144,6 +155,9 @@ class FramesOf(FrameSet):
 
     def frame(self, index: int) -> Frame:
         return self.frames.frame(self._source(index))
+
+    def truth(self, index: int) -> Frame:
+        return self.frames.truth(self._source(index))
 
     def labels(self, index: int) -> np.ndarray:
         return self.frames.labels(self._source(index))
@@ -238,6 +252,27 @@ def drop_close(points: np.ndarray, sensor: Sensor, *, mode: str, close_m: float)
     """
     kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, mode=mode, close_m=close_m))
     return points[kept], len(points) - int(kept.sum())
+
+
+def no_points(sensor: Sensor) -> np.ndarray:
+    """A cloud without points, f32[0, c], of a sensor's columns.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> no_points(TINY).shape
+    (0, 5)
+    """
+    return np.zeros((0, sensor.point_columns), np.float32)
+
+
+def without_points(frame: Frame) -> Frame:
+    """The boxes of a frame alone; keeps nothing of the cloud in memory.
+
+    >>> frame = Frame(np.zeros((9, 5)), np.zeros((1, 9)), np.zeros(1, int), np.ones(1, int), num_close=4)
+    >>> boxes = without_points(frame)
+    >>> boxes.points.shape, boxes.num_points.tolist(), boxes.num_close
+    ((0, 5), [1], 0)
+    """
+    return dataclasses.replace(frame, points=frame.points[:0].copy(), num_close=0)  # a view would keep the cloud
 
 
 def without_close(frame: Frame, sensor: Sensor, *, mode: str = "all", close_m: float = 1.0) -> Frame:

@@ -46,6 +46,8 @@ class KittiFrames(FrameSet):
     are brought there: gravity centre, yaw counter-clockwise from +x. They are upright for the camera, so its tilt
     against the Velodyne, about a degree, is lost. KITTI knows no velocities: NaN. Labels count :data:`CLASSES`.
 
+    The labels do not say how many points a box holds, so :meth:`truth` reads the cloud, too, and counts them.
+
     Only what the left colour camera sees is labelled. Points outside of its image are therefore dropped, or a
     detector would learn that all behind the car is background.
 

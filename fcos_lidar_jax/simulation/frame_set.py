@@ -18,7 +18,8 @@ class SimulatedFrames(FrameSet):
 
     The objects are near, and only those that enough points show are annotated: what a small detector can learn.
     Ten sweeps of fast traffic are a stress set for the fusion of sweeps: ego vehicle and objects move fast, and
-    most cells hold points of several sweeps.
+    most cells hold points of several sweeps. What is annotated depends on the points that show it,
+    so :meth:`truth` makes the whole frame.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> frames = SimulatedFrames(TINY, number=2)

@@ -12,12 +12,13 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.data.classes import MappedFrames
-from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.data.frame import Frame, FrameSet, without_points
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.training.agreement import agreed
 from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
 from fcos_lidar_jax.types import Detections
 
@@ -69,6 +70,31 @@ def predict(
     >>> [found.detections.boxes.shape for found in predict(detector, unseen_frames(detector.sensor, 2))]
     [(500, 9), (500, 9)]
     """
+    for group in predict_groups(detector, frames, indices=indices, batch_size=batch_size, devices=devices):
+        yield from group
+
+
+def predict_groups(
+    detector: CloudDetector,
+    frames: FrameSet,
+    *,
+    indices: Sequence[int] | None = None,
+    batch_size: int = 1,
+    devices: Sequence[Any] | None = None,
+) -> Iterator[list[Prediction]]:
+    """As :func:`predict`, the frames together that the devices work on at once: between two groups processes may
+    agree on something.
+
+    Raises:
+        OSError: another process cannot read its frames of the next group.
+
+    >>> from fcos_lidar_jax.inference import load_detector
+    >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
+    >>> detector = load_detector("quickstart")
+    >>> groups = predict_groups(detector, unseen_frames(detector.sensor, 3), devices=jax.devices()[:1])
+    >>> [[prediction.index for prediction in group] for group in groups]
+    [[0], [1], [2]]
+    """
     if batch_size < 1:
         raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
@@ -95,26 +121,26 @@ def predict(
                 loaded[row] = frame, cloud
         return loaded, (points, valid)
 
-    def finished(group: list[int], loaded: dict[int, tuple[Frame, Cloud]], found: Any) -> Iterator[Prediction]:
+    def finished(group: list[int], loaded: dict[int, tuple[Frame, Cloud]], found: Any) -> list[Prediction]:
         arrays = multihost_utils.process_allgather(found, tiled=True) if jax.process_count() > 1 else found
         arrays = jax.device_get(arrays)
-        for row, index in enumerate(group):
-            detections = jax.tree.map(lambda leaf, row=row: leaf[row], arrays)
-            yield Prediction(index, detections, *loaded.get(row, (None, None)))
+        rows = (jax.tree.map(lambda leaf, row=row: leaf[row], arrays) for row in range(len(group)))
+        return [Prediction(group[r], found, *loaded.get(r, (None, None))) for r, found in enumerate(rows)]
 
     with ThreadPoolExecutor(_AHEAD) as pool:
         reading = deque(pool.submit(read, group) for group in groups[:_AHEAD])
         running: tuple[list[int], dict[int, tuple[Frame, Cloud]], Any] | None = None
         for number, group in enumerate(groups):
-            loaded, clouds = reading.popleft().result()
+            with agreed("cannot read its frames"):
+                loaded, clouds = reading.popleft().result()
             if number + _AHEAD < len(groups):
                 reading.append(pool.submit(read, groups[number + _AHEAD]))
             found = program(*shard_batch(clouds, mesh))
             if running is not None:
-                yield from finished(*running)
+                yield finished(*running)
             running = group, loaded, found
         if running is not None:
-            yield from finished(*running)
+            yield finished(*running)
 
 
 def evaluate(
@@ -136,11 +162,16 @@ def evaluate(
     """
     mapped = MappedFrames(frames, detector.classes)
     progress = Progress("test frames", len(mapped))
-    found, truths = [], []
-    for prediction in predict(detector, mapped, batch_size=batch_size, devices=devices):
-        frame = prediction.frame or mapped.frame(prediction.index)
-        found.append(prediction.detections)
-        none = frame.points[:0].copy()  # Not a view: the clouds of a data set need not fit into memory.
-        truths.append(Frame(none, frame.boxes, frame.labels, frame.num_points))
-        progress.show(len(found))
+    found, truths = list[Detections](), list[Frame]()
+    for group in predict_groups(detector, mapped, batch_size=batch_size, devices=devices):
+        with agreed("cannot read its boxes"):
+            truths += [_truth(prediction, mapped) for prediction in group]
+        found += [prediction.detections for prediction in group]
+        if jax.process_index() == 0:
+            progress.show(len(found))
     return evaluate_frames(found, truths, metric_of(detector.classes, tuple(detector.config.ranges_m.values())))
+
+
+def _truth(prediction: Prediction, frames: FrameSet) -> Frame:
+    """The boxes alone: the clouds of a data set need not fit into memory."""
+    return frames.truth(prediction.index) if prediction.frame is None else without_points(prediction.frame)

@@ -1,11 +1,15 @@
 """Detections of many frames in a results file; an interrupted run resumes."""
 
+import contextlib
 import json
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
+from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
@@ -14,8 +18,11 @@ from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.trainer.prediction import predict
+from fcos_lidar_jax.trainer.prediction import Prediction, predict_groups
+from fcos_lidar_jax.training.agreement import agreed, check_same
 from fcos_lidar_jax.types import Detections
+
+_REMOVED = ("close", "invalid", "truncated")  # Why points were removed.
 
 
 def write_predictions(
@@ -29,7 +36,9 @@ def write_predictions(
 ) -> dict[str, int]:
     """Detect in every frame and write a results file.
 
-    What is done is kept in a resume log beside the file, which is removed when the file is written.
+    What is done is kept in a resume log beside the file, which is removed when the file is written. Several
+    processes share the frames, and the first writes; the path is the same for all. SIGTERM to any of them stops
+    all after the same frames.
 
     Args:
         detector, frames: network with its weights, and what to detect in; the frames' names differ.
@@ -39,23 +48,49 @@ def write_predictions(
         batch_size: as in :func:`fcos_lidar_jax.trainer.prediction.predict`.
 
     Returns:
-        points that were removed in this run and why: ``close``, ``invalid``, ``truncated``.
+        points that were removed in this run, by all processes, and why: ``close``, ``invalid``, ``truncated``.
+
+    Raises:
+        ValueError: the processes have different detectors or frames.
+        OSError: another process failed.
+        SystemExit: after SIGTERM, in a cluster.
     """
-    file, removed = path.with_name(f"{path.stem}.resume_log"), {"close": 0, "invalid": 0, "truncated": 0}
-    names = [frames.name(index) for index in range(len(frames))]
-    with ResumeLog(file, _fingerprint(detector, frames, batch_size)) as log:
-        todo = [index for index, name in enumerate(names) if name not in log]
+    file = path.with_name(f"{path.stem}.resume_log")
+    removed = np.zeros(len(_REMOVED), np.int32)
+    with contextlib.ExitStack() as held:
+        log = None
+        with agreed("cannot detect"):
+            names = [frames.name(index) for index in range(len(frames))]
+            same = detections_fingerprint(detector, names, batch_size)
+            if jax.process_index() == 0:
+                log = held.enter_context(ResumeLog(file, _fingerprint(detector, frames, batch_size)))
+        check_same(same, "detector, frames or batch size")
+        done = multihost_utils.broadcast_one_to_all(np.array([log is not None and name in log for name in names]))
         progress = Progress("frames", len(frames))
-        progress.show(len(log))
-        for prediction in predict(detector, frames, indices=todo, batch_size=batch_size):
-            log.add(names[prediction.index], entries(prediction.index, prediction.detections))
-            for reason in removed:
-                removed[reason] += getattr(prediction.cloud, f"num_{reason}", 0)
+        if log is not None:
             progress.show(len(log))
-        if jax.process_index() == 0:
-            write(path, log.entries(names))
-    file.unlink(missing_ok=True)
-    return removed
+        groups = predict_groups(detector, frames, indices=np.flatnonzero(~done).tolist(), batch_size=batch_size)
+        for number, group in enumerate(groups, 1):
+            removed += sum((_removed(prediction) for prediction in group), start=np.zeros_like(removed))
+            with agreed("cannot write"):
+                if log is not None:
+                    for prediction in group:
+                        log.add(names[prediction.index], entries(prediction.index, prediction.detections))
+                        progress.show(len(log))
+            # JAX has taken SIGTERM from Python, and tells all processes of it.
+            if jax.process_count() > 1 and multihost_utils.reached_preemption_sync_point(number):
+                raise SystemExit(128 + signal.SIGTERM)
+        with agreed("cannot write"):
+            if log is not None:
+                write(path, log.entries(names))
+                file.unlink(missing_ok=True)
+    of_all = multihost_utils.process_allgather(removed[None], tiled=True).sum(axis=0)
+    return dict(zip(_REMOVED, of_all.tolist(), strict=True))
+
+
+def _removed(prediction: Prediction) -> np.ndarray:
+    """Points that this process removed from a cloud, by reason."""
+    return np.array([getattr(prediction.cloud, f"num_{reason}", 0) for reason in _REMOVED], np.int32)
 
 
 def detections_fingerprint(detector: CloudDetector, *others: object) -> str:

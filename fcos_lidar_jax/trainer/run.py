@@ -34,6 +34,7 @@ from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.trainer.prediction import evaluate, predict
+from fcos_lidar_jax.training.agreement import agreed
 from fcos_lidar_jax.training.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -165,7 +166,7 @@ def train(
     tests = None if tests is None else MappedFrames(tests, config.classes)
     mesh = make_mesh(devices)
     is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
-    with _agreed():  # What can be refused is refused before the folder becomes a run's.
+    with agreed("cannot train"):  # What can be refused is refused before the folder becomes a run's.
         if type(steps) is not int or steps < 1:
             raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
         if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
@@ -323,22 +324,6 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     for name, (was, wanted) in _differences(found, spec):
         raise ValueError(f"{file}: {name}: was {was!r}, got {wanted!r}: only the same run can be resumed")
     return missing
-
-
-@contextlib.contextmanager
-def _agreed() -> Iterator[None]:
-    """All processes go on, or none: one that refuses is waited for by the others, which stop too."""
-    error: Exception | None = None
-    try:
-        yield
-    except Exception as failure:
-        error = failure
-    if jax.process_count() > 1:
-        fine = multihost_utils.process_allgather(np.array(error is None))
-        if error is None and not fine.all():
-            error = OSError(f"process {int(np.argmin(fine))}: cannot train, see what it says")
-    if error is not None:
-        raise error
 
 
 @contextlib.contextmanager

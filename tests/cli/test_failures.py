@@ -29,6 +29,10 @@ def fail_with(error):
         (MemoryError(), "out of memory: in training --optimizer.accumulate"),
         (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: in training --optimizer.accumulate"),
         (RuntimeError("Unable to initialize backend 'x': no"), "expected a platform of this machine: Unable to"),
+        (
+            RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
+            "another process ended, see what it says: UNK",
+        ),
         (ValueError("x" * 120_000), "x" * 900),
     ],
 )

@@ -167,14 +167,9 @@ BAD = {
     "threads": ("--threads -1", "--threads: got -1, expected at least 0"),
     "workers": ("--workers -1", "--workers: got -1"),
     "seed": ("--seed -1", "--seed: got -1"),
-    "half a cluster": ("--num-processes 2", "expected all or none"),
     "all faded": (
         "--fade-epochs 4 --steps 4",
         "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: nothing would ever be pasted",
-    ),
-    "process": (
-        "--coordinator localhost:1 --num-processes 2 --process-index 2",
-        "--process-index: got 2, expected 0 to 2 excluded",
     ),
     "no data": ("--data-root gone", "gone: no such folder, expected a data set"),
     "version": ("--version v9", "v9: no such folder"),

@@ -1,20 +1,72 @@
 """Predictions and evaluations of frames."""
 
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
 from tiny_run import CONFIG, FRAMES, TESTS, weights
 
+from fcos_lidar_jax.data.frame import Frame, FramesOf
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.trainer import evaluate, prediction
+from fcos_lidar_jax.trainer import evaluate, predict, prediction
+from fcos_lidar_jax.trainer.prediction import predict_groups
 
 
-def test_an_evaluation_keeps_no_cloud(monkeypatch):
-    kept = []
+@pytest.fixture(scope="module")
+def detector():
+    return TrainedDetector(build_detector(CONFIG, FRAMES.sensor), weights())
 
-    def evaluate_frames(found, truths, metric):
-        kept.extend(truths)
 
-    monkeypatch.setattr(prediction, "evaluate_frames", evaluate_frames)
-    detector = TrainedDetector(build_detector(CONFIG, FRAMES.sensor), weights())
+@pytest.fixture
+def compared(monkeypatch) -> list[Frame]:
+    """The truth that an evaluation compares with."""
+    kept: list[Frame] = []
+    monkeypatch.setattr(prediction, "evaluate_frames", lambda found, truths, metric: kept.extend(truths))
+    return kept
+
+
+def test_an_evaluation_keeps_no_cloud(detector, compared):
     evaluate(detector, TESTS)
-    assert [frame.points.shape for frame in kept] == 2 * [(0, 5)]
-    assert all(frame.points.base is None for frame in kept), "a view of the whole cloud"
+    assert [frame.points.shape for frame in compared] == 2 * [(0, 5)]
+    assert all(frame.points.base is None for frame in compared), "a view of the whole cloud"
+
+
+class TruthAlone(FramesOf):
+    """Test frames whose clouds are on another machine."""
+
+    def frame(self, index: int) -> Frame:
+        raise OSError("not here")
+
+    def truth(self, index: int) -> Frame:
+        return dataclasses.replace(
+            self.frames.truth(index), num_points=np.full(len(TESTS.labels(index)), 70 + index)
+        )
+
+
+def test_of_what_another_process_has_read_the_boxes_alone_are_read(detector, compared, monkeypatch):
+    def groups(*args, **options):
+        for group in predict_groups(detector, TESTS):
+            yield [dataclasses.replace(found, frame=None, cloud=None) for found in group]
+
+    monkeypatch.setattr(prediction, "predict_groups", groups)
+    evaluate(detector, TruthAlone(TESTS))
+    assert [set(frame.num_points.tolist()) for frame in compared] == [{70}, {71}]
+    np.testing.assert_array_equal(compared[1].boxes, TESTS.frame(1).boxes)
+
+
+def test_groups_are_what_the_devices_work_on_at_once(detector):
+    size = 2 * len(jax.devices())
+    groups = list(predict_groups(detector, FRAMES, indices=[7, 3, 5], batch_size=2))
+    indices = [[found.index for found in group] for group in groups]
+    assert indices == [[7, 3, 5][i : i + size] for i in range(0, 3, size)]
+    one_by_one = list(predict(detector, FRAMES, indices=[7, 3, 5], batch_size=2))
+    assert [found.index for found in one_by_one] == [7, 3, 5]
+    for a, b in zip(one_by_one, (found for group in groups for found in group), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, a.detections, b.detections)
+
+
+def test_a_batch_has_at_least_one_cloud(detector):
+    with pytest.raises(ValueError, match="batch_size: got 0, expected at least 1"):
+        next(predict(detector, FRAMES, batch_size=0))

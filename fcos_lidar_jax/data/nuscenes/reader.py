@@ -9,7 +9,7 @@ import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.classes import unknown_name
-from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint
+from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, has_index, open_index
 from fcos_lidar_jax.data.nuscenes.names import label_of
@@ -323,9 +323,14 @@ class NuScenesFrames(FrameSet):
     def frame(self, index: int) -> Frame:
         data, token = self.nuscenes, self.tokens[index]
         close = {"remove_close": self.remove_close, "close_m": self.close_m, "sensor": self.sensor}
-        truth = data.boxes(token)
+        truth = self.truth(index)
         points, num_close = data.fuse_sweeps(token, self.num_sweeps, **close)
-        return Frame(points, truth.boxes, truth.labels, truth.num_lidar_pts, num_close)
+        return dataclasses.replace(truth, points=points, num_close=num_close)
+
+    def truth(self, index: int) -> Frame:
+        """As of any frame set; of the tables alone."""
+        found = self.nuscenes.boxes(self.tokens[index])
+        return Frame(no_points(self.sensor), found.boxes, found.labels, found.num_lidar_pts)
 
     def labels(self, index: int) -> np.ndarray:
         return self.nuscenes.labels(self.tokens[index])

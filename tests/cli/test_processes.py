@@ -1,0 +1,308 @@
+"""Several processes as one: the options, and two processes on this machine that train and evaluate."""
+
+import json
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from unittest.mock import Mock
+
+import jax
+import pytest
+from commands import assert_one_line_error, child_environment, command, in_use
+from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
+
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.training import Checkpoint, save_checkpoint
+from fcos_lidar_jax.training.metrics_log import read_metrics
+
+SRUN = {
+    "SLURM_JOB_ID": "7",
+    "SLURM_STEP_NODELIST": "localhost",
+    "SLURM_NTASKS": "2",
+    "SLURM_STEP_NUM_NODES": "1",
+    "SLURM_STEP_TASKS_PER_NODE": "2",
+}
+ALONE = {"SLURM_STEP_TASKS_PER_NODE": "1(x2)", "SLURM_PROCID": "1", "SLURM_LOCALID": "0"}
+BY_HAND = ProcessOptions(coordinator="10.0.0.1:12345", num_processes=2, process_index=1)
+BY_LAUNCHER = ProcessOptions(distributed=True)
+GIVEN = ("10.0.0.1:12345", 2, 1)
+NOTHING = (None, None, None)
+JOINED = {
+    "one task a node": (BY_LAUNCHER, SRUN | ALONE, NOTHING, ()),
+    "eight tasks a node": (
+        BY_LAUNCHER,
+        SRUN | {"SLURM_STEP_TASKS_PER_NODE": "8", "SLURM_PROCID": "5", "SLURM_LOCALID": "5"},
+        NOTHING,
+        (5,),
+    ),
+    "TPU pod": (BY_LAUNCHER, {"TPU_WORKER_ID": "1"}, NOTHING, None),
+    "by hand": (BY_HAND, {}, GIVEN, None),
+    "by hand under srun": (BY_HAND, SRUN | ALONE, GIVEN, ()),
+}
+
+
+@pytest.mark.parametrize("case", JOINED)
+def test_jax_is_told_which_process_this_is_and_which_gpus_it_takes(case, monkeypatch):
+    options, environment, place, ids = JOINED[case]
+    monkeypatch.setattr(jax.distributed, "initialize", initialize := Mock())
+    join_processes(options, environment)
+    initialize.assert_called_once_with(*place, local_device_ids=ids)
+
+
+def test_a_process_alone_meets_nobody(monkeypatch):
+    monkeypatch.setattr(jax.distributed, "initialize", initialize := Mock())
+    join_processes(ProcessOptions(), SRUN | ALONE)
+    initialize.assert_not_called()
+
+
+def test_others_that_are_not_met_are_told_in_one_line(monkeypatch):
+    monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=RuntimeError("DEADLINE_EXCEEDED: late")))
+    with pytest.raises(OSError, match=r"^10.0.0.1:12345: the processes did not meet: DEADLINE_EXCEEDED: late$"):
+        join_processes(BY_HAND, {})
+
+
+@pytest.mark.parametrize(
+    "place", ["localhost", "localhost:", ":1", "localhost:x", "localhost:65536", "localhost:0"]
+)
+def test_a_coordinator_has_a_host_and_a_port(place):
+    check_processes(BY_HAND)
+    check_processes(ProcessOptions(coordinator="[::1]:65535", num_processes=1, process_index=0))
+    options = ProcessOptions(coordinator=place, num_processes=1, process_index=0)
+    with pytest.raises(ValueError, match=re.escape(f"--coordinator: got {place!r}, expected HOST:PORT")):
+        check_processes(options)
+
+
+BAD = {
+    "half a cluster": ("--num-processes 2", "expected all or none"),
+    "no process": ("--coordinator localhost:1 --num-processes 0 --process-index 0", "--num-processes: got 0"),
+    "process": (
+        "--coordinator localhost:1 --num-processes 2 --process-index 2",
+        "--process-index: got 2, expected 0 to 2 excluded",
+    ),
+    "no launcher": ("--distributed", "--distributed: found no launcher .* expected Slurm, Open MPI or a TPU pod"),
+}
+OF_EVALUATE = {
+    "results": ("--distributed --results x", "--results: got several processes, expected one"),
+    "backend": (
+        "--distributed --backend openvino",
+        "--backend: got openvino with several processes, expected xla",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", [*BAD, *OF_EVALUATE])
+def test_options_that_cannot_work_get_one_line(tmp_path, capsys, name, monkeypatch):
+    line, message = (BAD | OF_EVALUATE)[name]
+    # In these tests JAX has begun to work long ago, which it would complain about first.
+    monkeypatch.setattr(jax.distributed, "initialize", jax._src.distributed.global_state.initialize)
+    evaluate = ["evaluate", "--format", "simulated", "--out", str(tmp_path / "out"), *line.split()]
+    evaluate += [] if name == "results" else ["--checkpoint", "quickstart"]
+    train = ["train", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out"), *line.split()]
+    for args in (evaluate,) if name in OF_EVALUATE else (evaluate, train):
+        assert_one_line_error(capsys, args, message)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """Two scenes of six keyframes, one to train and one to test on, with an index; a checkpoint beside them."""
+    home = tmp_path_factory.mktemp("home")
+    (home / "sensor.json").write_text(json.dumps(sensor_to_json(SENSOR)))
+    command("synthesize --scenes 2 --keyframes 6 --out", home / "data", "--sensor", home / "sensor.json")
+    command("prepare --num-sweeps 1 --data-root", home / "data")
+    save_checkpoint(home / "start", Checkpoint(CONFIG, SENSOR, weights(), 1))
+    return home / "data"
+
+
+def start(args: list[str], **variables: str) -> subprocess.Popen[str]:
+    words = [sys.executable, "-m", "fcos_lidar_jax", *args]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(words, env=child_environment(**variables), text=True, **pipes)
+
+
+def start_two(how: str, *args: list[str]) -> list[subprocess.Popen[str]]:
+    """The command as two processes, each with its own arguments, that find each other one way or the other."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = str(free.getsockname()[1])
+
+    def one(index: int) -> subprocess.Popen[str]:
+        if how == "coordinator":
+            place = ["--coordinator", f"localhost:{port}", "--num-processes", "2", "--process-index", str(index)]
+            return start([*args[index], *place])
+        own = {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index), "JAX_COORDINATOR_PORT": port}
+        return start([*args[index], "--distributed"], **SRUN, **own)
+
+    return [one(index) for index in range(2)]
+
+
+def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
+    """Exit codes and what was printed."""
+    try:
+        printed = [process.communicate(timeout=200) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [(process.returncode, *texts) for process, texts in zip(processes, printed, strict=True)]
+
+
+def evaluate(data: Path, out: Path, *more: str) -> list[str]:
+    """The command on the six keyframes of the split val."""
+    checkpoint = str(data.parent / "start")
+    return [
+        "evaluate",
+        "--data-root",
+        str(data),
+        "--checkpoint",
+        checkpoint,
+        "--no-report",
+        "--out",
+        str(out),
+        *more,
+    ]
+
+
+def contents(out: Path) -> dict[str, str]:
+    """Of all files, but for how long the evaluation took."""
+    texts = {path.name: path.read_text() for path in out.iterdir() if path.name != ".lock"}
+    return {name: re.sub(r'"eval_time": [^,]*', "", text) for name, text in texts.items()}
+
+
+@pytest.fixture(scope="module")
+def alone(root, tmp_path_factory) -> dict[str, str]:
+    """What one process writes."""
+    out = tmp_path_factory.mktemp("alone")
+    command(*evaluate(root, out))
+    return contents(out)
+
+
+@pytest.mark.parametrize("how", ["coordinator", "slurm"])
+def test_two_processes_evaluate_as_one(root, alone, tmp_path, how):
+    first, second = ended(start_two(how, *[evaluate(root, tmp_path / "both")] * 2))
+    assert (first[0], second[0]) == (0, 0), first[2] + second[2]
+    assert "mAP" in first[1]
+    assert [line for line in second[1].splitlines() if not line.startswith("[Gloo]")] == []
+    assert "frames 6/6" in first[2]
+    assert "frames" not in second[2]
+    assert contents(tmp_path / "both") == alone
+    assert alone.keys() == {"metrics_summary.json", "curves.json", "results_nusc.json"}
+    boxes = json.loads(alone["results_nusc.json"])["results"]
+    assert len(boxes) == 6
+    assert min(map(len, boxes.values())) > 0
+
+
+def error_lines(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line.startswith("fcos-lidar: error: ")]
+
+
+def test_a_cloud_that_one_cannot_read_ends_all_and_what_is_done_stays_done(root, alone, tmp_path):
+    """The second process has data of its own, in which its cloud of the third pair of frames is cut:
+    the first pair is done, the second is not yet written."""
+    other = shutil.copytree(root, tmp_path / "home" / "data")
+    shutil.copytree(root.parent / "start", other.parent / "start")
+    data = NuScenes(other, "v1.0-synthetic")
+    (file,) = data.sweep_files(data.split("val")[5], 1)
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1])
+    both = [evaluate(data, tmp_path / "both") for data in (root, other)]
+    first, second = ended(start_two("coordinator", *both))
+    assert (first[0], second[0]) == (1, 1)
+    told = "fcos-lidar: error: process 1: cannot read its frames, see what it says"
+    assert error_lines(first[2]) == [told]
+    (line,) = error_lines(second[2])
+    assert f"{file}: got {len(whole) - 1} bytes" in line
+    assert {path.name for path in (tmp_path / "both").iterdir()} == {"results_nusc.resume_log", ".lock"}
+    file.write_bytes(whole)
+    first, second = ended(start_two("coordinator", *both))
+    assert (first[0], second[0]) == (0, 0), first[2] + second[2]
+    assert "frames 2/6" in first[2]
+    assert contents(tmp_path / "both") == alone
+
+
+def test_processes_with_different_detectors_are_refused(root, tmp_path):
+    other = tmp_path / "start"
+    save_checkpoint(other, Checkpoint(CONFIG, SENSOR, jax.tree.map(lambda leaf: leaf + 1, weights()), 1))
+    both = [evaluate(root, tmp_path / "both"), evaluate(root, tmp_path / "both", "--checkpoint", str(other))]
+    line = "process 1: detector, frames or batch size: got another than process 0, expected the same"
+    for code, _, errors in ended(start_two("coordinator", *both)):
+        assert (code, error_lines(errors)) == (1, [f"fcos-lidar: error: {line}"])
+
+
+def test_what_the_first_cannot_do_ends_all(root, tmp_path):
+    """Begin, for another works in the folder; and write, for a folder stands where a file is to be."""
+    out, begun = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see what it says"
+    with in_use(out):
+        first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
+    assert (first[0], second[0]) == (1, 1)
+    assert "in use: process" in error_lines(first[2])[0]
+    assert error_lines(second[2]) == [begun]
+    (out / "results_nusc.resume_log").mkdir()
+    first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
+    assert (first[0], second[0]) == (1, 1)
+    assert "results_nusc.resume_log" in error_lines(first[2])[0]
+    assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see what it says"]
+
+
+def test_sigterm_to_one_stops_both_after_the_same_frames(root, tmp_path):
+    frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
+    args = ["evaluate", *frames, "--checkpoint", str(root.parent / "start"), "--out", str(tmp_path / "both")]
+    both, log = start_two("coordinator", args, args), tmp_path / "both" / "detections.resume_log"
+    until = time.monotonic() + 100
+    while not (log.exists() and log.stat().st_size) and both[0].poll() is None and time.monotonic() < until:
+        time.sleep(0.01)
+    both[1].send_signal(signal.SIGTERM)
+    for code, _, errors in ended(both):
+        assert (code, error_lines(errors)) == (143, []), errors
+    done = log.read_bytes().count(b"\n") - 1
+    assert 0 < done < 400
+    assert done % 2 == 0
+
+
+def train(data: Path, out: Path) -> list[str]:
+    """Four steps of batches of two with objects cut from these frames, and an evaluation at the end."""
+    where = ["--data-root", str(data), "--out", str(out), "--weights", str(data.parent / "start")]
+    sensor = ["--sensor", str(data.parent / "sensor.json"), "--max-points", "1024", "--samples", "0:6"]
+    often = ["--steps", str(STEPS), "--save-every", str(STEPS), "--evaluate-every", str(STEPS)]
+    return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often]
+
+
+def test_data_that_one_cannot_open_end_all(root, tmp_path):
+    both = [train(root, tmp_path / "run"), [*train(root, tmp_path / "run"), "--data-root", str(tmp_path / "gone")]]
+    first, second = ended(start_two("coordinator", *both))
+    assert (first[0], second[0]) == (1, 1)
+    assert error_lines(first[2]) == ["fcos-lidar: error: process 1: cannot train, see what it says"]
+    assert "gone: no such folder" in error_lines(second[2])[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def two_devices(root, tmp_path_factory) -> list[dict]:
+    """Metrics of one process with two devices."""
+    out = tmp_path_factory.mktemp("devices") / "run"
+    ((code, _, errors),) = ended([start(train(root, out), JAX_NUM_CPU_DEVICES="2")])
+    assert code == 0, errors
+    return read_metrics(out)
+
+
+_OF_ONE = {"seconds", "waiting_seconds", "samples_per_second"}  # Time.
+_OF_ONE |= {"pasted_objects", "truncated_points", "truncated_boxes", "invalid_points"}  # The first one's own rows.
+
+
+@pytest.mark.parametrize("how", ["coordinator", "slurm"])
+def test_two_processes_train_as_one_with_two_devices(root, two_devices, tmp_path, how):
+    first, second = ended(start_two(how, *[train(root, tmp_path / "run")] * 2))
+    assert (first[0], second[0]) == (0, 0), first[2] + second[2]
+    found = read_metrics(tmp_path / "run")
+    assert len(found) == STEPS + 1
+    assert (tmp_path / "run" / "objects" / "manifest.json").is_file()
+    for ours, theirs in zip(found, two_devices, strict=True):
+        assert ours.keys() == theirs.keys()
+        for name in ours.keys() - _OF_ONE:
+            assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name
