@@ -1,0 +1,119 @@
+"""Programs compiled for a GPU that is not there: what is counted in them, and how failures are told."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from experiments.benchmarks import gpu_programs
+from experiments.benchmarks.gpu_programs import PROGRAMS, Args, all_programs, check, count_kernels
+from experiments.hardware import hardware
+from fcos_lidar_jax.presets import PRESETS
+
+MODULE = """HloModule jit_step
+
+%fused (p: f32[4]) -> f32[4] {
+  ROOT %a = f32[4]{0} add(%p, %p)
+}
+
+%inner (t: (s32[], f32[4])) -> (s32[], f32[4]) {
+  %f1 = f32[4]{0} fusion(%x), kind=kLoop, calls=%fused
+  ROOT %t1 = (s32[], f32[4]{0}) tuple(%i, %f1)
+}
+
+%outer (t: (s32[], f32[4])) -> (s32[], f32[4]) {
+  %f2 = f32[4]{0} fusion(%x), kind=kLoop, calls=%fused
+  %s = f32[4]{0} sort(%f2), dimensions={0}
+  %w2 = (s32[], f32[4]{0}) while(%t), condition=%c, body=%inner
+  ROOT %t2 = (s32[], f32[4]{0}) tuple(%i, %s)
+}
+
+%few (p: f32[4]) -> f32[4] {
+  ROOT %f3 = f32[4]{0} fusion(%p), kind=kLoop, calls=%fused
+}
+
+%many (p: f32[4]) -> f32[4] {
+  %f4 = f32[4]{0} fusion(%p), kind=kLoop, calls=%fused
+  ROOT %f5 = f32[4]{0} fusion(%f4), kind=kLoop, calls=%fused
+}
+
+ENTRY %main (p: f32[4]) -> f32[4] {
+  %p = f32[4]{0} parameter(0)
+  %w = (s32[], f32[4]{0}) while(%t), condition=%c, body=%outer, backend_config={"known_trip_count":{"n":"5"}}
+  %conv = (f32[4]{0}, u8[0]{0}) custom-call(%p, %p), custom_call_target="__cudnn$convForward"
+  %b = f32[4]{0} conditional(%i, %p, %p), branch_computations={%few, %many}
+  ROOT %copy = f32[4]{0} copy(%b)
+}
+"""
+
+
+def test_kernels_are_counted_by_loop_and_of_branches_the_larger():
+    kernels, loops = count_kernels(MODULE)
+    assert kernels == 2 + 2  # The convolution, the copy, and the branch of two.
+    assert loops == [(5, 2), (None, 1)]
+
+
+def test_all_programs_hold_every_preset_and_the_check():
+    programs = all_programs()
+    assert programs.items() >= PROGRAMS.items()
+    for kind in ("train", "detect"):
+        assert {p.preset for p in programs.values() if p.kind == kind} == set(PRESETS)
+
+
+@pytest.mark.parametrize("name", ["train-compact", "train-nuscenes-8-devices", "detect-nuscenes", "train-kitti"])
+def test_programs_are_those_of_the_package(name):
+    """Shapes of the arguments, which of them are split over the devices, and what is given away."""
+    program = PROGRAMS[name]
+    function, given, split, donated = gpu_programs._function(program)
+    config = PRESETS[program.preset]
+    assert callable(function)
+    assert len(given) == len(split)
+    if program.kind == "train":
+        assert given[1].points.shape[:2] == (program.batch, config.max_points)
+        assert (split, donated) == ((False, True), (0,))
+    else:
+        assert given[1].shape[0] == config.max_points
+        assert (split, donated) == ((False,) * 3, ())
+
+
+def test_a_program_that_kills_the_compiler_is_told_in_its_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "nvidia/cuda_nvcc").mkdir(parents=True)
+    good = {**dataclasses.asdict(PROGRAMS["detect-compact"]), "seconds": 3, "gflop_per_frame": 2.0, "slow": 0}
+    good |= {"temporary_mib": 5, "kernels": 7, "loops": [[5, 2], [None, 4]], "stage_gflop": {"stem": 1.0}}
+    runs = iter([(0, json.dumps(good), ""), (-6, "", "one\nF 1 x.cc:627] Check failed: a == b (1 vs. 2)\nstack")])
+    environments = []
+
+    def compiled(command, *, env, **options):
+        environments.append(env)
+        return subprocess.CompletedProcess(command, *next(runs))
+
+    hardware()  # Before its own processes are replaced.
+    monkeypatch.setattr(gpu_programs.subprocess, "run", compiled)
+    args = Args(plugin=tmp_path, programs=("detect-compact", "train-compact"), out=tmp_path / "record.json")
+    with pytest.raises(ValueError, match=r"not as they should be: train-compact$"):
+        check(args)
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert "2 GFLOP per frame stem 1" in first
+    assert "loops 5x2 ?x4" in first
+    assert second.endswith("FAILED: exit code -6: F 1 x.cc:627] Check failed: a == b (1 vs. 2)")
+    assert last == "1 of 2 programs compile as they should"
+    assert list(json.loads((tmp_path / "record.json").read_text())["programs"]) == [
+        "detect-compact",
+        "train-compact",
+    ]
+    assert environments[0]["PYTHONPATH"].startswith(str(tmp_path))
+
+
+def test_a_missing_plugin_and_unknown_programs_are_one_line(tmp_path):
+    command = [sys.executable, "-m", "experiments.benchmarks.gpu_programs", "--plugin", str(tmp_path)]
+    for options, line in (
+        ([], "run bash .ci/gpu"),
+        (["--programs", "x"], "--programs: got 'x', expected some of"),
+    ):
+        done = subprocess.run([*command, *options], capture_output=True, text=True, check=False, env=os.environ)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert line in done.stderr
+        assert len(done.stderr.splitlines()) == 1
