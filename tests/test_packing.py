@@ -119,7 +119,7 @@ def test_what_does_not_fit_is_named_and_never_rounded(column, value, finding):
     batch = make_batch([cloud[:2], cloud, cloud], columns=6)
     with pytest.raises(MisfitError) as caught:
         pack(batch, Packing(2))
-    assert (caught.value.sample, str(caught.value)) == (1, finding)
+    assert (caught.value.row, str(caught.value)) == (1, finding)
     assert_same_bits(unpack(pack(batch, Packing(0, False, False))), in_front(batch))
 
 

@@ -24,10 +24,10 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
-from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
+from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, pack
-from fcos_lidar_jax.types import HostBatch
+from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack_row
+from fcos_lidar_jax.types import Batch, HostBatch
 from fcos_lidar_jax.workers import end_with_parent
 
 _MAX_COLUMNS = 6
@@ -90,6 +90,73 @@ def steps_per_epoch(frames: FrameSet, config: Config) -> int:
     return -(-SampleOrder(frames, config, seed=0).epoch_size // config.optimizer.batch_size)
 
 
+@dataclasses.dataclass(frozen=True)
+class _BatchOf:
+    """The batch of a step, as a function of the step alone."""
+
+    frames: FrameSet
+    config: Config
+    seed: int
+    order: SampleOrder
+    rows: range  # Of the global batch, those of this process.
+    fade_step: int  # From which on nothing is pasted.
+    paste: MakePaste | None
+    packing: Packing | None
+    alone: bool  # No other process runs the program.
+
+    def __call__(self, step: int) -> HostBatch:
+        if self.packing is None:
+            return self._plain(step)
+        try:
+            return self._packed(step, self.packing)
+        except MisfitError as error:
+            name = self._names(step)[error.row]
+            found = f"frame {name!r}: {error}, as in the frames that were looked at first"
+        if not self.alone:
+            raise ValueError(f"{found}; several processes pack all batches alike: use --no-packing")
+        return dataclasses.replace(self._plain(step), misfit=found)
+
+    def _plain(self, step: int) -> HostBatch:
+        batch, counts = empty_batch(len(self.rows), **self._sizes()), Counter[str]()
+        for row, position in enumerate(self._positions(step)):
+            counts.update(self._fill(batch, row, step, position))
+        return HostBatch(batch, dict(counts), self._names(step))
+
+    def _packed(self, step: int, packing: Packing) -> HostBatch:
+        batch, counts = empty_packed(len(self.rows), packing, **self._sizes()), Counter[str]()
+        # One memory for all samples, which stays in the processor's cache. Of its points only valid rows are read.
+        sample: Any = empty_batch(1, **self._sizes())
+        for row, position in enumerate(self._positions(step)):
+            for array in (sample.valid, sample.boxes, sample.labels, sample.box_valid):
+                array[:] = 0
+            counts.update(self._fill(sample, 0, step, position))
+            pack_row(batch, row, sample)
+        return HostBatch(batch, dict(counts), self._names(step))
+
+    def _fill(self, batch: Batch, row: int, step: int, position: int) -> dict[str, int]:
+        index, num_pasted = self.order[position], 0
+        frame = self.frames.frame(index)
+        check_boxes(frame.boxes, self.frames.name(index))
+        seen = frame.num_points >= 1
+        boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
+        parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)
+        if self.paste is not None and step < self.fade_step:
+            pasted, removed = self.paste(frame, np.random.default_rng([self.seed, position]))
+            parts.append(pasted)
+            num_pasted = len(pasted.boxes)
+        return {"pasted_objects": num_pasted, **fill_row(batch, row, parts, removed)}
+
+    def _sizes(self) -> dict[str, int]:
+        columns = self.frames.sensor.point_columns
+        return {"max_points": self.config.max_points, "max_boxes": self.config.max_boxes, "columns": columns}
+
+    def _positions(self, step: int) -> list[int]:
+        return [step * self.config.optimizer.batch_size + row for row in self.rows]
+
+    def _names(self, step: int) -> tuple[str, ...]:
+        return tuple(self.frames.name(self.order[position]) for position in self._positions(step))
+
+
 @contextlib.contextmanager
 def make_batches(
     frames: FrameSet,
@@ -149,30 +216,17 @@ def make_batches(
             f"process {process_index} of {num_processes}: expected a number that divides the batch of {size}"
         )
     order = SampleOrder(frames, config, seed=seed)
-    rows = range(process_index * size // num_processes, (process_index + 1) * size // num_processes)
-    fade_step = num_steps - config.fade_epochs * -(-order.epoch_size // size)
-    paste = make_paste(objects, config) if objects is not None and config.copy_paste is not None else None
-
-    def batch_of(step: int) -> HostBatch:
-        positions = [step * size + row for row in rows]
-        shown = [order[position] for position in positions]
-        names = tuple(frames.name(index) for index in shown)
-        counts, columns = Counter(pasted_objects=0), frames.sensor.point_columns
-        batch = empty_batch(len(shown), max_points=config.max_points, max_boxes=config.max_boxes, columns=columns)
-        for row, (position, index) in enumerate(zip(positions, shown, strict=True)):
-            frame = frames.frame(index)
-            check_boxes(frame.boxes, names[row])
-            seen = frame.num_points >= 1
-            boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
-            parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)
-            if paste is not None and step < fade_step:
-                pasted, removed = paste(frame, np.random.default_rng([seed, position]))
-                parts.append(pasted)
-                counts["pasted_objects"] += len(pasted.boxes)
-            counts.update(fill_row(batch, row, parts, removed))
-        host = HostBatch(batch, dict(counts), names)
-        return host if packing is None else _packed(host, packing, alone=num_processes == 1)
-
+    batch_of = _BatchOf(
+        frames=frames,
+        config=config,
+        seed=seed,
+        order=order,
+        rows=range(process_index * size // num_processes, (process_index + 1) * size // num_processes),
+        fade_step=num_steps - config.fade_epochs * -(-order.epoch_size // size),
+        paste=make_paste(objects, config) if objects is not None and config.copy_paste is not None else None,
+        packing=packing,
+        alone=num_processes == 1,
+    )
     steps = grain.MapDataset.range(first_step, num_steps).map(batch_of)
     # Batches are large: one waits ready beside those in work, no more.
     stream = steps.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads + 1))
@@ -263,17 +317,6 @@ def _owned(host: HostBatch) -> HostBatch:
     Before it is handed on: grain frees the memory in a thread of its own, in which it needs some time.
     """
     return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch))
-
-
-def _packed(host: HostBatch, packing: Packing, *, alone: bool) -> HostBatch:
-    """The batch packed; plain, with the reason, where it does not fit and no other process runs the program."""
-    try:
-        return dataclasses.replace(host, batch=pack(host.batch, packing))  # type: ignore[arg-type]
-    except MisfitError as error:
-        found = f"frame {host.names[error.sample]!r}: {error}, as in the frames that were looked at first"
-        if not alone:
-            raise ValueError(f"{found}; several processes pack all batches alike: use --no-packing") from None
-        return dataclasses.replace(host, misfit=found)
 
 
 def _handed_on(batches: Iterable[HostBatch], *, copied: bool) -> Iterator[HostBatch]:
