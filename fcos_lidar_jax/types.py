@@ -12,7 +12,7 @@ import dataclasses
 from typing import Any
 
 import jax
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float32, Int32, UInt8, UInt16
 
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
 """The nine channel types of a range image (paper, section 3.1)."""
@@ -59,6 +59,32 @@ class Batch:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class PackedBatch:
+    """A :class:`Batch` on its way to the device, in fewer bytes, see :mod:`fcos_lidar_jax.packing`.
+
+    Valid rows are in front, in their order, and zeros behind them.
+
+    >>> import numpy as np
+    >>> clouds = np.zeros((2, 4096, 3), np.float32), *[np.zeros((2, 4096), np.uint8)] * 2
+    >>> truth = np.zeros((2, 32, 9)), np.zeros((2, 32), int), np.zeros((2, 32), bool)
+    >>> PackedBatch(*clouds, np.zeros((2, 10), np.float32), None, np.array([17, 4000]), *truth).xyz.nbytes
+    98304
+    """
+
+    xyz: Float32[Array, "b n 3"]  # Metres.
+    intensity: UInt8[Array, "b n"] | Float32[Array, "b n"]  # On the scale 0-255.
+    lag: UInt8[Array, "b n"] | UInt16[Array, "b n"] | Float32[Array, "b n"]
+    """Index into the sample's ``lags``; the time lag itself, in seconds, where there are none."""
+    lags: Float32[Array, "b t"]  # Time lags of each sample, seconds.
+    laser: UInt8[Array, "b n"] | Float32[Array, "b n"] | None  # Laser number, for sensors whose rows come from it.
+    count: Int32[Array, "b"]  # Valid rows.
+    boxes: Float32[Array, "b m 9"]  # This and what follows: as in :class:`Batch`.
+    labels: Int32[Array, "b m"]
+    box_valid: Bool[Array, "b m"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class HostBatch:
     """A batch on its way to the device, with what is to be reported about it.
 
@@ -66,9 +92,10 @@ class HostBatch:
     {'truncated_points': 3}
     """
 
-    batch: Batch  # NumPy arrays of this process's rows.
+    batch: Batch | PackedBatch  # NumPy arrays of this process's rows; on the devices, arrays of the global batch.
     counts: dict[str, int]  # To be recorded beside the metrics, such as ``truncated_points``.
     names: tuple[str, ...]  # Of the samples' frames, for messages.
+    misfit: str | None = None  # Why it is not packed where the run's batches are.
 
 
 @jax.tree_util.register_dataclass

@@ -4,15 +4,18 @@
 
 Reads a data set in nuScenes' layout (``fcos-lidar synthesize`` makes one; by default the real scene-0523 below the
 environment's ``FCOS_LIDAR_REAL_DATA``), cuts a ground-truth database from it, and times the stages of a sample on
-one thread. Then whole batches, prepared on demand, by two threads, and by two processes; and a training step of
-the quickstart preset, to be compared with. Files come from the page cache; ``read_from_disk_ms`` is without it.
+one thread. Then whole batches, prepared on demand, by two threads, and by two processes; the paper's batches on
+their way to a device, by turns plain from the main thread, as they once went, and packed in the background, as
+GPUs are fed; and a training step of the quickstart preset, to be compared with. A CPU stands in for the device,
+and a copy in its memory for the transfer. Files come from the page cache; ``read_from_disk_ms`` is without it.
 Other programs lengthen the wall clock, not the processor time: with the cores to itself a loader makes about cores
 / (processor time a sample) samples a second.
 
-Cost: two minutes. Expected on two cores: at least 40 samples a second. The paper's eight GPUs need 52.8: 40 epochs
-of 123,580 samples, class-balanced resampling counted, in 26 hours.
+Cost: four minutes. Expected on two cores: at least 40 samples a second, and 0.71 of the bytes. The paper's eight
+GPUs need 52.8: 40 epochs of 123,580 samples, class-balanced resampling counted, in 26 hours.
 """
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -22,11 +25,14 @@ import statistics
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
@@ -38,16 +44,22 @@ from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase, prepare_database
-from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.input_pipeline.loader import make_batches, packing_for
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
+from fcos_lidar_jax.training.feed import feed
+from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
+from fcos_lidar_jax.types import HostBatch
 
 EPOCHS, EPOCH_SAMPLES, HOURS = 40, 123_580, 26
 """The paper's training on 8 A100: an epoch of nuScenes' 28,130 training frames after class-balanced resampling."""
 FULL_SIZE = Path("experiments/results/full_size.json")  # Has the time of a training step of the paper's preset.
 WAYS = {"on demand": (0, 0), "2 threads": (2, 0), "2 processes": (0, 2)}
 """Of preparing batches: threads, worker processes."""
+Batches = Iterator[HostBatch]
+Delivery = Callable[[Batches], AbstractContextManager[Batches]]
+"""What brings prepared batches to where they are wanted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +73,9 @@ class Args(Options):
     batch_size: int = 8  # Samples a batch.
     samples: int = 160  # To load in each way of preparing batches.
     repeats: int = 15  # Samples timed for the stages; the median counts.
+    feed_batch_size: int = 32  # Samples a batch on the way to the device.
+    feed_turns: int = 5  # Turns of each way of feeding; the median counts.
+    feed_samples: int = 160  # To bring to the device in a turn.
     train_step: bool = True  # Time a training step of the quickstart preset too.
 
 
@@ -129,22 +144,61 @@ def cpu_s() -> float:
 
 
 def throughput(
-    frames: NuScenesFrames, config: Config, objects: GroundTruthDatabase, samples: int, **how: int
+    frames: NuScenesFrames,
+    config: Config,
+    objects: GroundTruthDatabase,
+    samples: int,
+    *,
+    delivery: Delivery = contextlib.nullcontext,
+    **how: Any,
 ) -> dict[str, float]:
     """Samples a second, once it runs; as much waits ready at the end as at the beginning."""
     size, warm = config.optimizer.batch_size, 6
     steps = -(-samples // size)
     truncated: Counter[str] = Counter(truncated_points=0, truncated_boxes=0)
-    with make_batches(frames, config, seed=0, num_steps=10 * (warm + steps), objects=objects, **how) as batches:
-        for _ in range(warm):
+    options: dict[str, Any] = {"seed": 0, "num_steps": 10 * (warm + steps), "objects": objects, **how}
+    with make_batches(frames, config, **options) as prepared, delivery(prepared) as batches:
+        for _ in range(warm - 1):
             next(batches)
+        num_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(next(batches).batch))
         began, cpu = time.perf_counter(), cpu_s()
         for _ in range(steps):
             counts = next(batches).counts
             truncated.update({name: counts[name] for name in truncated})
         wall, cpu = time.perf_counter() - began, cpu_s() - cpu
     found = {"samples_per_s": round(steps * size / wall, 1), "cpu_ms_a_sample": round(1e3 * cpu / steps / size, 1)}
-    return {**found, "cores_had": round(cpu / wall, 2), **truncated}
+    return {**found, "cores_had": round(cpu / wall, 2), "bytes_a_batch": num_bytes, **truncated}
+
+
+@contextlib.contextmanager
+def by_main_thread(batches: Batches, mesh: Mesh) -> Iterator[Batches]:
+    """To the device when the next batch is asked for, and there when it is handed on."""
+    yield (dataclasses.replace(b, batch=jax.block_until_ready(shard_batch(b.batch, mesh))) for b in batches)
+
+
+def feeds(
+    frames: NuScenesFrames, config: Config, objects: GroundTruthDatabase, *, turns: int, samples: int
+) -> dict[str, Any]:
+    """Bytes and samples a second that reach the device, in both ways by turns."""
+    mesh = make_mesh(jax.devices()[:1])
+    ways: dict[str, dict[str, Any]] = {
+        "plain, main thread": {"delivery": functools.partial(by_main_thread, mesh=mesh)},
+        "packed, background": {
+            "delivery": functools.partial(feed, mesh=mesh),
+            "packing": packing_for(frames, config),
+        },
+    }
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
+    for _ in range(turns):
+        for name, how in ways.items():
+            found[name].append(throughput(frames, config, objects, samples, threads=2, lend=True, **how))
+    medians = {
+        name: {key: statistics.median(turn[key] for turn in each) for key in each[0]}
+        for name, each in found.items()
+    }
+    before, after = medians.values()
+    ratios = {f"{key}_ratio": round(after[key] / before[key], 3) for key in ("samples_per_s", "bytes_a_batch")}
+    return {"batch_size": config.optimizer.batch_size, **medians, **ratios}
 
 
 def _needs(train_step: bool) -> dict[str, float]:
@@ -177,6 +231,8 @@ def measure(args: Args) -> dict[str, Any]:
         record |= stages(frames, objects, config, args.repeats)
         load = functools.partial(throughput, frames, config, objects, args.samples)
         record["loader"] = {name: load(threads=n, workers=m) for name, (n, m) in WAYS.items()}
+        large = change(optimizer__batch_size=args.feed_batch_size)(NUSCENES)
+        record["feed"] = feeds(frames, large, objects, turns=args.feed_turns, samples=args.feed_samples)
     return {**record, "needed_samples_per_s": _needs(args.train_step)}
 
 

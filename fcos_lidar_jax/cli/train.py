@@ -75,8 +75,12 @@ class Train:
     keep: int = 2  # Newest checkpoints that are kept beside the best.
     no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without flips, rotations and scales.
     no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without objects of other frames.
-    threads: int = 2  # That prepare batches.
-    workers: int = 0  # Processes that prepare batches, beside the threads.
+    threads: int | None = None
+    """That prepare batches, each a whole one, in every worker where there are workers; default: in all as many as
+    this process may use cores, less one where there are more than two, at most 16."""
+    workers: int = 0  # Processes that prepare batches, instead of this one.
+    no_packing: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Send points to GPUs and TPUs unpacked, in more bytes, with the same results. To CPUs they always are."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
     """Several processes share each batch."""
 
@@ -106,6 +110,7 @@ def run(args: Train) -> None:
                 tests=task.tests,
                 objects=objects,
                 schedule=Schedule(args.save_every, args.evaluate_every, args.keep),
+                packing=False if args.no_packing else None,
                 **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
             )
     except (KeyboardInterrupt, SystemExit):

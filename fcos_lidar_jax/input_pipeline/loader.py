@@ -8,8 +8,10 @@ share it.
 
 import contextlib
 import dataclasses
+import os
 import shutil
 import signal
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -20,14 +22,18 @@ import numpy as np
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
-from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
+from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.types import HostBatch
+from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack_row
+from fcos_lidar_jax.types import Batch, HostBatch
 from fcos_lidar_jax.workers import end_with_parent
 
 _MAX_COLUMNS = 6
 _CLASS_BALANCE = 0xCB65  # Keeps these draws apart from others of the same seed.
+_MAX_THREADS = 16  # Each has a batch in work, which is large.
+_INSPECTED = 5  # Frames whose points choose the packing.
 
 
 class SampleOrder:
@@ -84,6 +90,73 @@ def steps_per_epoch(frames: FrameSet, config: Config) -> int:
     return -(-SampleOrder(frames, config, seed=0).epoch_size // config.optimizer.batch_size)
 
 
+@dataclasses.dataclass(frozen=True)
+class _BatchOf:
+    """The batch of a step, as a function of the step alone."""
+
+    frames: FrameSet
+    config: Config
+    seed: int
+    order: SampleOrder
+    rows: range  # Of the global batch, those of this process.
+    fade_step: int  # From which on nothing is pasted.
+    paste: MakePaste | None
+    packing: Packing | None
+    alone: bool  # No other process runs the program.
+
+    def __call__(self, step: int) -> HostBatch:
+        if self.packing is None:
+            return self._plain(step)
+        try:
+            return self._packed(step, self.packing)
+        except MisfitError as error:
+            name = self._names(step)[error.row]
+            found = f"frame {name!r}: {error}, as in the frames that were looked at first"
+        if not self.alone:
+            raise ValueError(f"{found}; several processes pack all batches alike: use --no-packing")
+        return dataclasses.replace(self._plain(step), misfit=found)
+
+    def _plain(self, step: int) -> HostBatch:
+        batch, counts = empty_batch(len(self.rows), **self._sizes()), Counter[str]()
+        for row, position in enumerate(self._positions(step)):
+            counts.update(self._fill(batch, row, step, position))
+        return HostBatch(batch, dict(counts), self._names(step))
+
+    def _packed(self, step: int, packing: Packing) -> HostBatch:
+        batch, counts = empty_packed(len(self.rows), packing, **self._sizes()), Counter[str]()
+        # One memory for all samples, which stays in the processor's cache. Of its points only valid rows are read.
+        sample: Any = empty_batch(1, **self._sizes())
+        for row, position in enumerate(self._positions(step)):
+            for array in (sample.valid, sample.boxes, sample.labels, sample.box_valid):
+                array[:] = 0
+            counts.update(self._fill(sample, 0, step, position))
+            pack_row(batch, row, sample)
+        return HostBatch(batch, dict(counts), self._names(step))
+
+    def _fill(self, batch: Batch, row: int, step: int, position: int) -> dict[str, int]:
+        index, num_pasted = self.order[position], 0
+        frame = self.frames.frame(index)
+        check_boxes(frame.boxes, self.frames.name(index))
+        seen = frame.num_points >= 1
+        boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
+        parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)
+        if self.paste is not None and step < self.fade_step:
+            pasted, removed = self.paste(frame, np.random.default_rng([self.seed, position]))
+            parts.append(pasted)
+            num_pasted = len(pasted.boxes)
+        return {"pasted_objects": num_pasted, **fill_row(batch, row, parts, removed)}
+
+    def _sizes(self) -> dict[str, int]:
+        columns = self.frames.sensor.point_columns
+        return {"max_points": self.config.max_points, "max_boxes": self.config.max_boxes, "columns": columns}
+
+    def _positions(self, step: int) -> list[int]:
+        return [step * self.config.optimizer.batch_size + row for row in self.rows]
+
+    def _names(self, step: int) -> tuple[str, ...]:
+        return tuple(self.frames.name(self.order[position]) for position in self._positions(step))
+
+
 @contextlib.contextmanager
 def make_batches(
     frames: FrameSet,
@@ -95,8 +168,10 @@ def make_batches(
     objects: GroundTruthDatabase | None = None,
     process_index: int = 0,
     num_processes: int = 1,
-    threads: int = 2,
+    threads: int | None = None,
     workers: int = 0,
+    packing: Packing | None = None,
+    lend: bool = False,
 ) -> Iterator[Iterator[HostBatch]]:
     """The batches of a run from some step on, prepared ahead; leaving the context stops all that prepares them.
 
@@ -112,20 +187,28 @@ def make_batches(
         objects: to paste; needed unless ``config.copy_paste`` is None.
         process_index: of this process among those that share each global batch.
         num_processes: process i gets rows i * B / n to (i + 1) * B / n, so the parts in order are the whole.
-        threads: that prepare batches, in each worker where there are workers; 0 prepares on demand.
+        threads: that prepare batches, in each worker where there are workers; 0 prepares on demand. Default: see
+            :func:`default_threads`. One batch more than there are threads is in work or waits.
         workers: processes that prepare batches; 0 for none.
+        packing: by which batches are packed, see :func:`packing_for`; None for plain ones. A batch that does not
+            fit comes plain, and a line on standard error says why, once.
+        lend: leave batches of workers in the memory through which they came, and save a copy. Keep none of their
+            arrays then: they fill memory that the workers need, and must be gone before the process ends.
 
     Yields:
         an iterator over :class:`fcos_lidar_jax.types.HostBatch`, of this process's rows.
 
     Raises:
-        ValueError: sizes that do not divide, no frames, or no objects where some are to be pasted.
+        ValueError: sizes that do not divide, no frames, or no objects where some are to be pasted. From the
+            iterator: a frame that cannot be read, or one that does not fit the packing where there are several
+            processes, for all of them must run the same program.
     """
     import grain
     from absl import flags
 
     if not 0 <= first_step <= num_steps:
         raise ValueError(f"first_step: got {first_step}, expected 0 to {num_steps}")
+    threads = default_threads(workers) if threads is None else threads
     check_loader_options(config, objects, threads=threads, workers=workers, num_processes=num_processes)
     size = config.optimizer.batch_size
     if not 0 <= process_index < num_processes or size % num_processes:
@@ -133,29 +216,17 @@ def make_batches(
             f"process {process_index} of {num_processes}: expected a number that divides the batch of {size}"
         )
     order = SampleOrder(frames, config, seed=seed)
-    rows = range(process_index * size // num_processes, (process_index + 1) * size // num_processes)
-    fade_step = num_steps - config.fade_epochs * -(-order.epoch_size // size)
-    paste = make_paste(objects, config) if objects is not None and config.copy_paste is not None else None
-
-    def batch_of(step: int) -> HostBatch:
-        positions = [step * size + row for row in rows]
-        shown = [order[position] for position in positions]
-        names = tuple(frames.name(index) for index in shown)
-        counts, columns = Counter(pasted_objects=0), frames.sensor.point_columns
-        batch = empty_batch(len(shown), max_points=config.max_points, max_boxes=config.max_boxes, columns=columns)
-        for row, (position, index) in enumerate(zip(positions, shown, strict=True)):
-            frame = frames.frame(index)
-            check_boxes(frame.boxes, names[row])
-            seen = frame.num_points >= 1
-            boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
-            parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)
-            if paste is not None and step < fade_step:
-                pasted, removed = paste(frame, np.random.default_rng([seed, position]))
-                parts.append(pasted)
-                counts["pasted_objects"] += len(pasted.boxes)
-            counts.update(fill_row(batch, row, parts, removed))
-        return HostBatch(batch, dict(counts), names)
-
+    batch_of = _BatchOf(
+        frames=frames,
+        config=config,
+        seed=seed,
+        order=order,
+        rows=range(process_index * size // num_processes, (process_index + 1) * size // num_processes),
+        fade_step=num_steps - config.fade_epochs * -(-order.epoch_size // size),
+        paste=make_paste(objects, config) if objects is not None and config.copy_paste is not None else None,
+        packing=packing,
+        alone=num_processes == 1,
+    )
     steps = grain.MapDataset.range(first_step, num_steps).map(batch_of)
     # Batches are large: one waits ready beside those in work, no more.
     stream = steps.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads + 1))
@@ -165,17 +236,53 @@ def make_batches(
         stream = stream.mp_prefetch(
             grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1), _leave_signals
         )
-    prepared: Any = _from_workers(stream) if workers else iter(stream)
-    with contextlib.closing(prepared) as batches:
+    prepared: Any = iter(stream)
+    handed_on: Any = _handed_on(prepared, copied=workers > 0 and not lend)
+    with contextlib.closing(prepared), contextlib.closing(handed_on) as batches:
         yield batches
 
 
+def default_threads(workers: int = 0) -> int:
+    """Threads that prepare batches where nobody says how many, in each of ``workers`` processes if there are any.
+
+    In all as many as this process may use cores, less one for the main thread where there are more than two; at
+    least 1 and at most 16.
+
+    >>> 1 <= default_threads() <= 16
+    True
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    free = cores - 1 if cores > 2 else cores
+    return max(min(free, _MAX_THREADS) // max(workers, 1), 1)
+
+
+def packing_for(frames: FrameSet, config: Config) -> Packing:
+    """The packing of a run's batches, from the points of some frames, spread over the set: the first, the last and
+    three between. The same frames give the same in every process.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+    >>> packing_for(SimulatedFrames(TINY, 3), QUICKSTART).num_lags > 0
+    True
+    """
+    indices = np.unique(np.linspace(0, len(frames) - 1, _INSPECTED).round().astype(int))
+    clouds = (frames.frame(int(index)).points for index in indices)
+    usable = (points[usable_rows(points)] for points in clouds)
+    return choose_packing(usable, num_sweeps=config.num_sweeps, num_pasted=sum(config.paste_targets))
+
+
 def check_loader_options(
-    config: Config, objects: GroundTruthDatabase | None, *, threads: int, workers: int, num_processes: int = 1
+    config: Config,
+    objects: GroundTruthDatabase | None,
+    *,
+    threads: int | None,
+    workers: int,
+    num_processes: int = 1,
 ) -> None:
     """Refuse what :func:`make_batches` cannot prepare batches with, before there is a run; arguments as there."""
     for name, value in (("threads", threads), ("workers", workers)):
-        if value < 0:
+        if value is not None and value < 0:
             raise ValueError(f"{name}: got {value}, expected at least 0")
     if config.copy_paste is not None and objects is None:
         raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
@@ -204,12 +311,22 @@ def _check_shared_memory(config: Config, workers: int, num_processes: int) -> No
         )
 
 
-def _from_workers(stream: Iterable[HostBatch]) -> Iterator[HostBatch]:
-    """Batches out of the shared memory in which the workers pass them."""
-    iterator: Any = iter(stream)
-    with contextlib.closing(iterator):
-        for item in iterator:
-            batch = dataclasses.replace(item, batch=jax.tree.map(np.array, item.batch))
-            # Before it is handed on: grain frees the memory in a thread of its own, in which it needs some time.
-            del item
-            yield batch
+def _owned(host: HostBatch) -> HostBatch:
+    """A batch copied out of the shared memory in which the workers pass it.
+
+    Before it is handed on: grain frees the memory in a thread of its own, in which it needs some time.
+    """
+    return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch))
+
+
+def _handed_on(batches: Iterable[HostBatch], *, copied: bool) -> Iterator[HostBatch]:
+    """Batches that the caller alone keeps, and a line about the first that does not fit the packing."""
+    told = False
+    for host in batches:
+        if host.misfit is not None and not told:
+            line = f"{host.misfit}: such batches go unpacked, for which the step is compiled once more"
+            print(line, file=sys.stderr, flush=True)
+            told = True
+        held = [_owned(host) if copied else host]
+        del host
+        yield held.pop()

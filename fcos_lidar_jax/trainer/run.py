@@ -29,7 +29,7 @@ from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import check_loader_options, make_batches
+from fcos_lidar_jax.input_pipeline.loader import check_loader_options, make_batches, packing_for
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
@@ -44,11 +44,12 @@ from fcos_lidar_jax.training.checkpoint import (
     with_later_fields,
 )
 from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, find_checkpoint
+from fcos_lidar_jax.training.feed import feed
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
 from fcos_lidar_jax.training.metrics_log import MetricsLog, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.preemption import stop_requests
-from fcos_lidar_jax.training.sharding import check_batch_size, jit_step, make_mesh, replicate, shard_batch
+from fcos_lidar_jax.training.sharding import check_batch_size, jit_step, make_mesh, replicate
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 from fcos_lidar_jax.types import TrainState
 
@@ -122,8 +123,9 @@ def train(
     devices: Sequence[Any] | None = None,
     hooks: Sequence[Hook] = (),
     schedule: Schedule = Schedule(),
-    threads: int = 2,
+    threads: int | None = None,
     workers: int = 0,
+    packing: bool | None = None,
 ) -> TrainState:
     """Train to the end, or until Ctrl-C or SIGTERM, which save a checkpoint first.
 
@@ -141,7 +143,10 @@ def train(
         devices: to share each batch; default: all.
         hooks: called after every step.
         schedule: when to save and to evaluate.
-        threads, workers: threads that prepare batches, and processes beside them.
+        threads, workers: threads that prepare batches, and processes beside them; default: as many threads as
+            :func:`fcos_lidar_jax.input_pipeline.loader.default_threads` says, and no processes.
+        packing: whether batches travel to the devices in fewer bytes, see :mod:`fcos_lidar_jax.packing`; the
+            results are the same. Default: unless the devices are CPUs.
 
     Returns:
         the last state.
@@ -201,6 +206,8 @@ def train(
             make_paste(objects, config)
         mismatch = sensor_mismatch(frames.frame(0).points, frames.sensor)
         single = config.num_sweeps > 1 and _of_one_sweep(frames)
+        on_cpus = mesh.devices.flat[0].platform == "cpu"
+        packed = packing_for(frames, config) if packing or (packing is None and not on_cpus) else None
     with _claimed(run, resume=resume):
         start = _start(run, optimizer, seed, resume, given)
         first = int(start.step)
@@ -237,11 +244,11 @@ def train(
                 _evaluate(run, number, state, metrics)
 
         processes = {"process_index": jax.process_index(), "num_processes": jax.process_count()}
-        helpers = {"threads": threads, "workers": workers, **processes}
+        helpers: dict[str, Any] = {"threads": threads, "workers": workers, "packing": packed, **processes}
         batches = make_batches(
-            frames, config, seed=seed, num_steps=steps, first_step=first, objects=objects, **helpers
+            frames, config, seed=seed, num_steps=steps, first_step=first, objects=objects, lend=True, **helpers
         )
-        with stop_requests(active=not several) as request, batches as stream:
+        with stop_requests(active=not several) as request, batches as prepared, feed(prepared, mesh) as stream:
 
             def stopping(done: int) -> bool:
                 if several:  # all stop after the same step, whichever of them was asked to
@@ -255,7 +262,7 @@ def train(
                 state = fit(
                     step,
                     state,
-                    (dataclasses.replace(b, batch=shard_batch(b.batch, mesh)) for b in stream),
+                    stream,
                     num_steps=steps,
                     report=report,
                     pause_at=run.saves_at,

@@ -1,5 +1,6 @@
 """The Python loop around the step: progress, finite checks, pauses, a clean stop."""
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -42,7 +43,8 @@ def fit(
     Args:
         step: compiled ``(state, batch) -> (state, metrics)``; it may take the state's buffers.
         state: where to begin; the run ends when ``state.step`` is ``num_steps``.
-        batches: at least as many as there are steps left.
+        batches: at least as many as there are steps left; the time that each takes to come is recorded as
+            ``waiting_seconds``.
         num_steps: of the whole run.
         report: called with (steps done, metrics of the last of them) after every step.
         pause_at: whether to pause after so many steps.
@@ -91,6 +93,7 @@ def fit(
         host = next(iterator)
         waited = time.monotonic() - began
         state, metrics = step(state, host.batch)
+        host = dataclasses.replace(host, batch=None)  # The step is its last user: its memory is free for the next.
         done += 1
         read()
         unread = done, host, metrics, waited

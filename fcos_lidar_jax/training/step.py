@@ -12,12 +12,13 @@ from jax import lax
 
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.models import Detector, Variables
+from fcos_lidar_jax.packing import unpack
 from fcos_lidar_jax.training import centre_objective, objective
 from fcos_lidar_jax.training.objective import Metrics
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
-from fcos_lidar_jax.types import Batch, TrainState
+from fcos_lidar_jax.types import Batch, PackedBatch, TrainState
 
-TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
+TrainStep = Callable[[TrainState, Batch | PackedBatch], tuple[TrainState, Metrics]]
 
 
 def make_state(
@@ -109,8 +110,8 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
     """A training step: augment unless ``config.augment`` is None, project, predict, assign, differentiate, update.
 
     Returns:
-        pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. The metrics are scalars but
-        for ``positives_per_level`` i32[6].
+        pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. A packed batch is unpacked first.
+        The metrics are scalars but for ``positives_per_level`` i32[6].
 
     >>> from fcos_lidar_jax.models import build_detector
     >>> from fcos_lidar_jax.presets import QUICKSTART
@@ -137,8 +138,9 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         points, boxes = jax.vmap(augment_one)(keys, batch.points, batch.boxes)
         return dataclasses.replace(batch, points=points, boxes=boxes)
 
-    def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        grads, batch_stats, metrics = gradient(state.params, state.batch_stats, augmented(state, batch))
+    def step(state: TrainState, batch: Batch | PackedBatch) -> tuple[TrainState, Metrics]:
+        batch = augmented(state, unpack(batch))
+        grads, batch_stats, metrics = gradient(state.params, state.batch_stats, batch)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
         metrics["gradient_norm"] = optax.tree.norm(grads)

@@ -23,9 +23,17 @@ from fcos_lidar_jax.data.frame import Frame, GivenFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.input_pipeline.database import prepare_database
-from fcos_lidar_jax.input_pipeline.loader import SampleOrder, make_batches, steps_per_epoch
+from fcos_lidar_jax.input_pipeline.loader import (
+    SampleOrder,
+    default_threads,
+    make_batches,
+    packing_for,
+    steps_per_epoch,
+)
+from fcos_lidar_jax.packing import Packing, unpack
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2
+from fcos_lidar_jax.types import Batch, PackedBatch
 
 CONFIG = dataclasses.replace(
     QUICKSTART,
@@ -99,6 +107,78 @@ def test_the_parts_of_all_processes_are_the_whole(objects, alone, num_processes)
         for a, b in zip(jax.tree.leaves(joined), jax.tree.leaves(batch.batch), strict=True):
             np.testing.assert_array_equal(a, b)
         assert batch.counts == {name: sum(p[step].counts[name] for p in parts) for name in batch.counts}
+
+
+def in_front(batch):
+    """The valid rows of every cloud in front, in their order, and zeros behind."""
+    points, valid = np.zeros_like(batch.points), np.zeros_like(batch.valid)
+    for row, number in enumerate(batch.valid.sum(axis=1)):
+        points[row, :number] = [p for p, yes in zip(batch.points[row], batch.valid[row], strict=True) if yes]
+        valid[row, :number] = True
+    return dataclasses.replace(batch, points=points, valid=valid)
+
+
+def unpacked(host):
+    assert isinstance(host.batch, PackedBatch)
+    return dataclasses.replace(host, batch=jax.tree.map(np.array, unpack(host.batch)))
+
+
+@pytest.mark.parametrize("how", [{}, {"threads": 3}, {"workers": 2, "first_step": 1}])
+def test_packed_batches_are_the_plain_ones_with_their_valid_rows_in_front(objects, alone, how):
+    packing = packing_for(ToyFrames(), CONFIG)
+    assert packing == Packing(3 * (1 + sum(CONFIG.paste_targets)), byte_intensity=False)
+    found = [unpacked(host) for host in run(config=CONFIG, objects=objects, packing=packing, **how)]
+    plain = [dataclasses.replace(host, batch=in_front(host.batch)) for host in alone]
+    assert any((host.batch.valid != other.batch.valid).any() for host, other in zip(alone, plain, strict=True))
+    assert_same(found, plain[how.get("first_step", 0) :])
+
+
+def frames_of_whole_intensities(odd):
+    """Frames of which one has an intensity that is no whole number."""
+    frames = [toy_frame(index) for index in range(8)]
+    for index, frame in enumerate(frames):
+        frame.points[:, 3] = np.round(frame.points[:, 3])
+        frame.points[7, 3] = 12.5 if index == odd else 12
+    return ListedFrames(tuple(frames))
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_what_does_not_fit_the_packing_comes_plain_and_a_line_says_why(capfd, workers):
+    frames = frames_of_whole_intensities(odd=1)
+    packing = packing_for(frames, PLAIN)
+    assert packing == Packing(num_lags=3)  # frame 1 is not among those that are looked at
+    found = run(frames, packing=packing, workers=workers)
+    odd = ["frame 1" in host.names for host in found]
+    assert [isinstance(host.batch, Batch) for host in found] == odd
+    assert 1 < sum(odd) < len(odd)
+    told = "frame 'frame 1': intensity: got 12.5, expected whole numbers from 0 to 255, as in the frames that were"
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "frame" in line]
+    assert line.startswith(told)
+    plain = [dataclasses.replace(host, misfit=None) if out else unpacked(host) for host, out in zip(found, odd)]  # noqa: B905
+    assert_same(plain, run(frames))
+
+
+def test_several_processes_refuse_what_does_not_fit_the_packing():
+    frames = frames_of_whole_intensities(odd=1)
+    parts = [
+        {"num_processes": 2, "process_index": index, "packing": packing_for(frames, PLAIN)} for index in (0, 1)
+    ]
+    with pytest.raises(ValueError, match="frame 'frame 1'") as caught:
+        [run(frames, **part) for part in parts]
+    told = "frame 'frame 1': intensity: got 12.5, expected whole numbers from 0 to 255, as in "
+    assert re.fullmatch(f"{told}[^\n]*: use --no-packing", str(caught.value))
+
+
+@pytest.mark.parametrize(
+    ("cores", "workers", "threads"),
+    [(1, 0, 1), (2, 0, 2), (3, 0, 2), (8, 0, 7), (17, 0, 16), (128, 0, 16), (2, 2, 1), (32, 4, 4), (4, 16, 1)],
+)
+def test_threads_follow_from_the_cores(monkeypatch, cores, workers, threads):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    assert default_threads(workers) == threads
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    assert default_threads(workers) == threads
 
 
 def seen_frames(batches, size=7):
@@ -287,6 +367,21 @@ def test_real_samples_fit_the_presets(real_data, tmp_path, preset):
         lags = [len(np.unique(cloud[row][:, 4])) for cloud, row in zip(points, valid, strict=True)]
         assert all(lag >= preset.num_sweeps for lag in lags)
         assert preset.num_sweeps > 1 or lags == [1, 1, 1]
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(("preset", "row_bytes"), [(NUSCENES, 15), (NUSCENES_SINGLE, 14)])
+def test_real_samples_are_packed_whole(real_data, tmp_path, preset, row_bytes):
+    data = NuScenes(real_data / "nuscenes_scene0523", "v1.0-scene0523")
+    frames = NuScenesFrames(data, tuple(data.split("scene0523")[-6:]), preset.num_sweeps)
+    options = {"objects": prepare_database(frames, tmp_path), "count": 2}
+    config = dataclasses.replace(preset, optimizer=dataclasses.replace(preset.optimizer, batch_size=3))
+    packing = packing_for(frames, config)
+    assert packing.byte_intensity
+    assert packing.row_bytes == row_bytes
+    found = [unpacked(host) for host in run(frames, config, packing=packing, **options)]
+    plain = [dataclasses.replace(host, batch=in_front(host.batch)) for host in run(frames, config, **options)]
+    assert_same(found, plain)
 
 
 @dataclasses.dataclass(frozen=True)

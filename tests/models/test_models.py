@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import export, lax
+from jax import lax
 from tiny_run import CONFIG, SENSOR
 
 from fcos_lidar_jax.config import ModelConfig, StemConfig
@@ -81,37 +81,6 @@ def test_forms_of_the_stem_are_equal_in_values_and_gradients(choices):
             np.testing.assert_allclose(split, other, atol=1e-12)
             for a, b in zip(jax.tree.leaves(split_grads), jax.tree.leaves(other_grads), strict=True):
                 np.testing.assert_allclose(a, b, atol=1e-10 * float(np.abs(b).max() + 1))
-
-
-def test_the_form_of_the_stem_is_that_of_the_platform_also_in_exported_programs():
-    config = dataclasses.replace(SMALL_STEM, channels_per_type=12, num_convs=1, dilations=(1,))
-    image = normal(0, 2, 8, 12, 27)
-    variables = variables_of(Stem(config), image)
-
-    def of(form):
-        stem = Stem(config, form=form)
-        return jax.jit(lambda v, x: stem.apply(v, x, train=True, mutable=["batch_stats"]))
-
-    platforms = [("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda")]
-    programs = {p: export.export(of(None), platforms=p)(variables, image) for p in platforms}
-    # Two groups, all nine with zeros between them, all nine without.
-    kernels = {"split": "3x3x6x24xf32>", "dense": "3x3x27x108xf32>", "grouped": "feature_group_count = 9"}
-    forms = {p: {f for f, k in kernels.items() if k in program.mlir_module()} for p, program in programs.items()}
-    assert [forms[p] for p in platforms] == [{"split"}, {"grouped"}, {"dense"}, {"split", "grouped"}]
-    weights = normal(1, 2, 8, 12, 8)
-
-    def gradient(form):
-        def total(variables):
-            found = of(form)(variables, image)
-            return (found[0] * weights).sum(), found
-
-        gradient, found = jax.jit(jax.grad(total, has_aux=True))(variables)
-        return jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(gradient)]), found
-
-    (chosen, found), (split, expected) = gradient(None), gradient("split")
-    assert float(jnp.abs(chosen - split).max()) < 1e-6 * float(jnp.abs(split).max())
-    for other in (found, programs["cpu", "cuda"].call(variables, image)):
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-6), other, expected)
 
 
 def test_grouped_stem_is_one_library_convolution_per_layer():

@@ -23,7 +23,9 @@ from fcos_lidar_jax.input_pipeline.database import prepare_database
 from fcos_lidar_jax.trainer import run as runs
 from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
+from fcos_lidar_jax.training.feed import feed
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.types import Batch, PackedBatch
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -130,16 +132,21 @@ def test_a_finished_run_says_so_and_nothing_changes(finished, capsys):
 
 
 def disturb(monkeypatch, at: int, how) -> None:
-    """Something happens while one of the batches is made."""
-    make_batches = loader.make_batches
+    """Something happens while the run takes one of its batches, which may have been made long before."""
+    first = 0
+
+    def make_batches(*args, first_step, **kwargs):
+        nonlocal first
+        first = first_step
+        return loader.make_batches(*args, first_step=first_step, **kwargs)
 
     @contextmanager
-    def disturbed(*args, **kwargs):
-        with make_batches(*args, **kwargs) as stream:
-            first = kwargs["first_step"]
+    def disturbed(batches, mesh):
+        with feed(batches, mesh) as stream:
             yield (how(host) if step == at else host for step, host in enumerate(stream, start=first))
 
-    monkeypatch.setattr(runs, "make_batches", disturbed)
+    monkeypatch.setattr(runs, "make_batches", make_batches)
+    monkeypatch.setattr(runs, "feed", disturbed)
 
 
 def signalled(number: int):
@@ -151,8 +158,7 @@ def signalled(number: int):
 
 
 def broken(host):
-    points = host.batch.points.copy()
-    points[1, :, 3] = 3e38  # finite, until the network adds it up
+    points = host.batch.points.at[1, :, 3].set(3e38)  # finite, until the network adds it up
     return dataclasses.replace(host, batch=dataclasses.replace(host.batch, points=points))
 
 
@@ -186,6 +192,28 @@ def test_stopped_failed_and_resumed_it_ends_where_the_run_left_alone_ended(
         for run in (whole, folder)
     )
     assert found == wanted
+
+
+def test_with_packed_batches_it_ends_in_the_same_bits(finished, tmp_path, monkeypatch):
+    whole, state, _ = finished
+    fed = []
+
+    @contextmanager
+    def seen(batches, mesh):
+        with feed(batches, mesh) as stream:
+            yield (fed.append(type(host.batch)) or host for host in stream)
+
+    monkeypatch.setattr(runs, "feed", seen)
+    packed = train_tiny(tmp_path / "packed", weights=weights(), packing=True)
+    assert fed == [PackedBatch] * STEPS
+    assert bits(packed) == bits(state)
+    wanted, found = (
+        [line["loss/total"] for line in read_metrics(f) if "loss/total" in line]
+        for f in (whole, tmp_path / "packed")
+    )
+    assert found == wanted
+    train_tiny(tmp_path / "plain", weights=weights(), steps=1)
+    assert fed[STEPS:] == [Batch]  # to a CPU, where nobody says
 
 
 KILLED = """
