@@ -320,8 +320,8 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
     from fcos_lidar_jax.inference.export import export_detector, load_exported
     from fcos_lidar_jax.inference.load import load_trained
     from fcos_lidar_jax.models import build_detector
-    from fcos_lidar_jax.sensors import load_sensor
     from fcos_lidar_jax.packing import Packing, empty_packed
+    from fcos_lidar_jax.sensors import load_sensor
     from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 
     def spec(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
