@@ -107,7 +107,12 @@ def _row(inclination: Float32[Array, "n"], sensor: Sensor) -> Int32[Array, "n"]:
         top = np.float32(sensor.inclinations_rad[0])
         return jnp.floor((top - inclination) * np.float32(1 / step) + 0.5).astype(jnp.int32)
     edges = -np.asarray(sensor.row_edges_rad, np.float32)
-    return jnp.searchsorted(edges, -inclination, side="right").astype(jnp.int32) - 1
+    # A search is a loop, which a GPU starts step by step: there all edges are compared.
+    search, compare = (
+        functools.partial(jnp.searchsorted, side="right", method=method) for method in ("scan", "compare_all")
+    )
+    row = lax.platform_dependent(jnp.asarray(edges), -inclination, cpu=search, default=compare)
+    return row.astype(jnp.int32) - 1
 
 
 def priority_keys(

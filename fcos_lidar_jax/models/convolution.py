@@ -7,6 +7,7 @@ computed as the weight gradient of an undilated one. Everything else is the libr
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -51,7 +52,7 @@ def convolve(
     kernel = kernel.astype(x.dtype)
     high, wide = (size // 2 * dilation for size in kernel.shape[:2])
     if kernel.shape[:2] == (1, 1) and groups == 1:
-        return pointwise(every(x, stride), kernel[0, 0], precision=precision)
+        return pointwise(x, kernel[0, 0], stride=stride, precision=precision)
     if circular and wide:
         x = jnp.concatenate([x[:, :, -wide:], x, x[:, :, :wide]], axis=2)
         wide = 0
@@ -73,42 +74,42 @@ def convolve(
     return _with_weight_gradient(product, forms, x, kernel)
 
 
-def every(x: Image, stride: int) -> Image:
-    """Every ``stride``-th pixel of both axes, from the first on.
-
-    Reshaped and indexed, not sliced with a stride: XLA aborts on a GPU where it fuses such a slice into a matrix
-    product (``triton_tiling_propagation.cc: Check failed``, seen with jaxlib 0.10.2).
-
-    >>> every(jnp.arange(15.0).reshape(1, 3, 5, 1), 2)[0, :, :, 0].tolist()
-    [[0.0, 2.0, 4.0], [10.0, 12.0, 14.0]]
-    """
-    if stride == 1:
-        return x
-    x = jnp.pad(x, ((0, 0), (0, -x.shape[1] % stride), (0, -x.shape[2] % stride), (0, 0)))
-    b, h, w, c = x.shape
-    return x.reshape(b, h // stride, stride, w // stride, stride, c)[:, :, 0, :, 0]
-
-
 def pointwise(
     x: Image,
     kernel: Float[Array, "_ _"],
     *,
+    stride: int = 1,
     dtype: DTypeLike | None = None,
     precision: lax.Precision | None = None,
 ) -> Image:
-    """A 1x1 convolution as a matrix product, summed in ``dtype``, by default that of ``x``.
+    """A 1x1 convolution, summed in ``dtype``, by default that of ``x``: on a CPU as a matrix product.
 
     >>> pointwise(jnp.ones((1, 8, 8, 2)), jnp.ones((2, 4)))[0, 0, 0].tolist()
     [2.0, 2.0, 2.0, 2.0]
     """
     kernel = kernel.astype(x.dtype)
-    product = functools.partial(_of_pixels, dtype=dtype, precision=precision)
-    forms = {"cpu": _flat} if _multiply_adds(x, kernel) >= LARGE else {}
+    taken = (x.shape[0], -(-x.shape[1] // stride), -(-x.shape[2] // stride))
+    product = functools.partial(_of_pixels, stride=stride, dtype=dtype or x.dtype, precision=precision)
+    large = math.prod(taken[1:]) * kernel.size >= LARGE
+    forms = {"cpu": functools.partial(_flat, stride=stride)} if large else {}
     return _with_weight_gradient(product, forms, x, kernel)
 
 
-def _of_pixels(x: Image, kernel: Array, dtype: DTypeLike | None, precision: lax.Precision | None) -> Image:
-    return jnp.einsum("bhwc,co->bhwo", x, kernel, preferred_element_type=dtype, precision=precision)
+def _of_pixels(x: Image, kernel: Array, stride: int, dtype: DTypeLike, precision: lax.Precision | None) -> Image:
+    def matrix_product(x: Array, kernel: Array) -> Array:
+        x = x[:, ::stride, ::stride]
+        return jnp.einsum("bhwc,co->bhwo", x, kernel, preferred_element_type=dtype, precision=precision)
+
+    def convolution(x: Array, kernel: Array) -> Array:
+        layout, strides = ("NHWC", "HWIO", "NHWC"), (stride, stride)
+        kernel = kernel[None, None]
+        return lax.conv_general_dilated(x, kernel, strides, "VALID", dimension_numbers=layout, precision=precision)
+
+    if dtype != x.dtype:  # The library has no gradient of a convolution of two types.
+        return matrix_product(x, kernel)
+    # On GPUs XLA fuses matrix products with what is around them, and fails at some: it aborts where there is a
+    # stride (triton_tiling_propagation.cc: Check failed) and finds no tiles for others on an A100 (jaxlib 0.10.2).
+    return lax.platform_dependent(x, kernel, cpu=matrix_product, default=convolution)
 
 
 def _multiply_adds(x: Image, kernel: Array) -> int:
@@ -149,8 +150,9 @@ def _backward(product: Callable, forms: tuple, inputs: tuple[Image, Array], g: I
 _custom.defvjp(_forward, _backward)
 
 
-def _flat(x: Image, g: Image) -> Float[Array, "_ _"]:
+def _flat(x: Image, g: Image, *, stride: int) -> Float[Array, "_ _"]:
     """Weight gradient of a 1x1 convolution, one product of all pixels, the wider side on the right."""
+    x = x[:, ::stride, ::stride]
     x, g = x.reshape(-1, x.shape[-1]), g.reshape(-1, g.shape[-1])
     product = functools.partial(jnp.einsum, "pa,pb->ab", preferred_element_type=_summed_in(x))
     if x.shape[1] <= g.shape[1]:
