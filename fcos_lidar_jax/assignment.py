@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import points_in_box
 from fcos_lidar_jax.types import Targets
 
@@ -44,9 +45,8 @@ def owners(
     """
     solid = jnp.where(jnp.asarray(box_valid)[:, None], boxes, 0.0)
     given = jnp.asarray(points), jnp.asarray(present), solid, jnp.asarray(box_valid)
-    if form is not None:
-        return {"loop": _owners_by_box, "reduction": _owners_by_rank}[form](*given)
-    return lax.platform_dependent(*given, cpu=_owners_by_box, default=_owners_by_rank)
+    forms = {"loop": _owners_by_box, "reduction": _owners_by_rank}
+    return in_form(form, forms, *given, cpu="loop", default="reduction")
 
 
 def _volume(boxes: Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
 
@@ -54,25 +55,12 @@ def rotated_nms(
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     ranked = jnp.where(usable, scores, -jnp.inf)
     kinds = jnp.zeros(ranked.shape, jnp.int32) if labels is None else jnp.asarray(labels)
-    _check_form(form)
     if overlap not in ("bev", "3d"):
         raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
     options = {"threshold": iou_threshold, "max_outputs": max_outputs, "vertical": overlap == "3d"}
     rows, matrix = (functools.partial(suppress, **options) for suppress in (_by_rows, _by_matrix))
     candidates = oriented(boxes), ranked, usable, kinds
-    return _in_form(form, rows, matrix, *candidates)
-
-
-def _check_form(form: str | None) -> None:
-    if form not in ("rows", "matrix", None):
-        raise ValueError(f"form: got {form!r}, expected 'rows', 'matrix' or None")
-
-
-def _in_form(form: str | None, rows: Callable[..., T], matrix: Callable[..., T], *given: Array) -> T:
-    """The result of one form; by default of the one that suits the platform."""
-    if form is not None:
-        return (rows if form == "rows" else matrix)(*given)
-    return lax.platform_dependent(*given, cpu=rows, default=matrix)
+    return in_form(form, {"rows": rows, "matrix": matrix}, *candidates, cpu="rows", default="matrix")
 
 
 def merge_boxes(
@@ -108,25 +96,24 @@ def merge_boxes(
     >>> merge_boxes(boxes, jnp.array([0.8, 0.4]), valid, *best, iou_threshold=0.3)[0, 0].round(3).tolist()
     0.10000000149011612
     """
-    _check_form(form)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
     kinds = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
     mean = functools.partial(_weighted_mean, threshold=iou_threshold, vertical=overlap == "3d")
     given = jnp.asarray(boxes, jnp.float32), weights, kinds, usable, kept, used
-    rows, matrix = (functools.partial(merged, mean) for merged in (_merged_in_turn, _merged_at_once))
-    return _in_form(form, rows, matrix, *given)
+    rows, matrix = (functools.partial(merged, mean) for merged in (_merged_by_rows, _merged_by_matrix))
+    return in_form(form, {"rows": rows, "matrix": matrix}, *given, cpu="rows", default="matrix")
 
 
 def _weighted_mean(
-    box: Array, kind: Array, candidates: Array, weights: Array, kinds: Array, *, threshold: float, vertical: bool
+    box: Array, kind: Array, candidates: tuple[Array, ...], *, threshold: float, vertical: bool
 ) -> Array:
-    """A box, c, improved by the candidates [n, c] that overlap it and are of its kind."""
-    offsets = candidates - box
+    """A box, c, improved by the candidates, boxes [n, c], that overlap it and are of its kind."""
+    boxes, turned, weights, kinds = candidates
+    turn = wrap_angle(boxes[:, 6] - box[6])
     # Elementwise throughout: with an update of the column a GPU would write out [kept, n, c].
-    offsets = jnp.where(lax.iota(jnp.int32, box.shape[0]) == 6, wrap_angle(offsets), offsets)
-    turn = offsets[:, 6]
-    member = _overlaps(oriented(box), oriented(candidates), threshold, vertical)
+    offsets = jnp.where(lax.iota(jnp.int32, box.shape[0]) == 6, turn[:, None], boxes - box)
+    member = _overlaps(oriented(box), turned, threshold, vertical)
     member &= (kinds == kind) & (jnp.abs(turn) <= _MAX_TURN_RAD)
     weight = jnp.where(member, weights, 0.0)
     shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
@@ -135,28 +122,29 @@ def _weighted_mean(
     return mean.at[6].set(wrap_angle(mean[6]))
 
 
-def _merged_in_turn(
+def _merged_by_rows(
     mean: Callable[..., Array], boxes: Array, weights: Array, kinds: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
     """One kept box after the other: as many turns as there are."""
     best, best_kinds = boxes[kept], kinds[kept]
 
     def of_best(order: Array) -> Array:
-        few = boxes[order], weights[order], kinds[order]
+        few = boxes[order], oriented(boxes[order]), weights[order], kinds[order]
 
         def merged(slot: Array, result: Array) -> Array:
-            return result.at[slot].set(mean(best[slot], best_kinds[slot], *few))
+            return result.at[slot].set(mean(best[slot], best_kinds[slot], few))
 
         return lax.fori_loop(0, used.sum(), merged, jnp.zeros_like(best))
 
     return _with_few(of_best, jnp.argsort(~usable, stable=True), usable)
 
 
-def _merged_at_once(
+def _merged_by_matrix(
     mean: Callable[..., Array], boxes: Array, weights: Array, kinds: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
     """All kept boxes at once: one reduction over [kept, n]."""
-    merged = jax.vmap(mean, (0, 0, None, None, None))(boxes[kept], kinds[kept], boxes, weights, kinds)
+    candidates = boxes, oriented(boxes), weights, kinds
+    merged = jax.vmap(mean, (0, 0, None))(boxes[kept], kinds[kept], candidates)
     return jnp.where(used[:, None], merged, 0.0)
 
 

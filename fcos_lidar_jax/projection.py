@@ -1,10 +1,10 @@
 """Points to a range image by multi-round projection (paper, sections 3.1 and 3.2).
 
-Every round keeps, per cell, the point with the smallest key, by a scatter-min; the losers enter the next
-round. A key is exact and total: older sweep, then bits of the range, then row of the input. So the winners do not
-depend on the order in which a device works, on batching, on ``jit`` or on the number of devices. They may depend
-on the platform: square roots, divisions and angles of a CPU, a GPU and a TPU can differ in the last bit, which
-moves a point at the edge of a cell or changes which of two equally far points wins.
+Every round keeps, per cell, the point with the smallest key, by a scatter-min; the losers enter the next round. On
+TPUs one sort does the same. A key is exact and total: older sweep, then bits of the range, then row of the input.
+So the winners do not depend on the order in which a device works, on batching, on ``jit`` or on the number of
+devices. They may depend on the platform: square roots, divisions and angles of a CPU, a GPU and a TPU can differ
+in the last bit, which moves a point at the edge of a cell or changes which of two equally far points wins.
 """
 
 import functools
@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import RangeImage
@@ -156,14 +157,9 @@ def winners(
     >>> winners(jnp.array([0, 0, 0]), keys, num_cells=1, num_rounds=4).tolist()
     [[1, 2, 0, -1]]
     """
-    if form not in ("scatter", "sort", None):
-        raise ValueError(f"form: got {form!r}, expected 'scatter', 'sort' or None")
-    scatter, sort = (
-        functools.partial(of, num_cells=num_cells, num_rounds=num_rounds) for of in (_by_scatter, _by_sort)
-    )
-    if form is not None:
-        return (scatter if form == "scatter" else sort)(cell, keys)
-    return lax.platform_dependent(cell, keys, tpu=sort, default=scatter)
+    forms = {"scatter": _by_scatter, "sort": _by_sort}
+    sized = {name: functools.partial(of, num_cells=num_cells, num_rounds=num_rounds) for name, of in forms.items()}
+    return in_form(form, sized, cell, keys, tpu="sort", default="scatter")
 
 
 def _by_scatter(cell: Array, keys: Array, *, num_cells: int, num_rounds: int) -> Array:
