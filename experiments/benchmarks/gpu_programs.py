@@ -1,10 +1,10 @@
 """What does XLA make of the programs for a GPU that is not there? Compiled by its whole pipeline, never run.
 
-    bash .ci/gpu                                                        # fetches XLA's plugin (0.6 GB), then this
-    python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin    # once it is there
-    python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin --programs train-nuscenes detect-compact
-    python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin --all  # every preset
-    python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin --suppression 20
+    bash .ci/gpu  # fetches XLA's plugin (0.6 GB) into build/gpu/plugin, then runs this script with its arguments
+    bash .ci/gpu --programs train-nuscenes detect-compact
+    bash .ci/gpu --all  # every preset
+    bash .ci/gpu --suppression 20
+    python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin  # once the plugin is there
 
 Every program is compiled in a process of its own, so that an abort of XLA costs a line and not the check. A line
 per program: seconds, GFLOP per frame, temporary memory, kernels outside of loops, and the loops with their number
