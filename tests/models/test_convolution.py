@@ -89,17 +89,17 @@ def test_batches_of_gradients_and_gradients_of_batches(case):
     assert_close([found_x[:, 0], found_kernel], [to_x, to_kernel], 1e-5)
 
 
-@pytest.mark.parametrize("groups", [1, 3])
+@pytest.mark.parametrize("dtype", TOLERANCES)
+@pytest.mark.parametrize(("groups", "dilation"), [(1, 3), (3, 3), (1, 2)])
 @pytest.mark.parametrize("circular", [False, True])
 @pytest.mark.parametrize("size", [(3, 3), (5, 3), (3, 1)])
-def test_weight_gradients_by_phases_are_the_librarys(size, circular, groups):
+def test_weight_gradients_by_phases_are_the_librarys(size, circular, groups, dilation, dtype):
     """Of sizes that the dilation divides and does not divide, as a GPU computes them."""
-    dilation, rng = 3, np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     high, wide = (k // 2 * dilation for k in size)
     for height, width in ((9, 13), (12, 9), (1, 20)):
-        x, kernel = (
-            jnp.asarray(rng.normal(size=s), "float32") for s in ((2, height, width, 6), (*size, 6 // groups, 9))
-        )
+        shapes = (2, height, width, 6), (*size, 6 // groups, 9)
+        x, kernel = (jnp.asarray(rng.normal(size=shape), dtype) for shape in shapes)
         x = jnp.pad(x, ((0, 0), (0, 0), (wide, wide), (0, 0)), mode="wrap") if circular else x
         padding = (high, 0 if circular else wide)
         product = functools.partial(
@@ -111,19 +111,25 @@ def test_weight_gradients_by_phases_are_the_librarys(size, circular, groups):
             feature_group_count=groups,
         )
         value, pull_back = jax.vjp(product, x, kernel)
-        g = jnp.asarray(rng.normal(size=value.shape), "float32")
+        g = jnp.asarray(rng.normal(size=value.shape), dtype)
         options = {"dilation": dilation, "padding": padding, "groups": groups, "precision": None}
-        assert_close([convolution._by_phases(x, g, sizes=size, **options)], [pull_back(g)[1]], 1e-5)
+        found, expected = convolution._by_phases(x, g, sizes=size, **options), pull_back(g)[1]
+        assert found.dtype == expected.dtype
+        assert_close([found], [expected], TOLERANCES[dtype])
 
 
-def test_on_a_gpu_no_kernel_is_as_large_as_the_image():
-    """The weight gradient of a dilated convolution has a stride there; by phases nothing has."""
+def test_on_a_gpu_no_kernel_is_as_large_as_the_image(monkeypatch):
+    """The library's weight gradient of a dilated convolution has the image for a kernel, and a stride."""
     function, arguments, *_ = example("dilated")
-    strides = {}
-    for platform in ("cpu", "cuda"):
-        program = export.export(jax.jit(gradients(function)), platforms=(platform,))(*arguments)
-        strides[platform] = "stride = [3, 3]" in program.mlir_module()
-    assert strides == {"cpu": False, "cuda": False}  # On a CPU by rows: every image is large here.
+
+    def has_stride(platform):
+        program = export.export(jax.jit(lambda *given: gradients(function)(*given)), platforms=(platform,))
+        return "stride = [3, 3]" in program(*arguments).mlir_module()
+
+    assert not has_stride("cuda")
+    monkeypatch.setattr(convolution, "LARGE", math.inf)  # Small images are the library's on a CPU.
+    assert has_stride("cpu")
+    assert not has_stride("cuda")
 
 
 @pytest.mark.parametrize("stride", [1, 2])
