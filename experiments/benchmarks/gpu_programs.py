@@ -86,7 +86,7 @@ class Program:
     precision: str = "float32"
     batch: int = 1
     remat: bool = False
-    meta_kernel: bool = False
+    additions: tuple[str, ...] = ()  # Fields of the model that are switched on.
     card: Card = "h100"
     devices: int = 1
 
@@ -119,7 +119,8 @@ def all_programs() -> dict[str, Program]:
             label = name + ("" if precision == "float32" else f"-{precision}") + "-1"
             programs[f"train-{label}"] = Program("train", name, precision)
             programs[f"detect-{label}"] = Program("detect", name, precision)
-    programs["train-compact-meta_kernel"] = Program("train", "compact", batch=2, meta_kernel=True)
+    for addition in ("meta_kernel", "local_geometry"):
+        programs[f"train-compact-{addition}"] = Program("train", "compact", batch=2, additions=(addition,))
     return programs
 
 
@@ -305,8 +306,8 @@ def _configured(program: Program) -> Any:
     config = PRESETS[program.preset]
     model = config.model
     if config.pillars is None:
-        changes = {"precision": program.precision, "remat": program.remat, "meta_kernel": program.meta_kernel}
-        model = dataclasses.replace(model, **changes)
+        switches = dict.fromkeys(program.additions, True)
+        model = dataclasses.replace(model, precision=program.precision, remat=program.remat, **switches)
     optimizer = dataclasses.replace(config.optimizer, batch_size=program.batch)
     return dataclasses.replace(config, model=model, optimizer=optimizer)
 

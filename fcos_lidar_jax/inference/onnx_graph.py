@@ -19,6 +19,7 @@ from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.locations import ImageLayout, image_layout
 from fcos_lidar_jax.models.layers import EPSILON, norm_groups, pieces
 from fcos_lidar_jax.models.lidar_net import STAGE_STRIDES
+from fcos_lidar_jax.models.local_geometry import COLUMNS, ROWS, UNIT_M, window
 from fcos_lidar_jax.models.modality import channel_groups
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import CHANNELS
@@ -70,6 +71,8 @@ def network_graph(detector: TrainedDetector) -> bytes:
     image = _preprocessing(network, "features", model, layout)
     geometry = _geometry(network, image, rounds, model.channel_scale) if model.meta_kernel else None
     stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
+    if model.local_geometry:
+        stem = network("Add", stem, _local_geometry(network, image, rounds, model))
     levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks, geometry))
     k = len(config.classes)
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
@@ -182,13 +185,17 @@ class _Network:
             )
         return x
 
-    def padded(self, x: str) -> str:
-        """With a pixel more on every side: zeros, or wrapped around the width."""
+    def padded(self, x: str, high: int = 1, wide: int = 1) -> str:
+        """With more pixels on every side: zeros, or wrapped around the width."""
         if self.circular:
-            last, first = self("Slice", x, [-1], [_END], [3]), self("Slice", x, [0], [1], [3])
-            x = self("Concat", last, x, first, axis=3)
-        wide = 0 if self.circular else 1
-        return self("Pad", x, [0, 0, 1, wide, 0, 0, 1, wide])
+            last, first = self("Slice", x, [-wide], [_END], [3]), self("Slice", x, [0], [wide], [3])
+            x, wide = self("Concat", last, x, first, axis=3), 0
+        return self("Pad", x, [0, 0, high, wide, 0, 0, high, wide])
+
+    def cut(self, x: str, row: int, column: int, high: int = 1, wide: int = 1) -> str:
+        """A window of a padded image; its end is counted from the image's, whose size the graph need not know."""
+        ends = [_END if place == 2 * pad else place - 2 * pad for place, pad in ((row, high), (column, wide))]
+        return self("Slice", x, [row, column], ends, [2, 3])
 
     def upsample(self, x: str, rows: int, columns: int) -> str:
         """Every row and column repeated."""
@@ -253,6 +260,30 @@ def _geometry(network: _Network, image: str, rounds: int, scale: Sequence[float]
     return metres, network("Where", filled, 1.0, 0.0)
 
 
+def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConfig) -> str:
+    """As :class:`fcos_lidar_jax.models.local_geometry.LocalGeometry`."""
+    points, exists = _geometry(network, image, rounds, model.channel_scale)
+    azimuth = network("Mul", network("Gather", image, [4 * rounds], axis=1), model.channel_scale[4])
+    azimuth = network("Add", azimuth, model.channel_mean[4])
+    cos, sin = network("Cos", azimuth), network("Sin", azimuth)
+    around, there = (network.padded(x, ROWS, COLUMNS) for x in (points, exists))
+    channels = []
+    for row, column in window():
+        offset = network("Sub", network.cut(around, row, column, ROWS, COLUMNS), points)
+        dx, dy, dz = (network("Slice", offset, [axis], [axis + 1], [1]) for axis in range(3))
+        both = network("Mul", network.cut(there, row, column, ROWS, COLUMNS), exists)
+        radial = network("Add", network("Mul", cos, dx), network("Mul", sin, dy))
+        tangential = network("Sub", network("Mul", cos, dy), network("Mul", sin, dx))
+        turned = network("Concat", radial, tangential, dz, axis=1)
+        channels += [network("Mul", network("Asinh", network("Div", turned, UNIT_M)), both), both]
+    x = network("Concat", *channels, axis=1)
+    for layer in range(2):
+        gain, shift = network.batch_norm(f"local_geometry/norm{layer}")
+        kernel = network.parameter(f"local_geometry/linear{layer}") * gain
+        x = network("Relu", network.conv(x, kernel[None, None], shift))
+    return x
+
+
 def _meta_kernel(network: _Network, x: str, geometry: tuple[str, str], path: str) -> str:
     """As :class:`fcos_lidar_jax.models.meta_kernel.MetaKernel`."""
     points, exists = geometry
@@ -262,9 +293,7 @@ def _meta_kernel(network: _Network, x: str, geometry: tuple[str, str], path: str
     here = network("Sub", placed, network.parameter(f"{path}/hidden_bias")[:, None, None])
     around, total = [network.padded(image) for image in (network("Mul", x, exists), placed)], ""
     for row, column in np.ndindex(3, 3):
-        # The last rows and columns are counted from the end: the graph need not know the size.
-        ends = [_END if tap == 2 else tap - 2 for tap in (row, column)]
-        f, there = (network("Slice", image, [row, column], ends, [2, 3]) for image in around)
+        f, there = (network.cut(image, row, column) for image in around)
         bias = network.parameter(f"{path}/weigh_bias")
         weight = network.conv(network("Relu", network("Sub", there, here)), weigh, bias)
         tap = network.conv(network("Mul", weight, f), kernel[row, column][None, None] * gain)

@@ -16,6 +16,7 @@ from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
 from fcos_lidar_jax.models.layers import Image, recomputed
 from fcos_lidar_jax.models.lidar_net import Backbone
+from fcos_lidar_jax.models.local_geometry import LocalGeometry
 from fcos_lidar_jax.models.meta_kernel import geometry_of
 from fcos_lidar_jax.models.modality import Stem
 from fcos_lidar_jax.sensors import Sensor
@@ -58,8 +59,11 @@ class Network(nn.Module):
     num_classes: int
 
     def setup(self) -> None:
-        c = self.config  # the four names are the top level of the parameters
+        c = self.config  # the names are the top level of the parameters
         self.stem = Stem(c.stem, c.circular_width, c.precision)
+        if c.local_geometry:
+            normalised = c.channel_mean, c.channel_scale
+            self.local_geometry = LocalGeometry(c.stem.out_channels, *normalised, c.circular_width)
         self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width, c.remat)
         self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
         sizes = self.num_classes, c.head_channels, c.head_convs
@@ -68,6 +72,8 @@ class Network(nn.Module):
     def __call__(self, image: Image, *, train: bool) -> Outputs:
         with jax.named_scope("stem"):
             x = (recomputed(self.stem) if self.config.remat else self.stem)(image, train=train)
+            if self.config.local_geometry:
+                x = x + self.local_geometry(image, train=train).astype(x.dtype)
         with jax.named_scope("backbone"):
             geometry = geometry_of(image, self.config.channel_scale) if self.config.meta_kernel else None
             levels = self.backbone(x, geometry, train=train)

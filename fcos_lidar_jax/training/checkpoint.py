@@ -29,7 +29,7 @@ from fcos_lidar_jax.types import TrainState
 _FORMAT = 3
 _OLD_FORMAT = 2
 LATER_FIELDS = {
-    "model": {"remat": False, "regression_axes": "lidar", "meta_kernel": False},
+    "model": {"remat": False, "regression_axes": "lidar", "meta_kernel": False, "local_geometry": False},
     "loss": {"quality": "iou", "centreness_m": 0.75},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
 }
@@ -322,7 +322,7 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     """A configuration's JSON object with the fields that older ones do not have.
 
     >>> with_later_fields({"model": {"remat": True}})["model"]
-    {'remat': True, 'regression_axes': 'lidar', 'meta_kernel': False}
+    {'remat': True, 'regression_axes': 'lidar', 'meta_kernel': False, 'local_geometry': False}
     """
     later = dict[str, Any]()
     for section, fields in LATER_FIELDS.items():

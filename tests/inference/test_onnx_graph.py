@@ -53,6 +53,14 @@ CASES = {
         with_model(with_stem(), meta_kernel=True, channel_scale=(12.0, 11.5, 0.9, 8.0, 0.3, 0.2, 20.0, 2.0, 0.16)),
         ODD,
     ),
+    "local geometry, two rounds, padded columns": (
+        with_model(with_stem(), local_geometry=True, channel_mean=(1, 2, -1, 12, 0.3, -0.2, 20, 0, 0.1)),
+        ODD,
+    ),
+    "local geometry, circular, doubled rows": (
+        with_model(CONFIG, local_geometry=True, circular_width=True, row_upscale=2),
+        SENSOR,
+    ),
     "Meta-Kernel, circular, doubled rows": (
         with_model(CONFIG, meta_kernel=True, circular_width=True, row_upscale=2),
         SENSOR,

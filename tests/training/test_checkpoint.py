@@ -92,7 +92,7 @@ def test_a_checkpoint_of_older_fields_is_converted(copy, written, version):
     old = json.loads(file.read_text())
     config = old["config"]
     later = {
-        "model": {"remat": False, "regression_axes": "lidar", "meta_kernel": False},
+        "model": {"remat": False, "regression_axes": "lidar", "meta_kernel": False, "local_geometry": False},
         "loss": {"quality": "iou", "centreness_m": 0.75},
         "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
     }
