@@ -16,7 +16,7 @@ class ProcessOptions:
     """Which of several processes this is."""
 
     distributed: bool = False
-    """Join the other processes that Slurm, Open MPI or a TPU pod has started; JAX learns from it where they are."""
+    """Join the other processes that Slurm, Open MPI or a TPU pod has started; JAX finds them by itself."""
     coordinator: str | None = None
     """HOST:PORT of process 0, without such a launcher; needs --num-processes and --process-index."""
     num_processes: int | None = None  # Number of processes in all.

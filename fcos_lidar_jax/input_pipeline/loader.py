@@ -335,14 +335,12 @@ class _HandedOn:
 
     def __init__(self, batches: Iterator[HostBatch], *, copied: bool) -> None:
         self._batches, self._copied = batches, copied
-        self._told = self._closed = False
+        self._told = False
 
     def __iter__(self) -> Iterator[HostBatch]:
         return self
 
     def __next__(self) -> HostBatch:
-        if self._closed:
-            raise StopIteration
         host = next(self._batches)
         if host.misfit is not None and not self._told:
             line = f"{host.misfit}: such batches go unpacked, for which the step is compiled once more"
@@ -351,4 +349,5 @@ class _HandedOn:
         return _owned(host) if self._copied else host
 
     def close(self) -> None:
-        self._closed = True
+        """Let go of what prepares them; there are none any more."""
+        self._batches = iter(())
