@@ -113,6 +113,7 @@ class _BatchOf:
         try:
             if plain is None:
                 return self._packed(step, self.packing)
+            assert isinstance(plain.batch, Batch)
             return dataclasses.replace(plain, batch=pack(plain.batch, self.packing))
         except MisfitError as error:
             name = self._names(step)[error.row]

@@ -1,4 +1,4 @@
-"""What is counted while a results file is written; the file itself is in tests/cli/test_cli.py."""
+"""What is counted while a results file is written; the file itself is in tests/cli/test_evaluate.py."""
 
 from types import SimpleNamespace
 
