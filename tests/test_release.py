@@ -30,7 +30,7 @@ def test_workflows_only_call_the_scripts_and_all_of_them():
     assert all(re.fullmatch(r"bash \.ci/(\w+|\$\{\{ matrix\.check \}\})", command) for command in commands)
     called = {name for names in re.findall(r"check: \[(.*)\]", text) for name in names.split(", ")}
     called |= {command.rpartition("/")[2] for command in commands if "matrix" not in command}
-    assert called == {"run", "lowest", "newest", "wheel", "site", "notebook"}
+    assert called == {"run", "lowest", "newest", "wheel", "gpu", "site", "notebook"}
     assert all((SCRIPTS / name).is_file() for name in called)
 
 

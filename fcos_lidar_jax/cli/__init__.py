@@ -3,6 +3,7 @@
 import contextlib
 import os
 import platform
+import re
 import select
 import signal
 import sys
@@ -19,6 +20,7 @@ _LESS_MEMORY = (
     "--batch-size 1 needs the least"
 )
 _MAX_LINE = 1000
+_CLOSED_CONNECTION = "closed by peer|reset by peer|Broken pipe|Read error|Write error"
 _CLOSED_PIPE = 128 + signal.SIGPIPE
 
 
@@ -103,7 +105,9 @@ def _explain(error: Exception) -> str | None:
             f"JAX_PLATFORMS: got {os.environ.get('JAX_PLATFORMS')!r}, expected a platform of this machine: {text}"
         )
     if isinstance(error, RuntimeError) and "Gloo" in text:  # JAX's connection to other processes, on CPUs
-        return f"another process ended, see what it says: {text}"
+        gone = "Gloo context initialization" not in text and re.search(_CLOSED_CONNECTION, text)
+        told = "another process ended, see what it says" if gone else "the connection of the processes failed"
+        return f"{told}: {text}"
     if isinstance(error, ValueError | OSError | ArithmeticError):
         return text or f"{type(error).__name__} without a message"
     return None

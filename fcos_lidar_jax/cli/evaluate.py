@@ -35,6 +35,7 @@ from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.trainer.results import write_predictions
 from fcos_lidar_jax.training.agreement import agreed
+from fcos_lidar_jax.training.preemption import take_sigterm_back
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.evaluation_report import PAGE, Example, clear_report, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page
@@ -94,6 +95,7 @@ def run(args: Evaluate) -> None:
             if is_main_process:
                 locked.enter_context(folder_lock(args.out, "evaluating"))
         _detect(args, task)
+        take_sigterm_back()
         with agreed("cannot evaluate"):
             if is_main_process:  # the others wait, for a process that has left would be missed
                 _score(args, _compare(args, task))

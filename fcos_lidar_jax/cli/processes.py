@@ -16,11 +16,11 @@ class ProcessOptions:
     """Which of several processes this is."""
 
     distributed: bool = False
-    """One of several processes, started by Slurm, Open MPI or a TPU pod, which describe the cluster to JAX."""
+    """Join the other processes that Slurm, Open MPI or a TPU pod has started; JAX finds them by itself."""
     coordinator: str | None = None
-    """HOST:PORT of process 0, where JAX cannot find it; with --num-processes and --process-index."""
-    num_processes: int | None = None  # In all.
-    process_index: int | None = None  # Which one this is, from 0.
+    """HOST:PORT of process 0, without such a launcher; needs --num-processes and --process-index."""
+    num_processes: int | None = None  # Number of processes in all.
+    process_index: int | None = None  # Index of this process, counted from 0.
 
     @property
     def several(self) -> bool:
@@ -51,21 +51,23 @@ def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.
     """Meet the other processes, if there are any; before JAX's devices are asked for.
 
     Raises:
-        ValueError: nothing describes a cluster.
+        ValueError: nothing describes a cluster, or a variable of the environment cannot be read.
         OSError: the others were not reached.
     """
     if not options.several:
         return
+    where = options.coordinator or "the cluster of the environment"
     place, ids = dataclasses.astuple(options)[1:], local_device_ids(environment)
     try:
         jax.distributed.initialize(*place, local_device_ids=ids)
-    except ValueError as error:  # Of what is missing, and nothing is where there is a coordinator.
-        raise ValueError(
+    except ValueError as error:
+        if options.coordinator is not None or "defined" not in str(error):
+            raise ValueError(f"{where}: this process cannot join: {error}") from None
+        raise ValueError(  # JAX says which of coordinator, number and index is not defined
             f"--distributed: found no launcher ({error}), expected Slurm, Open MPI or a TPU pod; elsewhere give "
             "--coordinator, --num-processes and --process-index"
         ) from None
     except RuntimeError as error:
-        where = options.coordinator or "the cluster of the environment"
         raise OSError(f"{where}: the processes did not meet: {error}") from None
 
 

@@ -76,11 +76,11 @@ class Train:
     no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without flips, rotations and scales.
     no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without objects of other frames.
     threads: int | None = None
-    """That prepare batches, each a whole one, in every worker where there are workers; default: in all as many as
-    this process may use cores, less one where there are more than two, at most 16."""
-    workers: int = 0  # Processes that prepare batches, instead of this one.
+    """Threads that prepare batches, per worker process if there are any. Default: the available cores, divided
+    among the workers, less one if there are more than two; at most 16."""
+    workers: int = 0  # Worker processes that prepare batches in place of the main process; 0 for none.
     no_packing: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Send points to GPUs and TPUs unpacked, in more bytes, with the same results. To CPUs they always are."""
+    """Send batches to GPUs and TPUs unpacked: more bytes, the same results. CPUs always get them unpacked."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
     """Several processes share each batch."""
 

@@ -13,7 +13,7 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack_row
+from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack, pack_row
 from fcos_lidar_jax.types import Batch, HostBatch
 from fcos_lidar_jax.workers import end_with_parent
 
@@ -103,18 +103,27 @@ class _BatchOf:
     paste: MakePaste | None
     packing: Packing | None
     alone: bool  # No other process runs the program.
+    misfits: list[str] = dataclasses.field(default_factory=list)  # Found in this process.
 
     def __call__(self, step: int) -> HostBatch:
         if self.packing is None:
             return self._plain(step)
+        # Packing sample by sample is faster, but what does not fit is then prepared again: no more than once.
+        plain = self._plain(step) if self.misfits else None
         try:
-            return self._packed(step, self.packing)
+            if plain is None:
+                return self._packed(step, self.packing)
+            assert isinstance(plain.batch, Batch)
+            return dataclasses.replace(plain, batch=pack(plain.batch, self.packing))
         except MisfitError as error:
             name = self._names(step)[error.row]
             found = f"frame {name!r}: {error}, as in the frames that were looked at first"
         if not self.alone:
-            raise ValueError(f"{found}; several processes pack all batches alike: use --no-packing")
-        return dataclasses.replace(self._plain(step), misfit=found)
+            raise ValueError(
+                f"{found}; several processes pack all batches alike: use --no-packing, in Python packing=False"
+            )
+        self.misfits.append(found)
+        return dataclasses.replace(plain or self._plain(step), misfit=found)
 
     def _plain(self, step: int) -> HostBatch:
         batch, counts = empty_batch(len(self.rows), **self._sizes()), Counter[str]()
@@ -237,7 +246,7 @@ def make_batches(
             grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1), _leave_signals
         )
     prepared: Any = iter(stream)
-    handed_on: Any = _handed_on(prepared, copied=workers > 0 and not lend)
+    handed_on = _HandedOn(prepared, copied=workers > 0 and not lend)
     with contextlib.closing(prepared), contextlib.closing(handed_on) as batches:
         yield batches
 
@@ -319,14 +328,27 @@ def _owned(host: HostBatch) -> HostBatch:
     return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch))
 
 
-def _handed_on(batches: Iterable[HostBatch], *, copied: bool) -> Iterator[HostBatch]:
-    """Batches that the caller alone keeps, and a line about the first that does not fit the packing."""
-    told = False
-    for host in batches:
-        if host.misfit is not None and not told:
+class _HandedOn:
+    """Batches that the caller alone keeps, and a line about the first that does not fit the packing.
+
+    No generator, for it is closed while a thread may still be waiting in it for a batch.
+    """
+
+    def __init__(self, batches: Iterator[HostBatch], *, copied: bool) -> None:
+        self._batches, self._copied = batches, copied
+        self._told = False
+
+    def __iter__(self) -> Iterator[HostBatch]:
+        return self
+
+    def __next__(self) -> HostBatch:
+        host = next(self._batches)
+        if host.misfit is not None and not self._told:
             line = f"{host.misfit}: such batches go unpacked, for which the step is compiled once more"
             print(line, file=sys.stderr, flush=True)
-            told = True
-        held = [_owned(host) if copied else host]
-        del host
-        yield held.pop()
+            self._told = True
+        return _owned(host) if self._copied else host
+
+    def close(self) -> None:
+        """Let go of what prepares them; there are none any more."""
+        self._batches = iter(())

@@ -56,7 +56,7 @@ def write_predictions(
         SystemExit: after SIGTERM, in a cluster.
     """
     file = path.with_name(f"{path.stem}.resume_log")
-    removed = np.zeros(len(_REMOVED), np.int32)
+    removed = [0] * len(_REMOVED)
     with contextlib.ExitStack() as held:
         log = None
         with agreed("cannot detect"):
@@ -70,27 +70,44 @@ def write_predictions(
         if log is not None:
             progress.show(len(log))
         groups = predict_groups(detector, frames, indices=np.flatnonzero(~done).tolist(), batch_size=batch_size)
+        number = 0
         for number, group in enumerate(groups, 1):
-            removed += sum((_removed(prediction) for prediction in group), start=np.zeros_like(removed))
+            removed = [sum(counts) for counts in zip(removed, *map(_removed, group), strict=True)]
             with agreed("cannot write"):
                 if log is not None:
                     for prediction in group:
                         log.add(names[prediction.index], entries(prediction.index, prediction.detections))
                         progress.show(len(log))
-            # JAX has taken SIGTERM from Python, and tells all processes of it.
-            if jax.process_count() > 1 and multihost_utils.reached_preemption_sync_point(number):
-                raise SystemExit(128 + signal.SIGTERM)
+            _stop_after_sigterm(number)
+        _stop_after_sigterm(number + 1)  # If it came in the last group.
         with agreed("cannot write"):
             if log is not None:
                 write(path, log.entries(names))
                 file.unlink(missing_ok=True)
-    of_all = multihost_utils.process_allgather(removed[None], tiled=True).sum(axis=0)
-    return dict(zip(_REMOVED, of_all.tolist(), strict=True))
+    return dict(zip(_REMOVED, _sum_over_processes(removed), strict=True))
 
 
-def _removed(prediction: Prediction) -> np.ndarray:
-    """Points that this process removed from a cloud, by reason."""
-    return np.array([getattr(prediction.cloud, f"num_{reason}", 0) for reason in _REMOVED], np.int32)
+def _stop_after_sigterm(number: int) -> None:
+    """In a cluster, even of one process, JAX has taken SIGTERM from Python, and tells all processes of it.
+
+    Args:
+        number: of groups done; every process calls this with the same numbers.
+    """
+    if jax.distributed.is_initialized() and multihost_utils.reached_preemption_sync_point(number):
+        raise SystemExit(128 + signal.SIGTERM)
+
+
+def _removed(prediction: Prediction) -> list[int]:
+    """Points that this process removed from a cloud, by reason; of one that another has read, none."""
+    cloud = prediction.cloud
+    return [0] * len(_REMOVED) if cloud is None else [int(getattr(cloud, f"num_{reason}")) for reason in _REMOVED]
+
+
+def _sum_over_processes(counts: list[int]) -> list[int]:
+    """Sums of counts below 2**64, which travel as two words: JAX would keep 32 bits."""
+    words = np.array([divmod(count, 2**32) for count in counts], np.uint32)
+    of_all = multihost_utils.process_allgather(words[None], tiled=True).astype(object)
+    return (of_all[..., 0] * 2**32 + of_all[..., 1]).sum(axis=0).tolist()
 
 
 def detections_fingerprint(detector: CloudDetector, *others: object) -> str:

@@ -23,7 +23,7 @@ from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.classes import MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.files import atomic_write, folder_lock, read_json
+from fcos_lidar_jax.files import atomic_write, checksum, folder_lock, read_json
 from fcos_lidar_jax.inference.cloud import sensor_mismatch
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts
@@ -34,7 +34,7 @@ from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.trainer.prediction import evaluate, predict
-from fcos_lidar_jax.training.agreement import agreed
+from fcos_lidar_jax.training.agreement import agreed, check_same
 from fcos_lidar_jax.training.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -154,7 +154,7 @@ def train(
     Raises:
         ValueError: the folder holds another run, no class is shared, devices and batch do not fit, steps or seed
             are out of range, or the augmentation does not suit the sector that the sensor covers, see
-            :func:`fcos_lidar_jax.augment.check_augmentation`.
+            :func:`fcos_lidar_jax.augment.check_augmentation`; or processes were given different runs or data.
         OSError: another process trains in the folder, or it cannot be written.
         NonFiniteLossError, NonFiniteStateError: the last checkpoint is from before.
         KeyboardInterrupt: after Ctrl-C, when all is saved.
@@ -208,6 +208,8 @@ def train(
         single = config.num_sweeps > 1 and _of_one_sweep(frames)
         on_cpus = mesh.devices.flat[0].platform == "cpu"
         packed = packing_for(frames, config) if packing or (packing is None and not on_cpus) else None
+    program = json.dumps([spec, None if packed is None else dataclasses.asdict(packed)], sort_keys=True)
+    check_same(checksum(program.encode()), "configuration, data or packing")
     with _claimed(run, resume=resume):
         start = _start(run, optimizer, seed, resume, given)
         first = int(start.step)

@@ -29,9 +29,13 @@ def agreed(failed: str) -> Iterator[None]:
     except BaseException as failure:  # an interruption, too
         error = failure
     if jax.process_count() > 1:
-        fine = multihost_utils.process_allgather(np.array(error is None))
-        if error is None and not fine.all():
-            error = OSError(f"process {int(np.argmin(fine))}: {failed}, see what it says")
+        try:
+            fine = multihost_utils.process_allgather(np.array(error is None))
+            if error is None and not fine.all():
+                error = OSError(f"process {int(np.argmin(fine))}: {failed}, see what it says")
+        except Exception:  # Another process ended: what is known of this one's own failure says more.
+            if error is None:
+                raise
     if error is not None:
         raise error
 

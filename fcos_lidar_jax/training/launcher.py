@@ -24,14 +24,14 @@ def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
         MPI started it, or ``JAX_LOCAL_DEVICE_IDS`` says it, so that JAX decides.
 
     Raises:
-        ValueError: a variable of the launcher that cannot be read, with its name.
+        ValueError: a variable of the launcher, or JAX's, that cannot be read, with its name.
 
     >>> local_device_ids({"OMPI_COMM_WORLD_LOCAL_SIZE": "8", "OMPI_COMM_WORLD_LOCAL_RANK": "3"})
     (3,)
     >>> local_device_ids({"OMPI_COMM_WORLD_LOCAL_SIZE": "1", "OMPI_COMM_WORLD_LOCAL_RANK": "0"})
     ()
     """
-    place = None if "JAX_LOCAL_DEVICE_IDS" in environment else _place(environment)
+    place = None if _said_to_jax(environment) else _place(environment)
     if place is None:
         return None
     rank, size = place
@@ -43,6 +43,14 @@ def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
     # CUDA_VISIBLE_DEVICES may be missing, or name them by UUID. A JAX that took "none" at its word would find no
     # GPU and stop: nothing would stay idle unseen.
     return () if size == 1 or _sees_its_own(environment) else (rank,)
+
+
+def _said_to_jax(environment: Mapping[str, str]) -> bool:
+    """Whether JAX's own variable says which GPUs; as in JAX, an empty one says nothing."""
+    text = environment.get("JAX_LOCAL_DEVICE_IDS", "")
+    if text and not all(part.strip().isdecimal() for part in text.split(",")):
+        raise ValueError(f"JAX_LOCAL_DEVICE_IDS: got {text!r}, expected numbers of GPUs, as 0 or 0,1")
+    return text != ""
 
 
 def _place(environment: Mapping[str, str]) -> tuple[int, int] | None:

@@ -33,6 +33,14 @@ def fail_with(error):
             RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
             "another process ended, see what it says: UNK",
         ),
+        (
+            RuntimeError("Gloo context initialization failed: Read error"),
+            "the connection of the processes failed: G",
+        ),
+        (
+            RuntimeError("Gloo AllGather failed: Timed out"),
+            "the connection of the processes failed: Gloo AllGather",
+        ),
         (ValueError("x" * 120_000), "x" * 900),
     ],
 )

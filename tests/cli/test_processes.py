@@ -69,6 +69,21 @@ def test_others_that_are_not_met_are_told_in_one_line(monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (BY_HAND, "10.0.0.1:12345: this process cannot join: invalid literal"),
+        (BY_LAUNCHER, "the cluster of the environment: this process cannot join: invalid literal"),
+    ],
+)
+def test_what_is_wrong_is_not_blamed_on_a_missing_launcher(monkeypatch, options, line):
+    monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=ValueError("invalid literal")))
+    with pytest.raises(ValueError, match=f"^{line}$"):
+        join_processes(options, {})
+    with pytest.raises(ValueError, match=r"^JAX_LOCAL_DEVICE_IDS: got 'x', expected numbers of GPUs"):
+        join_processes(options, {"JAX_LOCAL_DEVICE_IDS": "x"})
+
+
+@pytest.mark.parametrize(
     "place", ["localhost", "localhost:", ":1", "localhost:x", "localhost:65536", "localhost:0"]
 )
 def test_a_coordinator_has_a_host_and_a_port(place):
@@ -250,19 +265,43 @@ def test_what_the_first_cannot_do_ends_all(root, tmp_path):
     assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see what it says"]
 
 
-def test_sigterm_to_one_stops_both_after_the_same_frames(root, tmp_path):
-    frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
-    args = ["evaluate", *frames, "--checkpoint", str(root.parent / "start"), "--out", str(tmp_path / "both")]
-    both, log = start_two("coordinator", args, args), tmp_path / "both" / "detections.resume_log"
+def start_one(args: list[str]) -> list[subprocess.Popen[str]]:
+    """A cluster of one process."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    return [start([*args, "--coordinator", f"localhost:{port}", "--num-processes", "1", "--process-index", "0"])]
+
+
+def wait_for(file: Path, process: subprocess.Popen[str]) -> None:
+    """Until the file has content, or the process has ended."""
     until = time.monotonic() + 100
-    while not (log.exists() and log.stat().st_size) and both[0].poll() is None and time.monotonic() < until:
+    while not (file.exists() and file.stat().st_size) and process.poll() is None and time.monotonic() < until:
         time.sleep(0.01)
-    both[1].send_signal(signal.SIGTERM)
-    for code, _, errors in ended(both):
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_sigterm_to_one_stops_all_after_the_same_frames(root, tmp_path, number):
+    frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
+    args = ["evaluate", *frames, "--checkpoint", str(root.parent / "start"), "--out", str(tmp_path / "all")]
+    processes = start_one(args) if number == 1 else start_two("coordinator", args, args)
+    log = tmp_path / "all" / "detections.resume_log"
+    wait_for(log, processes[0])
+    processes[-1].send_signal(signal.SIGTERM)
+    for code, _, errors in ended(processes):
         assert (code, error_lines(errors)) == (143, []), errors
     done = log.read_bytes().count(b"\n") - 1
     assert 0 < done < 400
-    assert done % 2 == 0
+    assert done % number == 0
+
+
+def test_sigterm_ends_the_scoring_too(root, tmp_path):
+    (process,) = start_one([*evaluate(root, tmp_path / "alone"), "--bootstrap", "1000000"])
+    wait_for(tmp_path / "alone" / "results_nusc.json", process)
+    time.sleep(2)  # until the scoring has begun
+    process.send_signal(signal.SIGTERM)
+    ((code, _, errors),) = ended([process])
+    assert (code, error_lines(errors)) == (143, []), errors
 
 
 def train(data: Path, out: Path) -> list[str]:

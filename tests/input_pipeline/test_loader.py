@@ -166,7 +166,28 @@ def test_several_processes_refuse_what_does_not_fit_the_packing():
     with pytest.raises(ValueError, match="frame 'frame 1'") as caught:
         [run(frames, **part) for part in parts]
     told = "frame 'frame 1': intensity: got 12.5, expected whole numbers from 0 to 255, as in "
-    assert re.fullmatch(f"{told}[^\n]*: use --no-packing", str(caught.value))
+    assert re.fullmatch(f"{told}[^\n]*: use --no-packing, in Python packing=False", str(caught.value))
+
+
+class CountedFrames(ListedFrames):
+    """Frames that count how often they are read."""
+
+    def frame(self, index):
+        READ.append(index)
+        return super().frame(index)
+
+
+READ: list[int] = []
+
+
+def test_of_what_does_not_fit_only_the_first_batch_is_prepared_twice(capfd):
+    frames = CountedFrames(frames_of_whole_intensities(odd=1).frames)
+    packing = packing_for(frames, PLAIN)
+    READ.clear()
+    found = run(frames, packing=packing)
+    misfits = sum(host.misfit is not None for host in found)
+    assert 1 < misfits < len(found)
+    assert 4 * len(found) < len(READ) <= 4 * (len(found) + 1)
 
 
 @pytest.mark.parametrize(

@@ -216,6 +216,22 @@ def test_with_packed_batches_it_ends_in_the_same_bits(finished, tmp_path, monkey
     assert fed[STEPS:] == [Batch]  # to a CPU, where nobody says
 
 
+def test_processes_of_other_data_or_packing_are_refused_before_there_is_a_run(tmp_path, monkeypatch):
+    def refuse(checksum, what):
+        found.append(checksum)
+        raise ValueError(f"process 1: {what}: got another")
+
+    found = []
+    monkeypatch.setattr(runs, "check_same", refuse)
+    others = {"frames": GivenFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)}, {"packing": True}, {}, {}
+    for other in others:
+        with pytest.raises(ValueError, match=r"^process 1: configuration, data or packing: got another$"):
+            train_tiny(tmp_path / "run", **other)
+    assert len(set(found)) == 3
+    assert found[2] == found[3]
+    assert list(tmp_path.iterdir()) == []
+
+
 KILLED = """
 import os, signal, sys
 from tiny_run import train_tiny, weights

@@ -42,6 +42,17 @@ def test_the_failure_of_another_stops_all(of_three):
     assert [bool(own) for own in sent] == [True, True]
 
 
+def test_where_the_others_cannot_be_told_the_own_failure_is_raised(of_three, monkeypatch):
+    def gather(_):
+        raise RuntimeError("Gloo AllGather failed: Connection closed by peer")
+
+    monkeypatch.setattr(agreement.multihost_utils, "process_allgather", gather)
+    with pytest.raises(ValueError, match=r"^my own reason$"), agreed("cannot read"):
+        raise ValueError("my own reason")
+    with pytest.raises(RuntimeError, match="Connection closed"), agreed("cannot read"):
+        pass
+
+
 def test_alone_a_block_is_a_block():
     with pytest.raises(ValueError, match="own"), agreed("cannot read"):
         raise ValueError("own")

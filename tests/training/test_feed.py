@@ -105,6 +105,41 @@ def test_ctrl_c_interrupts_the_wait_for_a_batch(mesh):
     assert left() == []
 
 
+class HangingFrames(ToyFrames):
+    """The frames of the second batch come when they are told to."""
+
+    def frame(self, index):
+        reading.append(index)
+        if len(reading) > PLAIN.optimizer.batch_size:
+            go_on.wait(20)
+        return super().frame(index)
+
+
+go_on, reading = threading.Event(), list[int]()
+
+
+@pytest.mark.parametrize("threads", [0, 1])
+def test_ctrl_c_interrupts_the_wait_for_a_thread_that_hangs(mesh, threads):
+    """Leaving the loader as well does not replace it by a failure of its own."""
+    go_on.clear()
+    reading.clear()
+    interrupt = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
+    prepared = make_batches(HangingFrames(), PLAIN, seed=0, num_steps=6, threads=threads)
+
+    def leave_early():
+        with prepared as batches, feed(batches, mesh, ahead=1) as stream:
+            next(stream)
+            wait_until(lambda: len(reading) > PLAIN.optimizer.batch_size)
+            interrupt.start()
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            leave_early()
+    finally:
+        go_on.set()
+    wait_until(lambda: not left())
+
+
 def test_memory_on_loan_may_be_used_again_while_a_batch_is_alive(mesh):
     """At an address where JAX would take the memory itself for the array, on a CPU."""
     memory = np.empty(4096 + 64, np.uint8)

@@ -54,8 +54,10 @@ CASES = {
         (3,),
     ),
     "said by JAX's own variable": (FIRST | {STEP: "1", "JAX_LOCAL_DEVICE_IDS": "0,2"}, None),
+    "JAX's own variable is empty": (FOURTH | {STEP: "8", "JAX_LOCAL_DEVICE_IDS": ""}, (3,)),
 }
 BAD = {
+    "JAX's own variable": ({"JAX_LOCAL_DEVICE_IDS": "0,x"}, "JAX_LOCAL_DEVICE_IDS: got '0,x', expected numbers"),
     "tasks": (FIRST | {STEP: "1(2)"}, f"{STEP}: got '1(2)', expected tasks per node, as 8 or 2(x3),1"),
     "no tasks": (FIRST | {STEP: ""}, f"{STEP}: got '', expected tasks per node"),
     "node": (FIRST | {STEP: "2,1"}, "SLURM_NODEID: got '', expected a whole number"),
