@@ -137,8 +137,8 @@ class Stem(nn.Module):
         num_kernels = len(config.dilations) if config.merge == "per_branch" else 1
         kernels = [self.param(f"merge{i}", nn.initializers.he_normal(), shape) for i in range(num_kernels)]
         for index, dilation in enumerate(config.dilations):
-            if index and not train:
-                # One branch after the other: side by side their features would fill twice the memory of a GPU.
+            if index:
+                # One branch after the other: side by side, their features would need more of a GPU's memory.
                 parts, merged = lax.optimization_barrier((parts, merged))
             options = dilation, form, self.circular, self.precision
             branch = ModalityBranch(config, tuple(groups), *options, name=f"branch{index}")
