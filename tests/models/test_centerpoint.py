@@ -125,12 +125,11 @@ def test_the_neck_is_strided_convolutions():
     assert from_channels(jnp.zeros((1, 2, 2, 28)), 2).shape == (1, 4, 4, 7)
 
 
-def test_points_are_taken_and_boxes_predicted_in_full_float32_precision(scene):
+def test_points_are_taken_in_full_float32_precision(scene):
     apply, variables, make, points, valid = scene
     program = apply.lower(variables, make(points, valid)).as_text().splitlines()
     products = [line for line in program if "stablehlo.dot_general" in line]
     full = [line for line in products if "HIGHEST" in line]
     assert len(full) == 1 < len(products)
     assert "x10xf32>, tensor<10x" in full[0]  # the ten features of the points
-    predictions = sum("HIGHEST" in line for line in program if "stablehlo.convolution" in line)
-    assert predictions == 6  # five numbers of a box, and the heat map of all classes
+    assert not any("HIGHEST" in line for line in program if "stablehlo.convolution" in line)

@@ -1,0 +1,119 @@
+"""How much does a change of the network or of its losses learn in a few minutes? One number per trial.
+
+    python -m experiments.studies.ladder --trials base CenterPoint
+    python -m experiments.studies.ladder --trials base "local geometry" --seeds 0 1 2
+
+Every trial is ``compact`` with changes, on a quarter of the turn of nuScenes' HDL-32E (32 x 272 pixels), one sweep
+and one round, 4,000 frames of varied streets that are simulated once and kept, 3,000 steps of one frame in a
+single one-cycle. The score is the mAP of nuScenes' form on 200 unseen frames, and on 60 of them at each quarter.
+A trial that was stopped is resumed by the same command. ``experiments/LOG.md`` has a line per trial. Cost: about
+half an hour of one core per trial, and some minutes once for the frames.
+"""
+
+import dataclasses
+import json
+import math
+import statistics
+from pathlib import Path
+from typing import Any
+
+from experiments.changes import Change, change
+from experiments.runs import benchmark, detections, trained
+from experiments.script import Options, run_measurement
+from experiments.studies.centerpoint import PEER
+from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.cached import CachedFrames
+from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.models import count_parameters
+from fcos_lidar_jax.presets import COMPACT, NUSCENES
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
+from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
+from fcos_lidar_jax.simulation.streets import CITY
+from fcos_lidar_jax.trainer import Schedule
+from fcos_lidar_jax.training.metrics_log import read_metrics
+
+SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
+TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
+_BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, as in the scale ``sector``.
+
+BASE: Change = change(
+    name="ladder",
+    max_points=12_288,
+    max_boxes=64,
+    copy_paste=None,
+    class_balanced=False,
+    projection=dataclasses.replace(NUSCENES.projection, num_rounds=1, remove_close="all", close_m=_BONNET_M),
+    model__circular_width=False,
+    # A turn leaves the sector, and a mirrored street would look down behind.
+    augment__flip_y_probability=0.0,
+    augment__max_rotation_rad=math.radians(5),
+)
+# One group of 45 channels: types need not be kept apart where the input is relative.
+WIDE: dict[str, Any] = {
+    "model__stem__groups": "all",
+    "model__stem__channels_per_type": 5,
+    "model__stem__dilations": (1, 3, 6),
+}
+TRIALS: dict[str, Change] = {
+    "base": change(),
+    "CenterPoint": PEER.change,
+    "wide stem": change(**WIDE),
+    "local geometry": change(model__local_geometry=True),
+    "local geometry, wide stem": change(model__local_geometry=True, **WIDE),
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Args(Options):
+    """Which trials."""
+
+    trials: tuple[str, ...] = ("base",)  # Names of trials.
+    seeds: tuple[int, ...] = (0,)  # Of weights, order and augmentation.
+    steps: int = STEPS  # Updates of each.
+    work: Path = Path("outputs/ladder")  # Folder of frames and runs.
+
+
+def frames(work: Path, split: str) -> FrameSet:
+    """Frames of a split, simulated once."""
+    number, first = {"train": (TRAIN_FRAMES, 0), "test": (TEST_FRAMES, UNSEEN_SEED)}[split]
+    made = SimulatedFrames(SENSOR, number, first, 60, NUSCENES_HDL32E.limit_xy_m, 1, _BONNET_M, 1, streets=CITY)
+    return CachedFrames(made, work / f"frames_{split}_{number}")
+
+
+def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
+    """Scores of a training."""
+    tests = frames(args.work, "test")
+    along = ChosenFrames(tests, tuple(range(CURVE_FRAMES)))
+    folder = args.work / f"{name.replace(' ', '_').replace(',', '')}_{args.steps}_{seed}"
+    schedule = Schedule(-(-args.steps // 10), -(-args.steps // 4), 1)
+    detector = trained(
+        folder, config, frames(args.work, "train"), steps=args.steps, seed=seed, tests=along, schedule=schedule
+    )
+    found, seen = detections(detector, tests)
+    summary, records = benchmark(found, seen).summary, read_metrics(folder)
+    seconds = [r["seconds"] for r in records if "seconds" in r]
+    return {
+        "trial": name,
+        "seed": seed,
+        "mAP": round(summary["mean_ap"], 4),
+        "curve": [round(r["test/mAP"], 4) for r in records if "test/mAP" in r],
+        "AP": {k: round(v, 3) for k, v in summary["mean_dist_aps"].items() if v > 0.001},
+        "step_s": round(statistics.median(seconds), 3),
+        "parameters": count_parameters(detector.variables["params"])["total"],
+    }
+
+
+def measure(args: Args) -> dict[str, Any]:
+    """Train, evaluate, print a line for each."""
+    if unknown := [name for name in args.trials if name not in TRIALS]:
+        raise ValueError(f"--trials: got {unknown[0]!r}, expected some of {', '.join(TRIALS)}")
+    rows = []
+    for seed in args.seeds:
+        for name in args.trials:
+            rows.append(trial(name, TRIALS[name](BASE(COMPACT)), seed, args))
+            print(json.dumps(rows[-1]), flush=True)
+    return {"rows": rows}
+
+
+if __name__ == "__main__":
+    run_measurement(measure, Args, __doc__)

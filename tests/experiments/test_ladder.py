@@ -1,0 +1,43 @@
+"""The learning ladder: its trials are possible networks, and differ from the base in what they say."""
+
+import dataclasses
+
+import jax
+import pytest
+
+from experiments.studies import ladder
+from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, measure
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import COMPACT
+
+
+@pytest.mark.parametrize("name", TRIALS)
+def test_every_trial_is_a_network_for_the_sector(name):
+    config = TRIALS[name](BASE(COMPACT))
+    detector = build_detector(config, SENSOR)
+    assert jax.eval_shape(detector.init, jax.random.key(0))["params"]
+    assert (config == BASE(COMPACT)) == (name == "base")
+    assert dataclasses.replace(config.optimizer) == COMPACT.optimizer
+
+
+def test_the_wide_stem_is_one_group():
+    stem = TRIALS["local geometry, wide stem"](BASE(COMPACT)).model.stem
+    assert (stem.groups, stem.channels_per_type * 9, stem.dilations) == ("all", 45, (1, 3, 6))
+
+
+def test_an_unknown_trial_is_refused_before_anything_is_trained(monkeypatch):
+    monkeypatch.setattr(ladder, "trial", None)
+    with pytest.raises(ValueError, match="--trials: got 'magic', expected some of base, CenterPoint"):
+        measure(Args(trials=("base", "magic")))
+
+
+def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys):
+    """Two steps on four frames: that everything is there, not what it is."""
+    for name, value in (("TRAIN_FRAMES", 4), ("TEST_FRAMES", 3), ("CURVE_FRAMES", 2)):
+        monkeypatch.setattr(ladder, name, value)
+    (row,) = measure(Args(trials=("local geometry",), steps=4, work=tmp_path))["rows"]
+    assert (row["trial"], row["seed"], len(row["curve"])) == ("local geometry", 0, 4)
+    assert 0 <= row["mAP"] <= 1
+    assert row["step_s"] > 0
+    assert row["parameters"] == 1_268_894
+    assert '"trial": "local geometry"' in capsys.readouterr().out
