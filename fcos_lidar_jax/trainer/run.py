@@ -144,7 +144,7 @@ def train(
         hooks: called after every step.
         schedule: when to save and to evaluate.
         threads, workers: threads that prepare batches, and processes beside them; default: as many threads as
-            :func:`fcos_lidar_jax.input_pipeline.loader.default_threads` says, and no processes.
+            ``input_pipeline.loader.default_threads`` says, and no processes.
         packing: whether batches travel to the devices in fewer bytes, see :mod:`fcos_lidar_jax.packing`; the
             results are the same. Default: unless the devices are CPUs.
 
