@@ -139,7 +139,9 @@ class Stem(nn.Module):
         for index, dilation in enumerate(config.dilations):
             if index:
                 # One branch after the other: side by side, their features would need more of a GPU's memory.
-                parts, merged = lax.optimization_barrier((parts, merged))
+                parts, merged = lax.platform_dependent(
+                    (parts, merged), cpu=lambda both: both, default=lax.optimization_barrier
+                )
             options = dilation, form, self.circular, self.precision
             branch = ModalityBranch(config, tuple(groups), *options, name=f"branch{index}")
             features = branch(parts, train=train)
