@@ -5,7 +5,6 @@ cheapest become positive; K follows from the boxes they predict. A location has 
 by (owner, cost) and a rank do, without a [boxes, locations] matrix.
 """
 
-import functools
 from typing import Literal
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
-from fcos_lidar_jax.forms import in_form
+from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import points_in_box
 from fcos_lidar_jax.types import Targets
 
@@ -78,13 +77,8 @@ def _owners_by_rank(points: Array, present: Array, boxes: Array, box_valid: Arra
 
 
 def _edges(group: Array, num_boxes: int) -> Array:
-    """Where each group begins among sorted groups, i32[num_boxes + 1]: searched on a CPU, counted elsewhere.
-
-    A search is a loop of dependent steps, which a GPU starts one by one.
-    """
-    search, count = (functools.partial(jnp.searchsorted, method=method) for method in ("scan", "compare_all"))
-    first = lax.iota(group.dtype, num_boxes + 1)
-    return lax.platform_dependent(group, first, cpu=search, default=count).astype(jnp.int32)
+    """Where each group begins among sorted groups, i32[num_boxes + 1]."""
+    return search(group, lax.iota(group.dtype, num_boxes + 1)).astype(jnp.int32)
 
 
 def _by_owner(owner: Array, value: Array, num_boxes: int) -> tuple[Array, Array, Array]:

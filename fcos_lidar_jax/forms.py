@@ -1,8 +1,10 @@
 """One function in several forms, each fast on another platform."""
 
+import functools
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Literal, TypeVar
 
+import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
@@ -31,3 +33,16 @@ def in_form(form: str | None, forms: Mapping[str, Callable[..., T]], *given: Arr
     if form not in forms:
         raise ValueError(f"form: got {form!r}, expected {', '.join(map(repr, forms))} or None")
     return forms[form](*given)
+
+
+def search(ascending: Array, values: Array, *, side: Literal["left", "right"] = "left") -> Array:
+    """``jnp.searchsorted``: a search on a CPU; elsewhere a comparison of all pairs, which needs no loop.
+
+    >>> import jax.numpy as jnp
+    >>> search(jnp.array([1.0, 2.0, 2.0]), jnp.array([2.0]), side="right").tolist()
+    [3]
+    """
+    scan, compare = (
+        functools.partial(jnp.searchsorted, side=side, method=method) for method in ("scan", "compare_all")
+    )
+    return lax.platform_dependent(ascending, values, cpu=scan, default=compare)

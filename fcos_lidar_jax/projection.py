@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
-from fcos_lidar_jax.forms import in_form
+from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import RangeImage
@@ -108,11 +108,7 @@ def _row(inclination: Float32[Array, "n"], sensor: Sensor) -> Int32[Array, "n"]:
         top = np.float32(sensor.inclinations_rad[0])
         return jnp.floor((top - inclination) * np.float32(1 / step) + 0.5).astype(jnp.int32)
     edges = -np.asarray(sensor.row_edges_rad, np.float32)
-    # A search is a loop, which a GPU starts step by step: there all edges are compared.
-    search, compare = (
-        functools.partial(jnp.searchsorted, side="right", method=method) for method in ("scan", "compare_all")
-    )
-    row = lax.platform_dependent(jnp.asarray(edges), -inclination, cpu=search, default=compare)
+    row = search(jnp.asarray(edges), -inclination, side="right")
     return row.astype(jnp.int32) - 1
 
 

@@ -113,7 +113,7 @@ class Stem(nn.Module):
     Takes a normalised image of ``9 r`` channels, those of one type adjacent.
 
     The same function in three forms, with the same parameters: ``"split"``, independent chains, of which narrow
-    ones are joined; ``"dense"``, one block-diagonal kernel, with 7.7 times the operations in the paper's stem;
+    ones are joined; ``"dense"``, one block-diagonal kernel, with several times the operations;
     ``"grouped"``, ``feature_group_count``. The last two are for comparison: on CPUs the grouped form is slow, and
     where a batch is split over devices XLA gathers its images on every one of them.
     """
@@ -125,8 +125,7 @@ class Stem(nn.Module):
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
-        form = self.form
-        config = self.config
+        config, form = self.config, self.form
         num_rounds = image.shape[-1] // 9
         groups = channel_groups(config, num_rounds)
         sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups, form)]
