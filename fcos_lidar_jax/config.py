@@ -131,8 +131,8 @@ class ModelConfig:
     """Not in the paper: the 3x3 of the backbone's first block weighs its neighbours by their offsets in space, as
     in RangeDet, see ``fcos_lidar_jax.models.meta_kernel``."""
     local_geometry: bool = False
-    """Not in the paper: offsets to the points of the neighbouring pixels as further input, beside the stem, see
-    ``fcos_lidar_jax.models.local_geometry``."""
+    """Not in the paper: each location's offsets to the points of the neighbouring pixels as further input of its
+    head, see ``fcos_lidar_jax.models.local_geometry``."""
     background_prior: float = 0.99  # Reading: the background's probability at the start.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Reading: subtracted from the nine channels in the preprocessing."""

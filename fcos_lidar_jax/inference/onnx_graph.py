@@ -16,10 +16,10 @@ import numpy as np
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.config import ModelConfig, StemConfig, config_to_json
 from fcos_lidar_jax.inference.detector import TrainedDetector
-from fcos_lidar_jax.locations import ImageLayout, image_layout
+from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout
 from fcos_lidar_jax.models.layers import EPSILON, norm_groups, pieces
 from fcos_lidar_jax.models.lidar_net import STAGE_STRIDES
-from fcos_lidar_jax.models.local_geometry import COLUMNS, ROWS, UNIT_M, window
+from fcos_lidar_jax.models.local_geometry import COLUMNS, OWN, ROWS, UNIT_M, window
 from fcos_lidar_jax.models.modality import channel_groups
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import CHANNELS
@@ -71,12 +71,11 @@ def network_graph(detector: TrainedDetector) -> bytes:
     image = _preprocessing(network, "features", model, layout)
     geometry = _geometry(network, image, rounds, model.channel_scale) if model.meta_kernel else None
     stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
-    if model.local_geometry:
-        stem = network("Add", stem, _local_geometry(network, image, rounds, model))
     levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks, geometry))
     k = len(config.classes)
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
-    _heads(network, levels, model, shapes)
+    local = _local_geometry(network, image, rounds, model) if model.local_geometry else None
+    _heads(network, levels, local, model, shapes)
     network.check_all_used()
     described = onnx.helper.make_tensor_value_info
     float32 = onnx.TensorProto.FLOAT
@@ -276,7 +275,8 @@ def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConf
         tangential = network("Sub", network("Mul", cos, dy), network("Mul", sin, dx))
         turned = network("Concat", radial, tangential, dz, axis=1)
         channels += [network("Mul", network("Asinh", network("Div", turned, UNIT_M)), both), both]
-    x = network("Concat", *channels, axis=1)
+    own = network("Gather", image, [rounds * channel for channel in OWN], axis=1)
+    x = network("Concat", *channels, own, axis=1)
     for layer in range(2):
         gain, shift = network.batch_norm(f"local_geometry/norm{layer}")
         kernel = network.parameter(f"local_geometry/linear{layer}") * gain
@@ -338,13 +338,23 @@ _PREDICTIONS = {
 
 
 def _heads(
-    network: _Network, levels: Sequence[str], model: ModelConfig, shapes: Mapping[str, Sequence[int]]
+    network: _Network,
+    levels: Sequence[str],
+    local: str | None,
+    model: ModelConfig,
+    shapes: Mapping[str, Sequence[int]],
 ) -> None:
     """The outputs, at the locations of all levels."""
     found: dict[str, list[str]] = {name: [] for name in _PREDICTIONS}
     for level, image in enumerate(levels):
         path = "heads/shared" if model.tied_heads else f"heads/level{level + 2}"
+        here = network("Slice", local, [0, 0], [_END] * 2, [2, 3], [STRIDES[level]] * 2) if local else None
+        image = network("Add", image, here) if here else image
         towers = {name: network.tower(image, f"{path}/{name}_tower", model.head_convs) for name in _TOWERS}
+        if here:
+            for name, x in towers.items():
+                joined = network.conv(here, network.parameter(f"{path}/{name}_local/kernel"))
+                towers[name] = network("Relu", network("Add", x, joined))
         for name, (tower, layers) in _PREDICTIONS.items():
             kernel, bias = (
                 np.concatenate([network.parameter(f"{path}/{tower}/{layer}_{part}") for layer in layers], axis=-1)

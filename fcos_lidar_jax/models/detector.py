@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import Config, ModelConfig
-from fcos_lidar_jax.locations import ImageLayout, image_layout, pad_image
+from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout, pad_image
 from fcos_lidar_jax.models.centerpoint import build_centerpoint
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
@@ -63,7 +63,7 @@ class Network(nn.Module):
         self.stem = Stem(c.stem, c.circular_width, c.precision)
         if c.local_geometry:
             normalised = c.channel_mean, c.channel_scale
-            self.local_geometry = LocalGeometry(c.stem.out_channels, *normalised, c.circular_width)
+            self.local_geometry = LocalGeometry(c.fpn_channels, *normalised, c.circular_width)
         self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width, c.remat)
         self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
         sizes = self.num_classes, c.head_channels, c.head_convs
@@ -72,15 +72,18 @@ class Network(nn.Module):
     def __call__(self, image: Image, *, train: bool) -> Outputs:
         with jax.named_scope("stem"):
             x = (recomputed(self.stem) if self.config.remat else self.stem)(image, train=train)
-            if self.config.local_geometry:
-                x = x + self.local_geometry(image, train=train).astype(x.dtype)
         with jax.named_scope("backbone"):
             geometry = geometry_of(image, self.config.channel_scale) if self.config.meta_kernel else None
             levels = self.backbone(x, geometry, train=train)
         with jax.named_scope("fpn"):
             levels = self.fpn(levels)
+        local = None
+        if self.config.local_geometry:
+            with jax.named_scope("local_geometry"):
+                features = self.local_geometry(image, train=train)
+            local = [features[:, ::stride, ::stride] for stride in STRIDES]
         with jax.named_scope("heads"):
-            return self.heads(levels)
+            return self.heads(levels, local)
 
 
 def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, layout: ImageLayout) -> Image:

@@ -66,13 +66,23 @@ class Head(nn.Module):
     circular: bool = False
 
     @nn.compact
-    def __call__(self, x: Image) -> Outputs:
-        """Predictions at all locations of the level, flattened."""
+    def __call__(self, x: Image, local: Image | None = None) -> Outputs:
+        """Predictions at all locations of the level, flattened.
+
+        Local features of the locations, if given, join before the towers and again behind them, where no other
+        convolution than the predictions follows.
+        """
         k = self.num_classes
+        if local is not None:
+            local = local.astype(x.dtype)
+            x = x + local
         # With zero logits for the classes this makes P(background) the prior.
         prior = math.log(k * self.background_prior / (1 - self.background_prior))
         classes = Tower(self.channels, self.depth, self.circular, name="classification_tower")(x)
         boxes = Tower(self.channels, self.depth, self.circular, name="regression_tower")(x)
+        if local is not None:
+            classes = self._joined(classes, local, "classification_local")
+            boxes = self._joined(boxes, local, "regression_local")
         biases = {"logits": (0.0,) * k + (prior,)}
         logits = Predictions({"logits": k + 1}, biases, self.circular, name="classification")(classes)["logits"]
         sizes = {**{name: count * k for name, count in _REGRESSION.items()}, "iou": k}
@@ -83,6 +93,9 @@ class Head(nn.Module):
 
         regression = [flat(numbers[name], count, k) for name, count in _REGRESSION.items()]
         return Outputs(flat(logits, k + 1), jnp.concatenate(regression, axis=2), flat(numbers["iou"], k))
+
+    def _joined(self, x: Image, local: Image, name: str) -> Image:
+        return jax.nn.relu(x + Conv(self.channels, 1, name=name)(local))
 
 
 class Heads(nn.Module):
@@ -96,9 +109,11 @@ class Heads(nn.Module):
     circular: bool = False
 
     @nn.compact
-    def __call__(self, levels: list[Image]) -> Outputs:
-        """Predictions at the locations of all levels, joined from P2 to P7."""
+    def __call__(self, levels: list[Image], local: list[Image] | None = None) -> Outputs:
+        """Predictions at the locations of all levels, joined from P2 to P7; with local features of each level."""
         options = self.num_classes, self.channels, self.depth, self.background_prior, self.circular
         shared = Head(*options, name="shared") if self.tied else None
-        outputs = [(shared or Head(*options, name=f"level{i + 2}"))(x) for i, x in enumerate(levels)]
+        given = local or [None] * len(levels)
+        pairs = zip(levels, given, strict=True)
+        outputs = [(shared or Head(*options, name=f"level{i + 2}"))(*pair) for i, pair in enumerate(pairs)]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *outputs)

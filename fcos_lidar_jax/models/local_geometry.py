@@ -1,19 +1,26 @@
-"""Local geometry: where the points around a pixel lie, seen from its own point. Not in the paper."""
+"""Local geometry: where the points around a pixel lie, seen from its own point. Not in the paper.
+
+A box is regressed from the point of one pixel. Every convolution mixes pixels, whose points may be metres apart,
+so little of a single pixel is left at the heads. Local geometry gives it to them directly.
+"""
 
 import itertools
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from fcos_lidar_jax.models.convolution import Image, pointwise
 from fcos_lidar_jax.models.layers import BatchNorm, kernel_init
+from fcos_lidar_jax.types import CHANNELS
 
 ROWS, COLUMNS = 1, 3
 """How far the window reaches from its pixel."""
 UNIT_M = 0.2
 """Offsets are compressed by ``asinh(offset / UNIT_M)``: linear below a decimetre or two, logarithmic beyond."""
 HIDDEN = 32
+OWN = tuple(map(CHANNELS.index, ("z", "range", "inclination", "intensity", "existence")))
 
 
 def window() -> list[tuple[int, int]]:
@@ -68,12 +75,19 @@ def local_offsets(
     return jnp.stack(channels, axis=-1)
 
 
-class LocalGeometry(nn.Module):
-    """Features of :func:`local_offsets`, to be added to the stem's: two 1x1 convolutions with batch norm and ReLU.
+def own_numbers(image: Image) -> Image:
+    """Height, range, inclination, intensity and existence of each pixel's first-round point, normalised.
 
-    The raw coordinates of neighbours are metres apart from zero and decimetres from each other: the differences,
-    which are what an object looks like, are lost in them.
+    The azimuth and what depends on it are left out: an object looks the same wherever it is around the sensor.
+
+    >>> own_numbers(jnp.arange(18.0).reshape(1, 1, 1, 18))[0, 0, 0].tolist()  # two rounds
+    [4.0, 6.0, 10.0, 12.0, 14.0]
     """
+    return image[..., :: image.shape[-1] // 9][..., np.array(OWN)]
+
+
+class LocalGeometry(nn.Module):
+    """Features of :func:`local_offsets` and :func:`own_numbers`: two 1x1 convolutions with batch norm and ReLU."""
 
     features: int
     mean: tuple[float, ...]
@@ -82,7 +96,8 @@ class LocalGeometry(nn.Module):
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
-        x = local_offsets(image, mean=self.mean, scale=self.scale, circular=self.circular)
+        offsets = local_offsets(image, mean=self.mean, scale=self.scale, circular=self.circular)
+        x = jnp.concatenate([offsets, own_numbers(image)], axis=-1)
         for layer, width in enumerate((HIDDEN, self.features)):
             kernel = self.param(f"linear{layer}", kernel_init, (x.shape[-1], width))
             (x,) = BatchNorm(name=f"norm{layer}")([pointwise(x, kernel)], train=train)

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from tiny_run import CONFIG, SENSOR
 
+from fcos_lidar_jax.locations import STRIDES, image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters
+from fcos_lidar_jax.models.heads import Head
 from fcos_lidar_jax.models.layers import EPSILON
 from fcos_lidar_jax.models.local_geometry import (
     COLUMNS,
@@ -80,14 +82,24 @@ def test_offsets_are_their_definition_in_loops_also_under_jit_and_vmap(circular,
     assert len(window()) == 20
 
 
-def test_features_are_two_layers_of_the_offsets():
-    image, points = image_of()
+def own_by_loops(image, rounds: int):
+    """Channels of the first round by name, pixel by pixel."""
+    names = "z", "range", "inclination", "intensity", "existence"
+    found = np.zeros((*SHAPE, len(names)))
+    for place in np.ndindex(*SHAPE):
+        for k, name in enumerate(names):
+            found[(*place, k)] = image[(*place, CHANNELS.index(name) * rounds)]
+    return found
+
+
+def test_features_are_two_layers_of_the_offsets_and_of_the_points_own_numbers():
+    image, points = image_of(rounds=2)
     module = LocalGeometry(5, MEAN, SCALE)
     shapes = jax.eval_shape(lambda: module.init(jax.random.key(0), image, train=False))
     rng = np.random.default_rng(1)
     variables = jax.tree.map(lambda leaf: jnp.asarray(rng.uniform(0.1, 1, leaf.shape), jnp.float32), shapes)
     variables["params"]["linear0"] -= 0.5
-    x = by_loops(points, circular=False)
+    x = np.concatenate([by_loops(points, circular=False), own_by_loops(image, 2)], axis=-1)
     for layer in range(2):
         p, s = variables["params"], variables["batch_stats"][f"norm{layer}"]
         y = x @ np.asarray(p[f"linear{layer}"], np.float64)
@@ -95,7 +107,7 @@ def test_features_are_two_layers_of_the_offsets():
         x = np.maximum((y - s["mean"]) / np.sqrt(s["var"] + EPSILON) * norm["scale"] + norm["bias"], 0)
     found = module.apply(variables, image, train=False)
     np.testing.assert_allclose(found, x, rtol=1e-3, atol=1e-2)
-    assert variables["params"]["linear0"].shape == (80, HIDDEN)
+    assert variables["params"]["linear0"].shape == (85, HIDDEN)
     assert (x > 0).any()
 
 
@@ -114,15 +126,20 @@ def test_gradients_are_finite_where_nothing_is_near(points):
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradients))
 
 
-def test_it_is_added_to_the_stem_and_nothing_else_changes():
-    plain = build_detector(CONFIG, SENSOR)
-    model = dataclasses.replace(CONFIG.model, local_geometry=True)
+@pytest.mark.parametrize("tied", [False, True])
+def test_it_joins_the_heads_of_every_level_and_nothing_else_changes(tied):
+    model = dataclasses.replace(CONFIG.model, tied_heads=tied)
+    plain = build_detector(dataclasses.replace(CONFIG, model=model), SENSOR)
+    model = dataclasses.replace(model, local_geometry=True)
     local = build_detector(dataclasses.replace(CONFIG, model=model), SENSOR)
     variables = local.init(jax.random.key(0))
     parts = count_parameters(variables["params"])
-    width = CONFIG.model.stem.out_channels
-    assert parts.pop("local_geometry") == 80 * HIDDEN + HIDDEN * width + 2 * (HIDDEN + width)
-    assert parts.keys() == count_parameters(jax.eval_shape(plain.init, jax.random.key(0))["params"]).keys()
+    width, before = model.fpn_channels, count_parameters(jax.eval_shape(plain.init, jax.random.key(0))["params"])
+    assert parts["local_geometry"] == 85 * HIDDEN + HIDDEN * width + 2 * (HIDDEN + width)
+    heads = 1 if tied else len(STRIDES)
+    assert parts["heads"] - before["heads"] == heads * 2 * width * model.head_channels
+    assert all(parts[name] == number for name, number in before.items() if name not in ("heads", "total"))
+
     rng = np.random.default_rng(0)
     features = rng.uniform(1, 5, (1, SENSOR.num_rows, SENSOR.num_columns, 9, CONFIG.projection.num_rounds))
     features = jnp.asarray(features, jnp.float32)
@@ -133,9 +150,33 @@ def test_it_is_added_to_the_stem_and_nothing_else_changes():
         jnp.zeros_like, variables["params"]["local_geometry"]["norm1"]
     )
     without = {name: {k: v for k, v in tree.items() if k != "local_geometry"} for name, tree in variables.items()}
+    without["params"]["heads"] = jax.tree.map(
+        lambda head: {name: leaves for name, leaves in head.items() if not name.endswith("_local")},
+        variables["params"]["heads"],
+        is_leaf=lambda tree: "classification_tower" in tree,
+    )
     expected, _ = jax.jit(plain.apply)(without, features)
-    close = functools.partial(
-        np.testing.assert_allclose, rtol=0, atol=1e-5
-    )  # Another program may round otherwise.
+    close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-5)  # Another program rounds otherwise.
     jax.tree.map(close, apply(silent, features)[0], expected)
-    assert float(jnp.abs(found.logits - expected.logits).max()) > 0
+    first = 0
+    for size in image_layout(SENSOR, model).level_sizes:
+        level = slice(first, first + size)
+        assert float(jnp.abs(found.logits[:, level] - expected.logits[:, level]).max()) > 0
+        assert float(jnp.abs(found.regression[:, level] - expected.regression[:, level]).max()) > 0
+        first += size
+
+
+def test_a_location_is_given_the_features_of_its_own_pixel():
+    head = Head(2, 8, 1, 0.9)
+    rng = np.random.default_rng(0)
+    image, local = (jnp.asarray(rng.uniform(size=(1, 6, 8, 8)), jnp.float32) for _ in range(2))
+    variables = head.init(jax.random.key(0), image, local)
+    towers = jax.tree.map(jnp.zeros_like, variables["params"])  # Only what joins behind the towers is left.
+    for name in ("classification", "regression"):
+        towers[f"{name}_local"] = variables["params"][f"{name}_local"]
+    kernel = np.zeros((3, 3, 8, 3), np.float32)
+    kernel[1, 1] = rng.normal(size=(8, 3))
+    towers["classification"] = {"logits_kernel": jnp.asarray(kernel), "logits_bias": jnp.zeros(3)}
+    found = head.apply({"params": towers}, image, local).logits
+    joined = np.maximum(np.asarray(local) @ np.asarray(towers["classification_local"]["kernel"][0, 0]), 0)
+    np.testing.assert_allclose(found, (joined @ kernel[1, 1]).reshape(1, -1, 3), rtol=1e-4, atol=1e-5)
