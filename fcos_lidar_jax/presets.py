@@ -97,6 +97,7 @@ COMPACT = dataclasses.replace(
         row_upscale=1,
         circular_width=True,
         regression_axes="ray",
+        local_geometry=True,
         stem=StemConfig(channels_per_type=4, out_channels=16, dilations=(1, 3)),
         backbone_blocks=(2, 3, 3, 2),
         backbone_widths=(16, 48, 64, 64),

@@ -51,7 +51,15 @@ def test_presets_are_the_papers():
     ("preset", "own"),
     [
         (QUICKSTART, ()),
-        (COMPACT, (("model", "circular_width"), ("model", "regression_axes"), ("inference", "merge_iou"))),
+        (
+            COMPACT,
+            (
+                ("model", "circular_width"),
+                ("model", "regression_axes"),
+                ("model", "local_geometry"),
+                ("inference", "merge_iou"),
+            ),
+        ),
     ],
 )
 def test_small_presets_differ_in_numbers_only(preset, own):

@@ -119,7 +119,7 @@ def all_programs() -> dict[str, Program]:
             label = name + ("" if precision == "float32" else f"-{precision}") + "-1"
             programs[f"train-{label}"] = Program("train", name, precision)
             programs[f"detect-{label}"] = Program("detect", name, precision)
-    for addition in ("meta_kernel", "local_geometry"):
+    for addition in ("meta_kernel",):
         programs[f"train-compact-{addition}"] = Program("train", "compact", batch=2, additions=(addition,))
     return programs
 

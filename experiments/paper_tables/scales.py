@@ -339,6 +339,7 @@ _SECTOR = change(
     class_balanced=False,
     projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
     model__circular_width=False,
+    model__local_geometry=False,
     # Wide enough for the 45 inputs of five rounds.
     model__stem__channels_per_type=8,
     model__stem__out_channels=24,

@@ -48,18 +48,10 @@ BASE: Change = change(
     augment__flip_y_probability=0.0,
     augment__max_rotation_rad=math.radians(5),
 )
-# One group of 45 channels: types need not be kept apart where the input is relative.
-WIDE: dict[str, Any] = {
-    "model__stem__groups": "all",
-    "model__stem__channels_per_type": 5,
-    "model__stem__dilations": (1, 3, 6),
-}
 TRIALS: dict[str, Change] = {
-    "base": change(),
+    "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
-    "wide stem": change(**WIDE),
-    "local geometry": change(model__local_geometry=True),
-    "local geometry, wide stem": change(model__local_geometry=True, **WIDE),
+    "local geometry": change(),
 }
 
 

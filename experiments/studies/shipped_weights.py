@@ -53,12 +53,10 @@ _FRESH = change(copy_paste=None, class_balanced=False)  # What makes more of few
 CONFIGS = {
     "quickstart": change(augment=None, optimizer__ema_decay=0.999)(_FRESH(QUICKSTART)),
     # No street is shown twice. A mirrored or turned one would look down behind, and have its blind arcs elsewhere.
-    # Most trainings begin with the weights of an earlier one, which need less of a warm-up and a lower peak.
     "hdl32e": change(
         augment__flip_y_probability=0.0,
         augment__max_rotation_rad=math.radians(3),
-        optimizer__warmup_fraction=0.1,
-        optimizer__peak_learning_rate=1.5e-3,
+        optimizer__warmup_fraction=0.2,
     )(_FRESH(COMPACT)),
 }
 EVENER_CITY = dataclasses.replace(CITY, name="city, classes more even", city_classes=0.25)
