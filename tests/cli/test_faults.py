@@ -1,4 +1,4 @@
-"""Commands that are killed, find a full disk or may not write; the tests of each command ask more of such questions."""
+"""Commands that are killed, find a full disk or may not write; the tests of each command ask more of this."""
 
 import hashlib
 import json
