@@ -1,8 +1,8 @@
 """Result cells: ``cells.csv`` of a scale has a row per training, ``scale.json`` what all of them share.
 
 A cell is a seed and what its configuration changes in the scale's base, in words such as
-``num_sweeps=1, projection.num_rounds=3``. So a new field of the configuration renames no cell. Cells whose data or base differ
-from those of today are refused.
+``num_sweeps=1, projection.num_rounds=3``. So a new field of the configuration renames no cell. Cells whose data or
+base differ from those of today are refused.
 """
 
 import csv
@@ -90,7 +90,7 @@ def _write(file: Path, text: str) -> None:
 
 
 def _row(cell: Cell) -> dict[str, str]:
-    flat = flatten_dict(cell, sep=".", is_leaf=lambda _, value: not value)
+    flat: dict[str, Any] = flatten_dict(cell, sep=".", is_leaf=lambda _, value: not value)
     return {name: value if name in _TEXT else json.dumps(value) for name, value in flat.items()}
 
 
