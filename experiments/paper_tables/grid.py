@@ -1,9 +1,9 @@
 """A grid of configurations, trained and scored: what the paper's tables are made of.
 
 A cell is a configuration, a scale and a seed. Its result is a row of the scale's file (``cells.py``), so that a
-finished cell is never run again, a cell that several tables share is run once, a stopped one resumed. Processes that
-share the folders, one per GPU or core, share the cells. The code's revision does not name a cell; it stands in its
-row.
+finished cell is never run again, a cell that several tables share is run once, a stopped one resumed. Processes
+that share the folders, one per GPU or core, share the cells. The code's revision does not name a cell; it stands in
+its row.
 """
 
 import sys
