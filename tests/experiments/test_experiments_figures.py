@@ -96,20 +96,6 @@ def test_needed_operations_of_the_stem_by_hand():
     assert module_latency.needed_gflop(StemConfig()) == pytest.approx(3 * 2 * types / 1e9)
 
 
-def test_another_order_than_the_papers_is_explained_in_numbers():
-    pieces = [{"size": 6, "out": 6, "dilation": d, "count": 45, "median_ms": 2.0} for d in (1, 3, 6)]
-    alike = {"form": "split", "needed_gflop": 1.0, "executed_gflop": 2.0, "executed_gflop_per_s": 3.0}
-
-    def records(one_group, types, rounds_apart):
-        times = {"one group": one_group, "9 types": types, "9 types, rounds apart": rounds_apart}
-        return {name: {**alike, "pieces": pieces, "median_ms": ms} for name, ms in times.items()}
-
-    assert module_latency.order_differences(records(3.0, 1.0, 2.0)) == []
-    (line,) = module_latency.order_differences(records(3.0, 1.0, 4.0))
-    assert "9 types, rounds apart is faster than one group in the paper" in line
-    assert "2.0 executed as 'split' at 3 GFLOP/s (135 of 6 to 6: 270.0 ms)" in line
-
-
 @pytest.mark.real_data
 @pytest.mark.parametrize(("close", "expected"), REAL_COUNTS)
 def test_counts_of_the_real_cloud(real_data, close, expected):
