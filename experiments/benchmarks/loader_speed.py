@@ -4,8 +4,8 @@
 
 Reads a data set in nuScenes' layout (``fcos-lidar synthesize`` makes one; by default the real scene-0523 below the
 environment's ``FCOS_LIDAR_REAL_DATA``), cuts a ground-truth database from it, and times whole batches, prepared on
-demand, by two threads, and by two processes. Then the paper's batches on their way to a device, by turns plain from
-the main thread, as they once went, and packed in the background, as GPUs are fed; and a training step of the
+demand, by two threads, and by two processes. Then the paper's batches on their way to a device, by turns plain
+from the main thread, as they once went, and packed in the background, as GPUs are fed; and a training step of the
 quickstart preset, to be compared with. A CPU stands in for the device, and a copy in its memory for the transfer.
 Files come from the page cache. Other programs lengthen the wall clock, not the processor time: with the cores to
 itself a loader makes about cores / (processor time per sample) samples a second.

@@ -2,8 +2,8 @@
 
 A cell is a configuration, a scale and a seed. Its result is a row of the scale's file (``cells.py``), so that a
 finished cell is never run again, a cell that several tables share is run once, a stopped one resumed. Processes
-that share the folders, one per GPU or core, share the cells. The code's revision does not name a cell; it is in its
-row.
+that share the folders, one per GPU or core, share the cells. The code's revision does not name a cell; its row has
+it.
 """
 
 import sys
