@@ -4,13 +4,12 @@
 
 Reads a data set in nuScenes' layout (``fcos-lidar synthesize`` makes one; by default the real scene-0523 below the
 environment's ``FCOS_LIDAR_REAL_DATA``), cuts a ground-truth database from it, and times whole batches, prepared on
-demand, by two threads, and by two processes. Then the paper's batches on their way to a device, by turns plain
-from the main thread, as they once went, and packed in the background, as GPUs are fed; and a training step of the
-quickstart preset, to be compared with. A CPU stands in for the device, and a copy in its memory for the transfer.
-Files come from the page cache. Other programs lengthen the wall clock, not the processor time: with the cores to
-itself a loader makes about cores / (processor time per sample) samples a second.
+demand, by two threads, by two processes, and packed for a device, which a CPU stands in for, by two threads in the
+background; and a training step of the quickstart preset, to be compared with. Files come from the page cache.
+Other programs lengthen the wall clock, not the processor time: with the cores to itself a loader makes about cores
+/ (processor time per sample) samples a second.
 
-Cost: four minutes. Expected on two cores: at least 40 samples a second, and 0.71 of the bytes. The paper's eight
+Cost: two minutes. Expected on two cores: at least 40 samples a second. The paper's eight
 GPUs need 52.8: 40 epochs of 123,580 samples, class-balanced resampling counted, in 26 hours.
 """
 
@@ -20,7 +19,6 @@ import functools
 import json
 import multiprocessing
 import os
-import statistics
 import tempfile
 import time
 from collections import Counter
@@ -30,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from jax.sharding import Mesh
 
 from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
@@ -45,7 +42,7 @@ from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.feed import feed
-from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
+from fcos_lidar_jax.training.sharding import make_mesh
 from fcos_lidar_jax.types import HostBatch
 
 EPOCHS, EPOCH_SAMPLES, HOURS = 40, 123_580, 26
@@ -54,8 +51,6 @@ FULL_SIZE = Path("experiments/results/full_size.json")  # Has the time of a trai
 WAYS = {"on demand": (0, 0), "2 threads": (2, 0), "2 processes": (0, 2)}
 """Of preparing batches: threads, worker processes."""
 Batches = Iterator[HostBatch]
-Delivery = Callable[[Batches], AbstractContextManager[Batches]]
-"""What brings prepared batches to where they are wanted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,9 +63,6 @@ class Args(Options):
     split: str = "scene0523"  # Keyframes to load.
     batch_size: int = 8  # Samples a batch.
     samples: int = 160  # To load in each way of preparing batches.
-    feed_batch_size: int = 32  # Samples a batch on the way to the device.
-    feed_turns: int = 5  # Turns of each way of feeding; the median counts.
-    feed_samples: int = 160  # To bring to the device in a turn.
     train_step: bool = True  # Time a training step of the quickstart preset too.
 
 
@@ -89,7 +81,7 @@ def throughput(
     objects: GroundTruthDatabase,
     samples: int,
     *,
-    delivery: Delivery = contextlib.nullcontext,
+    delivery: Callable[[Batches], AbstractContextManager[Batches]] = contextlib.nullcontext,
     **how: Any,
 ) -> dict[str, float]:
     """Samples a second, once it runs; as much waits ready at the end as at the beginning."""
@@ -110,37 +102,6 @@ def throughput(
     return {**found, "cores_had": round(cpu / wall, 2), "bytes_a_batch": num_bytes, **truncated}
 
 
-@contextlib.contextmanager
-def by_main_thread(batches: Batches, mesh: Mesh) -> Iterator[Batches]:
-    """To the device when the next batch is asked for, and there when it is handed on."""
-    yield (dataclasses.replace(b, batch=jax.block_until_ready(shard_batch(b.batch, mesh))) for b in batches)
-
-
-def feeds(
-    frames: NuScenesFrames, config: Config, objects: GroundTruthDatabase, *, turns: int, samples: int
-) -> dict[str, Any]:
-    """Bytes and samples a second that reach the device, in both ways by turns."""
-    mesh = make_mesh(jax.devices()[:1])
-    ways: dict[str, dict[str, Any]] = {
-        "plain, main thread": {"delivery": functools.partial(by_main_thread, mesh=mesh)},
-        "packed, background": {
-            "delivery": functools.partial(feed, mesh=mesh),
-            "packing": packing_for(frames, config),
-        },
-    }
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
-    for _ in range(turns):
-        for name, how in ways.items():
-            found[name].append(throughput(frames, config, objects, samples, threads=2, lend=True, **how))
-    medians = {
-        name: {key: statistics.median(turn[key] for turn in each) for key in each[0]}
-        for name, each in found.items()
-    }
-    before, after = medians.values()
-    ratios = {f"{key}_ratio": round(after[key] / before[key], 3) for key in ("samples_per_s", "bytes_a_batch")}
-    return {"batch_size": config.optimizer.batch_size, **medians, **ratios}
-
-
 def _needs(train_step: bool) -> dict[str, float]:
     full_size = json.loads(FULL_SIZE.read_text(encoding="utf-8"))
     found = {
@@ -155,7 +116,7 @@ def _needs(train_step: bool) -> dict[str, float]:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """Time the stages, the loader in all ways, and the steps that it has to feed."""
+    """Time the loader in all ways, and the steps that it has to feed."""
     root = args.data_root or find_real_data(None, "nuscenes_scene0523")
     if root is None:
         raise ValueError("--data-root: missing, expected a data set in nuScenes' layout")
@@ -170,8 +131,12 @@ def measure(args: Args) -> dict[str, Any]:
         record["database"] = {"objects": len(objects), "cpu_ms_a_frame": round(spent_ms / len(frames), 1)}
         load = functools.partial(throughput, frames, config, objects, args.samples)
         record["loader"] = {name: load(threads=n, workers=m) for name, (n, m) in WAYS.items()}
-        large = change(optimizer__batch_size=args.feed_batch_size)(NUSCENES)
-        record["feed"] = feeds(frames, large, objects, turns=args.feed_turns, samples=args.feed_samples)
+        record["loader"]["packed, on the device"] = load(
+            threads=2,
+            lend=True,
+            delivery=functools.partial(feed, mesh=make_mesh(jax.devices()[:1])),
+            packing=packing_for(frames, config),
+        )
     return {**record, "needed_samples_per_s": _needs(args.train_step)}
 
 
