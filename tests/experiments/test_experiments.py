@@ -121,8 +121,9 @@ def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
             return {**super().score(config, seed, folder), "curve": [[10, 0.1], [20, 0.2 + 0.1 * seed]]}
 
     for scale in (Pretended(), Looked(name="looked")):
-        train_table(table6_untied_heads.TABLE, scale=scale, seeds=(0, 1))
-        drawn = tmp_path / "smoke" / "table6_curves.png"
+        folder = tmp_path / scale.name
+        train_table(table6_untied_heads.TABLE, scale=scale, seeds=(0, 1), out=folder, runs=folder)
+        drawn = folder / "smoke" / "table6_curves.png"
         assert drawn.exists() == isinstance(scale, Looked)
     assert drawn.read_bytes().startswith(b"\x89PNG")
 
