@@ -24,6 +24,7 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "experiments" / "README.md",
+    ROOT / "experiments" / "LOG.md",
     *sorted(DOCS.glob("*.md")),
 ]
 RUN_ELSEWHERE = {  # pages that have a test of their own, which goes on from what they make

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from browser import find_browser, open_tab, start_browser
 
-from experiments.browser import find_browser, open_tab, start_browser
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.visualization.page import page_frame, write_page
