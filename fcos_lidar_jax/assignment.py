@@ -119,7 +119,7 @@ def cheapest(
     num_boxes, num_locations = num_positive.shape[0], owner.shape[0]
     group, _, index = _by_owner(owner, cost, num_boxes)
     rank = lax.iota(jnp.int32, num_locations) - _edges(group, num_boxes)[group]
-    limit = jnp.pad(num_positive, (0, 1))
+    limit = jnp.append(num_positive, jnp.zeros(1, num_positive.dtype))
     return jnp.zeros(num_locations, bool).at[index].set(rank < limit[group])
 
 
