@@ -225,7 +225,7 @@ def test_padding_alone_gives_an_empty_image():
 
 
 def test_too_few_columns_for_the_sensor_are_refused():
-    with pytest.raises(ValueError, match="got 5 columns, sensor 'laser' needs 6"):
+    with pytest.raises(ValueError, match="got 5 columns, expected 6 for sensor 'laser'"):
         project_points(cloud(0), np.ones(400, bool), LASER)
 
 
