@@ -190,7 +190,7 @@ def _pack_number(values: np.ndarray, packed: np.ndarray, name: str) -> str | Non
 
 
 def _pack_lags(values: np.ndarray, packed: np.ndarray, table: np.ndarray) -> str | None:
-    """Write indices and the table, or the values if there is no table; return a message if the table is too small."""
+    """Write indices and the table, or the values without a table; return a message if the table is too small."""
     if not len(table):
         packed[:] = values
         return None
