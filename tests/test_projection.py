@@ -159,7 +159,7 @@ def test_unknown_forms_are_rejected():
 
 @pytest.mark.parametrize("sensor", PRESETS.values(), ids=PRESETS)
 def test_columns_run_clockwise_from_azimuth_pi(sensor):
-    """Points at azimuth pi, for both signs of zero, or just to the left are in column 0, to the right in the last."""
+    """Column 0 starts at azimuth pi, for both signs of y = 0, and the last column ends there."""
     x, _, z = sensor.origin_m
     behind, count = np.float32(x - 5), sensor.num_columns
     y = np.array([0.0, -0.0, 1e-3, -1e-3], np.float32)
