@@ -226,7 +226,7 @@ def test_a_damaged_data_set_is_not_called_finished(made, tmp_path, capsys, damag
     else:
         content = file.read_bytes()
         file.write_bytes(content[:-20] if damage == "cut" else content.replace(b"0", b"1", 1))
-    found = "nothing" if "lost" in damage else "another content"
+    found = "nothing" if "lost" in damage else "other content"
     assert f"{file}: found {found}, expected the file as written" in refusal(capsys, root)
 
 
@@ -325,10 +325,10 @@ def test_another_order_in_the_same_folder_is_refused(made, tmp_path, capsys):
     changed |= {"streets": ("plain", "city")}
     for name, (got, begun) in changed.items():
         line = refusal(capsys, made, *(["--no-rolling-shutter"] if got == "False" else [f"--{name}", got]))
-        assert f"{name}: got {got}, but the data set there was begun with {begun}" in line
+        assert f"{name}: got {got}, expected {begun} as in the data set begun there" in line
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
     line = refusal(capsys, made, "--sensor", str(tmp_path / "near.json"))
-    assert f"sensor.limit_xy_m: got 9.0, but the data set there was begun with {TINY.limit_xy_m}" in line
+    assert f"sensor.limit_xy_m: got 9.0, expected {TINY.limit_xy_m} as in the data set begun there" in line
     assert contents(made) == before
 
 
@@ -336,7 +336,7 @@ def test_folders_of_others_are_refused(made, tmp_path, capsys):
     own = tmp_path / "own"
     own.mkdir()
     (own / "thesis.txt").write_text("mine")
-    assert "not empty, and not begun by this command" in refusal(capsys, own)
+    assert "found other files, expected an empty folder" in refusal(capsys, own)
     assert contents(own) == {"thesis.txt": b"mine"}
     assert "thesis.txt: found a file, expected a folder" in refusal(capsys, own / "thesis.txt")
     copy = tmp_path / "copy"
