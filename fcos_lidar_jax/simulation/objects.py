@@ -80,7 +80,7 @@ CLUTTER_MODELS = _read_models("clutter.toml")
 def sample_object_model(
     rng: np.random.Generator, name: str, *, moving: bool = False, city: bool = False
 ) -> ObjectModel:
-    """Sample a model of a class by the models' shares; with ``moving`` a model that moves, if the class has any."""
+    """Sample a model of a class by share; with ``moving``, a model that can move if the class has any."""
     models = OBJECT_MODELS[name]
     in_city = [model.share if model.city_share is None else model.city_share for model in models]
     shares = np.cumsum(in_city if city else [model.share for model in models])
@@ -130,8 +130,8 @@ def object_solids(model: ObjectModel, size_m: np.ndarray, paint: float) -> np.nd
 def vary_shape(rng: np.random.Generator, solids: np.ndarray, size_m: np.ndarray, deviation: float) -> None:
     """Vary the extents of an object's parts in place and independently, such that the box stays tight.
 
-    Sides of parts at a side of the box do not move. Wheels and parts that extend beyond the box, such as the fence on
-    a barrier, keep their shapes.
+    Sides of parts at a side of the box do not move. Wheels and parts that extend beyond the box, such as the fence
+    on a barrier, keep their shapes.
 
     Args:
         solids: [s], in the frames of their boxes.

@@ -95,7 +95,7 @@ def sample_scene(rng: np.random.Generator, spec: DatasetSpec) -> World:
 
 
 def _sample_placement(rng: np.random.Generator) -> np.ndarray:
-    """Sample the pose of the street frame in the global frame, rotated about z and shifted in x and y, f64[4, 4]."""
+    """Random pose of the street frame in the global frame, with rotation about z only, f64[4, 4]."""
     yaw = rng.uniform(-np.pi, np.pi)
     placement = np.eye(4)
     placement[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -117,7 +117,7 @@ def _write_points(path: Path, points: np.ndarray) -> None:
 
 
 def _global_boxes(world: World, street_to_global: np.ndarray, time_s: float) -> np.ndarray:
-    """Boxes ``x, y, z, l, w, h, yaw`` of all objects at a time, f64[m, 7], rounded to millimetres as in the tables."""
+    """Boxes ``x, y, z, l, w, h, yaw`` of all objects, f64[m, 7], rounded to millimetres as in the tables."""
     pose, sizes = world.object_poses(time_s), world.traffic.sizes
     center = pose[:, :3] + sizes * (0, 0, 0.5)
     turn = np.arctan2(street_to_global[1, 0], street_to_global[0, 0])

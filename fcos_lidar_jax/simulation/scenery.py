@@ -1,4 +1,4 @@
-"""Scenery along plain streets: buildings, fences, walls, trees and poles."""
+"""Scenery along the streets: buildings, fences, walls, trees and poles."""
 
 import numpy as np
 from numpy.random import Generator
@@ -55,7 +55,8 @@ def _positions(
     """Ground points ``s`` along a street and ``d`` beside its middle, without points within ``clear`` of a street.
 
     Also returns the indices of the remaining points.
-    """    s, d = np.broadcast_arrays(s, d)
+    """
+    s, d = np.broadcast_arrays(s, d)
     x, y = (s, side * d) if along == 0 else (ground.crossing_x + side * d, s)
     free = np.flatnonzero(~ground.on_road(x, y, clear))
     x, y = x[free], y[free]
