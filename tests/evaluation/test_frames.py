@@ -129,7 +129,7 @@ def test_truth_that_is_too_far_to_count_is_told():
     told = {each: [line for line in warnings(counted[each], 9, truth) if "beyond" in line] for each in counted}
     named = ", ".join(f"{name} 5 m" for name in OWN[:2])
     assert told[near] == [
-        f"{far} boxes of the truth are beyond the range of their class and do not count: {named}"
+        f"{far} boxes of the truth are beyond the range of their class and are not evaluated: {named}"
     ]
     assert told[all_of_it] == []
     assert len(counted[near].truth) + far == len(counted[all_of_it].truth)
@@ -164,7 +164,7 @@ def test_without_truth_there_is_no_score_and_no_interval_breaks(tmp_path):
     evaluation = evaluate_frames(found, empty, metric_of(OWN))
     assert np.isnan(evaluation.summary["mean_ap"])
     assert evaluation.summary["absent_classes"] == list(OWN)
-    assert warnings(evaluation, 3) == ["no ground truth counts here: no score"]
+    assert warnings(evaluation, 3) == ["no ground truth is evaluated: no score"]
     write_evaluation(tmp_path, evaluation, {}, repeats=3)
     write_evaluation_report(tmp_path, title="t", num_samples=2, examples=(), sensor=TINY)
     page = (tmp_path / "report.html").read_text()
@@ -215,10 +215,10 @@ def test_scores_are_named_as_what_they_are():
     assert lines[1].startswith("trans_err ")
     assert re.fullmatch(r"95% intervals over samples: mAP by centre distance 0\.\d+ to 0\.\d+", lines[2])
     absent = ", ".join(OWN[2:])
-    assert warnings(evaluation, 9) == [f"no ground truth counts of {absent}: left out of the means"]
+    assert warnings(evaluation, 9) == [f"no ground truth is evaluated for {absent}: excluded from the means"]
     invalid = [dataclasses.replace(d, valid=d.valid & False) for d in found]
     nothing = evaluate_frames(invalid, truths, metric_of(OWN))
-    assert "not a single box" in warnings(nothing, 0)[1]
+    assert "contain no boxes" in warnings(nothing, 0)[1]
     assert "within the range" in warnings(nothing, 5)[1]
 
 

@@ -132,7 +132,7 @@ def test_what_is_let_in_with_a_warning(tmp_path):
     np.testing.assert_array_equal(results.boxes.velocity, [[0.5, 0], [np.nan, 1], [np.nan, np.nan]])
     meta, rotation = results.warnings
     assert "meta: use_camera, use_radar, use_map, use_external: missing" in meta
-    assert "sample b: box 1: rotation: normalised, got a quaternion of norm 3; so were 1 more" in rotation
+    assert "sample b: box 1: rotation: normalised, got a quaternion of norm 3, and 1 more" in rotation
     assert read_results(document(), TOKENS).warnings == ()
     [line] = read_results(document(attribute_name="pedestrian.moving"), TOKENS).warnings  # as in the devkit
     assert line.endswith("sample b: box 1: attribute_name: counted as wrong, got 'pedestrian.moving' for a car")

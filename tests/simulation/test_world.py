@@ -19,7 +19,7 @@ from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, trave
 from fcos_lidar_jax.simulation.nuscenes_tables import attribute_of, visibility_of
 from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_size
 from fcos_lidar_jax.simulation.solids import BOX, SOLID, corners, make_solids
-from fcos_lidar_jax.simulation.traffic import EGO_MIDDLE_M, EGO_SIZE_M, Traffic, _Taken
+from fcos_lidar_jax.simulation.traffic import EGO_MIDDLE_M, EGO_SIZE_M, Traffic, _Occupancy
 from fcos_lidar_jax.simulation.world import World, sample_labels, sample_world
 
 FLAT = Ground(np.zeros((1, 3)), 300, 900, 7, 0.0, 3, (0.3, 0.3, 0.3))
@@ -75,7 +75,7 @@ def test_there_is_room_where_shapely_sees_no_rectangle_near_at_any_moment():
 
     (standing, sizes), (added, added_sizes) = moving(4), moving(4)
     occupied = np.concatenate([standing[:, 0, :2], sizes[:, :2], standing[:, 0, 2:]], axis=1)
-    taken = _Taken(times, occupied)
+    taken = _Occupancy(times, occupied)
     for poses, size in zip(added, added_sizes, strict=True):
         taken.add(poses, size)
     stay = np.repeat(standing[:, :1], len(times), axis=1)
