@@ -115,7 +115,7 @@ def match_frame(
     max_heading_error_rad: float = np.inf,
     heading_period_rad: Float[np.ndarray, "k"] | None = None,
 ) -> Match:
-    """Greedy one-to-one matching: by decreasing score, match each detection to the nearest free truth of its class.
+    """Match detections, by decreasing score, to the nearest free truth of their class, one to one.
 
     Args:
         boxes, true_boxes: detections and truths, ``x, y, z, l, w, h, yaw, vx, vy``.

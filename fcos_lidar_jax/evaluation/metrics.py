@@ -67,7 +67,7 @@ class Metric:
 
 
 NUSCENES_METRIC = Metric(NUSCENES_CLASSES, tuple(int(RANGES_M[name]) for name in NUSCENES_CLASSES), benchmark=True)
-"""The benchmark's metric, ``detection_cvpr_2019``; ranges are measured from the ego vehicle, not from its sensor."""
+"""The benchmark's metric, ``detection_cvpr_2019``; ranges are measured from the ego vehicle, not the sensor."""
 
 
 def metric_of(classes: Sequence[str], class_ranges_m: Sequence[float] = ()) -> Metric:
@@ -144,7 +144,7 @@ def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxCo
 
 
 def within_range(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> np.ndarray:
-    """Whether boxes are within the range of their class from the ego vehicle (frames: from the sensor), bool[n]."""
+    """Whether boxes are nearer to ``truth.ego_translation`` than the range of their class, bool[n]."""
     offset = boxes.translation[:, :2] - truth.ego_translation[boxes.sample, :2]
     return np.sqrt((offset**2).sum(axis=1)) < np.array(metric.class_ranges_m, float)[boxes.label]
 
@@ -206,10 +206,10 @@ def mean_error(error: np.ndarray, confidence: np.ndarray) -> float:
 def score(rankings: Sequence[Ranking], metric: Metric) -> tuple[dict[str, Curves], dict[str, Any]]:
     """Curves per class, and the scores: AP per class and distance, its means, and the errors of the hits.
 
-    For the benchmark, the scores are the official summary without ``eval_time``, ``cfg`` and ``meta``. Other metrics
-    have neither NDS nor attribute errors, and have velocity errors only for classes whose truth has velocities.
-    Their means are over the classes that occur in the truth; ``absent_classes`` lists the other classes. Without any
-    truth the mAP is NaN.
+    For the benchmark, the scores are the official summary without ``eval_time``, ``cfg`` and ``meta``. Other
+    metrics have neither NDS nor attribute errors, and have velocity errors only for classes whose truth has
+    velocities. Their means are over the classes that occur in the truth; ``absent_classes`` lists the other
+    classes. Without any truth the mAP is NaN.
     """
     benchmark, all_errors = metric.benchmark, {}
     of_class = dict(zip(metric.classes, rankings, strict=True))
