@@ -97,16 +97,16 @@ class Curves:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """The numbers, and what they were made of."""
+    """Result of an evaluation."""
 
-    metric: Metric  # by which it was evaluated
-    tokens: tuple[str, ...]  # the samples
+    metric: Metric
+    tokens: tuple[str, ...]  # names of the samples
     summary: dict[str, Any]  # see score
     curves: dict[str, Curves]  # by class
     rankings: tuple[Ranking, ...]  # by label
-    predictions: BoxColumns  # those that count
-    truth: BoxColumns  # the boxes that count
-    seconds: float  # how long filtering, matching and scoring took
+    predictions: BoxColumns  # after filtering
+    truth: BoxColumns  # after filtering
+    seconds: float  # time of filtering, matching and scoring
 
 
 def evaluate(predictions: BoxColumns, truth: GroundTruth, metric: Metric = NUSCENES_METRIC) -> Evaluation:
@@ -118,11 +118,11 @@ def evaluate(predictions: BoxColumns, truth: GroundTruth, metric: Metric = NUSCE
         metric: the metric; labels of predictions and truth index its classes.
     """
     began = time.perf_counter()
-    counted, true = (filter_boxes(boxes, truth, metric) for boxes in (predictions, truth.boxes))
-    rankings = rank(counted, true, heading_period_rad=metric.heading_period_rad)
+    predictions, true = (filter_boxes(boxes, truth, metric) for boxes in (predictions, truth.boxes))
+    rankings = rank(predictions, true, heading_period_rad=metric.heading_period_rad)
     curves, summary = score(rankings, metric)
     seconds = time.perf_counter() - began
-    return Evaluation(metric, truth.tokens, summary, curves, rankings, counted, true, seconds)
+    return Evaluation(metric, truth.tokens, summary, curves, rankings, predictions, true, seconds)
 
 
 def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxColumns:
