@@ -178,7 +178,7 @@ def test_without_truth_there_is_no_score_and_intervals_stay_defined(tmp_path):
 
 
 def test_all_resampled_sets_are_scored_over_the_same_classes():
-    """One class is detected equally well in all frames; another is never detected and occurs in two frames only."""
+    """One class is detected equally well in all frames; another one occurs in two frames and is never detected."""
     found, truths = made(OWN, [0], frames=12)
     rare = dataclasses.replace(truths[0], labels=np.ones_like(truths[0].labels))
     missed = dataclasses.replace(found[0], valid=np.zeros_like(found[0].valid))

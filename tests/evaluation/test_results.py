@@ -55,9 +55,9 @@ BOXES = {
     "far away": ({"translation": [1e300, 0, 0]}, r"translation: got .*, expected numbers of at most 1e\+08"),
     "vanishing quaternion": (
         {"rotation": [1e-200, 0, 0, 0]},
-        "rotation: got .*, expected a quaternion w, x, y, z",
+        "rotation: got .*, expected a nonzero quaternion w, x, y, z",
     ),
-    "zero quaternion": ({"rotation": [0, 0, 0, 0]}, "rotation: got .*, expected a quaternion w, x, y, z"),
+    "zero quaternion": ({"rotation": [0, 0, 0, 0]}, "rotation: got .*, expected a nonzero quaternion w, x, y, z"),
     "yaw for rotation": ({"rotation": 0.3}, "rotation: expected `array`, got `float`"),
     "NaN translation": ({"translation": [1, float("nan"), 0]}, r"translation\[1\]: expected `float`, got null"),
     "huge translation": ({"translation": [1, float("inf"), 0]}, r"translation\[1\]: expected `float`, got `str`"),

@@ -276,7 +276,7 @@ def test_a_smaller_spread_moves_objects_away():
 
 
 def test_a_frame_with_rolling_shutter_takes_the_time_of_a_turn():
-    """The first and the last column are measured from positions as far apart as the ego vehicle drives in a turn."""
+    """Between the first and the last column, the ego vehicle drives on for the duration of a turn."""
     still, moving = (
         by_laser(
             scan(
