@@ -177,9 +177,7 @@ def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise BlockingIOError(
-                f"{path}: in use: another process writes to it, expected no other process"
-            ) from None
+            raise BlockingIOError(f"{path}: in use: another process, expected no other process") from None
         file.truncate(0)
         size = 0  # Bytes of whole lines.
 
@@ -202,14 +200,12 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     """Read a JSON file and check its content against a type.
 
     Args:
-        path: file in UTF-8. NaN and infinities are accepted, so that callers can reject them with the field's
-            name.
+        path: file in UTF-8. NaN and infinities are accepted; callers reject them by name.
         kind: any type that msgspec can check.
         what: noun phrase for the expected file, used in the message for a missing file.
 
     Raises:
-        ValueError: one line with the file and, if the type does not match, the place, the found and the expected
-            value.
+        ValueError: one line with the file and, on a type mismatch, the place, the found and the expected value.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "a.json"

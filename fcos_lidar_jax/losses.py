@@ -54,7 +54,7 @@ def l1_loss(
     Args:
         prediction: regression values of the owner's class.
         target: from :func:`fcos_lidar_jax.coding.encode`; a NaN velocity is unknown and adds no loss.
-        mask: locations that count.
+        mask: locations to sum over.
         velocity_weight: weight of the last two values; the other weights are 1.
 
     >>> total, _ = l1_loss(jnp.ones((1, 10)), jnp.zeros((1, 10)), jnp.ones(1, bool), velocity_weight=0.2)
@@ -74,7 +74,7 @@ def iou_loss(
 
     Args:
         prediction, target: ``x, y, z, l, w, h, cos yaw, sin yaw``.
-        mask: locations that count.
+        mask: locations to sum over.
         kind: ``"iou"`` is 1 - IoU, ``"log_iou"`` is -ln IoU (UnitBox), ``"giou"`` and ``"diou"`` use the smallest
             box that encloses both and is aligned with the target.
 

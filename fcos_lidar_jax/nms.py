@@ -15,7 +15,8 @@ from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
 
 T = TypeVar("T")
-_COMMON_COUNTS = (1024, 2048)  # Few of the thousands of slots usually hold valid boxes; compute on that many.
+Mean = Callable[..., Array]
+_COMMON_COUNTS = (1024, 2048)  # Numbers of slots that usually suffice for all valid boxes, of thousands of slots.
 _MAX_TURN_RAD = np.pi / 3  # Merged boxes must agree on the heading within this angle.
 
 
@@ -123,13 +124,7 @@ def _weighted_mean(
 
 
 def _merged_by_rows(
-    mean: Callable[..., Array],
-    boxes: Array,
-    weights: Array,
-    labels: Array,
-    usable: Array,
-    kept: Array,
-    used: Array,
+    mean: Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
     """Merge the kept boxes one at a time."""
     kept_boxes, kept_labels = boxes[kept], labels[kept]
@@ -146,13 +141,7 @@ def _merged_by_rows(
 
 
 def _merged_by_matrix(
-    mean: Callable[..., Array],
-    boxes: Array,
-    weights: Array,
-    labels: Array,
-    usable: Array,
-    kept: Array,
-    used: Array,
+    mean: Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
     """Merge all kept boxes in one reduction over [kept, n]."""
     candidates = boxes, oriented(boxes), weights, labels
@@ -167,7 +156,7 @@ def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
 
 
 def _on_valid(compute: Callable[[Array], T], order: Array, valid: Array) -> T:
-    """Compute on the shortest prefix of ``order`` in ``_COMMON_COUNTS`` that contains all valid boxes."""
+    """Call ``compute`` on a prefix of ``order``, valid boxes first, that contains all valid boxes."""
     counts = [*(count for count in _COMMON_COUNTS if count < len(order)), len(order)]
     branches = [functools.partial(lambda count: compute(order[:count]), count) for count in counts]
     return lax.switch(jnp.searchsorted(jnp.array(counts[:-1], jnp.int32), valid.sum()), branches)

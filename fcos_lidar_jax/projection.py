@@ -50,14 +50,10 @@ def remove_close(
 
     Args:
         points: x, y, z, intensity, time lag. NumPy input gives NumPy output, JAX input gives JAX output.
-        valid: False for padding.
-        sensor: provides the origin.
+        valid, sensor: False for padding; the sensor's position.
         mode: ``"all"`` drops the points from all sweeps, ``"sweeps"`` from all but the current sweep, ``"none"``
-            keeps them.
+            keeps them. Other modes raise a ValueError.
         close_m: half the side of the emptied square.
-
-    Raises:
-        ValueError: unknown mode.
 
     >>> me = jnp.zeros((1, 5))
     >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), mode="all").tolist()
@@ -107,7 +103,7 @@ def image_cells(
 
 
 def _row(inclination: Float32[Array, "n"], sensor: Sensor) -> Int32[Array, "n"]:
-    """Row of the nearest beam; outside ``range(num_rows)`` beyond the field of view."""
+    """Row of the nearest beam; a row outside the image for points outside the field of view."""
     step = sensor.even_step_rad
     if step is not None:
         top = np.float32(sensor.inclinations_rad[0])

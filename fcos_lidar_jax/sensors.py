@@ -209,8 +209,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead.
 
     Args:
-        record: the parsed JSON value.
-        where: name of its source in error messages.
+        record, where: the parsed JSON value, and the name of its source in error messages.
 
     Raises:
         ValueError: naming ``where``, the field, the found and the expected value.

@@ -53,10 +53,7 @@ def sensor_boxes(
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Evaluated predictions (boxes, labels, scores) and truth (boxes, labels) of a sample in a sensor's frame.
 
-    Args:
-        sample: row of the sample.
-        sensor_to_global: f64[4, 4], pose of the sensor.
-        min_score: threshold of the predictions.
+    ``sensor_to_global`` is the pose of the sensor, f64[4, 4]; ``min_score`` is the threshold of the predictions.
     """
     turn, origin = sensor_to_global[:3, :3], sensor_to_global[:3, 3]
 

@@ -172,14 +172,10 @@ def geometry(boxes: Sequence[JsonBox], where: str) -> tuple[dict[str, np.ndarray
 
 
 def index_of(boxes: Sequence[msgspec.Struct], field: str, known: Mapping[str, int], where: str) -> np.ndarray:
-    """Map the names in a field of the boxes to numbers, i64[n].
-
-    Args:
-        known: numbers of at least -1 by name; ``""`` stands for no name.
-        where: file and sample.
+    """Map the names in a field of the boxes to numbers of at least -1, i64[n]; ``""`` stands for no name.
 
     Raises:
-        ValueError: unknown name.
+        ValueError: unknown name, with ``where`` (file and sample).
     """
     index = np.array([known.get(getattr(box, field), -2) for box in boxes], np.int64)
     names = ", ".join(filter(None, known))

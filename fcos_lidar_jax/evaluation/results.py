@@ -99,8 +99,7 @@ def _check_meta(meta: dict[str, Any], name: str) -> list[str]:
         if flag in meta and not isinstance(meta[flag], bool):
             raise ValueError(f"{name}: meta: {flag}: got {meta[flag]!r}, expected true or false")
     absent = [flag for flag in USE_FLAGS if flag not in meta]
-    line = f"{name}: meta: {', '.join(absent)}: missing; the benchmark's server requires all five flags"
-    return [line] if absent else []
+    return [f"{name}: meta: {', '.join(absent)}: missing; the benchmark's server needs all five"] if absent else []
 
 
 def _columns(sample: int, boxes: list[Box], *, where: str, token: str) -> tuple[BoxColumns, np.ndarray]:

@@ -83,7 +83,6 @@ def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config,
     Args:
         config: configuration to adapt. The result has no class balance, copy-paste or augmentation, which are
             meant for few frames.
-        steps: number of training steps.
         seed: selects the frames from ``seed * steps * batch_size`` on. Different seeds give different streets for
             the same number of steps and fewer than half a million samples in total. Runs of different lengths may
             share streets.

@@ -31,14 +31,12 @@ def make_frame(
 
     Args:
         seed: any non-negative integer.
-        num_objects: number of objects to place, or their mean if ``streets.setting``; objects without room are
-            omitted.
+        num_objects: number of objects, or their mean with ``streets.setting``; objects without room are omitted.
         reach_m: maximum distance of the objects along the street; by default 80 % of the sensor's range limit.
         min_points: objects with fewer points in the current sweep are not annotated.
         num_sweeps: number of fused sweeps, including the current one; the world moves between sweeps.
         fast_traffic: see :func:`~.world.sample_world`.
         close_m: see :func:`scan_sweeps`.
-        streets: variety of the streets.
 
     Raises:
         ValueError: fewer than one sweep.
@@ -110,10 +108,7 @@ def scan_sweeps(
 
 
 def boxes_in_sensor_frame(world: World, pose: np.ndarray, time_s: float) -> np.ndarray:
-    """Boxes ``x, y, z, l, w, h, yaw, vx, vy`` of all objects in the frame of the points, f64[m, 9].
-
-    ``pose``, f64[4, 4], maps the frame of the points to the frame of the street.
-    """
+    """Boxes ``x, y, z, l, w, h, yaw, vx, vy`` of all objects, f64[m, 9], in the point frame at ``pose``."""
     placed, sizes = world.object_poses(time_s), world.traffic.sizes
     center = placed[:, :3] + sizes * (0, 0, 0.5)
     heading = np.stack([np.cos(placed[:, 3]), np.sin(placed[:, 3]), 0 * placed[:, 3]], axis=1) @ pose[:3, :3]

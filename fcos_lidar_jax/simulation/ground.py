@@ -10,7 +10,7 @@ LANE_M = 3.5
 _MARK_HALF_M = 0.08
 _DIRECTIONS = 720  # number of profiles of uneven ground around the sensor
 _PROFILE_M = np.geomspace(1.0, 120.0, 144)  # distances from the sensor at which a profile is sampled
-_BISECTIONS = 5  # of the profile segment that contains a hit
+_BISECTIONS = 5  # bisections of the profile segment that contains a hit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,10 +40,8 @@ class Ground:
         """Height of the ground without kerbs."""
         height = np.max([a * x + b * y + c for a, b, c in self.planes], axis=0)
         if self.crown:
-            offset = np.minimum(
-                np.abs(y) / self.half_width, np.abs(x - self.crossing_x) / self.crossing_half_width
-            )
-            height = height - self.crown * np.minimum(offset, 1) ** 2
+            main, other = np.abs(y) / self.half_width, np.abs(x - self.crossing_x) / self.crossing_half_width
+            height = height - self.crown * np.minimum(np.minimum(main, other), 1) ** 2
         return height if self.relief is None else height + self.relief.at(x, y)
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -40,13 +40,13 @@ _EDGE_RETURNS = 0.5
 class Scan:
     """One turn, ray by ray: columns in order of time, each from the lowest laser up, as in nuScenes files."""
 
-    points: np.ndarray  # f32[w * h, 5]: x, y, z in the frame of the points, intensity 0-255, laser (0 lowest)
+    points: np.ndarray  # f32[w * h, 5]: x, y, z in the point frame, intensity 0-255, laser (0 lowest)
     returned: np.ndarray  # bool[w * h]: False for rays without a return, whose points lie around the sensor
     seen_share: np.ndarray  # f64[m]: share of the rays towards each object that reach it; 0 without such rays
 
 
 def sample_mount(rng: Generator, sensor: Sensor, *, level: bool = False, streets: Streets = PLAIN) -> np.ndarray:
-    """Random pose of the frame of the points in the ego frame, f64[4, 4]: x right, y forward, slightly tilted."""
+    """Random pose of the point frame in the ego frame, f64[4, 4]: x right, y forward, slightly tilted."""
     tilt, roll, turn = (0.0, 0.0, 0.0) if level else np.clip(rng.normal(0, (0.016, 0.01, 0.005)), -0.04, 0.04)
     tilt -= 0.0 if level else streets.pitch_rad
     height = _HEIGHT_M + streets.mount_m * rng.spawn(1)[0].standard_normal()
@@ -60,7 +60,7 @@ def sample_mount(rng: Generator, sensor: Sensor, *, level: bool = False, streets
 
 
 def sensor_pose(world: World, mount: np.ndarray, time_s: float) -> np.ndarray:
-    """Pose of the frame of the points in the street frame, f64[4, 4]; ``mount`` is from :func:`sample_mount`."""
+    """Pose of the point frame in the street frame, f64[4, 4]; ``mount`` is from :func:`sample_mount`."""
     return world.ego_pose(time_s) @ mount
 
 
@@ -77,7 +77,7 @@ def scan(
 
     Args:
         mount: f64[4, 4], from :func:`sample_mount`.
-        time_s: time at the end of the turn; the points are in the frame at this time.
+        time_s: time at the end of the turn; the points are in the point frame at this time.
         rng: source of noise and dropout.
         rolling_shutter: the ego vehicle and the objects move during the turn, and the points are compensated for
             the ego motion, as in nuScenes. Otherwise the turn takes no time.

@@ -45,11 +45,12 @@ def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callab
         ValueError: the folder contains other files or another data set.
         OSError: a file cannot be written, or another process writes to the folder.
     """
-    if _finished(spec, root, _check_order(spec, root)):  # check before writing anything
+    _check_order(spec, root)  # reject before writing anything
+    if _finished(spec, root):
         return False
     with folder_lock(root / _WORK, "synthesizing"):
         order = _check_order(spec, root)
-        if _finished(spec, root, order):  # another process finished it meanwhile
+        if _finished(spec, root):  # another process finished it meanwhile
             return False
         atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
         _write_rest(spec, root, workers, report)
@@ -79,24 +80,22 @@ def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
     file = root / _ORDER
     if not file.is_file():
         if root.is_dir() and any(p.name != _WORK for p in root.iterdir()):
-            raise ValueError(f"{root}: found other files, expected an empty folder or one of this command")
+            raise ValueError(f"{root}: found other files, expected an empty folder or a data set of this command")
         return order
     previous = read_json(file, dict[str, Any])
     for name, value in order.items():
         before = previous.get(name)
         if isinstance(value, dict) and isinstance(before, dict):
             fields = ("name", *sorted(value.keys() | before.keys()))
-            differing = [field for field in fields if value.get(field) != before.get(field)]
-            if differing:
-                field = differing[0]
-                name = name if field == "name" else f"{name}.{field}"
-                value, before = value.get(field), before.get(field)
+            field = next((field for field in fields if value.get(field) != before.get(field)), "name")
+            name = name if field == "name" else f"{name}.{field}"
+            value, before = value.get(field), before.get(field)
         if before != value:
             raise ValueError(f"{root}: {name}: got {value}, expected {before} as in the data set begun there")
     return order
 
 
-def _finished(spec: DatasetSpec, root: Path, order: dict[str, Any]) -> bool:
+def _finished(spec: DatasetSpec, root: Path) -> bool:
     """Whether the data set is complete; rejects a data set with files that are missing or changed since."""
     folder = root / spec.version
     if not folder.is_dir():

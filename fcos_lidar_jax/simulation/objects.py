@@ -92,10 +92,7 @@ def sample_object_model(
 
 
 def sample_size(rng: np.random.Generator, model: ObjectModel, factor: float = 1.0) -> np.ndarray:
-    """Sample length, width and height of a box in metres, within 2.5 deviations of the mean.
-
-    ``factor`` scales the model's deviations.
-    """
+    """Sample length, width, height in metres, up to 2.5 deviations from the mean; ``factor`` scales deviations."""
     return np.array(model.size_m) + factor * np.array(model.spread) * np.clip(rng.standard_normal(3), -2.5, 2.5)
 
 

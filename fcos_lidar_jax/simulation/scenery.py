@@ -52,10 +52,7 @@ def sample_scenery(
 def _positions(
     ground: Ground, along: int, side: int, s: np.ndarray, d: np.ndarray | float, clear: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ground points ``s`` along a street and ``d`` beside its middle, without points within ``clear`` of a street.
-
-    Also returns the indices of the remaining points.
-    """
+    """Ground points ``s`` along and ``d`` beside a street, off the carriageways by ``clear``; and their indices."""
     s, d = np.broadcast_arrays(s, d)
     x, y = (s, side * d) if along == 0 else (ground.crossing_x + side * d, s)
     free = np.flatnonzero(~ground.on_road(x, y, clear))
@@ -84,7 +81,6 @@ def _houses(
 def _fences(
     rng: Generator, ground: Ground, along: int, side: int, half: float, span: tuple[float, float]
 ) -> np.ndarray:
-    """Sample fences, walls and hedges behind the pavement."""
     s, length = _row_of(rng, span, (4, 24), (3, 12))
     beside = half + ground.pavement + rng.uniform(0.2, 0.45)
     center, free = _positions(ground, along, side, s, beside, length / 2 + ground.pavement)
@@ -133,7 +129,6 @@ def _trees(
 def _poles(
     rng: Generator, ground: Ground, along: int, side: int, half: float, span: tuple[float, float]
 ) -> np.ndarray:
-    """Sample lamp posts and signs."""
     s = _spaced(rng, span, 14)
     center, _ = _positions(ground, along, side, s, np.full(len(s), half + 0.45), 0.3)
     lamp = rng.random(len(center)) < 0.5

@@ -49,10 +49,7 @@ class Side:
         return self.span[1] - self.span[0]
 
     def poses(self, s: np.ndarray, beyond: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses ``x, y, 0, yaw`` at ``s`` along the street and ``beyond`` the kerb, facing the street, f64[k, 4].
-
-        Omits positions within ``clear`` of a carriageway, and also returns the indices of the remaining positions.
-        """
+        """Poses ``x, y, 0, yaw`` that face the street, off the carriageways by ``clear``; and their indices."""
         beside = self.side * (self.edge_m + beyond)
         x, y = (s, beside) if self.along == 0 else (self.ground.crossing_x + beside, s)
         free = np.flatnonzero(~self.ground.on_road(x, y, clear))
@@ -82,7 +79,7 @@ def sample_surroundings(rng: Generator, side: Side, streets: Streets, setting: s
 
 
 def sample_setting(rng: Generator) -> str:
-    """Sample the setting of a world."""
+    """Sample the setting of a world, such as ``"city"``."""
     return str(rng.choice(list(_SETTINGS), p=list(_SETTINGS.values())))
 
 

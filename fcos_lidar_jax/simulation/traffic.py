@@ -91,10 +91,7 @@ def sample_traffic(
             moment = rng.uniform(duration_s if fused else 0.0, duration_s)
             if place == "row":
                 row, clearance = places.row_for(name, moment, model, size), _ROW_CLEARANCE_M
-                if row.model is not model and name in (
-                    "traffic_cone",
-                    "barrier",
-                ):  # all cones or barriers of a row are alike
+                if row.model is not model and name in ("traffic_cone", "barrier"):  # rows of equal objects
                     model = row.model
                     size = sample_size(rng, model, streets.sizes)
                 motion = places.next_in_row(row, size)
@@ -184,8 +181,7 @@ class _Places:
     spread: float  # see streets.Streets
     # The unfinished row of each class.
     rows: dict[str, _Row] = dataclasses.field(default_factory=dict)
-    # Speed and acceleration by (street, side, lane), equal for all vehicles of a lane, so that their gaps are
-    # constant.
+    # Speed and acceleration by (street, side, lane). Vehicles of a lane share them, which keeps their gaps.
     flows: dict[tuple[int, int, int], tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     def sample_place(self, name: str, model: ObjectModel) -> str:
@@ -299,6 +295,6 @@ class _Places:
     def _motion(
         self, along: int, s: float, beside: float, turn: float, speed: float = 0.0, change: float = 0.0
     ) -> np.ndarray:
-        """Straight motion from a position along a street and to the left of its middle."""
+        """Straight motion from a position ``s`` along a street and ``beside`` its middle."""
         x, y = (s, beside) if along == 0 else (self.ground.crossing_x - beside, s)
         return make_motion(x=x, y=y, yaw=turn + along * np.pi / 2, speed=speed, acceleration=change)

@@ -78,7 +78,6 @@ def sample_world(
         fused: the world is scanned at its end only, as a few fused sweeps. Each object is within reach then.
         fast_traffic: the ego vehicle drives straight at 10 to 20 m/s, all lanes flow, and nearly all objects that
             can move do.
-        streets: variety of the streets.
 
     >>> labels = np.arange(10)
     >>> world = sample_world(np.random.default_rng(0), reach_m=30, beyond_m=40, duration_s=0.0, labels=labels)

@@ -118,9 +118,7 @@ def _write_scores(axis: Any, detections: list[tuple[np.ndarray, int, float]], li
     """Write scores beside their boxes, highest first; omits scores without room."""
     from matplotlib.patheffects import withStroke
 
-    half = (
-        np.array([1.5, 0.7]) * _TEXT_POINTS * 2 * limit_m / (0.9 * 72 * _SIZE_IN)
-    )  # half the size of a text, metres
+    half = np.array([1.5, 0.7]) * _TEXT_POINTS * 2 * limit_m / (0.9 * 72 * _SIZE_IN)  # half a label, metres
     placed: list[np.ndarray] = []
     for box, _, score in sorted(detections, key=lambda d: -d[2]):
         reach = np.ptp(_corners(box), axis=1) / 2 + half

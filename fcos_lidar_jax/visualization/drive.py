@@ -46,10 +46,8 @@ def draw_drive(
 
     Args:
         path: GIF file; the PNG files are named ``NAME_00.png``, ``NAME_01.png`` and so on.
-        scenes: keyframes in order.
         sensor: sensor of the range image.
         classes: class names by label.
-        title: title of all pictures.
         limit_m: half the side of the bird's-eye view.
         seconds_a_scene: duration of each scene.
         report: called with the number of finished scenes.

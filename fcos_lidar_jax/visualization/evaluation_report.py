@@ -56,8 +56,6 @@ def write_evaluation_report(
 
     Args:
         out: folder with these files.
-        title: title of the report.
-        num_samples: number of evaluated samples.
         examples: samples to plot.
         sensor: sensor of the range images.
         pictures: additional pictures, placed first.
@@ -152,8 +150,7 @@ def _draw_precision(path: str | Path, recall: Sequence[float], precision: Mappin
     """Plot precision over recall of one class; ``precision`` contains values by matching distance."""
     figure, axis = new_axis(4.2, 3.5)
     for rank, (distance, values) in enumerate(precision.items()):
-        # Curves end at the highest recall. Lines get wider and lower with distance, so that coinciding curves stay
-        # visible.
+        # Curves end at the highest recall. Wide lines below narrow ones keep coinciding curves visible.
         end = int(np.max(np.flatnonzero(values), initial=0)) + 1
         style = {"color": LINE_COLORS[rank], "linewidth": 1.2 + rank, "zorder": 9 - rank}
         axis.plot(recall[:end], values[:end], label=f"{float(distance):g} m", **style)

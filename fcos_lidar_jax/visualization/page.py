@@ -52,7 +52,6 @@ def page_frame(
     Args:
         points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
         found: boxes f32[m, 9] in the frame of the points, labels i32[m], scores f32[m].
-        name: name of the frame.
         time_us, pose: time, and pose f64[4, 4] in the world; only for frames of the same drive.
         ids: i32[m], identities over time.
         truth: boxes f32[k, 9], labels i32[k].
@@ -116,10 +115,7 @@ def write_page(
     """Write the HTML page.
 
     Args:
-        path: HTML file.
-        frames: frames in order.
         classes: class names by label.
-        title: title of the page.
         min_score: initial threshold of the visible boxes.
     """
     content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}

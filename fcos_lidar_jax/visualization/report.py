@@ -50,8 +50,6 @@ def write_report(
     Floats in the summary and in tables have three decimals; NaN is a dash.
 
     Args:
-        path: HTML file.
-        title: title and heading.
         summary: values by name.
         lead: one paragraph below the heading.
         links: text and file name of links to files beside the report.

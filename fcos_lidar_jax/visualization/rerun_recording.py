@@ -22,8 +22,7 @@ def check_rerun() -> None:
     try:
         import rerun  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
-        message = "--rrd: rerun is not installed: pip install 'fcos-lidar-jax[viz]'"
-        raise ValueError(message) from None
+        raise ValueError("--rrd: rerun is not installed: pip install 'fcos-lidar-jax[viz]'") from None
 
 
 @contextlib.contextmanager
