@@ -96,9 +96,7 @@ def test_waiting_for_a_lock_ends_when_it_is_released(tmp_path):
 def test_a_folder_lock_excludes_other_threads_and_processes_but_not_its_holder(tmp_path):
     with folder_lock(tmp_path, "writing"), folder_lock(tmp_path, "reading"), ThreadPoolExecutor() as pool:
         for another in (folder_lock(tmp_path, "x"), folder_lock(tmp_path / "." / "", "x")):
-            with pytest.raises(
-                BlockingIOError, match=rf"in use: process {os.getpid()} on .* is writing, expected"
-            ):
+            with pytest.raises(BlockingIOError, match=rf"in use: process {os.getpid()} on .* is writing, exp"):
                 pool.submit(another.__enter__).result()
         with holding(tmp_path / ".lock") as other:
             assert other.stdout.readline() == "False\n"

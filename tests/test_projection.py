@@ -25,10 +25,7 @@ SMALL = Sensor("small", even_inclinations(-20, 10, 4), 12)
 LASER = dataclasses.replace(SMALL, name="laser", row_source="laser", origin_m=(1.0, -2.0, 0.5))
 
 
-AHEAD, BEHIND = (
-    sector(NUSCENES_HDL32E, np.pi / 2, 272),
-    sector(WAYMO_TOP, -np.pi, 300),
-)  # one sector crosses azimuth pi
+AHEAD, BEHIND = sector(NUSCENES_HDL32E, np.pi / 2, 272), sector(WAYMO_TOP, -np.pi, 300)  # across azimuth pi
 
 
 def cloud(seed: int, number: int = 400, columns: int = 5) -> np.ndarray:

@@ -41,9 +41,7 @@ def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric
     1.0
     """
     if metric.benchmark:
-        raise ValueError(
-            "metric: got the nuScenes benchmark's, expected a metric from metric_of: frames have no attributes"
-        )
+        raise ValueError("metric: got the nuScenes benchmark's, expected metric_of(...): frames lack attributes")
     return evaluate(*frame_columns(found, frames), metric)
 
 
@@ -120,9 +118,8 @@ def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) ->
         columns = np.array([box.box for box in boxes], np.float64).reshape(-1, 9)
         near = ~(np.abs(columns) > FARTHEST_M).any(axis=1)
         expect(near, boxes, "box", where, f"numbers of at most {FARTHEST_M:g}")
-        expect(
-            (columns[:, 3:6] >= np.finfo(np.float32).tiny).all(axis=1), boxes, "box", where, "three positive sizes"
-        )
+        positive = (columns[:, 3:6] >= np.finfo(np.float32).tiny).all(axis=1)
+        expect(positive, boxes, "box", where, "three positive sizes")
         unknown = np.isnan(columns[:, 7:])
         expect(unknown[:, 0] == unknown[:, 1], boxes, "box", where, "a velocity of two numbers or of two nulls")
         scores = np.array([box.score for box in boxes])

@@ -52,7 +52,7 @@ def sample_scenery(
 def _positions(
     ground: Ground, along: int, side: int, s: np.ndarray, d: np.ndarray | float, clear: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ground points ``s`` along and ``d`` beside a street, off the carriageways by ``clear``; and their indices."""
+    """Ground points at ``s`` along and ``d`` beside a street, off carriageways by ``clear``; and their indices."""
     s, d = np.broadcast_arrays(s, d)
     x, y = (s, side * d) if along == 0 else (ground.crossing_x + side * d, s)
     free = np.flatnonzero(~ground.on_road(x, y, clear))

@@ -132,10 +132,9 @@ def test_most_objects_in_fast_traffic_move_fast(fast_frames):
 
 
 def test_old_points_of_moving_objects_trail_by_velocity_times_lag(fast_frames):
-    """Counts the points of each sweep in shifted boxes.
+    """A moving box shifted back by velocity x lag contains more points than with a lag of 0.05 s more or less.
 
-    A box moved back by velocity x lag contains more points than with a lag of 0.05 s more or less. A box of a
-    static object contains more points than when it is shifted by half a metre.
+    A static box contains more points than when it is shifted by half a metre.
     """
     trails, stays = np.zeros((10, 3), int), np.zeros((10, 3), int)
     around = np.array([-1.0, 0, 1])

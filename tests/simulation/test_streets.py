@@ -119,9 +119,7 @@ def test_the_ego_vehicle_blocks_the_same_rays_as_in_nuscenes():
     """The lowest unblocked beam is the first to the right, the eighth ahead and the eleventh behind."""
     sweep = scan_of(empty_world(changed(ego_outline=True)))
     points, returned = sweep.points.reshape(-1, 32, 5), by_laser(sweep.returned)
-    azimuth = np.degrees(
-        np.arctan2(points[:, 13, 0], points[:, 13, 1])
-    )  # of an unblocked beam, clockwise from straight ahead
+    azimuth = np.degrees(np.arctan2(points[:, 13, 0], points[:, 13, 1]))  # clockwise from straight ahead
     for towards, lowest in ((90, 0), (-104, 0), (0, 7), (176, 9.5)):
         there = np.abs((azimuth - towards + 180) % 360 - 180) < 2
         free = returned[there].any(axis=0)

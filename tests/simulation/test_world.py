@@ -129,9 +129,7 @@ def test_fast_traffic_flows_in_all_lanes_and_objects_are_near_at_the_end(fast_wo
         assert ((fast["speed"] >= 8) & (fast["speed"] <= 20)).all()
         assert (fast["acceleration"] == 0).all()
         crossing += (np.abs(np.sin(fast["yaw"])) > 0.9).sum()
-        singles = world.object_poses(0.45)[
-            ~np.isin(world.traffic.labels, [0, 3, 8, 9])
-        ]  # objects of these classes can stand in rows
+        singles = world.object_poses(0.45)[~np.isin(world.traffic.labels, [0, 3, 8, 9])]  # the others form rows
         away = np.hypot(*(singles[:, :2] - pose_at(world.ego, 0.45)[0, :2]).T)
         assert (away < (12 if len(world.traffic.labels) <= 20 else 50) + 30).all()
     assert crossing > 5
