@@ -121,6 +121,6 @@ def test_sensors_are_hashable_and_comparable():
 
 
 @pytest.mark.parametrize("field", ["inclinations_rad", "origin_m", "limit_z_m"])
-def test_a_list_is_refused_for_a_sensor_is_looked_up_by_its_hash(field):
+def test_lists_are_rejected_because_sensors_are_hashed(field):
     with pytest.raises(ValueError, match=rf"{field}: got \[.*\], expected a tuple"):
         dataclasses.replace(TINY, **{field: list(getattr(TINY, field))})

@@ -12,7 +12,7 @@ from fcos_lidar_jax.types import Detections
 def evaluate_keyframes(
     found: Iterable[Detections], data: NuScenes, tokens: Sequence[str], classes: Sequence[str]
 ) -> Evaluation:
-    """Evaluate detections in keyframes with the benchmark's metrics, equal to those of their results file.
+    """Evaluate detections in keyframes; the metrics are identical to the evaluation of their results file.
 
     Args:
         found: NumPy detections of each keyframe, in its LiDAR frame.

@@ -133,7 +133,7 @@ def _explain(error: msgspec.ValidationError) -> str:
 
 
 def expect_samples(found: Collection[str], wanted: Sequence[str], source: str, *, of: str) -> None:
-    """Check that exactly the wanted samples were found; ``of`` describes them, such as ``"split 'val'"``.
+    """Check that ``found`` contains exactly the samples in ``wanted``, described by ``of`` as ``"split 'val'"``.
 
     Raises:
         ValueError: naming the source, missing and unexpected samples.
