@@ -4,15 +4,15 @@
 
 The paper predicts the offset of the centre and the velocity along the axes of the LiDAR frame; LaserNet and
 RangeDet take the direction of each point's azimuth (``model.regression_axes``). And the paper pads the image
-with zeros, where ``compact`` lets it wrap around (``model.circular_width``). ``compact`` has neither RangeDet's
-Meta-Kernel (``model.meta_kernel``) nor a centreness in place of the predicted IoU (``loss.quality``). Its
-network is trained from random weights as it is, without each of the first two and with each of the others, on
+with zeros, where ``compact`` lets it wrap around (``model.circular_width``). ``compact`` has no
+centreness in place of the predicted IoU (``loss.quality``). Its
+network is trained from random weights as it is, without each of the first two and with the third, on
 the same frames of fresh streets, for the same number of steps, and tested on unseen ones: mAP by centre distance
 with the interval of the paired difference over frames drawn anew, AP at the shortest and at the longest matching
 distance, the errors of hits, the IoU of the positives during the last tenth of the training, and which part of
 the objects at the image's seam, and of those opposite, is found. The interval knows nothing of other seeds of
 the training, which differ by more. The time of the network is measured in turns. The same command resumes it.
-Cost: ten minutes for each of the five on two CPU cores.
+Cost: ten minutes for each of the four on two CPU cores.
 """
 
 import dataclasses
@@ -46,7 +46,6 @@ VARIANTS: dict[str, Change] = {
     COMPACT: change(),
     "LiDAR axes": change(model__regression_axes="lidar"),
     "zero padding": change(model__circular_width=False),
-    "Meta-Kernel": change(model__meta_kernel=True),
     "centreness": change(loss__quality="centreness"),
 }
 _LAST = 0.1  # Part of the training that the IoU of the positives is a mean over.

@@ -92,7 +92,7 @@ def test_a_sensor_is_described_by_its_first_fields_and_by_what_was_added():
 
 def test_every_choice_of_another_detector_names_a_cell_and_comes_back():
     other = change(pillars__min_radius=3)(CENTERPOINT_COMPACT)
-    ours = dataclasses.replace(CENTERPOINT_COMPACT, pillars=None)
+    ours = Config.of(CENTERPOINT_COMPACT)
     names = {cell_name(config, {}, 0) for config in (CENTERPOINT_COMPACT, other, ours)}
     assert len(names) == 3
     assert config_of_cell(json.loads(json.dumps(config_to_json(other)))) == other

@@ -233,7 +233,7 @@ def test_compact_is_compared_with_trainings_that_differ_in_one_addition(tmp_path
     base = dataclasses.replace(CONFIG, model=model)
     made = {name: changed(base) for name, changed in compact_additions.VARIANTS.items()}
     assert made.pop("compact") == base
-    fields = ("regression_axes", "circular_width", "meta_kernel", "quality")
+    fields = ("regression_axes", "circular_width", "quality")
     differing = [
         [f for f in fields if getattr(base.model, f, None) != getattr(other.model, f, None)]
         + [f for f in fields if getattr(base.loss, f, None) != getattr(other.loss, f, None)]
