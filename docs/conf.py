@@ -16,6 +16,7 @@ typing.GENERATING_DOCUMENTATION = True  # jaxtyping then names arrays without th
 _ROOT = Path(__file__).resolve().parents[1]
 _PAGES = {  # Documents of the repository that are pages of the site, by ``part`` below.
     "CONTRIBUTING.md": "contributing.md",
+    "experiments/LOG.md": "log.md",
     "experiments/README.md": "evidence.md",
     "fcos_lidar_jax/weights/hdl32e/README.md": "model_card.md",
 }

@@ -11,7 +11,6 @@ if the interval excludes the paper's figure, disagrees.
 """
 
 import dataclasses
-import json
 import math
 import re
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from typing import Any
 
 from experiments.paper import PAPER
 from experiments.paper_tables.__main__ import TABLES
-from experiments.paper_tables.cell_names import cell_name
+from experiments.paper_tables.cells import changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
 from experiments.paper_tables.tables import Row, Table
 from experiments.script import run_script
@@ -172,16 +171,12 @@ def _seeds_needed(gains: list[float], gain: float) -> int:
 def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str = "mAP") -> tuple[list[float], int]:
     """Points of a score that a row gains over its reference, by seed, where its cells are there; samples seen."""
     config, reference = (r.change(scale.base) for r in (row, table.reference_of(row)))
-    described, gains = scale.describe(), list[float]()
-    for seed in sorted({read_json(file, dict[str, Any])["seed"] for file in cells.glob("*.json")}):
-        one, other = (_scores(cells / f"{cell_name(c, described, seed)}.json") for c in (config, reference))
+    known, gains = read_cells(cells, scale), list[float]()
+    for seed in sorted({seed for _, seed in known}):
+        one, other = (known.get((changes_of(c, scale.base), seed), {}).get("scores") for c in (config, reference))
         if one and other:
             gains.append(100 * (one[score] - other[score]))
     return gains, scale.train_frames * config.optimizer.epochs
-
-
-def _scores(file: Path) -> dict[str, float] | None:
-    return json.loads(file.read_text(encoding="utf-8")).get("scores") if file.is_file() else None
 
 
 def figure_lines(results: Path) -> Iterator[str]:
@@ -208,7 +203,7 @@ def training_lines(results: Path, score: str) -> Iterator[str]:
     """The claims about a score whose rows were trained, a line of Markdown each."""
     scale = quarter(Path("unused"))
     for claim, table, row, paper in claims(score):
-        gains, samples = gains_of(table, row, scale, results / "tables" / scale.name / "cells", score)
+        gains, samples = gains_of(table, row, scale, results / "tables" / scale.name, score)
         if gains:
             said, decides = verdict(gains, paper)
             mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
@@ -221,7 +216,7 @@ def training_lines(results: Path, score: str) -> Iterator[str]:
 def not_trained(results: Path) -> list[str]:
     """The claims without a seed whose cells have scores, in words."""
     scale = quarter(Path("unused"))
-    cells = results / "tables" / scale.name / "cells"
+    cells = results / "tables" / scale.name
     return [claim for claim, table, row, _ in claims("mAP") if not gains_of(table, row, scale, cells)[0]]
 
 

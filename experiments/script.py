@@ -53,10 +53,32 @@ def run_measurement(
 
 def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> None:
     """Write a measurement as JSON, with the machine it was made on, and print it, or a text in its place."""
-    written = json.dumps({**record, **hardware()}, indent=1)
+    written = compact_json({**record, **hardware()})
     print(text or written, flush=True)
     file = out or Path("outputs", f"{Path(sys.argv[0]).stem}.json")
     atomic_write(file, lambda path: path.write_text(written + "\n", encoding="utf-8"))
+
+
+def compact_json(value: Any, depth: int = 2) -> str:
+    """JSON text; what lies deeper than ``depth`` levels shares a line.
+
+    >>> print(compact_json({"car": {"AP": [0.1, 0.2], "truths": 3}, "seed": 0}))
+    {
+     "car": {
+      "AP": [0.1, 0.2],
+      "truths": 3
+     },
+     "seed": 0
+    }
+    """
+    if not depth or not value or not isinstance(value, dict | list):
+        return json.dumps(value)
+    parts = [compact_json(v, depth - 1) for v in (value.values() if isinstance(value, dict) else value)]
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(name)}: {part}" for name, part in zip(value, parts, strict=True)]
+    first, last = "{}" if isinstance(value, dict) else "[]"
+    inside = ",\n".join(parts).replace("\n", "\n ")
+    return f"{first}\n {inside}\n{last}"
 
 
 def find_real_data(folder: Path | None, *parts: str) -> Path | None:

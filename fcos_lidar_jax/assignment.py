@@ -1,8 +1,8 @@
 """Which location predicts which box (paper, section 3.4).
 
-A location is a candidate of the box that holds its first-round point. Of the candidates of a box, the K
-cheapest become positive; K follows from the boxes they predict. A location has one owner at most, so one sort
-by (owner, cost) and a rank do, without a [boxes, locations] matrix.
+A location is a candidate for the box that contains its first-round point. The K cheapest candidates of each box
+become positive; K depends on the boxes that the candidates predict. Because a location has at most one owner, one
+sort by (owner, cost) ranks all candidates without a [boxes, locations] matrix.
 """
 
 from typing import Literal
@@ -26,26 +26,26 @@ def owners(
     *,
     form: Literal["loop", "reduction"] | None = None,
 ) -> Int32[Array, "n"]:
-    """The box that owns each point: the smallest that holds it, boundary included.
+    """Index of the smallest box that contains each point, boundary included.
 
     Args:
-        points, present: metres; False where there is no point.
-        boxes, box_valid: ``x, y, z, l, w, h, yaw, ...``, anything where invalid; False for padding.
-        form: a loop over the boxes, or one reduction over all pairs; the same result (static). None: the loop on
-            a CPU, the reduction elsewhere, decided where the program runs.
+        points, present: coordinates in metres; False where there is no point.
+        boxes, box_valid: ``x, y, z, l, w, h, yaw, ...``, arbitrary where invalid; False for padding.
+        form: ``"loop"`` over the boxes or one ``"reduction"`` over all pairs, with equal results (static). None
+            selects the loop on CPUs and the reduction elsewhere, when the program runs.
 
     Returns:
-        box index, -1 for none; equal volumes go to the lower index.
+        box index, or -1 where no box contains the point; the lower index wins among equal volumes.
 
     >>> boxes = jnp.array([[0, 0, 0, 4, 4, 4, 0], [0, 0, 0, 2, 2, 2, 0]], jnp.float32)
     >>> points = jnp.array([[0.5, 0, 0], [1.5, 0, 0], [9, 0, 0]])
     >>> owners(points, jnp.ones(3, bool), boxes, jnp.ones(2, bool)).tolist()
     [1, 0, -1]
     """
-    solid = jnp.where(jnp.asarray(box_valid)[:, None], boxes, 0.0)
-    given = jnp.asarray(points), jnp.asarray(present), solid, jnp.asarray(box_valid)
+    points, present, box_valid = jnp.asarray(points), jnp.asarray(present), jnp.asarray(box_valid)
+    boxes = jnp.where(box_valid[:, None], boxes, 0.0)
     forms = {"loop": _owners_by_box, "reduction": _owners_by_rank}
-    return in_form(form, forms, *given, cpu="loop", default="reduction")
+    return in_form(form, forms, points, present, boxes, box_valid, cpu="loop", default="reduction")
 
 
 def _volume(boxes: Array) -> Array:
@@ -53,36 +53,36 @@ def _volume(boxes: Array) -> Array:
 
 
 def _owners_by_box(points: Array, present: Array, boxes: Array, box_valid: Array) -> Array:
-    """One box after the other: a loop, fast where memory is the limit."""
+    """Visit the boxes one at a time: fast where memory bandwidth is the limit."""
     volume = _volume(boxes)
 
     def visit(best: tuple[Array, Array], index: Array) -> tuple[tuple[Array, Array], None]:
-        least, owner = best
+        smallest, owner = best
         inside = points_in_box(points, boxes[index]) & present & box_valid[index]
-        better = inside & (volume[index] < least)
-        return (jnp.where(better, volume[index], least), jnp.where(better, index, owner)), None
+        better = inside & (volume[index] < smallest)
+        return (jnp.where(better, volume[index], smallest), jnp.where(better, index, owner)), None
 
     start = (jnp.full(points.shape[0], jnp.inf, points.dtype), jnp.full(points.shape[0], -1, jnp.int32))
     return lax.scan(visit, start, jnp.arange(boxes.shape[0], dtype=jnp.int32))[0][1]
 
 
 def _owners_by_rank(points: Array, present: Array, boxes: Array, box_valid: Array) -> Array:
-    """All boxes at once, from the smallest: one reduction over [points, boxes], which is never written out."""
-    number, volume = boxes.shape[0], _volume(boxes)
+    """Reduce over [points, boxes], sorted by volume; XLA fuses the matrix away."""
+    num_boxes, volume = boxes.shape[0], _volume(boxes)
     order = jnp.argsort(volume, stable=True).astype(jnp.int32)
     boxes, eligible = boxes[order], (box_valid & (volume < jnp.inf))[order]
     inside = points_in_box(points[:, None], boxes) & present[:, None] & eligible
-    rank = jnp.where(inside, lax.iota(jnp.int32, number), number).min(axis=1, initial=number)
+    rank = jnp.where(inside, lax.iota(jnp.int32, num_boxes), num_boxes).min(axis=1, initial=num_boxes)
     return jnp.append(order, jnp.int32(-1))[rank]
 
 
 def _edges(group: Array, num_boxes: int) -> Array:
-    """Where each group begins among sorted groups, i32[num_boxes + 1]."""
+    """Start index of each group in sorted groups, i32[num_boxes + 1]."""
     return search(group, lax.iota(group.dtype, num_boxes + 1)).astype(jnp.int32)
 
 
 def _by_owner(owner: Array, value: Array, num_boxes: int) -> tuple[Array, Array, Array]:
-    """Locations sorted by (owner, value, index), the ownerless last: sorted owners, values and indices."""
+    """Sort locations by (owner, value, index), locations without an owner last: owners, values, indices."""
     group = jnp.where(owner < 0, num_boxes, owner)
     index = lax.iota(jnp.int32, owner.shape[0])
     return lax.sort((group, value, index), num_keys=2, is_stable=True)  # type: ignore[return-value]
@@ -91,28 +91,27 @@ def _by_owner(owner: Array, value: Array, num_boxes: int) -> tuple[Array, Array,
 def dynamic_k(
     owner: Int32[Array, "l"], iou: Float32[Array, "l"], *, num_boxes: int, top_q: int
 ) -> Int32[Array, "m"]:
-    """K of every box: the rounded sum of its ``top_q`` highest IoUs (x.5 goes up).
+    """K of each box: the sum of its ``top_q`` highest IoUs, rounded half up.
 
-    At least 1, at most the number of candidates. ``owner`` is -1 for locations without a box.
+    K is at least 1 and at most the number of candidates. ``owner`` is -1 for locations without a box.
 
     >>> dynamic_k(jnp.array([0, 0, 0, -1]), jnp.array([0.9, 0.6, 0, 0]), num_boxes=2, top_q=20).tolist()
     [2, 0]
     """
-    group, falling, _ = _by_owner(owner, -iou, num_boxes)
+    group, negative_iou, _ = _by_owner(owner, -iou, num_boxes)
     edges = _edges(group, num_boxes)
-    first, last = edges[:-1, None], edges[1:, None]
+    first, end = edges[:-1, None], edges[1:, None]
     slot = first + jnp.arange(top_q, dtype=jnp.int32)
-    # Gathered to [m, q] and summed along a fixed axis: the rounding cannot depend on the device.
-    best = jnp.where(slot < last, -falling[jnp.minimum(slot, owner.shape[0] - 1)], 0.0)
+    # Gather to [m, q] and sum along a fixed axis, so that rounding does not depend on the device.
+    best = jnp.where(slot < end, -negative_iou[jnp.minimum(slot, owner.shape[0] - 1)], 0.0)
     k = jnp.floor(best.sum(axis=1) + 0.5).astype(jnp.int32)
-    count = (last - first)[:, 0]
-    return jnp.minimum(jnp.maximum(k, 1), count)
+    return jnp.minimum(jnp.maximum(k, 1), (end - first)[:, 0])
 
 
 def cheapest(
     owner: Int32[Array, "l"], cost: Float32[Array, "l"], num_positive: Int32[Array, "m"]
 ) -> Bool[Array, "l"]:
-    """The ``num_positive`` cheapest locations of every box; equal costs go to the lower index.
+    """Mask of the ``num_positive`` cheapest locations of each box; the lower index wins among equal costs.
 
     >>> cheapest(jnp.array([0, 0, -1]), jnp.array([3.0, 2.0, 1.0]), jnp.array([1])).tolist()
     [False, True, False]
@@ -120,8 +119,8 @@ def cheapest(
     num_boxes, num_locations = num_positive.shape[0], owner.shape[0]
     group, _, index = _by_owner(owner, cost, num_boxes)
     rank = lax.iota(jnp.int32, num_locations) - _edges(group, num_boxes)[group]
-    wanted = jnp.concatenate([num_positive, jnp.zeros(1, num_positive.dtype)])
-    return jnp.zeros(num_locations, bool).at[index].set(rank < wanted[group])
+    limit = jnp.append(num_positive, jnp.zeros(1, num_positive.dtype))
+    return jnp.zeros(num_locations, bool).at[index].set(rank < limit[group])
 
 
 def assign(
@@ -132,15 +131,15 @@ def assign(
     num_boxes: int,
     top_q: int = 20,
 ) -> Targets:
-    """Dynamic reassignment of one sample (paper, section 3.4): all levels compete together.
+    """Assign the locations of one sample dynamically (paper, section 3.4); all levels compete with each other.
 
-    The cost of a candidate is the cross-entropy of the right class plus one minus the IoU of the decoded box.
-    Nothing is differentiated.
+    The cost of a candidate is the cross-entropy of the true class plus one minus the IoU of the decoded box.
+    No gradient flows through the assignment.
 
     Args:
-        owner: box of every location, -1 for none.
-        classification_cost: cross-entropy of the owner's class; anything where there is no owner.
-        iou: IoU of the decoded box with the owner; likewise.
+        owner: box of each location, -1 where there is no box.
+        classification_cost: cross-entropy of the owner's class; arbitrary where there is no owner.
+        iou: IoU of the decoded box with the owner; arbitrary where there is no owner.
         num_boxes, top_q: m and Q (static).
 
     >>> owner = jnp.array([0, 0, -1])
@@ -150,7 +149,7 @@ def assign(
     owned = owner >= 0
     iou = jnp.where(owned, lax.stop_gradient(iou), 0.0)
     cost = jnp.where(owned, lax.stop_gradient(classification_cost) + 1 - iou, jnp.inf)
-    # A diverging prediction is the last to be chosen, whatever comparison makes of NaN.
+    # Rank diverged predictions last: comparisons with NaN would order them arbitrarily.
     cost = jnp.where(jnp.isnan(cost), jnp.inf, cost)
     with jax.named_scope("assignment"):
         k = dynamic_k(owner, iou, num_boxes=num_boxes, top_q=top_q)

@@ -15,10 +15,10 @@ Truth = Float32[Array, "m 9"]
 
 
 def check_augmentation(config: AugmentConfig, sensor: Sensor) -> None:
-    """Refuse what would move most points of a sensor's sector out of it; a full turn may be moved in any way.
+    """Reject augmentation that moves most points out of a sensor's sector. A full turn allows any augmentation.
 
     Raises:
-        ValueError: a rotation by more than half of the sector, or a flip that does not map it onto itself.
+        ValueError: a rotation by more than half of the sector, or a flip that does not map the sector onto itself.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
     >>> check_augmentation(AugmentConfig(), sector(NUSCENES_HDL32E, 0.0, 272))
@@ -28,20 +28,20 @@ def check_augmentation(config: AugmentConfig, sensor: Sensor) -> None:
     if sensor.azimuth_limits_rad is None or sensor.num_columns * sensor.column_rad > 2 * np.pi - sensor.column_rad:
         return
     right, left = sensor.azimuth_limits_rad
-    where = f"for the sensor {sensor.name!r}, which covers {np.degrees(left - right):.0f} degrees"
-    most = (left - right) / 2
-    if config.max_rotation_rad > most:
+    where = f"sensor {sensor.name!r} covers {np.degrees(left - right):.0f} degrees"
+    half = (left - right) / 2
+    if config.max_rotation_rad > half:
         raise ValueError(
-            f"augment.max_rotation_rad: got {config.max_rotation_rad:.3g}, expected at most {most:.3g}, half of "
-            f"the sector, {where}"
+            f"augment.max_rotation_rad: got {config.max_rotation_rad:.3g}, expected at most {half:.3g}, half of "
+            f"the sector: {where}"
         )
-    # A flip of x takes the azimuth a to pi - a, one of y to -a.
+    # A flip of x maps azimuth a to pi - a, a flip of y maps it to -a.
     for name, turn in (("flip_x_probability", np.pi), ("flip_y_probability", 0.0)):
-        off = np.remainder(right + left - turn + np.pi, 2 * np.pi) - np.pi
-        if getattr(config, name) > 0 and abs(off) > 2 * sensor.column_rad:
+        offset = np.remainder(right + left - turn + np.pi, 2 * np.pi) - np.pi
+        if getattr(config, name) > 0 and abs(offset) > 2 * sensor.column_rad:
             raise ValueError(
-                f"augment.{name}: got {getattr(config, name)}, expected 0 {where} that the flip does not map onto "
-                "themselves"
+                f"augment.{name}: got {getattr(config, name)}, expected 0: {where}, and the flip does not map "
+                "this sector onto itself"
             )
 
 
@@ -101,16 +101,17 @@ def augment(
     *,
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Cloud, Truth]:
-    """Random flips, rotation and scale of one sample, about the sensor.
+    """Flip, rotate and scale one sample at random, about the sensor.
 
-    No global translation: it would break the range view. The range filter comes after, in the projection.
+    Global translation is omitted because it would break the range view. The projection applies the range limits
+    afterwards.
 
     Args:
-        key: this sample's key, see :func:`sample_key`.
-        points: x, y, z, ... in metres; the other columns are kept.
+        key: the sample's key, see :func:`sample_key`.
+        points: x, y, z, ... in metres; the other columns are unchanged.
         boxes: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocities stay NaN.
         config: probabilities and ranges.
-        origin_m: the sensor's position, which must not move.
+        origin_m: position of the sensor, which stays fixed.
 
     >>> still = AugmentConfig(0.0, 0.0, 0.0, (1.0, 1.0))
     >>> cloud, truth = jnp.ones((2, 5)), jnp.ones((1, 9))
@@ -125,17 +126,17 @@ def augment(
             (flip_x, keys[0], config.flip_x_probability),
             (flip_y, keys[1], config.flip_y_probability),
         ):
-            drawn = jax.random.bernoulli(flip_key, probability)
+            apply = jax.random.bernoulli(flip_key, probability)
             flipped = flip(points, boxes)
-            points, boxes = (jnp.where(drawn, a, b) for a, b in zip(flipped, (points, boxes), strict=True))
-        reach = config.max_rotation_rad
-        points, boxes = rotate(points, boxes, jax.random.uniform(keys[2], (), jnp.float32, -reach, reach))
+            points, boxes = (jnp.where(apply, a, b) for a, b in zip(flipped, (points, boxes), strict=True))
+        limit = config.max_rotation_rad
+        points, boxes = rotate(points, boxes, jax.random.uniform(keys[2], (), jnp.float32, -limit, limit))
         points, boxes = scale(points, boxes, jax.random.uniform(keys[3], (), jnp.float32, *config.scale_range))
         return points.at[:, :3].add(origin), boxes.at[:, :3].add(origin)
 
 
 def sample_key(key: Key, step: Int[Array, ""], index: Int[Array, ""]) -> Key:
-    """The key of one sample of one step, by its index in the *global* batch: the devices do not matter.
+    """Key of one sample of one step, from its index in the *global* batch, so independent of the devices.
 
     >>> a, b = (sample_key(jax.random.key(0), jnp.int32(3), jnp.int32(i)) for i in (0, 1))
     >>> bool((jax.random.key_data(a) == jax.random.key_data(b)).all())

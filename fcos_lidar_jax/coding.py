@@ -1,12 +1,12 @@
-"""Boxes to regression numbers and back (paper, equation 2).
+"""Encode boxes as regression values and decode them (paper, equation 2).
 
-The ten numbers: centre minus point (3), log of l, w, h (3), sin and cos of the yaw relative to the point's
-azimuth (2), velocity (2).
+The ten values are centre minus point (3), log of l, w, h (3), sin and cos of the yaw relative to the point's
+azimuth (2), and velocity (2).
 
-Two of them are horizontal vectors: the offset of the centre and the velocity. The paper gives both along the axes
-of the LiDAR frame, ``axes="lidar"``. With ``axes="ray"`` the first axis is the direction of the point's azimuth,
-as in LaserNet (Meyer et al., CVPR 2019) and RangeDet (Fan et al., ICCV 2021): a vehicle that is moved around the
-sensor then keeps all ten numbers, as it keeps its appearance in the range image.
+The centre offset and the velocity contain horizontal vectors. The paper gives both along the axes of the LiDAR
+frame, ``axes="lidar"``. With ``axes="ray"`` the first axis points along the point's azimuth, as in LaserNet (Meyer
+et al., CVPR 2019) and RangeDet (Fan et al., ICCV 2021). Moving a vehicle around the sensor then changes neither
+its ten values nor its appearance in the range image.
 """
 
 from typing import Literal
@@ -18,11 +18,11 @@ from fcos_lidar_jax.geometry import atan2, wrap_angle
 
 Axes = Literal["lidar", "ray"]
 
-LOG_SIZE_LIMIT = 5.0  # Log sizes are clipped to plus and minus this: an untrained exponent must not overflow.
+LOG_SIZE_LIMIT = 5.0  # Log sizes are clipped to +-LOG_SIZE_LIMIT so that exp of an untrained output is finite.
 
 
 def _turn(vectors: Array, sin: Array, cos: Array) -> Array:
-    """Horizontal vectors ``[..., 2]``, turned counter-clockwise."""
+    """Rotate horizontal vectors ``[..., 2]`` counter-clockwise."""
     x, y = vectors[..., 0], vectors[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
@@ -34,13 +34,13 @@ def encode(
     *,
     axes: Axes = "lidar",
 ) -> Float32[Array, "*l 10"]:
-    """Regression targets of boxes as seen from points.
+    """Regression targets of boxes relative to points.
 
     Args:
         boxes: ``x, y, z, l, w, h, yaw, vx, vy``.
-        points: the locations' 3D points, metres.
-        azimuth_rad: their azimuth.
-        axes: of centre offset and velocity, see the module (static).
+        points: 3D points of the locations, metres.
+        azimuth_rad: azimuth of the points.
+        axes: axes of the centre offset and the velocity, see the module docstring (static).
 
     >>> box = jnp.array([2, 0, 0, 1, 1, 1, 0.5, 3, 0], jnp.float32)
     >>> encode(box, jnp.array([1.0, 0, 0]), jnp.float32(0.5)).tolist()
@@ -49,8 +49,8 @@ def encode(
     yaw = boxes[..., 6] - azimuth_rad
     offset, velocity = boxes[..., :2] - points[..., :2], boxes[..., 7:9]
     if axes == "ray":
-        back = -jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
-        offset, velocity = _turn(offset, *back), _turn(velocity, *back)
+        clockwise = -jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
+        offset, velocity = _turn(offset, *clockwise), _turn(velocity, *clockwise)
     return jnp.concatenate(
         [
             offset,
@@ -65,7 +65,7 @@ def encode(
 
 
 def _unit(sin: Array, cos: Array) -> tuple[Array, Array]:
-    """Sine and cosine scaled to norm 1; (0, 1) for a vanishing pair. Gradients stay finite."""
+    """Scale sine and cosine to norm 1, or return (0, 1) for a zero pair. Gradients are finite."""
     square = sin * sin + cos * cos
     regular = square > 1e-12
     norm = jnp.sqrt(jnp.where(regular, square, 1.0))
@@ -88,7 +88,7 @@ def decode_oriented(
     *,
     axes: Axes = "lidar",
 ) -> Float32[Array, "*l 8"]:
-    """Predicted boxes as ``x, y, z, l, w, h, cos yaw, sin yaw``: differentiable, without an inverse tangent.
+    """Decode boxes to ``x, y, z, l, w, h, cos yaw, sin yaw``, differentiably and without an arctangent.
 
     >>> numbers = jnp.array([1, 0, 0, 0, 0, 0, 0, 2, 3, 0], jnp.float32)
     >>> decode_oriented(numbers, jnp.zeros(3), jnp.float32(0)).tolist()
@@ -108,7 +108,7 @@ def decode(
     *,
     axes: Axes = "lidar",
 ) -> Float32[Array, "*l 9"]:
-    """Predicted boxes ``x, y, z, l, w, h, yaw, vx, vy`` from the ten numbers; the inverse of :func:`encode`.
+    """Decode the ten values to boxes ``x, y, z, l, w, h, yaw, vx, vy``; the inverse of :func:`encode`.
 
     >>> box = jnp.array([2, 0, 0, 1, 1, 1, 0.5, 3, 0], jnp.float32)
     >>> here, angle = jnp.array([1.0, 0, 0]), jnp.float32(0.25)

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, locked against other processes, JSON that is checked, and checksums."""
+"""Atomic writes, locks between processes, checked JSON and checksums of files."""
 
 import contextlib
 import fcntl
@@ -17,17 +17,16 @@ import msgspec
 
 
 def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Write to a temporary file beside ``path`` and rename it: nobody ever sees half a file.
+    """Write to a temporary file beside ``path`` and rename it, so that no reader sees a partial file.
 
-    Whatever fails, an interruption too, leaves the old file as it was and no temporary one behind.
+    A failure or an interruption leaves the old file unchanged and removes the temporary file.
 
     Args:
-        path: where the file shall be; missing parent folders are made.
-        write: creates and writes the file that it is given; that name ends like ``path``, for writers that go by
-            the extension.
+        path: destination; missing parent folders are created.
+        write: creates and writes the file at the given temporary path, which has the extension of ``path``.
 
     Raises:
-        OSError: a folder, a link or a device stands at ``path``, or what the file system and ``write`` raise.
+        OSError: ``path`` is a folder, a link or a device, or the file system or ``write`` raised it.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "new" / "a.txt"
@@ -41,11 +40,11 @@ def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """As :func:`atomic_write`, for what is written bit by bit: the temporary file's name, within the context."""
+    """Context manager form of :func:`atomic_write`: yields the temporary path and renames it on exit."""
     path = Path(path)
     _check_kind(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The writer itself creates the file, so that its permissions are those of any other new file.
+    # The writer creates the file, so that it gets the default permissions.
     temporary = path.with_name(f".{secrets.token_hex(6)}{path.suffix}")
     try:
         with naming(path):
@@ -56,7 +55,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 class FileState(msgspec.Struct, frozen=True):
-    """What tells a file from an altered one: as build tools do, without reading it, and its checksum."""
+    """State of a file by which a later change is detected: size, time and inode, and a checksum of the content."""
 
     bytes: int
     mtime_ns: int
@@ -65,11 +64,11 @@ class FileState(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, file: Path) -> "FileState":
-        found = file.stat()
-        return cls(found.st_size, found.st_mtime_ns, found.st_ino, file_checksum(file))
+        stat = file.stat()
+        return cls(stat.st_size, stat.st_mtime_ns, stat.st_ino, file_checksum(file))
 
     def holds(self, file: Path) -> bool:
-        """Whether the file is the same: by size, time and inode, else, as after a copy, by its content.
+        """Whether the file is unchanged, by size, time and inode, or else by its content (for copies).
 
         >>> import tempfile
         >>> file = Path(tempfile.mkdtemp()) / "a"
@@ -80,15 +79,15 @@ class FileState(msgspec.Struct, frozen=True):
         >>> file.write_text("two"), state.holds(file)
         (3, False)
         """
-        found = file.stat()
-        if (found.st_size, found.st_mtime_ns, found.st_ino) == (self.bytes, self.mtime_ns, self.inode):
+        stat = file.stat()
+        if (stat.st_size, stat.st_mtime_ns, stat.st_ino) == (self.bytes, self.mtime_ns, self.inode):
             return True
-        return found.st_size == self.bytes and file_checksum(file) == self.blake2b
+        return stat.st_size == self.bytes and file_checksum(file) == self.blake2b
 
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Make errors of writing a file name it: where the disk is full, the system's own do not."""
+    """Add the file's name to write errors that lack it, such as a full disk."""
     try:
         yield
     except OSError as error:
@@ -98,10 +97,10 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a path at which :func:`atomic_write` would fail, as far as can be told without writing.
+    """Reject a path at which :func:`atomic_write` would fail, as far as this is known without writing.
 
     Raises:
-        OSError: naming what stands in the way.
+        OSError: naming the obstacle.
 
     >>> check_writable(Path("/dev/null/boxes.json"))
     Traceback (most recent call last):
@@ -112,11 +111,11 @@ def check_writable(path: Path) -> None:
     if not folder.is_dir():
         raise NotADirectoryError(f"{folder}: found a file, expected a folder to write to")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{folder}: no right to write there")
+        raise PermissionError(f"{folder}: found a folder without write permission, expected a folder to write to")
 
 
 def _check_kind(path: Path) -> None:
-    """Refuse what must not be replaced by a file: folders, devices, and links, whose targets would stay."""
+    """Reject paths that a file must not replace: folders, devices, and links, whose targets would remain."""
     if path.is_symlink():
         raise FileExistsError(f"{path}: found a link to {path.readlink()}, expected a file to write")
     if path.is_dir():
@@ -127,19 +126,19 @@ def _check_kind(path: Path) -> None:
 
 @contextlib.contextmanager
 def file_lock(path: str | Path, *, wait: bool = False) -> Iterator[bool]:
-    """Lock a file against all other processes of this machine and all other locks of this one.
+    """Lock a file against other processes of this machine and other locks of this process.
 
-    The lock ends with the context or with the process, whatever ends it; the file itself stays.
+    The lock is released when the context or the process ends. The file remains.
 
     Args:
-        path: of the lock file; it and missing parent folders are made.
-        wait: until nobody else holds the lock.
+        path: lock file; it and missing parent folders are created.
+        wait: wait until the lock is free.
 
-    Returns:
-        within the context, whether this lock is held; always true with ``wait``.
+    Yields:
+        whether this lock is held; always True with ``wait``.
 
     Raises:
-        OSError: the file cannot be made.
+        OSError: the file cannot be created.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "run.lock"
@@ -160,12 +159,12 @@ def file_lock(path: str | Path, *, wait: bool = False) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
-    """Replace a file line by line: within the context, a function that appends a line, given without its newline.
+    """Replace a file line by line; yields a function that appends one line, given without its newline.
 
-    Whatever happens, such as an interruption or a full disk, the file holds only whole lines.
+    The file contains only whole lines, even after an interruption or on a full disk.
 
     Raises:
-        OSError: naming the file: another process writes there, or a line cannot be written.
+        OSError: naming the file: another process writes to it, or a line cannot be written.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "a.jsonl"
@@ -178,38 +177,35 @@ def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise BlockingIOError(
-                f"{path}: in use: another process writes there, expected no other process"
-            ) from None
+            raise BlockingIOError(f"{path}: in use: another process, expected no other process") from None
         file.truncate(0)
-        whole = 0  # Bytes of whole lines.
+        size = 0  # Bytes of whole lines.
 
         def write(line: bytes) -> None:
-            nonlocal whole
-            left = memoryview(line + b"\n")
+            nonlocal size
+            rest = memoryview(line + b"\n")
             try:
                 with naming(path):
-                    while left:  # One call may write a part.
-                        left = left[file.write(left) :]
+                    while rest:  # One call may write only a part.
+                        rest = rest[file.write(rest) :]
             except BaseException:
-                file.truncate(whole)
+                file.truncate(size)
                 raise
-            whole += len(line) + 1
+            size += len(line) + 1
 
         yield write
 
 
 def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
-    """What a JSON file holds, checked against a type.
+    """Read a JSON file and check its content against a type.
 
     Args:
-        path: of the file, in UTF-8. NaN and infinities are let through, so that they can be refused by name.
+        path: file in UTF-8. NaN and infinities are accepted; callers reject them by name.
         kind: any type that msgspec can check.
-        what: is expected at the path, for the message where nothing is.
+        what: noun phrase for the expected file, used in the message for a missing file.
 
     Raises:
-        ValueError: one line with the file and, where the type does not fit, the place, what was found there and
-            what was expected.
+        ValueError: one line with the file and, on a type mismatch, the place, the found and the expected value.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "a.json"
@@ -228,27 +224,27 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
         raise ValueError(f"{path}: not JSON: {error}") from None
     try:
         return msgspec.convert(content, kind)
-    except (OverflowError, UnicodeError) as error:  # an integer that no float holds, half a pair of surrogates
+    except (OverflowError, UnicodeError) as error:  # an integer beyond float range, a lone surrogate
         raise ValueError(f"{path}: {error}") from None
     except msgspec.ValidationError as error:
         raise ValueError(f"{path}: {_explain(str(error), content)}") from None
 
 
 def _explain(message: str, content: Any) -> str:
-    """msgspec's message with what was found at its place; as it is where the place names no key (``$[...]``)."""
+    """Add the found value to msgspec's message; unchanged if its place contains no key (``$[...]``)."""
     problem, _, place = message.partition(" - at `")
     place = place.removesuffix("`")
     if not re.fullmatch(r"(\$(\.\w+|\[\d+\])*)?", place):
         return message
     for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", place):
         content = content[key or int(index)]
-    found = shown if len(shown := repr(content)) <= 60 else f"{shown[:57]}..."
-    wanted = re.fullmatch(r"Expected (.+?)(, got .*)?", problem.replace("`", ""))
-    return f"{place or '$'}: {f'got {found}, expected {wanted[1]}' if wanted else f'{problem}, got {found}'}"
+    got = text if len(text := repr(content)) <= 60 else f"{text[:57]}..."
+    expected = re.fullmatch(r"Expected (.+?)(, got .*)?", problem.replace("`", ""))
+    return f"{place or '$'}: {f'got {got}, expected {expected[1]}' if expected else f'{problem}, got {got}'}"
 
 
 def checksum(data: bytes) -> str:
-    """BLAKE2b of 16 bytes, in hexadecimal.
+    """16-byte BLAKE2b digest in hexadecimal.
 
     >>> checksum(b"")
     'cae66941d9efbd404e4d88758ea67670'
@@ -257,26 +253,26 @@ def checksum(data: bytes) -> str:
 
 
 def file_checksum(path: Path) -> str:
-    """:func:`checksum` of a file of any size."""
+    """:func:`checksum` of a file, which is read in blocks."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
-_held: dict[Path, int] = {}  # folders that this process has locked -> the thread that did
+_holders: dict[Path, int] = {}  # folders locked by this process -> thread that holds the lock
 
 
 @contextlib.contextmanager
 def folder_lock(folder: Path, doing: str) -> Iterator[None]:
-    """Keep other processes from working in a folder, by a file ``.lock`` in it that names the process.
+    """Lock a folder against other processes with a file ``.lock`` that names this process.
 
-    The thread that holds it may take it again. The lock ends with the process, whatever ends it.
+    The holding thread may take the lock again. The lock is released when the process ends.
 
     Args:
-        folder: made if missing.
-        doing: what this process does there, for the other processes' messages.
+        folder: created if missing.
+        doing: activity of this process, for the error messages of other processes.
 
     Raises:
-        OSError: another process works there; with its number and its machine.
+        OSError: another process holds the lock; the message contains its id, machine and activity.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -285,18 +281,18 @@ def folder_lock(folder: Path, doing: str) -> Iterator[None]:
     ['is', 'writing']
     """
     file, key = folder / ".lock", folder.resolve()
-    if _held.get(key) == threading.get_ident():
+    if _holders.get(key) == threading.get_ident():
         yield
         return
     with file_lock(file) as held:
         if not held:
             owner = file.read_text(encoding="utf-8", errors="replace")[:200] or "another process"
             raise BlockingIOError(f"{folder}: in use: {owner}, expected no other process")
-        _held[key] = threading.get_ident()
+        _holders[key] = threading.get_ident()
         try:
             file.write_text(f"process {os.getpid()} on {socket.gethostname()} is {doing}", encoding="utf-8")
             yield
         finally:
-            del _held[key]
-            with contextlib.suppress(OSError):  # the folder may be gone
+            del _holders[key]
+            with contextlib.suppress(OSError):  # the folder may have been removed
                 os.truncate(file, 0)

@@ -1,4 +1,4 @@
-"""One function in several forms, each fast on another platform."""
+"""Functions in several forms, each fast on a different platform."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -11,17 +11,17 @@ from jaxtyping import Array
 T = TypeVar("T")
 
 
-def in_form(form: str | None, forms: Mapping[str, Callable[..., T]], *given: Array, **platforms: str) -> T:
-    """The result of one form of a function.
+def in_form(form: str | None, forms: Mapping[str, Callable[..., T]], *args: Array, **platforms: str) -> T:
+    """Call one form of a function.
 
     Args:
-        form: name of the form; None for the one that suits the platform, decided where the program runs.
-        forms: functions of the same arguments and, up to rounding, the same result.
-        given: the arguments.
-        platforms: which form suits which platform, such as ``cpu="loop", default="reduction"``.
+        form: name of the form; None selects the form of the platform when the program runs.
+        forms: functions with the same arguments and, up to rounding, the same result.
+        args: positional arguments of the function.
+        platforms: form per platform, such as ``cpu="loop", default="reduction"``.
 
     Raises:
-        ValueError: no such form.
+        ValueError: unknown form.
 
     >>> import jax.numpy as jnp
     >>> forms = {"product": lambda x: x * 2, "sum": lambda x: x + x}
@@ -29,14 +29,14 @@ def in_form(form: str | None, forms: Mapping[str, Callable[..., T]], *given: Arr
     [2.0, 2.0]
     """
     if form is None:
-        return lax.platform_dependent(*given, **{name: forms[chosen] for name, chosen in platforms.items()})
+        return lax.platform_dependent(*args, **{platform: forms[name] for platform, name in platforms.items()})
     if form not in forms:
         raise ValueError(f"form: got {form!r}, expected {', '.join(map(repr, forms))} or None")
-    return forms[form](*given)
+    return forms[form](*args)
 
 
 def search(ascending: Array, values: Array, *, side: Literal["left", "right"] = "left") -> Array:
-    """``jnp.searchsorted``: a search on a CPU; elsewhere a comparison of all pairs, which needs no loop.
+    """``jnp.searchsorted`` by binary search on CPUs, and by comparison of all pairs, without a loop, elsewhere.
 
     >>> import jax.numpy as jnp
     >>> search(jnp.array([1.0, 2.0, 2.0]), jnp.array([2.0]), side="right").tolist()

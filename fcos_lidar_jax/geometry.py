@@ -1,4 +1,4 @@
-"""Angles, rotations, points in boxes: finite values and gradients on every input."""
+"""Angles, rotations and points in boxes, with finite values and gradients for every input."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,7 @@ _ATAN = (
 
 
 def safe_norm(*components: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Euclidean norm over its arguments, with zero gradient (not NaN) at zero.
+    """Euclidean norm of the vector of arguments, with zero gradient (not NaN) at zero.
 
     >>> float(safe_norm(jnp.float32(3), jnp.float32(4)))
     5.0
@@ -32,10 +32,10 @@ def safe_norm(*components: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def atan2(y: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Angle of (x, y) in [-pi, pi], within 3e-7 of the exact one in float32.
+    """Angle of (x, y) in [-pi, pi], within 3e-7 of the exact angle in float32.
 
-    A polynomial of additions and multiplications: it vectorises where the library call does not, and its
-    gradient is finite at the origin. Signed zeros follow the C convention.
+    Evaluates a polynomial with additions and multiplications only, which vectorises where the library call does
+    not and has a finite gradient at the origin. Signed zeros follow the C convention.
 
     >>> round(float(atan2(jnp.float32(1), jnp.float32(-1))), 4)
     2.3562
@@ -56,7 +56,7 @@ def atan2(y: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 def spherical(xyz: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
     """Range, azimuth in [-pi, pi] and inclination in [-pi/2, pi/2] of points (paper, equation 1).
 
-    As seen from the origin, where all three are zero.
+    All three are zero at the origin.
 
     >>> [round(float(v), 4) for v in spherical(jnp.array([0.0, 2.0, 0.0]))]
     [2.0, 1.5708, 0.0]
@@ -66,37 +66,36 @@ def spherical(xyz: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Arra
 
 
 def image_columns(azimuth: Float[Array, "n"], sensor: Sensor) -> tuple[Int32[Array, "n"], Bool[Array, "n"]]:
-    """The image column of each azimuth, clockwise from the left end of what the sensor covers, and whether it is
-    covered.
+    """Image column of each azimuth, clockwise from the sensor's first azimuth, and whether the sensor covers it.
 
     >>> from fcos_lidar_jax.sensors import TINY, sector
     >>> column, inside = image_columns(jnp.array([0.0, 3.0]), sector(TINY, 0.0, 2))
     >>> column[:1].tolist(), inside.tolist()
     ([1], [True, False])
     """
-    behind = np.float32(sensor.first_azimuth_rad) - azimuth
+    clockwise = np.float32(sensor.first_azimuth_rad) - azimuth
     if sensor.azimuth_limits_rad is not None:
-        behind = jnp.mod(behind, np.float32(2 * np.pi))
-    column = jnp.floor(behind * np.float32(1 / sensor.column_rad)).astype(jnp.int32)
+        clockwise = jnp.mod(clockwise, np.float32(2 * np.pi))
+    column = jnp.floor(clockwise * np.float32(1 / sensor.column_rad)).astype(jnp.int32)
     if sensor.azimuth_limits_rad is None:
         return column % sensor.num_columns, jnp.ones(column.shape, bool)
     return column, column < sensor.num_columns
 
 
 def wrap_angle(angle: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarray, "*n"]:
-    """The same direction in [-pi, pi); NumPy or JAX, as is the answer.
+    """Wrap angles to [-pi, pi). NumPy input gives NumPy output, JAX input gives JAX output.
 
     >>> round(float(wrap_angle(jnp.float32(3.5))), 4)
     -2.7832
     """
     xp = jnp if isinstance(angle, Array) else np
     wrapped = angle - 2 * np.pi * xp.floor((angle + np.pi) / (2 * np.pi))
-    # Rounding can land on the open end.
+    # Rounding can give pi itself, which the interval excludes.
     return xp.where(wrapped >= np.pi, -np.pi, wrapped)
 
 
 def rotation_matrix(rotation: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n 3 3"]:
-    """Rotations on column vectors from quaternions w, x, y, z of any length above 0, on the host.
+    """Rotation matrices for column vectors from quaternions w, x, y, z of any positive norm, on the host.
 
     >>> rotation_matrix(np.array([1.0, 0, 0, 1])).round(6).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -114,7 +113,7 @@ def rotation_matrix(rotation: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray
 def pose_matrix(
     rotation: Float64[np.ndarray, "*n 4"], translation: Float64[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n 4 4"]:
-    """Poses on homogeneous column vectors from quaternions w, x, y, z and metres, on the host.
+    """Pose matrices for homogeneous column vectors from quaternions w, x, y, z and metres, on the host.
 
     >>> pose_matrix(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]))[:3, 3].tolist()
     [1.0, 2.0, 3.0]
@@ -129,7 +128,7 @@ def points_in_box(
 ) -> Bool[Array | np.ndarray, "*o"]:
     """Whether points lie in boxes ``x, y, z, l, w, h, yaw, ...``, boundary included.
 
-    Elementwise with broadcasting; NumPy or JAX.
+    Works elementwise with broadcasting, on NumPy or JAX arrays.
 
     >>> bool(points_in_box(jnp.array([2.0, 1.0, 0.0]), jnp.array([0, 0, 0, 4, 2, 2, 0.0])))
     True

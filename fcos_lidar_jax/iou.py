@@ -1,10 +1,10 @@
-"""Rotated IoU of upright boxes, in the ground plane and in space, with exact gradients.
+"""Rotated IoU of upright boxes, in the ground plane and in 3D, with exact gradients.
 
-The intersection area follows from Green's theorem: in one rectangle's frame, sum over the other's four edges
-the integral of the clamped abscissa. There is no polygon clipping, sorting or branching, and the form is
-continuous through every degeneracy. The gradient is analytic: a boundary of the intersection moves the area
-by its length along its normal, so it is the clipped edges times their normals. It is given as a tangent, from
-which JAX transposes the reverse mode.
+Green's theorem gives the intersection area: in the frame of one rectangle, sum the integral of the clamped
+abscissa over the four edges of the other. This needs no polygon clipping, sorting or branching, and stays
+continuous through every degenerate position. The gradient is analytic: an edge that moves along its normal sweeps
+an area proportional to its length inside the other rectangle. A custom JVP implements it, and JAX derives reverse
+mode by transposition.
 """
 
 from typing import Any
@@ -17,14 +17,14 @@ from jaxtyping import Array, Float
 
 _TINY = 1e-7
 _COINCIDENT_M = 1e-5
-"""An edge that runs along a side within this distance counts as inside, so that rounding does not decide the
-gradient of coincident edges."""
+"""An edge within this distance of a parallel side counts as inside, so that the gradient of coincident edges does
+not depend on rounding."""
 
 Rectangle = tuple[Array, Array, Array, Array, Array, Array]  # x, y, l, w, cos yaw, sin yaw: arrays of one shape.
 
 
 def _corners(rectangle: Rectangle) -> tuple[list[Array], list[Array]]:
-    """Abscissas and ordinates of the four corners, counter-clockwise from the front right."""
+    """x and y of the four corners, counter-clockwise from the front right."""
     x, y, l, w, cos, sin = rectangle
     lx, ly, wx, wy = 0.5 * l * cos, 0.5 * l * sin, -0.5 * w * sin, 0.5 * w * cos
     xs = [x + lx - wx, x + lx + wx, x - lx + wx, x - lx - wx]
@@ -32,23 +32,23 @@ def _corners(rectangle: Rectangle) -> tuple[list[Array], list[Array]]:
 
 
 def _corners_in_frame(rectangle: Rectangle, frame: Rectangle) -> tuple[list[Array], list[Array]]:
-    """Corners of one rectangle in the axes of another."""
+    """Corners of one rectangle in the frame of another."""
     fx, fy, _, _, fcos, fsin = frame
     x, y, l, w, cos, sin = rectangle
     dx, dy = x - fx, y - fy
-    turned = fcos * cos + fsin * sin, fcos * sin - fsin * cos
-    return _corners((fcos * dx + fsin * dy, fcos * dy - fsin * dx, l, w, *turned))
+    relative_yaw = fcos * cos + fsin * sin, fcos * sin - fsin * cos
+    return _corners((fcos * dx + fsin * dy, fcos * dy - fsin * dx, l, w, *relative_yaw))
 
 
 def _crossing(start: Array, step: Array, half: Array) -> tuple[Array, Array]:
-    """Parameters at which ``start + t * step`` enters and leaves the slab of half width ``half``."""
+    """Parameters t where ``start + t * step`` enters and leaves the slab ``[-half, half]``."""
     safe = jnp.where(jnp.abs(step) < _TINY, _TINY, step)
     first, second = (-half - start) / safe, (half - start) / safe
     return jnp.minimum(first, second), jnp.maximum(first, second)
 
 
 def _slack(step: Array) -> Array:
-    """What a slab is widened by for an edge that runs along it."""
+    """Widening of a slab for edges parallel to it."""
     return jnp.where(jnp.abs(step) < _COINCIDENT_M, _COINCIDENT_M, 0.0)
 
 
@@ -62,7 +62,7 @@ def _area(a: Rectangle, b: Rectangle) -> Array:
         x, y = xs[i], ys[i]
         dx, dy = xs[(i + 1) % 4] - x, ys[(i + 1) % 4] - y
         low, high = (jnp.clip(t, 0.0, 1.0) for t in _crossing(y, dy, half_w))
-        # Between the crossings of the slab in x the abscissa is linear, outside it is clamped: three pieces.
+        # The clamped abscissa has three pieces: constant, linear inside the slab in x, constant.
         enter, leave = (jnp.clip(t, low, high) for t in _crossing(x, dx, half_l))
         at = [jnp.clip(x + t * dx, -half_l, half_l) for t in (low, enter, leave, high)]
         pieces = (
@@ -73,9 +73,9 @@ def _area(a: Rectangle, b: Rectangle) -> Array:
 
 
 def _area_gradient(moving: Rectangle, fixed: Rectangle) -> Rectangle:
-    """Derivative of the intersection area by the numbers of ``moving``.
+    """Derivative of the intersection area by the parameters of ``moving``.
 
-    Of each edge, the part inside ``fixed`` sweeps area when the edge moves along its normal.
+    The part of each edge inside ``fixed`` sweeps area when the edge moves along its normal.
     """
     half_l, half_w = 0.5 * fixed[2], 0.5 * fixed[3]
     xs, ys = _corners_in_frame(moving, fixed)
@@ -109,7 +109,7 @@ def _area_gradient(moving: Rectangle, fixed: Rectangle) -> Rectangle:
 
 
 def _area_tangent(rectangles: tuple[Rectangle, Rectangle], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
-    """The area and its tangent; of what is constant no derivative is computed."""
+    """Area and its tangent. Constant parameters cost no derivative."""
     a, b = rectangles
     products = [
         slope * tangent
@@ -124,7 +124,7 @@ _area.defjvp(_area_tangent, symbolic_zeros=True)
 
 
 def oriented(boxes: Float[Array | np.ndarray, "*m c"]) -> Float[Array, "*m 8"]:
-    """Boxes ``x, y, z, l, w, h, yaw, ...`` as ``x, y, z, l, w, h, cos yaw, sin yaw``.
+    """Convert boxes ``x, y, z, l, w, h, yaw, ...`` to ``x, y, z, l, w, h, cos yaw, sin yaw``.
 
     >>> oriented(jnp.array([0, 0, 0, 4, 2, 1, 0.0])).tolist()
     [0.0, 0.0, 0.0, 4.0, 2.0, 1.0, 1.0, 0.0]
@@ -139,7 +139,7 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
 
     Args:
         a, b: ``x, y, z, l, w, h, cos yaw, sin yaw``.
-        vertical: volumes instead of ground-plane areas (static).
+        vertical: True for volumes, False for areas in the ground plane (static).
 
     >>> box = oriented(jnp.array([0, 0, 0, 4, 2, 1, 0.0]))
     >>> [float(v) for v in oriented_overlap(box, box, vertical=True)]
@@ -147,16 +147,16 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
     """
     common = jnp.promote_types(a.dtype, b.dtype)
     a, b = jnp.broadcast_arrays(a.astype(common), b.astype(common))
-    # Sliced: indexing with an array would make the gradient a scatter.
+    # Slice: indexing with an array would turn the gradient into a scatter.
     ax, ay, az, al, aw, ah, acos, asin = (a[..., i] for i in range(8))
     bx, by, bz, bl, bw, bh, bcos, bsin = (b[..., i] for i in range(8))
-    # In the frame of a's centre the numbers stay small wherever the boxes are.
+    # Coordinates relative to the centre of a stay small wherever the boxes are.
     zero = jnp.zeros_like(ax)
     intersection = _area((zero, zero, al, aw, acos, asin), (bx - ax, by - ay, bl, bw, bcos, bsin))
     size_a, size_b = al * aw, bl * bw
     if vertical:
-        shared = jnp.minimum(az + 0.5 * ah, bz + 0.5 * bh) - jnp.maximum(az - 0.5 * ah, bz - 0.5 * bh)
-        intersection = intersection * jnp.maximum(shared, 0.0)
+        height = jnp.minimum(az + 0.5 * ah, bz + 0.5 * bh) - jnp.maximum(az - 0.5 * ah, bz - 0.5 * bh)
+        intersection = intersection * jnp.maximum(height, 0.0)
         size_a, size_b = size_a * ah, size_b * bh
     return intersection, size_a + size_b - intersection
 
@@ -179,10 +179,10 @@ def _ratio(intersection: Array, union: Array) -> Array:
 def rotated_iou_bev(
     a: Float[Array | np.ndarray, "*m c"], b: Float[Array | np.ndarray, "*n d"]
 ) -> Float[Array, "*o"]:
-    """IoU in the ground plane; elementwise with broadcasting, differentiable in forward and reverse mode.
+    """IoU in the ground plane, elementwise with broadcasting; differentiable in forward and reverse mode.
 
-    Boxes are ``x, y, z, l, w, h, yaw, ...`` in metres and radians. Values are in [0, 1], 0 where both areas are
-    zero; gradients are finite everywhere.
+    Boxes are ``x, y, z, l, w, h, yaw, ...`` in metres and radians. Values lie in [0, 1] and are 0 where both areas
+    are zero. Gradients are finite everywhere.
 
     >>> a, b = jnp.array([0, 0, 0, 4, 2, 1, 0.0]), jnp.array([2, 0, 0, 4, 2, 1, 0.0])
     >>> round(float(rotated_iou_bev(a, b)), 4)
@@ -194,7 +194,7 @@ def rotated_iou_bev(
 def rotated_iou_3d(
     a: Float[Array | np.ndarray, "*m c"], b: Float[Array | np.ndarray, "*n d"]
 ) -> Float[Array, "*o"]:
-    """IoU of upright boxes, z that of the gravity centre; otherwise as :func:`rotated_iou_bev`.
+    """3D IoU of upright boxes, with z at the centre of gravity; see :func:`rotated_iou_bev`.
 
     >>> a, b = jnp.array([0, 0, 0, 4, 2, 1, 0.0]), jnp.array([0, 0, 0.5, 4, 2, 1, jnp.pi])
     >>> round(float(rotated_iou_3d(a, b)), 4)

@@ -1,7 +1,7 @@
-"""The locations of the feature levels: the padded image, and the pixel and 3D point of every location.
+"""Locations of the feature levels: the padded image, and the pixel and 3D point of each location.
 
-Paper, sections 3.4 and 4: rows are repeated, a location's pixel is its index times the level's stride, and
-its 3D point is the first-round point there.
+Rows are repeated. The pixel of a location is its index times the stride of its level, and its 3D point is the
+first-round point at that pixel (paper, sections 3.4 and 4).
 """
 
 import dataclasses
@@ -15,20 +15,20 @@ from fcos_lidar_jax.config import ModelConfig
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Locations, RangeImage
 
-STRIDES = (1, 2, 4, 8, 16, 32)  # Of P2 ... P7 against the padded image.
+STRIDES = (1, 2, 4, 8, 16, 32)  # Strides of P2 to P7 in the padded image.
 
 
 @dataclasses.dataclass(frozen=True)
 class ImageLayout:
-    """Sizes of the image that the network sees.
+    """Sizes of the network's input image.
 
     Attributes:
-        rows, columns: of the sensor's image.
-        row_upscale: row i of the network's image is row ``i // row_upscale`` of the sensor's.
+        rows, columns: size of the sensor's image.
+        row_upscale: row i of the network's image is row ``i // row_upscale`` of the sensor's image.
         height: rows of the network's image, padded with empty rows to a multiple of 32.
-        width: columns, padded on the right to a multiple of 32.
-        full_turn: the first column follows the last one, so that copies of the first columns pad the image; else
-            empty columns do.
+        width: columns of the network's image, padded on the right to a multiple of 32.
+        full_turn: True where the first column follows the last. Copies of the first columns then pad the image;
+            otherwise empty columns do.
 
     >>> layout = ImageLayout(rows=32, columns=1086, row_upscale=2)
     >>> layout.height, layout.width, layout.level_sizes[0]
@@ -50,12 +50,12 @@ class ImageLayout:
 
     @property
     def level_sizes(self) -> tuple[int, ...]:
-        """Locations of each level."""
+        """Number of locations per level."""
         return tuple((self.height // s) * (self.width // s) for s in STRIDES)
 
     @property
     def num_locations(self) -> int:
-        """Locations of all levels."""
+        """Number of locations in all levels."""
         return sum(self.level_sizes)
 
 
@@ -64,10 +64,10 @@ def _up_to_stride(size: int) -> int:
 
 
 def image_sensor(sensor: Sensor, model: ModelConfig) -> Sensor:
-    """The sensor as binned for a model: with ``circular_width``, columns divisible by the largest stride.
+    """Sensor with the image columns of a model: divisible by the largest stride under ``circular_width``.
 
     Raises:
-        ValueError: ``circular_width`` for a sensor that covers only a part of the turn.
+        ValueError: ``circular_width`` for a sensor that covers only part of the turn.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
     >>> image_sensor(NUSCENES_HDL32E, ModelConfig(circular_width=True)).num_columns
@@ -76,7 +76,7 @@ def image_sensor(sensor: Sensor, model: ModelConfig) -> Sensor:
     if not model.circular_width:
         return sensor
     if sensor.azimuth_limits_rad is not None:
-        raise ValueError(f"circular_width: got True for sensor {sensor.name!r}, which covers a part of the turn")
+        raise ValueError(f"circular_width: got True for sensor {sensor.name!r}, which covers part of a turn")
     return dataclasses.replace(sensor, num_columns=_up_to_stride(sensor.num_columns))
 
 
@@ -94,7 +94,7 @@ def image_layout(sensor: Sensor, model: ModelConfig) -> ImageLayout:
 
 
 def pad_image(features: Float32[Array, "*b h w c r"], layout: ImageLayout) -> Float32[Array, "*b i j c r"]:
-    """Repeat the rows and pad to the network's size.
+    """Repeat the rows and pad the image to the network's size.
 
     >>> pad_image(jnp.ones((1, 16, 250, 9, 2)), ImageLayout(16, 250, 2)).shape
     (1, 32, 256, 9, 2)
@@ -113,7 +113,7 @@ def pad_image(features: Float32[Array, "*b h w c r"], layout: ImageLayout) -> Fl
 
 @functools.cache
 def location_cells(layout: ImageLayout) -> np.ndarray:
-    """Row-major cell of the sensor's image under every location, i32[l]; -1 under a pad row or column.
+    """Row-major cell of the sensor's image at each location, i32[l]; -1 in a padding row or column.
 
     >>> location_cells(ImageLayout(16, 256, 2))[:3].tolist()
     [0, 1, 2]
@@ -125,14 +125,13 @@ def location_cells(layout: ImageLayout) -> np.ndarray:
 
 
 def locate(image: RangeImage, layout: ImageLayout) -> Locations:
-    """The point, azimuth and cell of every location of one sample.
+    """Point, azimuth and cell of each location of one sample.
 
     >>> image = RangeImage(jnp.zeros((16, 256, 9, 1)), jnp.full((16, 256, 1), -1), jnp.int32(0))
     >>> int(locate(image, ImageLayout(16, 256, 2)).occupied.sum())
     0
     """
     cells = location_cells(layout)
-    first = image.features[..., 0].reshape(layout.rows * layout.columns, 9)
-    inside = cells >= 0
-    seen = jnp.where(inside[:, None], first[np.maximum(cells, 0)], 0.0)
-    return Locations(points=seen[:, :3], azimuth_rad=seen[:, 4], cell=jnp.asarray(cells), occupied=seen[:, 7] > 0)
+    first_round = image.features[..., 0].reshape(layout.rows * layout.columns, 9)
+    pixel = jnp.where((cells >= 0)[:, None], first_round[np.maximum(cells, 0)], 0.0)
+    return Locations(pixel[:, :3], azimuth_rad=pixel[:, 4], cell=jnp.asarray(cells), occupied=pixel[:, 7] > 0)

@@ -1,7 +1,7 @@
 """Losses of one sample (paper, section 3.4), each as (sum, count).
 
-The sums are divided once, over the global batch: a mean per sample or per device would weigh samples with
-few positives more.
+Each sum is divided once, over the global batch. A mean per sample or per device would give more weight to the
+positives of samples with few positives.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ def _masked(values: Array, mask: Array) -> SumCount:
 
 
 def cross_entropy(logits: Float32[Array, "l c"], labels: Int32[Array, "l"]) -> Float32[Array, "l"]:
-    """Cross-entropy of the softmax against class indices, one value a location.
+    """Softmax cross-entropy with class indices, one value per location.
 
     >>> round(float(cross_entropy(jnp.zeros((1, 2)), jnp.array([0]))[0]), 4)
     0.6931
@@ -33,7 +33,7 @@ def cross_entropy(logits: Float32[Array, "l c"], labels: Int32[Array, "l"]) -> F
 def classification_loss(
     logits: Float32[Array, "l c"], labels: Int32[Array, "l"], mask: Bool[Array, "l"]
 ) -> SumCount:
-    """Cross-entropy over the locations in ``mask``, the non-empty ones; label k is the background.
+    """Cross-entropy over the non-empty locations, given by ``mask``; label k is the background.
 
     >>> total, count = classification_loss(jnp.zeros((2, 2)), jnp.array([0, 1]), jnp.array([True, False]))
     >>> round(float(total), 4), int(count)
@@ -49,13 +49,13 @@ def l1_loss(
     *,
     velocity_weight: float,
 ) -> SumCount:
-    """Weighted sum of absolute differences over the ten regression numbers.
+    """Weighted sum of absolute differences of the ten regression values.
 
     Args:
-        prediction: numbers of the owner's class.
-        target: from :func:`fcos_lidar_jax.coding.encode`; a NaN velocity is unknown and costs nothing.
-        mask: locations that count.
-        velocity_weight: of the last two numbers; the others weigh 1.
+        prediction: regression values of the owner's class.
+        target: from :func:`fcos_lidar_jax.coding.encode`; a NaN velocity is unknown and adds no loss.
+        mask: locations to sum over.
+        velocity_weight: weight of the last two values; the other weights are 1.
 
     >>> total, _ = l1_loss(jnp.ones((1, 10)), jnp.zeros((1, 10)), jnp.ones(1, bool), velocity_weight=0.2)
     >>> round(float(total), 4)
@@ -70,13 +70,13 @@ def l1_loss(
 def iou_loss(
     prediction: Float32[Array, "l 8"], target: Float32[Array, "l 8"], mask: Bool[Array, "l"], *, kind: str = "iou"
 ) -> SumCount:
-    """Loss of the rotated 3D IoU of predicted and true boxes.
+    """Loss from the rotated 3D IoU of predicted and true boxes.
 
     Args:
         prediction, target: ``x, y, z, l, w, h, cos yaw, sin yaw``.
-        mask: locations that count.
-        kind: ``"iou"`` 1 - IoU; ``"log_iou"`` -ln IoU (UnitBox); ``"giou"`` and ``"diou"`` with the smallest
-            box around both that is aligned with the target.
+        mask: locations to sum over.
+        kind: ``"iou"`` is 1 - IoU, ``"log_iou"`` is -ln IoU (UnitBox), ``"giou"`` and ``"diou"`` use the smallest
+            box that encloses both and is aligned with the target.
 
     Raises:
         ValueError: unknown kind.
@@ -85,7 +85,7 @@ def iou_loss(
     >>> float(iou_loss(box, box, jnp.ones(1, bool))[0])
     0.0
     """
-    # What does not count is replaced before it can overflow: 0 * inf is NaN in the gradient.
+    # Replace masked boxes before they can overflow: 0 * inf is NaN in the gradient.
     unit = jnp.array([0, 0, 0, 1, 1, 1, 1, 0], prediction.dtype)
     prediction = jnp.where(mask[:, None], prediction, unit)
     target = jnp.where(mask[:, None], target, unit)
@@ -110,26 +110,25 @@ def iou_loss(
 
 
 def _enclosing(prediction: Array, target: Array) -> Array:
-    """Length, width and height of the box around both, along the axes of the target."""
+    """Length, width and height of the enclosing box along the axes of the target."""
     x, y, z, l, w, h, cos, sin = (target[:, i] for i in range(8))
     px, py, pz, pl, pw, ph, pcos, psin = (prediction[:, i] for i in range(8))
     dx, dy = px - x, py - y
     along, across = cos * dx + sin * dy, cos * dy - sin * dx
     rcos, rsin = jnp.abs(cos * pcos + sin * psin), jnp.abs(cos * psin - sin * pcos)
-    reach = [(along, rcos * pl + rsin * pw, l), (across, rsin * pl + rcos * pw, w), (pz - z, ph, h)]
-    return jnp.stack(
-        [jnp.maximum(d + s / 2, t / 2) - jnp.minimum(d - s / 2, -t / 2) for d, s, t in reach], axis=-1
-    )
+    axes = [(along, rcos * pl + rsin * pw, l), (across, rsin * pl + rcos * pw, w), (pz - z, ph, h)]
+    extent = [jnp.maximum(d + s / 2, t / 2) - jnp.minimum(d - s / 2, -t / 2) for d, s, t in axes]
+    return jnp.stack(extent, axis=-1)
 
 
 def centreness(
     prediction: Float32[Array, "l 8"], target: Float32[Array, "l 8"], width_m: float
 ) -> Float32[Array, "l"]:
-    """How near predicted centres are to the true ones: ``exp(-d^2 / width_m^2)`` of their distance d in space.
+    """Closeness of predicted and true centres, ``exp(-d^2 / width_m^2)`` for their 3D distance d.
 
-    An alternative to the IoU as the factor of the score: unlike the IoU it does not ask more of small boxes. After
-    an idea of Wilson et al. (What matters in range view 3D object detection, CoRL 2024), who make it the target of
-    the classification itself and choose the positives by it; here the assignment stays as it is.
+    An alternative to the IoU as the factor of the score, which is not stricter for small boxes. Wilson et al.
+    (What matters in range view 3D object detection, CoRL 2024) use it as the classification target and to select
+    positives; here the assignment is unchanged.
 
     >>> round(float(centreness(jnp.zeros((1, 8)), jnp.zeros((1, 8)).at[0, 0].set(0.5), 0.5)[0]), 4)
     0.3679
@@ -138,7 +137,7 @@ def centreness(
 
 
 def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], mask: Bool[Array, "l"]) -> SumCount:
-    """Binary cross-entropy of the predicted IoU against the measured one, which is not differentiated.
+    """Binary cross-entropy of the predicted IoU with the measured IoU, which receives no gradient.
 
     >>> total, _ = iou_prediction_loss(jnp.zeros(1), jnp.ones(1), jnp.ones(1, bool))
     >>> round(float(total), 4)

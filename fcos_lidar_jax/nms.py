@@ -15,8 +15,9 @@ from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
 
 T = TypeVar("T")
-_FEW = (1024, 2048)  # A trained detector has mostly no more valid boxes, of thousands of slots.
-_MAX_TURN_RAD = np.pi / 3  # Boxes that point elsewhere are no estimates of the same heading.
+Mean = Callable[..., Array]
+_COMMON_COUNTS = (1024, 2048)  # Numbers of slots that usually suffice for all valid boxes, of thousands of slots.
+_MAX_TURN_RAD = np.pi / 3  # Merged boxes must agree on the heading within this angle.
 
 
 def rotated_nms(
@@ -30,21 +31,21 @@ def rotated_nms(
     overlap: Literal["bev", "3d"] = "bev",
     form: Literal["rows", "matrix"] | None = None,
 ) -> tuple[Int32[Array, "d"], Bool[Array, "d"]]:
-    """Greedy suppression: the best box stays, whatever overlaps it by more than the threshold goes.
+    """Greedy suppression: keep the best box, remove boxes that overlap it by more than the threshold, repeat.
 
     Args:
         boxes: ``x, y, z, l, w, h, yaw, ...``.
-        scores: higher is better; equal scores go to the lower index. NaN counts as invalid.
-        valid: rows that take part.
-        labels: boxes of different labels never suppress each other; None for one class.
-        iou_threshold: suppressed if IoU > threshold (static).
-        max_outputs: d, boxes kept at most (static).
-        overlap: IoU in the ground plane or of the boxes (static).
-        form: one row of IoUs per kept box, or the whole matrix and a fixed point; the same result (static). None:
-            rows on a CPU, the matrix elsewhere, decided where the program runs.
+        scores: higher is better; the lower index wins among equal scores. NaN counts as invalid.
+        valid: False for padding.
+        labels: boxes with different labels never suppress each other; None for one class.
+        iou_threshold: a box is suppressed if IoU > threshold (static).
+        max_outputs: d, the maximum number of kept boxes (static).
+        overlap: ``"bev"`` for IoU in the ground plane, ``"3d"`` for IoU in 3D (static).
+        form: ``"rows"`` computes one row of IoUs per kept box, ``"matrix"`` the whole matrix and a fixed point,
+            with equal results (static). None selects rows on CPUs and the matrix elsewhere, when the program runs.
 
     Returns:
-        indices of the kept boxes by falling score, 0 in unused slots, and which slots are used.
+        indices of the kept boxes by decreasing score, 0 in unused slots, and a mask of the used slots.
 
     >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0], [9, 0, 0, 4, 2, 1, 0]])
     >>> scores, valid = jnp.array([0.5, 0.9, 0.1]), jnp.ones(3, bool)
@@ -53,13 +54,13 @@ def rotated_nms(
     ([1, 2, 0], [True, True, False])
     """
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
-    ranked = jnp.where(usable, scores, -jnp.inf)
-    kinds = jnp.zeros(ranked.shape, jnp.int32) if labels is None else jnp.asarray(labels)
+    scores = jnp.where(usable, scores, -jnp.inf)
+    labels = jnp.zeros(scores.shape, jnp.int32) if labels is None else jnp.asarray(labels)
     if overlap not in ("bev", "3d"):
         raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
     options = {"threshold": iou_threshold, "max_outputs": max_outputs, "vertical": overlap == "3d"}
     rows, matrix = (functools.partial(suppress, **options) for suppress in (_by_rows, _by_matrix))
-    candidates = oriented(boxes), ranked, usable, kinds
+    candidates = oriented(boxes), scores, usable, labels
     return in_form(form, {"rows": rows, "matrix": matrix}, *candidates, cpu="rows", default="matrix")
 
 
@@ -75,21 +76,21 @@ def merge_boxes(
     overlap: Literal["bev", "3d"] = "bev",
     form: Literal["rows", "matrix"] | None = None,
 ) -> Float32[Array, "d c"]:
-    """Weighted NMS (RangeDet: Fan et al., ICCV 2021): what suppression keeps, improved by what it suppressed.
+    """Weighted NMS (RangeDet: Fan et al., ICCV 2021): refine the kept boxes with the suppressed boxes.
 
-    Each kept box becomes the mean of itself and of the valid boxes of its label that overlap it by more than the
-    threshold and point within 60 degrees of it, weighted by their squared scores; angles as differences.
+    Each kept box becomes the mean, weighted by squared scores, of the valid boxes with its label that overlap it
+    by more than the threshold and whose headings differ by at most 60 degrees. Yaws are averaged as differences.
 
     Args:
-        boxes, scores, valid, labels, overlap: as given to :func:`rotated_nms`; columns after the seventh are
+        boxes, scores, valid, labels, overlap: arguments of :func:`rotated_nms`; columns after the seventh are
             averaged, too.
-        kept, used: what it returned.
-        iou_threshold: a box takes part if IoU > threshold (static).
-        form: one row of IoUs per kept box, or the whole matrix; equal up to rounding (static). None: rows on a
-            CPU, the matrix elsewhere, decided where the program runs.
+        kept, used: result of :func:`rotated_nms`.
+        iou_threshold: a box is averaged if IoU > threshold (static).
+        form: ``"rows"`` computes one row of IoUs per kept box, ``"matrix"`` the whole matrix; equal up to rounding
+            (static). None selects rows on CPUs and the matrix elsewhere, when the program runs.
 
     Returns:
-        the merged boxes, zero in unused slots.
+        merged boxes, zero in unused slots.
 
     >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0]])
     >>> valid, best = jnp.ones(2, bool), (jnp.array([0]), jnp.array([True]))
@@ -98,23 +99,23 @@ def merge_boxes(
     """
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
-    kinds = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
+    labels = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
     mean = functools.partial(_weighted_mean, threshold=iou_threshold, vertical=overlap == "3d")
-    given = jnp.asarray(boxes, jnp.float32), weights, kinds, usable, kept, used
-    rows, matrix = (functools.partial(merged, mean) for merged in (_merged_by_rows, _merged_by_matrix))
-    return in_form(form, {"rows": rows, "matrix": matrix}, *given, cpu="rows", default="matrix")
+    arrays = jnp.asarray(boxes, jnp.float32), weights, labels, usable, kept, used
+    rows, matrix = (functools.partial(merge, mean) for merge in (_merged_by_rows, _merged_by_matrix))
+    return in_form(form, {"rows": rows, "matrix": matrix}, *arrays, cpu="rows", default="matrix")
 
 
 def _weighted_mean(
-    box: Array, kind: Array, candidates: tuple[Array, ...], *, threshold: float, vertical: bool
+    box: Array, label: Array, candidates: tuple[Array, ...], *, threshold: float, vertical: bool
 ) -> Array:
-    """A box, c, improved by the candidates, boxes [n, c], that overlap it and are of its kind."""
-    boxes, turned, weights, kinds = candidates
+    """Weighted mean, c, of the candidate boxes, [n, c], that overlap a box and have its label."""
+    boxes, oriented_boxes, weights, labels = candidates
     turn = wrap_angle(boxes[:, 6] - box[6])
-    # Elementwise throughout: with an update of the column a GPU would write out [kept, n, c].
+    # Elementwise, because updating one column would make a GPU materialize [kept, n, c].
     offsets = jnp.where(lax.iota(jnp.int32, box.shape[0]) == 6, turn[:, None], boxes - box)
-    member = _overlaps(oriented(box), turned, threshold, vertical)
-    member &= (kinds == kind) & (jnp.abs(turn) <= _MAX_TURN_RAD)
+    member = _overlaps(oriented(box), oriented_boxes, threshold, vertical)
+    member &= (labels == label) & (jnp.abs(turn) <= _MAX_TURN_RAD)
     weight = jnp.where(member, weights, 0.0)
     shift = jnp.where(weight[:, None] > 0, weight[:, None] * offsets, 0.0).sum(axis=0)
     total = weight.sum()
@@ -123,55 +124,55 @@ def _weighted_mean(
 
 
 def _merged_by_rows(
-    mean: Callable[..., Array], boxes: Array, weights: Array, kinds: Array, usable: Array, kept: Array, used: Array
+    mean: Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
-    """One kept box after the other: as many turns as there are."""
-    best, best_kinds = boxes[kept], kinds[kept]
+    """Merge the kept boxes one at a time."""
+    kept_boxes, kept_labels = boxes[kept], labels[kept]
 
-    def of_best(order: Array) -> Array:
-        few = boxes[order], oriented(boxes[order]), weights[order], kinds[order]
+    def merge_all(order: Array) -> Array:
+        candidates = boxes[order], oriented(boxes[order]), weights[order], labels[order]
 
-        def merged(slot: Array, result: Array) -> Array:
-            return result.at[slot].set(mean(best[slot], best_kinds[slot], few))
+        def merge(slot: Array, merged: Array) -> Array:
+            return merged.at[slot].set(mean(kept_boxes[slot], kept_labels[slot], candidates))
 
-        return lax.fori_loop(0, used.sum(), merged, jnp.zeros_like(best))
+        return lax.fori_loop(0, used.sum(), merge, jnp.zeros_like(kept_boxes))
 
-    return _with_few(of_best, jnp.argsort(~usable, stable=True), usable)
+    return _on_valid(merge_all, jnp.argsort(~usable, stable=True), usable)
 
 
 def _merged_by_matrix(
-    mean: Callable[..., Array], boxes: Array, weights: Array, kinds: Array, usable: Array, kept: Array, used: Array
+    mean: Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
-    """All kept boxes at once: one reduction over [kept, n]."""
-    candidates = boxes, oriented(boxes), weights, kinds
-    merged = jax.vmap(mean, (0, 0, None))(boxes[kept], kinds[kept], candidates)
+    """Merge all kept boxes in one reduction over [kept, n]."""
+    candidates = boxes, oriented(boxes), weights, labels
+    merged = jax.vmap(mean, (0, 0, None))(boxes[kept], labels[kept], candidates)
     return jnp.where(used[:, None], merged, 0.0)
 
 
 def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
-    """IoU > threshold, without the division: false where the union vanishes."""
+    """IoU > threshold, computed without a division; False where the union is zero."""
     intersection, union = oriented_overlap(a, b, vertical=vertical)
     return intersection > threshold * union
 
 
-def _with_few(compute: Callable[[Array], T], order: Array, valid: Array) -> T:
-    """What is computed of boxes in an order, valid ones first: of the first few alone where no more are valid."""
-    numbers = [*(few for few in _FEW if few < len(order)), len(order)]
-    branches = [functools.partial(lambda number: compute(order[:number]), number) for number in numbers]
-    return lax.switch(jnp.searchsorted(jnp.array(numbers[:-1], jnp.int32), valid.sum()), branches)
+def _on_valid(compute: Callable[[Array], T], order: Array, valid: Array) -> T:
+    """Call ``compute`` on a prefix of ``order``, valid boxes first, that contains all valid boxes."""
+    counts = [*(count for count in _COMMON_COUNTS if count < len(order)), len(order)]
+    branches = [functools.partial(lambda count: compute(order[:count]), count) for count in counts]
+    return lax.switch(jnp.searchsorted(jnp.array(counts[:-1], jnp.int32), valid.sum()), branches)
 
 
 def _ranking(scores: Array, valid: Array) -> Array:
-    """Valid boxes first, by falling score, equal ones by index."""
+    """Order of the boxes: valid ones first, by decreasing score, then by index."""
     return jnp.lexsort((-scores, ~valid)).astype(jnp.int32)
 
 
 def _by_rows(boxes: Array, scores: Array, valid: Array, labels: Array, **options: Any) -> tuple[Array, Array]:
-    def of_best(best: Array) -> tuple[Array, Array]:
-        kept, used = _greedy(boxes[best], scores[best], valid[best], labels[best], **options)
-        return jnp.where(used, best[kept], 0), used
+    def suppress(order: Array) -> tuple[Array, Array]:
+        kept, used = _greedy(boxes[order], scores[order], valid[order], labels[order], **options)
+        return jnp.where(used, order[kept], 0), used
 
-    return _with_few(of_best, _ranking(scores, valid), valid)
+    return _on_valid(suppress, _ranking(scores, valid), valid)
 
 
 def _greedy(
@@ -184,7 +185,7 @@ def _greedy(
     def pick(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, alive, kept = state
         best = jnp.argmax(jnp.where(alive, scores, -jnp.inf)).astype(jnp.int32)
-        # A lone box with score -inf is still the best one left.
+        # argmax cannot tell remaining boxes with score -inf from suppressed boxes.
         best = jnp.where(alive[best], best, jnp.argmax(alive).astype(jnp.int32))
         rivals = _overlaps(boxes[best], boxes, threshold, vertical) & (labels == labels[best])
         return count + 1, (alive & ~rivals).at[best].set(False), kept.at[count].set(best)
@@ -197,11 +198,11 @@ def _greedy(
 def _by_matrix(
     boxes: Array, scores: Array, valid: Array, labels: Array, *, threshold: float, max_outputs: int, vertical: bool
 ) -> tuple[Array, Array]:
-    number = scores.shape[0]
+    num_boxes = scores.shape[0]
     order = _ranking(scores, valid)
     boxes, labels, valid = boxes[order], labels[order], valid[order]
     beats = _overlaps(boxes[:, None], boxes[None, :], threshold, vertical) & (labels[:, None] == labels)
-    beats &= jnp.arange(number)[:, None] < jnp.arange(number)
+    beats &= jnp.arange(num_boxes)[:, None] < jnp.arange(num_boxes)
 
     def suppress(state: tuple[Array, Array]) -> tuple[Array, Array]:
         kept, _ = state

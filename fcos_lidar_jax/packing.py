@@ -1,8 +1,8 @@
-"""Packing of batches for the way to the device: fewer bytes, and the same bits when unpacked there.
+"""Lossless packing of batches for transfer to the device.
 
-Of each sample only the valid rows travel, in their order, and their number in place of a mask. Intensity and laser
-number are bytes where they are whole numbers from 0 to 255, and time lags, of which a sweep has one, are indices
-into a table. Nothing is ever rounded: a batch that does not fit is refused.
+A packed sample contains only its valid rows, in order, and their count instead of a mask. Intensities and laser
+numbers are bytes if all are whole numbers from 0 to 255. Time lags are indices into a table, because all points of
+a sweep share one time lag. No value is rounded: a batch that does not fit raises :class:`MisfitError`.
 """
 
 import dataclasses
@@ -15,18 +15,18 @@ import numpy as np
 
 from fcos_lidar_jax.types import Batch, PackedBatch
 
-_MAX_LAGS = 2**16  # That an index of two bytes tells apart.
+_MAX_LAGS = 2**16  # Number of two-byte indices.
 
 
 @dataclasses.dataclass(frozen=True)
 class Packing:
-    """Which columns are packed, and how: the same for all batches of a run, so that one program takes them all.
+    """Column types of packed batches: the same for all batches of a run, so that one compiled program takes them.
 
     >>> Packing(num_lags=1).row_bytes, Packing(num_lags=530).row_bytes, Packing(num_lags=0).row_bytes
     (14, 15, 17)
     """
 
-    num_lags: int  # Size of the table of time lags, at most 65,536; 0 where lags travel as they are.
+    num_lags: int  # Size of the table of time lags, at most 65,536; 0 stores the lags themselves.
     byte_intensity: bool = True
     byte_laser: bool = True
 
@@ -36,36 +36,36 @@ class Packing:
 
     @property
     def lag_type(self) -> np.dtype:
-        """Of the column of time lags."""
+        """Type of the column of time lags."""
         return np.dtype(np.float32 if not self.num_lags else np.uint8 if self.num_lags <= 256 else np.uint16)
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a point without a laser number; unpacked they are 21."""
+        """Bytes per point without a laser number; an unpacked point has 21."""
         return 12 + (1 if self.byte_intensity else 4) + self.lag_type.itemsize
 
 
 class MisfitError(ValueError):
-    """A batch does not fit its run's packing.
+    """A batch does not fit the packing of its run.
 
     >>> error = MisfitError(3, "intensity: got 0.5, expected whole numbers from 0 to 255")
     >>> error.row, str(error)[:20]
     (3, 'intensity: got 0.5, ')
     """
 
-    def __init__(self, row: int, finding: str) -> None:
-        super().__init__(finding)
-        self.row = row  # Of the first sample that does not fit.
+    def __init__(self, row: int, message: str) -> None:
+        super().__init__(message)
+        self.row = row  # Row of the first sample that does not fit.
 
 
 def choose_packing(clouds: Iterable[np.ndarray], *, num_sweeps: int, num_pasted: int) -> Packing:
-    """The most compact packing that takes clouds like the given ones.
+    """Choose the most compact packing that fits the given clouds.
 
     Args:
-        clouds: f32[n, 5 or 6] each, valid rows alone, of some frames.
-        num_sweeps: that a cloud is fused from at most, as is a pasted object. Where a cloud has more time lags,
-            they are those of single points, and travel as they are.
-        num_pasted: objects that are pasted into a frame at most, each with time lags of its own.
+        clouds: f32[n, 5 or 6] each, the valid rows of sample frames.
+        num_sweeps: maximum number of sweeps per cloud and per pasted object. A cloud with more time lags has one
+            time lag per point, so the packing then stores the lags themselves.
+        num_pasted: maximum number of objects pasted into a frame, each with its own time lags.
 
     >>> cloud = np.array([[9, 0, 0, 17, 0], [8, 0, 0, 31, 0.05]], np.float32)
     >>> choose_packing([cloud], num_sweeps=10, num_pasted=60)
@@ -73,17 +73,17 @@ def choose_packing(clouds: Iterable[np.ndarray], *, num_sweeps: int, num_pasted:
     >>> choose_packing([cloud + np.float32(0.5)], num_sweeps=1, num_pasted=0)
     Packing(num_lags=0, byte_intensity=False, byte_laser=True)
     """
-    num_lags, byte = num_sweeps * (1 + num_pasted), {3: True, 5: True}
+    num_lags, is_byte = num_sweeps * (1 + num_pasted), {3: True, 5: True}
     num_lags = num_lags if num_lags <= _MAX_LAGS else 0
     for cloud in clouds:
-        for column in byte.keys() & set(range(cloud.shape[1])):
-            byte[column] &= _pack_number(cloud[:, column], np.zeros(len(cloud), np.uint8), "") is None
+        for column in is_byte.keys() & set(range(cloud.shape[1])):
+            is_byte[column] &= _pack_number(cloud[:, column], np.zeros(len(cloud), np.uint8), "") is None
         num_lags = num_lags if len(np.unique(cloud[:, 4])) <= num_sweeps else 0
-    return Packing(num_lags, byte[3], byte[5])
+    return Packing(num_lags, is_byte[3], is_byte[5])
 
 
 def empty_packed(size: int, packing: Packing, *, max_points: int, max_boxes: int, columns: int) -> PackedBatch:
-    """NumPy arrays of a packed batch in which nothing is valid yet, all zero.
+    """All-zero packed batch of NumPy arrays, without valid rows.
 
     >>> empty = empty_packed(2, Packing(num_lags=9), max_points=8, max_boxes=4, columns=5)
     >>> empty.xyz.shape, empty.lags.shape, empty.laser
@@ -105,10 +105,10 @@ def empty_packed(size: int, packing: Packing, *, max_points: int, max_boxes: int
 
 
 def pack_row(packed: PackedBatch, row: int, sample: Batch) -> None:
-    """Write a batch of one sample, NumPy arrays, into a row of :func:`empty_packed`.
+    """Write a NumPy batch of one sample into a row of :func:`empty_packed`.
 
     Raises:
-        MisfitError: with the row, what was found and what was expected.
+        MisfitError: with the row, the found and the expected values.
 
     >>> packed = empty_packed(2, Packing(num_lags=2), max_points=2, max_boxes=1, columns=5)
     >>> cloud = np.array([[[0, 0, 0, 0, 0], [8, 0, 0, 31, 0.5]]], np.float32), np.array([[False, True]])
@@ -117,30 +117,30 @@ def pack_row(packed: PackedBatch, row: int, sample: Batch) -> None:
     >>> packed.count.tolist(), packed.intensity.tolist()
     ([0, 1], [[0, 0], [31, 0]])
     """
-    into: Any = jax.tree.map(lambda array: array[row], packed)
-    # Far faster than a mask as index.
+    target: Any = jax.tree.map(lambda array: array[row], packed)
+    # np.compress is much faster than indexing with a mask.
     cloud = np.compress(np.asarray(sample.valid[0]), np.asarray(sample.points[0]), axis=0)
-    number = len(cloud)
-    packed.count[row] = number  # type: ignore[index]
-    # As one item of twelve bytes a row, faster than three numbers.
-    into.xyz[:number].view("V12")[:] = cloud[:, :3].view("V12")
-    finding = _pack_number(cloud[:, 3], into.intensity[:number], "intensity")
-    finding = finding or _pack_lags(cloud[:, 4], into.lag[:number], into.lags)
-    if into.laser is not None:
-        finding = finding or _pack_number(cloud[:, 5], into.laser[:number], "laser number")
-    if finding:
-        raise MisfitError(row, finding)
-    into.boxes[:], into.labels[:], into.box_valid[:] = sample.boxes[0], sample.labels[0], sample.box_valid[0]
+    count = len(cloud)
+    packed.count[row] = count  # type: ignore[index]
+    # Copying one 12-byte item per row is faster than copying three numbers.
+    target.xyz[:count].view("V12")[:] = cloud[:, :3].view("V12")
+    misfit = _pack_number(cloud[:, 3], target.intensity[:count], "intensity")
+    misfit = misfit or _pack_lags(cloud[:, 4], target.lag[:count], target.lags)
+    if target.laser is not None:
+        misfit = misfit or _pack_number(cloud[:, 5], target.laser[:count], "laser number")
+    if misfit:
+        raise MisfitError(row, misfit)
+    target.boxes[:], target.labels[:], target.box_valid[:] = sample.boxes[0], sample.labels[0], sample.box_valid[0]
 
 
 def pack(batch: Batch, packing: Packing) -> PackedBatch:
     """Pack a batch of NumPy arrays.
 
     Returns:
-        NumPy arrays whose shapes and types follow from those of the batch and the packing.
+        NumPy arrays whose shapes and types depend only on the shape of the batch and the packing.
 
     Raises:
-        MisfitError: with the first sample that does not fit, what was found in it and what was expected.
+        MisfitError: with the row of the first sample that does not fit, the found and the expected values.
 
     >>> cloud = np.array([[[9, 0, 0, 17, 0], [0, 0, 0, 0, 0], [8, 0, 0, 31, 0.5]]], np.float32)
     >>> boxes = np.zeros((1, 2, 9), np.float32), np.zeros((1, 2), np.int32), np.zeros((1, 2), bool)
@@ -156,7 +156,7 @@ def pack(batch: Batch, packing: Packing) -> PackedBatch:
 
 
 def unpack(batch: Batch | PackedBatch) -> Batch:
-    """The batch that was packed, its valid rows in front and zeros behind; a batch that is not packed as it is.
+    """Unpack a batch: valid rows first, in order, then zeros. An unpacked batch is returned unchanged.
 
     >>> cloud = np.array([[[9, 0, 0, 17, 0], [0, 0, 0, 0, 0], [8, 0, 0, 31, 0.5]]], np.float32)
     >>> boxes = np.zeros((1, 2, 9), np.float32), np.zeros((1, 2), np.int32), np.zeros((1, 2), bool)
@@ -171,7 +171,7 @@ def unpack(batch: Batch | PackedBatch) -> Batch:
     valid = jnp.arange(batch.xyz.shape[1], dtype=jnp.int32) < jnp.asarray(batch.count)[:, None]
     lag = jnp.asarray(batch.lag)
     if batch.lags.shape[1]:
-        # The first lag of the table, to which the index behind the valid rows leads, need not be zero.
+        # The indices of padding rows point to the first lag of the table, which need not be zero.
         table = jnp.take_along_axis(jnp.asarray(batch.lags), lag.astype(jnp.int32), axis=1, mode="clip")
         lag = jnp.where(valid, table, 0)
     columns: Sequence = (batch.intensity, lag) if batch.laser is None else (batch.intensity, lag, batch.laser)
@@ -181,25 +181,25 @@ def unpack(batch: Batch | PackedBatch) -> Batch:
 
 
 def _pack_number(values: np.ndarray, packed: np.ndarray, name: str) -> str | None:
-    """Write a column, and say what does not fit."""
-    with np.errstate(invalid="ignore"):  # of NaN and of numbers beyond a byte, which are found below
+    """Write a column and return a message about the first value that does not fit."""
+    with np.errstate(invalid="ignore"):  # NaN and numbers outside a byte, detected below
         packed[:] = values
-    # By their bits: -0.0 is not 0, though it equals it.
+    # Compare bits, because -0.0 equals 0 but must be preserved.
     same = packed.astype(np.float32).view(np.uint32) == np.ascontiguousarray(values).view(np.uint32)
     return None if same.all() else f"{name}: got {values[np.argmin(same)]}, expected whole numbers from 0 to 255"
 
 
 def _pack_lags(values: np.ndarray, packed: np.ndarray, table: np.ndarray) -> str | None:
-    """Write indices and the table, or the values where there is none; and say what does not fit."""
+    """Write indices and the table, or the values without a table; return a message if the table is too small."""
     if not len(table):
         packed[:] = values
         return None
-    bits = np.ascontiguousarray(values).view(np.uint32)  # -0.0 is not 0
-    # A sweep's points follow each other: runs of the same lag are far fewer than points.
-    begins = np.flatnonzero(np.concatenate([np.ones(len(bits[:1]), bool), bits[1:] != bits[:-1]]))
-    found, index = np.unique(bits[begins], return_inverse=True)
-    if len(found) > len(table):
-        return f"time lag: got {len(found)} different ones in a sample, expected at most {len(table)}"
-    table[: len(found)] = found.view(np.float32)
-    packed[:] = np.repeat(index.astype(packed.dtype), np.diff(begins, append=len(bits)))
+    bits = np.ascontiguousarray(values).view(np.uint32)  # distinguishes -0.0 from 0
+    # The points of a sweep are adjacent, so there are far fewer runs of equal lags than points.
+    starts = np.flatnonzero(np.concatenate([np.ones(len(bits[:1]), bool), bits[1:] != bits[:-1]]))
+    lags, index = np.unique(bits[starts], return_inverse=True)
+    if len(lags) > len(table):
+        return f"time lag: got {len(lags)} different values in a sample, expected at most {len(table)}"
+    table[: len(lags)] = lags.view(np.float32)
+    packed[:] = np.repeat(index.astype(packed.dtype), np.diff(starts, append=len(bits)))
     return None

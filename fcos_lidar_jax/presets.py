@@ -116,14 +116,14 @@ COMPACT = dataclasses.replace(
 )
 """One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with an eighth of its parameters.
 
-Where the time goes decides the numbers (``python -m experiments.benchmarks.preset_cost``; figures are times from
+Where the time goes decides the numbers (``experiments/LOG.md``, 2026-11-22; figures are times from
 file to boxes, relative to this preset). What works at stride 1 costs most, so it is narrow: heads of 48 channels
 1.23, of four convolutions 1.17, a stem of 8 channels a type 1.30, a first stage of 32 1.17. The backbone's later
 stages cost least, so there it is deep: the quickstart's blocks 0.92, its whole network 0.83. Doubled rows hold
 the same points for 1.95 times the time. Tied heads save parameters alone: 1.02. The image wraps around: no seam
 behind the vehicle. NMS at 0.1, weighted NMS and the IoU's exponent are not in the paper:
 ``python -m experiments.studies.post_processing`` measures what each adds. Neither are the axes of the regression;
-``python -m experiments.studies.compact_additions`` compares them with the paper's.
+``experiments/LOG.md`` compares them with the paper's.
 """
 
 CENTERPOINT_PILLARS = CenterPointConfig.of(

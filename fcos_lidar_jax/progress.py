@@ -1,18 +1,18 @@
-"""Progress of long work: a line now and then, with rate and time left."""
+"""Progress lines for long operations, with rate and time left."""
 
 import sys
 import time
 
 
 class Progress:
-    """Prints how far the work is, the same on a terminal and in a pipe.
+    """Prints progress lines to stderr, identical on a terminal and in a pipe.
 
-    The rate counts from the first call on, since the first piece of work often compiles or warms up something.
+    The rate excludes the work before the first call, which often includes compilation.
 
     Args:
-        unit: what is counted, in the plural.
-        total: how many there are.
-        every_s: seconds between two lines; the last piece of work always has one.
+        unit: name of the counted items, in the plural.
+        total: number of items.
+        every_s: minimum seconds between two lines; the last item always prints a line.
     """
 
     def __init__(self, unit: str, total: int, *, every_s: float = 10.0) -> None:
@@ -21,7 +21,7 @@ class Progress:
         self._next = 0.0
 
     def show(self, done: int, text: str = "") -> None:
-        """So many are done; ``text`` stands between the count and the rate."""
+        """Report ``done`` finished items, with ``text`` between the count and the rate."""
         now = time.monotonic()
         if self._began is None:
             self._began = now, done

@@ -1,4 +1,4 @@
-"""What a LiDAR is, as data: beams, columns, limits. Presets and sensors read from a file."""
+"""LiDAR sensors as data: beams, columns and limits, with presets and a JSON format."""
 
 import dataclasses
 import json
@@ -11,25 +11,25 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """A rotating LiDAR, reduced to what the range view needs (paper, section 3.1).
+    """A rotating LiDAR, described as far as the range view needs it (paper, section 3.1).
 
     Attributes:
-        name: for messages and pictures.
-        inclinations_rad: the beams' inclinations in radians, one per image row, strictly falling: row 0 is
-            the highest beam. For a sensor whose rows come from the laser number the table is nominal.
-        num_columns: azimuth bins of one turn, or of the sector that is covered. Columns run clockwise, column 0
-            starts at azimuth pi, or at the left end of the sector.
-        origin_m: the sensor's position in the frame of the points; subtracted before equation 1.
-        limit_xy_m: points with ``|x|`` or ``|y|`` at or beyond it are dropped (point frame, metres).
+        name: used in messages and pictures.
+        inclinations_rad: inclination of each beam in radians, one per image row and strictly decreasing: row 0 is
+            the highest beam. The table is nominal for sensors with ``row_source="laser"``.
+        num_columns: azimuth bins of one turn, or of the covered sector. Columns run clockwise; column 0 starts at
+            azimuth pi, or at the left end of the sector.
+        origin_m: position of the sensor in the frame of the points; subtracted before equation 1.
+        limit_xy_m: points with ``|x|`` or ``|y|`` at or beyond this limit are dropped (point frame, metres).
         limit_z_m: points with z outside this open interval are dropped (point frame, metres).
-        intensity_scale: a file's intensity times this is on the scale 0-255.
-        row_source: ``"inclination"`` bins the angle of each point; ``"laser"`` reads the row from a sixth
+        intensity_scale: factor from the intensity in files to the scale 0-255.
+        row_source: ``"inclination"`` bins the inclination of each point; ``"laser"`` reads the row from a sixth
             point column, for stacked sensors whose inclinations overlap.
-        azimuth_limits_rad: right and left end of the sector that is covered, counter-clockwise and at most a turn
-            apart, the right one within [-pi, pi]; None for a full turn. Points beside it are dropped.
+        azimuth_limits_rad: right and left end of the covered sector, counter-clockwise and at most a turn apart,
+            with the right end in [-pi, pi]; None for a full turn. Points outside the sector are dropped.
 
     Raises:
-        ValueError: at construction, naming the field, what was found and what was expected.
+        ValueError: at construction, naming the field, the found and the expected value.
 
     >>> NUSCENES_HDL32E.num_rows, NUSCENES_HDL32E.num_columns
     (32, 1086)
@@ -55,7 +55,7 @@ class Sensor:
         if not np.isfinite(table).all() or np.abs(table).max() > math.pi / 2:
             raise ValueError("inclinations_rad: expected finite radians within [-pi/2, pi/2]")
         if not (np.diff(table) < 0).all():
-            raise ValueError("inclinations_rad: expected strictly falling values, the highest beam first")
+            raise ValueError("inclinations_rad: expected strictly decreasing values, the highest beam first")
         if not isinstance(self.num_columns, int) or self.num_columns < 2:
             raise ValueError(f"num_columns: got {self.num_columns!r}, expected an integer of at least 2")
         if len(self.origin_m) != 3 or not np.isfinite(self.origin_m).all():
@@ -71,7 +71,7 @@ class Sensor:
         if self.azimuth_limits_rad is not None:
             ends = self.azimuth_limits_rad
             if len(ends) != 2 or not (abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi):
-                expected = "(right, left) with right within [-pi, pi] and left at most a turn beyond it"
+                expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
                 raise ValueError(f"azimuth_limits_rad: got {ends!r}, expected {expected}")
 
     @property
@@ -81,29 +81,29 @@ class Sensor:
 
     @property
     def column_rad(self) -> float:
-        """Width of a column."""
+        """Width of a column in azimuth."""
         right, left = self.azimuth_limits_rad or (-math.pi, math.pi)
         return (left - right) / self.num_columns
 
     @property
     def num_rows(self) -> int:
-        """Image rows: one per beam."""
+        """Number of image rows, one per beam."""
         return len(self.inclinations_rad)
 
     @property
     def point_columns(self) -> int:
-        """Columns of this sensor's point arrays: five, or six with the laser number."""
+        """Number of columns of point arrays: five, or six with the laser number."""
         return 6 if self.row_source == "laser" else 5
 
     @property
     def even_step_rad(self) -> float | None:
-        """The beams' spacing where it is even (rows are then found by arithmetic), else None."""
+        """Spacing of evenly spaced beams, which lets the projection compute rows by arithmetic; otherwise None."""
         steps = -np.diff(np.asarray(self.inclinations_rad, np.float64))
         return float(steps.mean()) if np.abs(steps - steps.mean()).max() < 1e-9 else None
 
     @property
     def row_edges_rad(self) -> tuple[float, ...]:
-        """Upper edges of all rows and the lower edge of the last, falling: midpoints between the beams."""
+        """Upper edges of all rows and lower edge of the last row, decreasing: midpoints between beams."""
         table = np.asarray(self.inclinations_rad, np.float64)
         middle = (table[1:] + table[:-1]) / 2
         first = table[0] + (table[0] - table[1]) / 2
@@ -112,7 +112,7 @@ class Sensor:
 
 
 def even_inclinations(lowest_deg: float, highest_deg: float, num_rows: int) -> tuple[float, ...]:
-    """Evenly spaced beams, both ends included, highest first, in radians.
+    """Inclinations of evenly spaced beams in radians, highest first, both ends included.
 
     >>> [round(math.degrees(v), 2) for v in even_inclinations(-30.67, 10.67, 3)]
     [10.67, -10.0, -30.67]
@@ -121,12 +121,12 @@ def even_inclinations(lowest_deg: float, highest_deg: float, num_rows: int) -> t
 
 
 def sector(sensor: Sensor, middle_rad: float, num_columns: int) -> Sensor:
-    """A part of a sensor's turn, of columns as wide as they were.
+    """Sensor that covers a sector of the turn, with columns of the same width.
 
     Args:
-        sensor: of a full turn.
-        middle_rad: azimuth of the sector's middle.
-        num_columns: of the sector.
+        sensor: sensor that covers a full turn.
+        middle_rad: azimuth of the middle of the sector.
+        num_columns: number of columns of the sector.
 
     >>> ahead = sector(NUSCENES_HDL32E, math.pi / 2, 272)
     >>> ahead.num_columns, [round(math.degrees(v), 2) for v in ahead.azimuth_limits_rad]
@@ -144,7 +144,7 @@ NUSCENES_HDL32E = Sensor("nuscenes_hdl32e", even_inclinations(-30.67, 10.67, 32)
 
 KITTI_HDL64E = Sensor(
     "kitti_hdl64e",
-    # Two laser blocks: the upper 32 a third of a degree apart, the lower 32 half a degree apart.
+    # Two blocks of lasers: the upper 32 beams are 1/3 degree apart, the lower 32 beams 1/2 degree.
     tuple(float(v) for v in np.radians([*(2.0 - np.arange(32) / 3), *(-8.83 - np.arange(32) / 2)])),
     2048,
     limit_xy_m=75.0,
@@ -161,8 +161,8 @@ WAYMO_TOP = Sensor(
     limit_z_m=(-3.0, 5.0),
     intensity_scale=255.0,
 )
-"""Waymo's top LiDAR, points in the vehicle frame. The beams are nominal: real calibrations carry a table,
-which belongs into a sensor file."""
+"""Waymo's top LiDAR, points in the vehicle frame, nominal beam table. Put the table of a real calibration in a
+sensor file."""
 
 ARGOVERSE2 = Sensor(
     "argoverse2",
@@ -173,46 +173,46 @@ ARGOVERSE2 = Sensor(
     limit_z_m=(-3.0, 5.0),
     row_source="laser",
 )
-"""Argoverse 2: two stacked 32-beam sensors whose inclinations overlap; the row is the laser number 0-63."""
+"""Argoverse 2: two stacked 32-beam sensors with overlapping inclinations; the row is the laser number 0-63."""
 
 TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, limit_xy_m=25.0)
 """A 16-beam sensor with a short reach, for tests."""
 
 SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 128, limit_xy_m=25.0)
-"""A 32-beam sensor of few columns for what is near: the quickstart's."""
+"""The quickstart's sensor: 32 beams, few columns, for short range."""
 
 PRESETS: dict[str, Sensor] = {
     s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY, SHORT_RANGE)
 }
-"""Name -> sensor."""
+"""Sensors by name."""
 
 
 def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
-    """The sensor as the JSON object that :func:`sensor_from_json` reads.
+    """Convert a sensor to the JSON object that :func:`sensor_from_json` reads.
 
     >>> sensor_from_json(sensor_to_json(TINY)) == TINY
     True
     """
     record = dataclasses.asdict(sensor)
-    if sensor.azimuth_limits_rad is None:  # a full turn is described as it was before there were sectors
+    if sensor.azimuth_limits_rad is None:  # keeps the JSON of full-turn sensors as it was before sectors existed
         del record["azimuth_limits_rad"]
     return record
 
 
-_MAX_ROWS = 4096  # far more than any LiDAR has: a damaged number must not exhaust the memory
+_MAX_ROWS = 4096  # far more than any LiDAR has, so that a corrupt number cannot exhaust the memory
 
 
 def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
-    """A sensor from a JSON object.
+    """Create a sensor from a JSON object with the fields of :class:`Sensor`.
 
-    The fields are those of :class:`Sensor`. Beams may be given as ``inclinations_rad`` (a list) or, evenly
-    spaced, as ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}``.
+    ``inclinations_rad`` is a list of beams. Evenly spaced beams can be given as
+    ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead.
 
     Args:
-        record, where: the parsed JSON value, and what to call its source in messages.
+        record, where: the parsed JSON value, and the name of its source in error messages.
 
     Raises:
-        ValueError: naming ``where``, the field, what was found and what was expected.
+        ValueError: naming ``where``, the field, the found and the expected value.
 
     >>> beams = {"lowest": -25, "highest": 3, "rows": 64}
     >>> sensor_from_json({"name": "mine", "num_columns": 1024, "inclinations_deg": beams}).num_rows
@@ -222,14 +222,15 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
         raise ValueError(f"{where}: got {type(record).__name__}, expected a JSON object")
     record = dict(record)
     if "inclinations_deg" in record:
-        even = record.pop("inclinations_deg")
-        if not isinstance(even, dict) or set(even) != {"lowest", "highest", "rows"}:
-            raise ValueError(f"{where}: inclinations_deg: expected an object with lowest, highest and rows")
-        low, high = (_number(even[end], f"{where}: inclinations_deg.{end}") for end in ("lowest", "highest"))
-        if not isinstance(even["rows"], int) or not 2 <= even["rows"] <= _MAX_ROWS:
-            expected = f"an integer of 2 to {_MAX_ROWS}"
-            raise ValueError(f"{where}: inclinations_deg.rows: got {even['rows']!r}, expected {expected}")
-        record["inclinations_rad"] = even_inclinations(low, high, even["rows"])
+        beams = record.pop("inclinations_deg")
+        if not isinstance(beams, dict) or set(beams) != {"lowest", "highest", "rows"}:
+            expected = "an object with lowest, highest and rows"
+            raise ValueError(f"{where}: inclinations_deg: got {beams!r}, expected {expected}")
+        low, high = (_number(beams[end], f"{where}: inclinations_deg.{end}") for end in ("lowest", "highest"))
+        if not isinstance(beams["rows"], int) or not 2 <= beams["rows"] <= _MAX_ROWS:
+            expected = f"an integer from 2 to {_MAX_ROWS}"
+            raise ValueError(f"{where}: inclinations_deg.rows: got {beams['rows']!r}, expected {expected}")
+        record["inclinations_rad"] = even_inclinations(low, high, beams["rows"])
     fields = {f.name: f for f in dataclasses.fields(Sensor)}
     unknown = sorted(set(record) - set(fields))
     if unknown:
@@ -257,13 +258,13 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
 
 
 def load_sensor(path: str | Path) -> Sensor:
-    """A sensor by preset name or from a JSON file.
+    """Load a sensor by preset name or from a JSON file.
 
     Args:
-        path: a key of :data:`PRESETS`, or a JSON file as :func:`sensor_from_json` describes.
+        path: a key of :data:`PRESETS`, or a JSON file in the format of :func:`sensor_from_json`.
 
     Raises:
-        ValueError: naming the file, the field, what was found and what was expected.
+        ValueError: naming the file, the field, the found and the expected value.
 
     >>> load_sensor("tiny") == TINY
     True
@@ -280,7 +281,7 @@ def load_sensor(path: str | Path) -> Sensor:
     return sensor_from_json(record, str(path))
 
 
-_MAX_NUMBER = 1e30  # also excludes NaN and integers that no float can hold
+_MAX_NUMBER = 1e30  # comparing with it also rejects NaN and integers beyond float range
 
 
 def _number(value: Any, where: str) -> float:

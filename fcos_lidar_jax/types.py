@@ -1,11 +1,11 @@
-"""The containers that travel between the modules: frozen dataclasses of arrays, registered as pytrees.
+"""Containers shared by the modules: frozen dataclasses of arrays, registered as pytrees.
 
-Axis letters, for the whole package: b batch, n points, r rounds, h rows, w columns, c channels, l locations
-(all feature levels, flattened and joined), m boxes (padded), k classes, d detections.
+Axis letters of the whole package: b batch, n points, r rounds, h rows, w columns, c channels, l locations (all
+feature levels, flattened and concatenated), m boxes (padded), k classes, d detections.
 
 Frame: the LiDAR frame of the current sweep, x right, y forward, z up; metres, radians, seconds.
-A box is ``x, y, z, l, w, h, yaw, vx, vy``: gravity centre, length along the heading, yaw counter-clockwise
-from +x in [-pi, pi), velocity along the LiDAR axes (NaN where unknown).
+A box is ``x, y, z, l, w, h, yaw, vx, vy``: centre of gravity, length along the heading, yaw counter-clockwise from
++x in [-pi, pi), velocity along the LiDAR axes (NaN where unknown).
 """
 
 import dataclasses
@@ -30,8 +30,8 @@ class RangeImage:
     """
 
     features: Float32[Array, "*b h w 9 r"]
-    """Raw units, channels in the order of :data:`CHANNELS`; zero in all nine where a slot is empty."""
-    point_index: Int32[Array, "*b h w r"]  # Row of the input points that fills the slot, -1 where empty.
+    """Channels in the order of :data:`CHANNELS`, in raw units; all nine are zero in empty slots."""
+    point_index: Int32[Array, "*b h w r"]  # Row of the input point in the slot, -1 where empty.
     num_dropped: Int32[Array, "*b"]
     """Valid input rows that were non-finite, beyond the sensor's limits or outside its field of view."""
 
@@ -49,20 +49,20 @@ class Batch:
     """
 
     points: Float32[Array, "b n c"]
-    """x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a sixth
-    column for sensors whose rows come from it; anything where invalid."""
+    """x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a sixth column
+    for sensors with ``row_source="laser"``; arbitrary where invalid."""
     valid: Bool[Array, "b n"]  # False for padding.
-    boxes: Float32[Array, "b m 9"]  # Boxes as the module describes; anything where invalid.
-    labels: Int32[Array, "b m"]  # Index into the classes.
+    boxes: Float32[Array, "b m 9"]  # Boxes, see the module docstring; arbitrary where invalid.
+    labels: Int32[Array, "b m"]  # Class index.
     box_valid: Bool[Array, "b m"]  # False for padding.
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PackedBatch:
-    """A :class:`Batch` on its way to the device, in fewer bytes, see :mod:`fcos_lidar_jax.packing`.
+    """A :class:`Batch` in fewer bytes for transfer to the device, see :mod:`fcos_lidar_jax.packing`.
 
-    Valid rows are in front, in their order, and zeros behind them.
+    Valid rows come first, in order; padding rows are zero.
 
     >>> import numpy as np
     >>> clouds = np.zeros((2, 4096, 3), np.float32), *[np.zeros((2, 4096), np.uint8)] * 2
@@ -72,13 +72,13 @@ class PackedBatch:
     """
 
     xyz: Float32[Array, "b n 3"]  # Metres.
-    intensity: UInt8[Array, "b n"] | Float32[Array, "b n"]  # On the scale 0-255.
+    intensity: UInt8[Array, "b n"] | Float32[Array, "b n"]  # Scale 0-255.
     lag: UInt8[Array, "b n"] | UInt16[Array, "b n"] | Float32[Array, "b n"]
-    """Index into the sample's ``lags``; the time lag itself, in seconds, where there are none."""
+    """Index into the sample's ``lags``, or the time lag in seconds if ``lags`` is empty."""
     lags: Float32[Array, "b t"]  # Time lags of each sample, seconds.
-    laser: UInt8[Array, "b n"] | Float32[Array, "b n"] | None  # Laser number, for sensors whose rows come from it.
-    count: Int32[Array, "b"]  # Valid rows.
-    boxes: Float32[Array, "b m 9"]  # This and what follows: as in :class:`Batch`.
+    laser: UInt8[Array, "b n"] | Float32[Array, "b n"] | None  # Laser number, if the rows come from it.
+    count: Int32[Array, "b"]  # Number of valid rows.
+    boxes: Float32[Array, "b m 9"]  # The remaining fields are the same as in :class:`Batch`.
     labels: Int32[Array, "b m"]
     box_valid: Bool[Array, "b m"]
 
@@ -86,22 +86,22 @@ class PackedBatch:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class HostBatch:
-    """A batch on its way to the device, with what is to be reported about it.
+    """A batch before and after transfer to the device, with information for logs and messages.
 
     >>> HostBatch(batch=None, counts={"truncated_points": 3}, names=("frame 0", "frame 7")).counts
     {'truncated_points': 3}
     """
 
-    batch: Batch | PackedBatch  # NumPy arrays of this process's rows; on the devices, arrays of the global batch.
-    counts: dict[str, int]  # To be recorded beside the metrics, such as ``truncated_points``.
-    names: tuple[str, ...]  # Of the samples' frames, for messages.
-    misfit: str | None = None  # Why it is not packed where the run's batches are.
+    batch: Batch | PackedBatch  # NumPy rows of this process; after transfer, arrays of the global batch.
+    counts: dict[str, int]  # Logged with the metrics, such as ``truncated_points``.
+    names: tuple[str, ...]  # Frame names of the samples, for messages.
+    misfit: str | None = None  # Reason why this batch is unpacked in a run with packed batches.
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Locations:
-    """What every location of the feature levels looks at (paper, section 3.4).
+    """Point and pixel of each location of the feature levels (paper, section 3.4).
 
     >>> import numpy as np
     >>> from fcos_lidar_jax.locations import ImageLayout, locate
@@ -112,8 +112,8 @@ class Locations:
 
     points: Float32[Array, "*b l 3"]  # First-round point of the location's pixel, metres; zero where empty.
     azimuth_rad: Float32[Array, "*b l"]  # Azimuth of that point; zero where empty.
-    cell: Int32[Array, "l"]  # Row-major cell of the sensor's own image (rows not doubled, columns not padded).
-    occupied: Bool[Array, "*b l"]  # False where the pixel is empty or a pad column.
+    cell: Int32[Array, "l"]  # Row-major cell of the sensor's image, before rows are repeated and columns padded.
+    occupied: Bool[Array, "*b l"]  # False where the pixel is empty or padding.
 
 
 @jax.tree_util.register_dataclass
@@ -123,11 +123,11 @@ class Outputs:
 
     >>> import numpy as np
     >>> outputs = Outputs(np.zeros((5460, 11)), np.zeros((5460, 10, 10)), np.zeros((5460, 10)))
-    >>> outputs.regression[:, :3, 0].shape  # of the first class, the offset to the centre of its box
+    >>> outputs.regression[:, :3, 0].shape  # centre offsets of the first class
     (5460, 3)
     """
 
-    logits: Float32[Array, "*b l c"]  # Class logits, k classes and the background last.
+    logits: Float32[Array, "*b l c"]  # Class logits: k classes, then the background.
     regression: Float32[Array, "*b l 10 k"]
     """Per class: centre offset 3, log size 3, sin and cos of the relative yaw, velocity 2 (equation 2)."""
     iou_logits: Float32[Array, "*b l k"]  # Logit of the predicted IoU, per class.
@@ -136,7 +136,7 @@ class Outputs:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Targets:
-    """The outcome of the assignment for one sample.
+    """Result of the assignment of one sample.
 
     >>> import jax.numpy as jnp
     >>> from fcos_lidar_jax.assignment import assign
@@ -145,9 +145,9 @@ class Targets:
     ([2], [True, True, False])
     """
 
-    owner: Int32[Array, "*b l"]  # Box whose points the location sees, -1 for none.
-    positive: Bool[Array, "*b l"]  # Among the K cheapest locations of its owner.
-    num_positive: Int32[Array, "*b m"]  # K of every box (0 for a box without candidates).
+    owner: Int32[Array, "*b l"]  # Box that contains the location's point, -1 where no box does.
+    positive: Bool[Array, "*b l"]  # True for the K cheapest locations of each owner.
+    num_positive: Int32[Array, "*b m"]  # K of each box (0 for a box without candidates).
 
 
 class Sums(NamedTuple):
@@ -176,17 +176,17 @@ class Detections:
     (0, 9)
     """
 
-    boxes: Float32[Array, "*b d 9"]  # Boxes as the module describes; zero where invalid.
+    boxes: Float32[Array, "*b d 9"]  # Boxes, see the module docstring; zero where invalid.
     scores: Float32[Array, "*b d"]  # Class probability times predicted IoU; zero where invalid.
-    labels: Int32[Array, "*b d"]  # Index into the classes; zero where invalid.
+    labels: Int32[Array, "*b d"]  # Class index; zero where invalid.
     valid: Bool[Array, "*b d"]  # False for padding.
-    num_dropped: Int32[Array, "*b"]  # As in :class:`RangeImage`.
+    num_dropped: Int32[Array, "*b"]  # See :class:`RangeImage`.
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrainState:
-    """All that training carries from step to step: arrays, no functions.
+    """State carried from step to step: arrays only, no functions.
 
     >>> import numpy as np
     >>> state = TrainState(np.int32(0), {"kernel": np.ones(3)}, {}, (), None, jax.random.key(0))
@@ -194,9 +194,9 @@ class TrainState:
     3
     """
 
-    step: Int32[Array, ""]  # Updates done.
+    step: Int32[Array, ""]  # Number of completed updates.
     params: Any  # Trainable arrays of the network.
     batch_stats: Any  # Running means and variances of the network's batch norms.
     opt_state: Any  # State of the optax optimizer.
     ema: Any  # Running mean of ``params``, or None.
-    key: Any  # The run's random key; every draw is ``fold_in(key, step)``, so a resumed run repeats itself.
+    key: Any  # Random key of the run; each step uses ``fold_in(key, step)``, so that a resumed run repeats itself.

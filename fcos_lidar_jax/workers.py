@@ -1,4 +1,4 @@
-"""Worker processes, which must not outlive their parent process."""
+"""Worker processes that must not outlive their parent process."""
 
 import multiprocessing
 import os
@@ -6,10 +6,7 @@ import threading
 
 
 def end_with_parent() -> None:
-    """Have this worker process exit as soon as its parent has, even where the parent was killed.
-
-    Called in the worker, once.
-    """
+    """Make this worker process exit when its parent exits or is killed. Call once, in the worker."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

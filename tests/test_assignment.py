@@ -1,4 +1,4 @@
-"""Owners and dynamic K against loops, on random and degenerate input."""
+"""Compare owners and dynamic K with loops, on random and degenerate input."""
 
 import functools
 
@@ -28,15 +28,15 @@ FORMS = pytest.mark.parametrize("form", ["loop", "reduction"])
 
 @FORMS
 @pytest.mark.parametrize("num_boxes", [1, 40, 256])
-def test_owners_equal_loops_with_overlapping_boxes(num_boxes, form):
+def test_owners_of_overlapping_boxes_match_loops(num_boxes, form):
     rng = np.random.default_rng(num_boxes)
     boxes = oracles.random_boxes(rng, num_boxes, 4.0).astype(np.float32)
     points = rng.normal(0, 4, (300, 3)).astype(np.float32) * [1, 1, 0.3]
     points = points.astype(np.float32)
     present, valid = rng.random(300) < 0.9, rng.random(num_boxes) < 0.8
-    found = np.asarray(owners(points, present, boxes, valid, form=form))
+    actual = np.asarray(owners(points, present, boxes, valid, form=form))
     expected = [oracles.owner(p, boxes, valid) if here else -1 for p, here in zip(points, present, strict=True)]
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(actual, expected)
     inside = [sum(oracles.inside(p, b) for b in boxes) for p in points]
     assert num_boxes == 1 or max(inside) >= 2
 
@@ -46,13 +46,13 @@ def test_owner_boundary_equal_volumes_and_padding(form):
     boxes = f32([[0, 0, 0, 2, 2, 2, 0], [0.5, 0, 0, 2, 2, 2, 0], [0, 0, 0, np.nan, 1, 1, 0]])
     points = f32([[1, 1, 1], [1.5, 0, 0], [0, 0, 0], [1.6, 0, 0], [0, 0, 0]])
     present = jnp.array([True, True, True, True, False])
-    found = owners(points, present, boxes, jnp.array([True, True, False]), form=form)
-    assert found.tolist() == [0, 1, 0, -1, -1]
+    actual = owners(points, present, boxes, jnp.array([True, True, False]), form=form)
+    assert actual.tolist() == [0, 1, 0, -1, -1]
     endless = f32([[0, 0, 0, np.inf, 2, 2, 0]])
     assert owners(points, present, endless, jnp.array([True]), form=form).tolist() == [-1] * 5
 
 
-def test_only_a_cpu_loops_over_boxes_and_searches():
+def test_only_cpu_programs_loop_over_boxes_and_in_searches():
     given = jnp.zeros((9, 3)), jnp.ones(9, bool), jnp.ones((4, 7)), jnp.ones(4, bool)
 
     def assigned(*given):
@@ -66,12 +66,12 @@ def test_only_a_cpu_loops_over_boxes_and_searches():
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("num_boxes", [1, 20, 256])
-def test_assignment_equals_the_matrix_form(seed, num_boxes):
+def test_assignment_matches_the_matrix_form(seed, num_boxes):
     rng = np.random.default_rng(seed)
     owner = rng.integers(-1, num_boxes, 2000).astype(np.int32)
     iou = (rng.random(2000) * (rng.random(2000) < 0.7)).astype(np.float32)
     cost = np.round(rng.random(2000) * 4, 1).astype(np.float32)  # many exact ties
-    iou = np.round(iou * 4) / 4 if seed % 2 else iou  # sums of quarters: exact halves to round
+    iou = np.round(iou * 4) / 4 if seed % 2 else iou  # sums of quarters include exact halves
     iou = iou.astype(np.float32)
     expected, ks = oracles.assign(owner, cost, iou, num_boxes, 20)
     targets = compute(i32(owner), f32(cost), f32(iou), num_boxes=num_boxes)
@@ -88,11 +88,11 @@ def test_k_rounds_half_up_is_at_least_one_and_at_most_the_candidates(ious, k):
     assert dynamic_k(i32(owner), f32([*ious, 1, 1, 1]), num_boxes=1, top_q=20).tolist() == [k]
 
 
-def test_equal_costs_go_to_the_lower_index():
+def test_the_lower_index_wins_among_equal_costs():
     assert cheapest(i32([0, 0, 0, 0]), f32([1, 1, 1, 1]), i32([2])).tolist() == [True, True, False, False]
 
 
-def test_no_boxes_all_padding_and_one_point():
+def test_without_candidates_and_with_one_candidate():
     none = compute(i32([-1] * 5), f32([0] * 5), f32([1] * 5), num_boxes=3)
     assert none.num_positive.tolist() == [0, 0, 0]
     assert not none.positive.any()
@@ -101,12 +101,12 @@ def test_no_boxes_all_padding_and_one_point():
     assert one.num_positive.tolist() == [0, 1]
 
 
-def test_a_diverging_prediction_is_chosen_last():
+def test_a_diverged_prediction_ranks_last():
     targets = compute(i32([0, 0, 0]), f32([np.nan, 5, np.inf]), f32([0.0, 0.0, 0.0]), num_boxes=1)
     assert targets.positive.tolist() == [False, True, False]
 
 
-def test_maps_over_a_batch_and_has_no_gradient():
+def test_works_under_vmap_and_passes_no_gradient():
     rng = np.random.default_rng(0)
     owner, cost, iou = i32(rng.integers(-1, 4, (3, 50))), f32(rng.random((3, 50))), f32(rng.random((3, 50)))
 

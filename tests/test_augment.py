@@ -1,4 +1,4 @@
-"""Augmentation against explicit matrices on points, corners and velocities."""
+"""Compare augmentation with explicit matrices on points, corners and velocities."""
 
 import dataclasses
 
@@ -33,15 +33,15 @@ def sample():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_points_corners_headings_and_velocities_move_by_one_matrix(name):
+def test_points_corners_headings_and_velocities_follow_one_matrix(name):
     function, matrix = CASES[name]
     points, boxes = sample()
     new_points, new_boxes = (np.asarray(v) for v in function(jnp.asarray(points), jnp.asarray(boxes)))
     np.testing.assert_allclose(new_points[:, :3], points[:, :3] @ matrix.T, atol=1e-4)
     np.testing.assert_array_equal(new_points[:, 3:], points[:, 3:])
-    for found, expected in zip(oracles.corners(new_boxes), oracles.corners(boxes) @ matrix.T, strict=True):
-        # As a set: a flip changes their order.
-        distance = np.linalg.norm(found[:, None] - expected[None], axis=-1)
+    for actual, expected in zip(oracles.corners(new_boxes), oracles.corners(boxes) @ matrix.T, strict=True):
+        # Compare as sets, because a flip changes the order of the corners.
+        distance = np.linalg.norm(actual[:, None] - expected[None], axis=-1)
         assert distance.min(1).max() < 1e-4
     heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(6)], 1) @ matrix.T
     yaw = np.arctan2(heading[:, 1], heading[:, 0])
@@ -54,7 +54,7 @@ def test_points_corners_headings_and_velocities_move_by_one_matrix(name):
     assert np.sum(inside) > 20
 
 
-def test_draws_cover_their_ranges_and_the_sensor_stays():
+def test_random_values_cover_their_ranges_and_the_sensor_stays_fixed():
     origin = (1.43, 0.0, 2.184)
     points, boxes = sample()
     points[0, :3] = origin
@@ -79,9 +79,9 @@ def test_draws_cover_their_ranges_and_the_sensor_stays():
     assert 0.35 < np.mean(np.sign(hand) != np.sign(reference)) < 0.65
 
 
-def test_what_would_leave_a_sensors_sector_is_refused():
+def test_augmentation_that_leaves_a_sensors_sector_is_rejected():
     ahead, right = (sector(NUSCENES_HDL32E, middle, 272) for middle in (np.pi / 2, 0.0))
-    behind = sector(NUSCENES_HDL32E, -np.pi, 272)  # across the end of the azimuth
+    behind = sector(NUSCENES_HDL32E, -np.pi, 272)  # crosses azimuth pi
     fine = {"max_rotation_rad": 0.5, "flip_x_probability": 0.0, "flip_y_probability": 0.0}
     check_augmentation(AugmentConfig(), NUSCENES_HDL32E)
     whole = dataclasses.replace(NUSCENES_HDL32E, azimuth_limits_rad=(-np.pi, np.pi))
@@ -92,7 +92,7 @@ def test_what_would_leave_a_sensors_sector_is_refused():
         (behind, "flip_y_probability", "flip_x_probability"),
     ):
         check_augmentation(AugmentConfig(**{**fine, allowed: 0.5}), sensor)
-        with pytest.raises(ValueError, match=rf"augment\.{refused}: got 0.5, expected 0 .*90 degrees"):
+        with pytest.raises(ValueError, match=rf"augment\.{refused}: got 0.5, expected 0: .*90 degrees"):
             check_augmentation(AugmentConfig(**{**fine, refused: 0.5}), sensor)
         with pytest.raises(ValueError, match=r"augment\.max_rotation_rad: got 0.9, expected at most 0.787"):
             check_augmentation(AugmentConfig(**{**fine, "max_rotation_rad": 0.9}), sensor)
@@ -107,7 +107,7 @@ def test_unknown_velocities_stay_unknown():
     assert unknown.sum() == 2
 
 
-def test_sample_keys_depend_on_step_and_index_alone():
+def test_sample_keys_depend_on_step_and_index_only():
     keys = [sample_key(jax.random.key(0), jnp.int32(s), jnp.int32(i)) for s in range(3) for i in range(3)]
     assert len({tuple(np.asarray(jax.random.key_data(k)).tolist()) for k in keys}) == 9
     batched = jax.vmap(lambda i: sample_key(jax.random.key(0), jnp.int32(2), i))(jnp.arange(3, dtype=jnp.int32))

@@ -1,4 +1,4 @@
-"""Equation 2: encoding by hand, decoding inverts it, gradients stay finite."""
+"""Check equation 2: encoding against NumPy, decoding as its inverse, finite gradients."""
 
 import functools
 
@@ -24,25 +24,25 @@ def samples(number=200):
     return boxes, points, np.arctan2(points[:, 1], points[:, 0]).astype(np.float32)
 
 
-def test_encoding_is_equation_2():
+def test_encoding_matches_equation_2():
     boxes, points, azimuth = samples()
     yaw = (boxes[:, 6].astype(float) - azimuth)[:, None]
     expected = [boxes[:, :3] - points, np.log(boxes[:, 3:6]), np.sin(yaw), np.cos(yaw), boxes[:, 7:]]
     np.testing.assert_allclose(jitted(encode)(boxes, points, azimuth), np.concatenate(expected, 1), atol=2e-5)
 
 
-def test_along_the_ray_offset_and_velocity_are_those_of_a_turned_frame():
+def test_ray_axes_rotate_offset_and_velocity():
     boxes, points, azimuth = samples()
-    found = np.asarray(jitted(encode)(boxes, points, azimuth, axes="ray"))
-    for numbers, box, point, angle in zip(found, boxes, points, azimuth.astype(float), strict=True):
+    actual = np.asarray(jitted(encode)(boxes, points, azimuth, axes="ray"))
+    for numbers, box, point, angle in zip(actual, boxes, points, azimuth.astype(float), strict=True):
         axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         np.testing.assert_allclose(numbers[:2], axes @ (box[:2] - point[:2]), atol=2e-5)
         np.testing.assert_allclose(numbers[8:], axes @ box[7:], atol=2e-5)
     unchanged = np.asarray(jitted(encode)(boxes, points, azimuth))[:, 2:8]
-    np.testing.assert_array_equal(found[:, 2:8], unchanged)
+    np.testing.assert_array_equal(actual[:, 2:8], unchanged)
 
 
-def test_along_the_ray_the_numbers_are_the_same_all_around_the_sensor():
+def test_values_along_ray_axes_are_the_same_all_around_the_sensor():
     boxes, points, azimuth = samples()
     boxes[:, 7:] += 5
     turned, angle = [a.copy() for a in (boxes, points)], 1.2
@@ -74,7 +74,7 @@ def test_decoding_inverts_encoding(axes):
 
 
 @both_axes
-def test_unknown_velocity_stays_unknown_and_nothing_else_does(axes):
+def test_only_unknown_velocities_encode_to_nan(axes):
     boxes, points, azimuth = samples()
     boxes[:3, 7:] = np.nan
     unknown = np.isnan(jitted(encode)(boxes, points, azimuth, axes=axes))
@@ -99,7 +99,7 @@ def test_degenerate_predictions_decode_to_finite_boxes_with_finite_gradients(axe
 
 
 @both_axes
-def test_same_under_jit_and_vmap(axes):
+def test_results_are_the_same_under_jit_and_vmap(axes):
     boxes, points, azimuth = map(jnp.asarray, samples())
     numbers = jitted(encode)(boxes, points, azimuth, axes=axes)
     for function, args in ((encode, (boxes, points, azimuth)), (decode, (numbers, points, azimuth))):

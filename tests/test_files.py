@@ -1,4 +1,4 @@
-"""Atomic writes and file locks: what other processes see of them."""
+"""Check atomic writes and file locks from the view of other processes."""
 
 import contextlib
 import json
@@ -12,26 +12,26 @@ import pytest
 from fcos_lidar_jax.files import atomic_write, file_lock, folder_lock, line_writer
 
 
-def test_atomic_write_replaces_a_file_whole(tmp_path):
+def test_atomic_write_replaces_the_whole_file(tmp_path):
     file = tmp_path / "new" / "folder" / "a.pcd.bin"
     atomic_write(file, lambda temporary: temporary.write_text("first"))
-    seen = []
+    states = []
 
     def write(temporary):
         temporary.write_text("sec")
-        seen.append((file.read_text(), temporary.parent, temporary.suffix))
+        states.append((file.read_text(), temporary.parent, temporary.suffix))
         temporary.write_text("second")
 
     atomic_write(str(file), write)
-    assert seen == [("first", file.parent, ".bin")], "the old file stands until the new one is whole"
+    assert states == [("first", file.parent, ".bin")], "the old file remains until the new file is complete"
     assert [(f.name, f.read_text()) for f in file.parent.iterdir()] == [("a.pcd.bin", "second")]
     mask = os.umask(0o022)
     os.umask(mask)
-    assert file.stat().st_mode & 0o777 == 0o666 & ~mask, "permissions of any new file"
+    assert file.stat().st_mode & 0o777 == 0o666 & ~mask, "default permissions"
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_failed_write_leaves_the_old_file_alone(tmp_path, error):
+def test_a_failed_write_keeps_the_old_file(tmp_path, error):
     file = tmp_path / "a.json"
     file.write_text("old")
 
@@ -60,7 +60,7 @@ with file_lock(sys.argv[1]) as held:
 
 @contextlib.contextmanager
 def holding(file, arguments=""):
-    """Another process that locks a file and keeps it until it is killed or its input ends."""
+    """Start a process that holds the lock of a file until it is killed or its input ends."""
     source = _HOLDER.replace("(sys.argv[1])", f"(sys.argv[1]{arguments})")
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", source, str(file)], **pipes) as process:
@@ -79,10 +79,10 @@ def test_a_lock_excludes_other_processes_until_its_holder_is_killed(tmp_path):
     with file_lock(file) as held:
         assert held
     with file_lock(file, wait=True) as held, file_lock(file) as second:
-        assert (held, second) == (True, False), "a lock left earlier is free again"
+        assert (held, second) == (True, False), "a released lock can be taken again"
 
 
-def test_waiting_for_a_lock_ends_when_it_is_given_up(tmp_path):
+def test_waiting_for_a_lock_ends_when_it_is_released(tmp_path):
     with contextlib.ExitStack() as first:
         assert first.enter_context(file_lock(tmp_path / "run.lock"))
         with holding(tmp_path / "run.lock", ", wait=True") as second:
@@ -93,12 +93,10 @@ def test_waiting_for_a_lock_ends_when_it_is_given_up(tmp_path):
             assert second.stdout.read() == "True\n"
 
 
-def test_a_folder_is_locked_for_other_threads_and_processes_and_again_for_the_one_that_holds_it(tmp_path):
+def test_a_folder_lock_excludes_other_threads_and_processes_but_not_its_holder(tmp_path):
     with folder_lock(tmp_path, "writing"), folder_lock(tmp_path, "reading"), ThreadPoolExecutor() as pool:
         for another in (folder_lock(tmp_path, "x"), folder_lock(tmp_path / "." / "", "x")):
-            with pytest.raises(
-                BlockingIOError, match=rf"in use: process {os.getpid()} on .* is writing, expected"
-            ):
+            with pytest.raises(BlockingIOError, match=rf"in use: process {os.getpid()} on .* is writing, exp"):
                 pool.submit(another.__enter__).result()
         with holding(tmp_path / ".lock") as other:
             assert other.stdout.readline() == "False\n"
@@ -115,7 +113,7 @@ FULL = """
 import resource, sys
 from pathlib import Path
 from fcos_lidar_jax.files import line_writer
-resource.setrlimit(resource.RLIMIT_FSIZE, (1500, 1500))  # writes beyond fail, as they do where there is no room
+resource.setrlimit(resource.RLIMIT_FSIZE, (1500, 1500))  # writes beyond 1,500 bytes fail, as on a full disk
 with line_writer(Path(sys.argv[1])) as write_line:
     for _ in range(int(sys.argv[2])):
         write_line(1000 * b"x")
@@ -123,8 +121,8 @@ with line_writer(Path(sys.argv[1])) as write_line:
 
 
 @pytest.mark.parametrize("lines", [2, 3])
-def test_a_full_disk_leaves_whole_lines_and_is_told(tmp_path, lines):
-    """The second line is the one of which a part finds room."""
+def test_a_full_disk_leaves_whole_lines_and_is_reported(tmp_path, lines):
+    """Only a part of the second line fits."""
     file = tmp_path / "a.jsonl"
     done = subprocess.run(
         [sys.executable, "-c", FULL, file, str(lines)], capture_output=True, text=True, check=False
@@ -134,7 +132,7 @@ def test_a_full_disk_leaves_whole_lines_and_is_told(tmp_path, lines):
     assert file.read_bytes() == 1000 * b"x" + b"\n"
 
 
-def test_lines_of_one_file_are_written_by_one_process(tmp_path):
+def test_a_second_line_writer_of_a_file_is_rejected(tmp_path):
     file = tmp_path / "a.jsonl"
     file.write_text("old\n")
     with line_writer(file) as write_line:
@@ -145,7 +143,7 @@ def test_lines_of_one_file_are_written_by_one_process(tmp_path):
     assert [json.loads(line) for line in file.read_text().splitlines()] == [1, 2]
 
 
-def test_an_interrupted_line_is_taken_back(tmp_path):
+def test_a_failed_line_is_removed(tmp_path):
     file = tmp_path / "a.jsonl"
     with line_writer(file) as write_line:
         write_line(b"1")

@@ -1,4 +1,4 @@
-"""Angles, norms and boxes against NumPy in float64."""
+"""Compare angles, norms and boxes with NumPy in float64."""
 
 import jax
 import jax.numpy as jnp
@@ -27,15 +27,15 @@ def awkward_pairs():
     return np.concatenate([grid, rng.normal(0, 20, (20_000, 2)).astype(np.float32)])
 
 
-def test_atan2_is_the_library_one_on_every_kind_of_pair():
+def test_atan2_matches_numpy_for_regular_and_special_values():
     pairs = awkward_pairs()
     expected = np.arctan2(pairs[:, 0].astype(np.float64), pairs[:, 1].astype(np.float64))
     for function in (atan2, jax.jit(atan2), jax.vmap(atan2)):
-        found = np.asarray(function(jnp.asarray(pairs[:, 0]), jnp.asarray(pairs[:, 1])))
-        assert np.abs(found - expected).max() < 3e-7
+        actual = np.asarray(function(jnp.asarray(pairs[:, 0]), jnp.asarray(pairs[:, 1])))
+        assert np.abs(actual - expected).max() < 3e-7
 
 
-def test_gradients_of_angles_and_norms_are_those_of_calculus_and_finite_at_zero():
+def test_gradients_of_angles_and_norms_are_exact_and_finite_at_zero():
     y, x = 3.0, -4.0
     gradient = jax.grad(atan2, argnums=(0, 1))(jnp.float32(y), jnp.float32(x))
     np.testing.assert_allclose(gradient, [x / 25, -y / 25], atol=1e-6)
@@ -45,7 +45,7 @@ def test_gradients_of_angles_and_norms_are_those_of_calculus_and_finite_at_zero(
         assert np.isfinite(np.asarray(at_zero)).all()
 
 
-def test_columns_of_a_sector_are_those_of_the_turn_that_it_is_cut_from():
+def test_columns_of_a_sector_match_the_full_turn():
     azimuth = np.linspace(-np.pi, np.pi, 20001)[:-1].astype(np.float32)
     whole, everywhere = image_columns(jnp.asarray(azimuth), NUSCENES_HDL32E)
     assert everywhere.all()
@@ -68,8 +68,7 @@ def test_spherical_inverts_to_the_point():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, jnp.float32])
-def test_wrapped_angles_are_in_the_half_open_turn_and_point_the_same_way(dtype):
-    """On the host in both types, and on the device."""
+def test_wrapped_angles_lie_in_the_half_open_interval_and_keep_their_direction(dtype):
     exact = np.concatenate([np.arange(-9, 10) * np.pi, np.random.default_rng(3).uniform(-20, 20, 5000)])
     angles = exact.astype(dtype)
     angles = np.concatenate([angles, *(np.nextafter(angles, angles.dtype.type(end)) for end in (-99, 99))])
@@ -81,14 +80,14 @@ def test_wrapped_angles_are_in_the_half_open_turn_and_point_the_same_way(dtype):
     assert np.abs(difference).max() < (1e-13 if kind is np.float64 else 1e-5)
     assert wrapped.max() < kind(np.pi)
     assert wrapped.min() >= kind(-np.pi) - np.spacing(kind(30))
-    if dtype is jnp.float32:  # a sum of two angles lands in the turn exactly
+    if dtype is jnp.float32:  # sums of two angles wrap to exactly -pi
         assert wrapped[np.abs(angles) < 6.5].min() == kind(-np.pi)
     few = np.flatnonzero(np.abs(exact) < 19)
     on_device = wrap_angle(jnp.asarray(exact[few].astype(np.float32)))
     np.testing.assert_allclose(wrapped[few], on_device, atol=4e-6)
 
 
-def test_boundary_of_a_box_is_inside():
+def test_the_boundary_of_a_box_is_inside():
     box = jnp.array([1, 2, 3, 4, 2, 1, 0], jnp.float32)
     for axis, half in enumerate((2.0, 1.0, 0.5)):
         for sign in (-1, 1):
@@ -99,17 +98,17 @@ def test_boundary_of_a_box_is_inside():
             assert not bool(points_in_box(jnp.asarray(point), box))
 
 
-def test_membership_by_explicit_rotation():
+def test_points_in_box_matches_explicit_rotation():
     rng = np.random.default_rng(2)
     boxes = oracles.random_boxes(rng, 20).astype(np.float32)
     points = rng.normal(0, 2, (200, 3)).astype(np.float32)
-    found = np.asarray(points_in_box(jnp.asarray(points)[:, None], jnp.asarray(boxes)[None]))
+    actual = np.asarray(points_in_box(jnp.asarray(points)[:, None], jnp.asarray(boxes)[None]))
     expected = [[oracles.inside(p, b) for b in boxes] for p in points]
-    np.testing.assert_array_equal(found, expected)
-    assert found.any()
+    np.testing.assert_array_equal(actual, expected)
+    assert actual.any()
 
 
-def test_rotations_and_poses_are_scipys():
+def test_rotations_and_poses_match_scipy():
     rng = np.random.default_rng(3)
     rotation, translation = rng.normal(size=(50, 4)), rng.normal(size=(50, 3))
     expected = Rotation.from_quat(rotation, scalar_first=True).as_matrix()

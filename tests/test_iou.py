@@ -1,4 +1,4 @@
-"""Rotated IoU against Shapely, closed forms and finite differences."""
+"""Compare rotated IoU with Shapely, closed forms and finite differences."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from fcos_lidar_jax.iou import oriented_iou_3d, rotated_iou_3d, rotated_iou_bev
 NUMBER = 20_000
 IDENTICAL = slice(5000, 6000)
 BOTH = pytest.mark.parametrize("function", [rotated_iou_3d, rotated_iou_bev])
-# Compiled once for all tests: every call of jax.jit on a new derivative compiles it anew.
+# Share the jitted functions between tests: jax.jit of a new derivative compiles again.
 VALUE = {f: jax.jit(f) for f in (rotated_iou_3d, rotated_iou_bev)}
 GRADIENT = {f: jax.jit(jax.grad(lambda a, b, f=f: f(a, b).sum(), argnums=(0, 1))) for f in VALUE}
 TANGENT = {f: jax.jit(lambda a, b, da, db, f=f: jax.jvp(f, (a, b), (da, db))[1]) for f in VALUE}
@@ -33,7 +33,7 @@ def pairs():
 
 
 @pytest.mark.parametrize(("function", "vertical"), [(rotated_iou_3d, True), (rotated_iou_bev, False)])
-def test_equals_shapely_on_20000_pairs(pairs, function, vertical):
+def test_matches_shapely_on_20000_pairs(pairs, function, vertical):
     expected = oracles.iou(*pairs, vertical=vertical)
     for compute in (VALUE[function], function):
         assert np.abs(np.asarray(compute(*pairs)) - expected).max() < 1e-5
@@ -49,7 +49,7 @@ def central_difference(function, a, b, da, db, step=1e-6):
 
 
 def assert_close(single, double, differences):
-    """float32 against float64, and float64 against differences but for identical boxes, where there is a kink."""
+    """Compare float32 with float64, and float64 with differences except at the kink of identical boxes."""
     regular = np.ones(NUMBER, bool)
     regular[IDENTICAL] = False
     assert max(np.abs(s - d).max() for s, d in zip(single, double, strict=True)) < 1e-3
@@ -80,8 +80,8 @@ def test_forward_mode_equals_float64_and_finite_differences(pairs, function):
 
 
 @BOTH
-def test_forward_and_reverse_mode_agree_also_mapped(pairs, function):
-    pairs = [jnp.asarray(p[4900:5200]) for p in pairs]  # nearly equal and identical ones
+def test_forward_and_reverse_mode_agree_under_vmap(pairs, function):
+    pairs = [jnp.asarray(p[4900:5200]) for p in pairs]  # nearly equal and identical pairs
     reverse = jax.jacrev(function, argnums=(0, 1))
     forward, reverse = (jax.jit(jax.vmap(jacobian))(*pairs) for jacobian in (FORWARD[function], reverse))
     for one, other in zip(forward, reverse, strict=True):
@@ -127,7 +127,7 @@ def test_degenerate_pairs(name):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * max(1.0, float(jnp.abs(other).max())))
 
 
-def test_broadcasts_and_maps_like_loops(pairs):
+def test_broadcasting_and_vmap_match_loops(pairs):
     a, b = jnp.asarray(pairs[0][:6]), jnp.asarray(pairs[1][:5])
     bev, in_space = VALUE[rotated_iou_bev], VALUE[rotated_iou_3d]
     loops = np.array([[float(bev(x, y)) for y in b] for x in a])
@@ -143,7 +143,7 @@ def test_broadcast_gradients_are_summed():
     np.testing.assert_allclose(total, single, atol=1e-5)
 
 
-def test_oriented_form_needs_no_angle():
+def test_oriented_iou_matches_shapely():
     a = jnp.array([1, 2, 0, 4, 2, 1.5, np.cos(0.3), np.sin(0.3)], jnp.float32)
     b = jnp.array([1.5, 2, 0, 4, 2, 1.5, np.cos(0.5), np.sin(0.5)], jnp.float32)
     expected = oracles.iou([[1, 2, 0, 4, 2, 1.5, 0.3]], [[1.5, 2, 0, 4, 2, 1.5, 0.5]], vertical=True)

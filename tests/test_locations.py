@@ -1,4 +1,4 @@
-"""Locations against loops over levels, rows and columns."""
+"""Compare locations with loops over levels, rows and columns."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ LAYOUTS = [
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=str)
-def test_pixel_of_a_location_is_index_times_stride(layout):
+def test_the_pixel_of_a_location_is_its_index_times_the_stride(layout):
     cells = location_cells(layout)
     first = 0
     for stride, size in zip(STRIDES, layout.level_sizes, strict=True):
@@ -58,7 +58,7 @@ def test_padding_repeats_rows_and_copies_the_first_columns_of_a_turn(layout):
     np.testing.assert_array_equal(padded[0], expected)
 
 
-def test_locations_see_the_first_round_and_pad_columns_are_empty():
+def test_locations_use_the_first_round_and_padding_is_empty():
     layout = ImageLayout(16, 250, 2)
     rng = np.random.default_rng(1)
     features = rng.random((16, 250, 9, 2), np.float32)
@@ -74,7 +74,7 @@ def test_locations_see_the_first_round_and_pad_columns_are_empty():
     assert (cells < 0).any()
 
 
-def test_circular_width_bins_into_whole_strides_and_pads_nothing():
+def test_circular_width_gives_whole_strides_without_padding():
     circular = ModelConfig(circular_width=True)
     assert image_sensor(NUSCENES_HDL32E, ModelConfig()) == NUSCENES_HDL32E
     assert image_sensor(NUSCENES_HDL32E, circular) == dataclasses.replace(NUSCENES_HDL32E, num_columns=1088)
@@ -87,7 +87,5 @@ def test_a_sector_does_not_wrap():
     part = sector(NUSCENES_HDL32E, np.pi / 2, 272)
     layout = image_layout(part, ModelConfig())
     assert (layout.columns, layout.width, layout.full_turn) == (272, 288, False)
-    with pytest.raises(
-        ValueError, match="circular_width: got True for sensor 'nuscenes_hdl32e_272_columns', which"
-    ):
+    with pytest.raises(ValueError, match="circular_width: got True for sensor 'nuscenes_hdl32e_272"):
         image_layout(part, ModelConfig(circular_width=True))

@@ -1,4 +1,4 @@
-"""Every loss against NumPy, and finite where nothing is."""
+"""Compare each loss with NumPy, and check that losses and gradients are finite."""
 
 import functools
 import math
@@ -19,14 +19,14 @@ KINDS = ("iou", "log_iou", "giou", "diou")
 
 @functools.partial(jax.jit, static_argnums=3)
 def iou_gradient(prediction, target, mask, kind):
-    """((Sum, count), gradient by the prediction)."""
+    """Return ((sum, count), gradient by the prediction)."""
 
     def loss(prediction):
         total, count = iou_loss(prediction, target, mask, kind=kind)
         return total, (total, count)
 
-    gradient, found = jax.grad(loss, has_aux=True)(prediction)
-    return found, gradient
+    gradient, actual = jax.grad(loss, has_aux=True)(prediction)
+    return actual, gradient
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_classification_is_the_cross_entropy_over_the_mask(rng):
     assert int(count) == mask.sum()
 
 
-def test_l1_weighs_velocity_and_skips_what_is_unknown(rng):
+def test_l1_weights_velocities_and_skips_unknown_ones(rng):
     prediction, target = rng.normal(0, 1, (2, NUMBER, 10))
     target[::3, 8:] = np.nan
     target[1, 9] = np.nan
@@ -72,14 +72,14 @@ def pairs(rng):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_iou_losses_by_shapely_and_corners(rng, kind):
+def test_iou_losses_match_shapely_and_corners(rng, kind):
     a, b = pairs(rng)
     mask = rng.random(NUMBER) < 0.8
     iou = oracles.iou(a, b, vertical=True)
     unions = (a[:, 3:6].prod(1) + b[:, 3:6].prod(1)) / (1 + iou)
     corners = np.concatenate([oracles.corners(a), oracles.corners(b)], axis=1)
-    turned = np.einsum("nij,nci->ncj", oracles.turns(b[:, 6]), corners)  # along the axes of the target
-    extents = np.ptp(turned, axis=1)
+    aligned = np.einsum("nij,nci->ncj", oracles.turns(b[:, 6]), corners)  # along the axes of the target
+    extents = np.ptp(aligned, axis=1)
     volume = extents.prod(1)
     distance = ((a[:, :3] - b[:, :3]) ** 2).sum(1)
     expected = {
@@ -96,29 +96,29 @@ def test_iou_losses_by_shapely_and_corners(rng, kind):
     assert not np.asarray(gradient)[~mask].any()
 
 
-def test_masked_out_rubbish_does_not_reach_the_gradient():
-    rubbish = f32([[np.inf] * 8, [np.nan] * 8] * (NUMBER // 2))
+def test_masked_values_get_zero_gradient():
+    masked = f32([[np.inf] * 8, [np.nan] * 8] * (NUMBER // 2))
     box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]] * NUMBER))
     for kind in KINDS:
-        assert not np.asarray(iou_gradient(rubbish, box, jnp.zeros(NUMBER, bool), kind)[1]).any()
+        assert not np.asarray(iou_gradient(masked, box, jnp.zeros(NUMBER, bool), kind)[1]).any()
 
 
-def test_centreness_is_a_gaussian_of_the_distance_in_space_whatever_the_sizes(rng):
+def test_centreness_is_a_gaussian_of_the_3d_distance(rng):
     prediction, target = rng.normal(0, 0.5, (2, NUMBER, 8))
-    found = jax.jit(centreness, static_argnums=2)(f32(prediction), f32(target), 0.75)
+    actual = jax.jit(centreness, static_argnums=2)(f32(prediction), f32(target), 0.75)
     expected = [
         math.exp(-(math.dist(a[:3], b[:3]) ** 2) / 0.75**2) for a, b in zip(prediction, target, strict=True)
     ]
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    np.testing.assert_allclose(actual, expected, rtol=1e-4)
     each = jax.vmap(lambda a, b: centreness(a[None], b[None], 0.75)[0])(f32(prediction), f32(target))
-    np.testing.assert_allclose(each, found, rtol=1e-6)
+    np.testing.assert_allclose(each, actual, rtol=1e-6)
     far = jax.grad(lambda a: centreness(a, f32(target), 0.75).sum())(f32(prediction) + 1e20)
     same = jax.grad(lambda a: centreness(a, a, 0.75).sum())(f32(prediction))
     assert np.isfinite(far).all()
     assert not np.asarray(same).any()
 
 
-def test_iou_prediction_is_the_binary_cross_entropy_and_leaves_the_iou_alone(rng):
+def test_iou_prediction_loss_is_binary_cross_entropy_without_gradient_for_the_iou(rng):
     logits, iou, mask = rng.normal(0, 3, NUMBER), rng.random(NUMBER), rng.random(NUMBER) < 0.6
     total, _ = iou_prediction_loss(f32(logits), f32(iou), jnp.asarray(mask))
     p = 1 / (1 + np.exp(-logits))
@@ -139,7 +139,7 @@ def test_losses_are_weighed_by_name():
     assert float(weighted({"top_q": f32(3.0)}, config)) == 3
 
 
-def test_unknown_kind_is_refused():
+def test_an_unknown_kind_is_rejected():
     box = oriented(f32([[0, 0, 0, 4, 2, 1, 0.3]]))
     with pytest.raises(ValueError, match="kind: got 'ciou'"):
         iou_loss(box, box, jnp.ones(1, bool), kind="ciou")

@@ -1,4 +1,4 @@
-"""Rotated NMS: both forms keep exactly what Shapely's greedy loop keeps."""
+"""Check that both forms of rotated NMS keep the same boxes as a greedy loop with Shapely."""
 
 import functools
 
@@ -34,31 +34,31 @@ def keep(boxes, scores, valid, labels, **options):
 @FORMS
 @pytest.mark.parametrize("overlap", ["bev", "3d"])
 @pytest.mark.parametrize("max_outputs", [200, 7])
-def test_keeps_what_shapely_keeps(form, overlap, max_outputs):
+def test_keeps_the_same_boxes_as_shapely(form, overlap, max_outputs):
     for seed in range(3):
         boxes, scores, valid, labels = clusters(seed)
         expected = oracles.nms(boxes, scores, valid, labels, 0.2, max_outputs, vertical=overlap == "3d")
-        found = keep(
+        actual = keep(
             boxes, scores, valid, labels, iou_threshold=0.2, max_outputs=max_outputs, overlap=overlap, form=form
         )
-        assert found == expected
+        assert actual == expected
         assert len(expected) < valid.sum()
 
 
 @pytest.mark.parametrize("valid", [0, 700, 1024, 1025, 1500])
-def test_of_many_slots_only_the_valid_ones_count(valid):
-    """Rows of more than 1,024 slots are computed for as many where no more are valid."""
+def test_invalid_slots_do_not_change_the_result(valid):
+    """Includes counts around 1,024, up to which the form ``rows`` computes with 1,024 slots only."""
     boxes, scores, _, labels = clusters(5, 1500)
     used = np.random.default_rng(0).permutation(1500) < valid
     assert used.sum() == valid
     options = {"iou_threshold": 0.2, "max_outputs": 100}
-    found = keep(boxes, scores, used, labels, **options, form="rows")
-    assert found == keep(boxes, scores, used, labels, **options, form="matrix")
-    assert bool(found) == bool(valid)
+    actual = keep(boxes, scores, used, labels, **options, form="rows")
+    assert actual == keep(boxes, scores, used, labels, **options, form="matrix")
+    assert bool(actual) == bool(valid)
 
 
 @FORMS
-def test_ties_go_to_the_lower_index_and_nan_scores_are_out(form):
+def test_the_lower_index_wins_ties_and_nan_scores_are_invalid(form):
     boxes = np.repeat(np.array([[0, 0, 0, 4, 2, 1, 0.0]], np.float32), 4, 0)
     scores = np.array([np.nan, 0.5, 0.5, 0.4], np.float32)
     valid, labels = np.ones(4, bool), np.zeros(4, np.int32)
@@ -71,12 +71,12 @@ def test_equal_iou_is_not_above_the_threshold(form):
     args = np.array([0.9, 0.8], np.float32), np.ones(2, bool), np.zeros(2, np.int32)
     assert keep(boxes, *args, iou_threshold=0.61, max_outputs=2, form=form) == [0, 1]
     assert keep(boxes, *args, iou_threshold=0.59, max_outputs=2, form=form) == [0]
-    still = np.repeat(boxes[:1], 2, 0)
-    assert keep(still, *args, iou_threshold=1.0, max_outputs=2, form=form) == [0, 1]
+    equal = np.repeat(boxes[:1], 2, 0)
+    assert keep(equal, *args, iou_threshold=1.0, max_outputs=2, form=form) == [0, 1]
 
 
 @FORMS
-def test_nothing_valid_and_boxes_without_size(form):
+def test_without_valid_boxes_and_with_boxes_of_zero_size(form):
     boxes = np.zeros((5, 7), np.float32)
     scores, labels = np.linspace(1, 0, 5, dtype=np.float32), np.zeros(5, np.int32)
     assert keep(boxes, scores, np.zeros(5, bool), labels, iou_threshold=0.2, max_outputs=3, form=form) == []
@@ -84,7 +84,7 @@ def test_nothing_valid_and_boxes_without_size(form):
 
 
 @FORMS
-def test_same_under_jit_and_vmap(form):
+def test_results_are_the_same_under_jit_and_vmap(form):
     data = [clusters(seed) for seed in range(3)]
     stacked = [jnp.stack([jnp.asarray(d[i]) for d in data]) for i in range(4)]
 
@@ -92,14 +92,14 @@ def test_same_under_jit_and_vmap(form):
         return rotated_nms(boxes, scores, valid, labels=labels, **OPTIONS, form=form)
 
     kept, used = jax.jit(jax.vmap(go))(*stacked)
-    alone = jax.jit(go)
+    suppress = jax.jit(go)
     for i in range(3):
-        single, single_used = alone(*(s[i] for s in stacked))
+        single, single_used = suppress(*(s[i] for s in stacked))
         np.testing.assert_array_equal(kept[i], single)
         np.testing.assert_array_equal(used[i], single_used)
 
 
-def test_the_form_is_that_of_the_platform_also_in_exported_programs():
+def test_exported_programs_use_the_form_of_their_platform():
     boxes, scores, valid = (jnp.asarray(part) for part in clusters(0, 70)[:3])
     suppress = jax.jit(lambda *args: rotated_nms(*args, **OPTIONS))
     programs = {
@@ -107,17 +107,17 @@ def test_the_form_is_that_of_the_platform_also_in_exported_programs():
         for platforms in (("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda"))
     }
     texts = {platforms: program.mlir_module() for platforms, program in programs.items()}
-    # Each form has one loop; the matrix of overlaps is told by its shape.
+    # Each form has one loop. The shape of the matrix of overlaps identifies the matrix form.
     loops = {platforms: text.count("stablehlo.while") for platforms, text in texts.items()}
     matrices = [platforms for platforms, text in texts.items() if "tensor<70x70xi1>" in text]
     assert loops == {("cpu",): 1, ("cuda",): 1, ("tpu",): 1, ("cpu", "cuda"): 2}
     assert matrices == [("cuda",), ("tpu",), ("cpu", "cuda")]
     rows = rotated_nms(boxes, scores, valid, **OPTIONS, form="rows")
-    for found, expected in zip(programs["cpu", "cuda"].call(boxes, scores, valid), rows, strict=True):
-        np.testing.assert_array_equal(found, expected)
+    for actual, expected in zip(programs["cpu", "cuda"].call(boxes, scores, valid), rows, strict=True):
+        np.testing.assert_array_equal(actual, expected)
 
 
-def test_unknown_options_are_refused():
+def test_unknown_options_are_rejected():
     empty = jnp.zeros((1, 7)), jnp.zeros(1), jnp.ones(1, bool)
     with pytest.raises((ValueError, TypeError), match="form"):
         rotated_nms(*empty, iou_threshold=0.2, max_outputs=1, form="fast")
@@ -140,8 +140,8 @@ def merged_by_loops(boxes, scores, valid, labels, kept, threshold, *, vertical):
 
 @FORMS
 @pytest.mark.parametrize("overlap", ["bev", "3d"])
-def test_merged_boxes_are_the_weighted_means_of_those_that_overlap(form, overlap):
-    """Some of them turned by half a turn, and some across the seam of the angle."""
+def test_merged_boxes_are_weighted_means_of_overlapping_boxes(form, overlap):
+    """Some boxes point backwards, and some yaws lie on either side of pi."""
     options = {"iou_threshold": 0.3, "overlap": overlap, "form": form}
     merge = jax.jit(merge_boxes, static_argnames=tuple(options))
     for seed in range(3):
@@ -151,36 +151,36 @@ def test_merged_boxes_are_the_weighted_means_of_those_that_overlap(form, overlap
         boxes = np.concatenate([boxes, rng.normal(0, 5, (len(boxes), 2)).astype(np.float32)], axis=1)
         scores = np.maximum(scores, np.float32(0.01))
         kept, used = compute(boxes, scores, valid, labels=labels, **OPTIONS)
-        found = np.asarray(merge(boxes, scores, valid, kept, used, labels=labels, **options))
-        assert not found[~np.asarray(used)].any()
-        chosen = np.asarray(kept)[np.asarray(used)]
-        expected = merged_by_loops(boxes, scores, valid, labels, chosen, 0.3, vertical=overlap == "3d")
-        difference = found[np.asarray(used)] - expected
+        actual = np.asarray(merge(boxes, scores, valid, kept, used, labels=labels, **options))
+        assert not actual[~np.asarray(used)].any()
+        indices = np.asarray(kept)[np.asarray(used)]
+        expected = merged_by_loops(boxes, scores, valid, labels, indices, 0.3, vertical=overlap == "3d")
+        difference = actual[np.asarray(used)] - expected
         difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
         np.testing.assert_allclose(difference, 0, atol=2e-4)
-        assert np.abs(expected - boxes[chosen]).max() > 0.05
+        assert np.abs(expected - boxes[indices]).max() > 0.05
 
 
 @pytest.mark.parametrize("slots", [300, 1500])
 def test_merging_does_not_depend_on_unused_slots(slots):
-    """Few valid boxes among many slots, and more valid ones than are looked at together."""
+    """Uses fewer and more valid boxes than the first count on which the form ``rows`` computes."""
     boxes, scores, _, labels = clusters(5, slots)
     scores = np.maximum(scores, np.float32(0.01))
     options = {"iou_threshold": 0.3}
-    alone = rotated_nms(boxes, scores, np.ones(slots, bool), labels=labels, **OPTIONS)
-    expected = merge_boxes(boxes, scores, np.ones(slots, bool), *alone, labels=labels, **options)
+    dense = rotated_nms(boxes, scores, np.ones(slots, bool), labels=labels, **OPTIONS)
+    expected = merge_boxes(boxes, scores, np.ones(slots, bool), *dense, labels=labels, **options)
     place = np.sort(np.random.default_rng(0).permutation(4000)[:slots])
     spread = [np.zeros((4000, *part.shape[1:]), part.dtype) for part in (boxes, scores, labels)]
-    for into, part in zip(spread, (boxes, scores, labels), strict=True):
-        into[place] = part
+    for target, part in zip(spread, (boxes, scores, labels), strict=True):
+        target[place] = part
     valid = np.isin(np.arange(4000), place)
-    kept, used = jnp.where(alone[1], place[alone[0]], 0), alone[1]
-    found = merge_boxes(*spread[:2], valid, kept, used, labels=spread[2], **options)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
-    assert np.abs(np.asarray(expected) - boxes[alone[0]])[np.asarray(used)].max() > 0.05
+    kept, used = jnp.where(dense[1], place[dense[0]], 0), dense[1]
+    actual = merge_boxes(*spread[:2], valid, kept, used, labels=spread[2], **options)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-5)
+    assert np.abs(np.asarray(expected) - boxes[dense[0]])[np.asarray(used)].max() > 0.05
 
 
-def test_merging_loops_on_a_cpu_only():
+def test_merging_loops_only_on_cpus():
     boxes, scores, valid, labels = clusters(0)
     given = boxes, scores, valid, jnp.arange(50), jnp.ones(50, bool)
     for platform, loops in (("cpu", 1), ("cuda", 0)):
@@ -190,16 +190,16 @@ def test_merging_loops_on_a_cpu_only():
 
 
 @FORMS
-def test_boxes_without_size_or_score_stay_as_they_are_and_gradients_are_finite(form):
+def test_boxes_with_zero_size_or_score_are_unchanged_and_gradients_are_finite(form):
     boxes = np.zeros((4, 9), np.float32)
     boxes[:, 0] = [0, 5, 5, 9]
     boxes[1:3, 3:6] = 1
     scores, valid = np.array([0.9, 0.0, 0.0, np.nan], np.float32), np.array([True, True, True, False])
     kept, used = jnp.array([0, 1, 0, 0]), jnp.array([True, True, False, False])
     merge = functools.partial(merge_boxes, iou_threshold=0.3, form=form)
-    found = np.asarray(merge(boxes, scores, valid, kept, used))
-    np.testing.assert_array_equal(found[:2], boxes[:2])
-    assert not found[2:].any()
+    actual = np.asarray(merge(boxes, scores, valid, kept, used))
+    np.testing.assert_array_equal(actual[:2], boxes[:2])
+    assert not actual[2:].any()
 
     def loss(boxes, scores):
         return jax.vmap(lambda b, s: merge(b, s, valid, kept, used))(boxes, scores).sum()

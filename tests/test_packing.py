@@ -1,4 +1,4 @@
-"""Packed and unpacked, a batch is the same bits; what does not fit is named, and never rounded."""
+"""Check that packing is lossless, and that values that do not fit are named and never rounded."""
 
 import dataclasses
 import os
@@ -19,7 +19,7 @@ unpack_compiled = jax.jit(unpack)
 
 
 def make_batch(clouds, *, columns=5, seed=0) -> Batch:
-    """Rows of every cloud scattered among rows that do not count, which hold rubbish."""
+    """Scatter the points of each cloud among padding rows of NaN."""
     rng = np.random.default_rng(seed)
     points = np.full((len(clouds), ROWS, columns), np.nan, np.float32)
     valid = np.zeros((len(clouds), ROWS), bool)
@@ -33,21 +33,21 @@ def make_batch(clouds, *, columns=5, seed=0) -> Batch:
     return Batch(points, valid, boxes, labels, rng.random((len(clouds), BOXES)) > 0.5)
 
 
-def in_front(batch: Batch) -> Batch:
-    """By a loop over rows: the valid ones in front, zeros behind them."""
+def compacted(batch: Batch) -> Batch:
+    """Move the valid rows to the front, by a loop over rows, and fill up with zeros."""
     points, valid = np.zeros_like(batch.points), np.zeros_like(batch.valid)
-    for sample, (cloud, counts) in enumerate(zip(batch.points, batch.valid, strict=True)):
-        for row, point in enumerate([p for p, yes in zip(cloud, counts, strict=True) if yes]):
+    for sample, (cloud, mask) in enumerate(zip(batch.points, batch.valid, strict=True)):
+        for row, point in enumerate([p for p, is_valid in zip(cloud, mask, strict=True) if is_valid]):
             points[sample, row], valid[sample, row] = point, True
     return dataclasses.replace(batch, points=points, valid=valid)
 
 
-def assert_same_bits(found: Batch, expected: Batch) -> None:
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+def assert_same_bits(actual: Batch, expected: Batch) -> None:
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         assert (a.dtype, a.shape, np.asarray(a).tobytes()) == (b.dtype, b.shape, np.asarray(b).tobytes())
 
 
-def form(tree) -> list:
+def shapes_and_types(tree) -> list:
     return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
 
 
@@ -67,19 +67,20 @@ def batches(draw, columns):
 @pytest.mark.parametrize("packing", [Packing(5), Packing(400), Packing(0), Packing(5, False, False)], ids=str)
 @settings(max_examples=40, deadline=None)
 @given(data=st.data())
-def test_unpacked_it_is_the_same_bits(packing, columns, data):
+def test_unpacking_restores_the_same_bits(packing, columns, data):
     batch = data.draw(batches(columns))
     packed = pack(batch, packing)
-    assert_same_bits(unpack_compiled(packed), in_front(batch))
-    assert_same_bits(unpack(packed), in_front(batch))
-    assert form(packed) == form(pack(make_batch([[]] * len(batch.points), columns=columns), packing))
+    assert_same_bits(unpack_compiled(packed), compacted(batch))
+    assert_same_bits(unpack(packed), compacted(batch))
+    empty = make_batch([[]] * len(batch.points), columns=columns)
+    assert shapes_and_types(packed) == shapes_and_types(pack(empty, packing))
 
 
 @pytest.mark.parametrize("packing", [Packing(2), Packing(300), Packing(0, False)], ids=str)
 @pytest.mark.parametrize("number", [0, ROWS])
 def test_full_and_empty_clouds(packing, number):
     batch = make_batch([[(1, 2, 3, 4, 0.5)] * number] * 2)
-    assert_same_bits(unpack(pack(batch, packing)), in_front(batch))
+    assert_same_bits(unpack(pack(batch, packing)), compacted(batch))
     assert int(unpack(pack(batch, packing)).valid.sum()) == 2 * number
 
 
@@ -91,7 +92,7 @@ def test_full_and_empty_clouds(packing, number):
         (Packing(0, False, False), 6, ("float32", "float32", "float32")),
     ],
 )
-def test_bytes_of_a_row(packing, columns, types):
+def test_packed_rows_have_the_stated_types_and_bytes(packing, columns, types):
     packed = pack(make_batch([[]], columns=columns), packing)
     arrays = packed.intensity, packed.lag, packed.laser
     assert tuple(None if array is None else str(array.dtype) for array in arrays) == types
@@ -101,7 +102,7 @@ def test_bytes_of_a_row(packing, columns, types):
 
 
 @pytest.mark.parametrize(
-    ("column", "value", "finding"),
+    ("column", "value", "message"),
     [
         (3, 12.5, "intensity: got 12.5, expected whole numbers from 0 to 255"),
         (3, 256.0, "intensity: got 256.0, expected whole numbers from 0 to 255"),
@@ -109,21 +110,21 @@ def test_bytes_of_a_row(packing, columns, types):
         (3, -0.0, "intensity: got -0.0, expected whole numbers from 0 to 255"),
         (3, np.nan, "intensity: got nan, expected whole numbers from 0 to 255"),
         (5, 0.25, "laser number: got 0.25, expected whole numbers from 0 to 255"),
-        (4, 0.2, "time lag: got 3 different ones in a sample, expected at most 2"),
-        (4, -0.0, "time lag: got 3 different ones in a sample, expected at most 2"),
+        (4, 0.2, "time lag: got 3 different values in a sample, expected at most 2"),
+        (4, -0.0, "time lag: got 3 different values in a sample, expected at most 2"),
     ],
 )
-def test_what_does_not_fit_is_named_and_never_rounded(column, value, finding):
+def test_values_that_do_not_fit_are_named_and_never_rounded(column, value, message):
     cloud = np.array([[1, 2, 3, 7, lag, 9] for lag in (0, 0.1, 0.1)], np.float32)
     cloud[2, column] = value
     batch = make_batch([cloud[:2], cloud, cloud], columns=6)
     with pytest.raises(MisfitError) as caught:
         pack(batch, Packing(2))
-    assert (caught.value.row, str(caught.value)) == (1, finding)
-    assert_same_bits(unpack(pack(batch, Packing(0, False, False))), in_front(batch))
+    assert (caught.value.row, str(caught.value)) == (1, message)
+    assert_same_bits(unpack(pack(batch, Packing(0, False, False))), compacted(batch))
 
 
-def test_the_index_of_a_lag_reaches_as_far_as_the_table():
+def test_the_table_of_lags_can_have_65536_entries():
     with pytest.raises(ValueError, match="num_lags: got 65537, expected 0 to 65536"):
         Packing(65_537)
     lags = np.arange(65_536, dtype=np.float32) / 1024
@@ -135,7 +136,7 @@ def test_the_index_of_a_lag_reaches_as_far_as_the_table():
         assert_same_bits(unpack_compiled(pack(batch, Packing(size))), batch)
 
 
-def test_a_plain_batch_stays_as_it_is():
+def test_an_unpacked_batch_is_returned_unchanged():
     batch = make_batch([[(1, 2, 3, 4, 0)]])
     assert unpack(batch) is batch
 
@@ -151,17 +152,17 @@ def cloud_of(*, intensity=(0, 255), lags=(0, 0.1), laser=()):
         ([cloud_of()], 2, 0, Packing(2)),
         ([cloud_of(), cloud_of(intensity=(1, 2.5))], 2, 0, Packing(2, byte_intensity=False)),
         ([cloud_of(intensity=(1, np.nan))], 2, 0, Packing(2, byte_intensity=False)),
-        ([cloud_of(lags=(0,))], 1, 50, Packing(51)),  # an index of one byte
-        ([cloud_of()], 10, 50, Packing(510)),  # of two
+        ([cloud_of(lags=(0,))], 1, 50, Packing(51)),  # one-byte indices
+        ([cloud_of()], 10, 50, Packing(510)),  # two-byte indices
         ([cloud_of()], 2, 40_000, Packing(0)),
-        ([cloud_of(), cloud_of(lags=(0, 0.1, 0.2))], 2, 0, Packing(0)),  # times of single points
+        ([cloud_of(), cloud_of(lags=(0, 0.1, 0.2))], 2, 0, Packing(0)),  # one time lag per point
         ([cloud_of(laser=(0, 63))], 2, 0, Packing(2)),
         ([cloud_of(laser=(0, 300))], 2, 0, Packing(2, byte_laser=False)),
         ([cloud_of()[:0]], 2, 0, Packing(2)),
         ([], 2, 0, Packing(2)),
     ],
 )
-def test_the_first_clouds_choose_the_packing(clouds, num_sweeps, num_pasted, expected):
+def test_the_given_clouds_determine_the_packing(clouds, num_sweeps, num_pasted, expected):
     assert choose_packing(clouds, num_sweeps=num_sweeps, num_pasted=num_pasted) == expected
 
 
@@ -176,10 +177,10 @@ def check_no_communication() -> None:
     compiled = unpack_compiled.lower(packed).compile()
     text = compiled.as_text()
     assert not any(word in text for word in ("all-gather", "all-reduce", "all-to-all", "collective-permute"))
-    assert_same_bits(compiled(packed), in_front(batch))
+    assert_same_bits(compiled(packed), compacted(batch))
 
 
-def test_every_device_unpacks_its_own_samples():
+def test_each_device_unpacks_its_own_samples():
     code = "import test_packing; test_packing.check_no_communication()"
     paths = [os.path.dirname(__file__), *sys.path]
     environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "2", "PYTHONPATH": os.pathsep.join(paths)}

@@ -1,4 +1,4 @@
-"""Progress lines."""
+"""Check progress lines."""
 
 import re
 import time
@@ -6,7 +6,7 @@ import time
 from fcos_lidar_jax.progress import Progress
 
 
-def test_first_and_last_are_shown_with_rate_and_time_left(capsys):
+def test_the_first_and_last_item_print_a_line(capsys):
     progress = Progress("scenes", 4, every_s=60)
     for done in (1, 2, 3, 4):
         progress.show(done, "32 objects")
@@ -18,7 +18,7 @@ def test_first_and_last_are_shown_with_rate_and_time_left(capsys):
     assert 10 < float(rate[1]) <= 50
 
 
-def test_resumed_work_counts_only_what_is_new(capsys):
+def test_the_rate_of_resumed_work_counts_only_new_items(capsys):
     progress = Progress("steps", 100, every_s=0)
     progress.show(90)
     time.sleep(0.05)

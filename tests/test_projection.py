@@ -1,4 +1,4 @@
-"""Multi-round projection against loops, on random, degenerate and real clouds."""
+"""Compare multi-round projection with loops, on random, degenerate and real clouds."""
 
 import dataclasses
 import functools
@@ -25,7 +25,7 @@ SMALL = Sensor("small", even_inclinations(-20, 10, 4), 12)
 LASER = dataclasses.replace(SMALL, name="laser", row_source="laser", origin_m=(1.0, -2.0, 0.5))
 
 
-AHEAD, BEHIND = sector(NUSCENES_HDL32E, np.pi / 2, 272), sector(WAYMO_TOP, -np.pi, 300)  # one across the seam
+AHEAD, BEHIND = sector(NUSCENES_HDL32E, np.pi / 2, 272), sector(WAYMO_TOP, -np.pi, 300)  # across azimuth pi
 
 
 def cloud(seed: int, number: int = 400, columns: int = 5) -> np.ndarray:
@@ -33,7 +33,7 @@ def cloud(seed: int, number: int = 400, columns: int = 5) -> np.ndarray:
     points = np.zeros((number, columns), np.float32)
     points[:, :2] = rng.normal(0, 20, (number, 2))
     points[:, 2] = rng.normal(-1, 1.5, number)
-    # Exact ties of cell and range, some of them between sweeps; the intensity tells the points apart.
+    # Exact ties of cell and range, some between sweeps. The intensity distinguishes the points.
     points[rng.integers(0, number, 60)] = points[rng.integers(0, number, 60)]
     points[:, 3] = rng.uniform(0, 255, number)
     points[:, 4] = rng.integers(0, 3, number) * np.float32(0.05)
@@ -43,7 +43,7 @@ def cloud(seed: int, number: int = 400, columns: int = 5) -> np.ndarray:
 
 
 def reference_cells(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Cells and ranges in float64, by the definitions; and how far each point is from a cell's edge."""
+    """Cells by definition, in float64, and the angle between each point and the nearest edge of its cell."""
     p = points.astype(np.float64)
     x, y, z = (p[:, i] - sensor.origin_m[i] for i in range(3))
     theta, phi = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
@@ -73,11 +73,11 @@ def reference_cells(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.
     [SMALL, LASER, AHEAD, BEHIND, *PRESETS.values()],
     ids=lambda s: s.name,
 )
-def test_cells_follow_the_definitions(sensor):
+def test_cells_match_their_definition(sensor):
     points = cloud(0, 5000, sensor.point_columns)
     cells, (range_m, azimuth, inclination) = image_cells(jnp.asarray(points), jnp.ones(5000, bool), sensor)
     expected, edge = reference_cells(points, sensor)
-    clear = edge > 1e-6  # rounding may decide on the edge itself
+    clear = edge > 1e-6  # rounding decides at the edge itself
     assert clear.mean() > 0.99
     np.testing.assert_array_equal(np.asarray(cells)[clear], expected[clear])
     xyz = points[:, :3].astype(np.float64) - np.array(sensor.origin_m)
@@ -86,8 +86,8 @@ def test_cells_follow_the_definitions(sensor):
     np.testing.assert_allclose(inclination, np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])), atol=4e-7)
 
 
-def test_a_sector_is_a_part_of_the_turn():
-    """Of points in the middle of the columns, so that no rounding decides."""
+def test_the_image_of_a_sector_is_part_of_the_image_of_the_turn():
+    """Uses points in the middle of their columns, so that the result does not depend on rounding."""
     turn, first = NUSCENES_HDL32E, 150
     part = sector(turn, np.pi - (first + 272 / 2) * turn.column_rad, 272)
     column, row = np.divmod(np.arange(turn.num_columns * turn.num_rows), turn.num_rows)
@@ -105,7 +105,7 @@ def test_a_sector_is_a_part_of_the_turn():
 
 @pytest.mark.parametrize("num_rounds", range(1, 8))
 @pytest.mark.parametrize("prioritize_current", [True, False])
-def test_rounds_keep_what_the_loops_keep(num_rounds, prioritize_current):
+def test_rounds_keep_the_same_points_as_loops(num_rounds, prioritize_current):
     points = cloud(num_rounds)
     valid = np.random.default_rng(9).random(len(points)) < 0.9
     image = project_points(points, valid, SMALL, num_rounds=num_rounds, prioritize_current=prioritize_current)
@@ -116,13 +116,13 @@ def test_rounds_keep_what_the_loops_keep(num_rounds, prioritize_current):
     assert int(image.num_dropped) == int((valid & (np.asarray(cell) == 48)).sum()) > 0
     features = np.asarray(image.features).reshape(48, 9, num_rounds)
     channels = np.stack([*points[:, :3].T, *map(np.asarray, angles), points[:, 3], np.ones(400), points[:, 4]], 1)
-    chosen = np.where(expected[..., None] >= 0, channels[expected], 0)
-    np.testing.assert_array_equal(features, chosen.swapaxes(1, 2))
+    expected_features = np.where(expected[..., None] >= 0, channels[expected], 0)
+    np.testing.assert_array_equal(features, expected_features.swapaxes(1, 2))
 
 
 @pytest.mark.parametrize("form", ["scatter", "sort"])
-def test_forms_of_the_winners_keep_what_a_sort_per_cell_keeps(form):
-    """With ties, empty cells, points that take no part, and more rounds than points."""
+def test_winners_match_a_sort_per_cell(form):
+    """Includes ties, empty cells, excluded points, and more rounds than points."""
     rng = np.random.default_rng(0)
     cell, keys = rng.integers(0, 21, 200).astype(np.int32), rng.integers(0, 9, 200).astype(np.uint32)
     keys[::7] |= np.uint32(1 << 31)
@@ -133,15 +133,15 @@ def test_forms_of_the_winners_keep_what_a_sort_per_cell_keeps(form):
         ranked = own[np.lexsort((own, keys[own]))][:30]
         expected[c, : len(ranked)] = ranked
     options = {"num_cells": 20, "num_rounds": 30, "form": form}
-    found = jax.jit(functools.partial(winners, **options))(cell, keys)
-    np.testing.assert_array_equal(found, expected)
+    actual = jax.jit(functools.partial(winners, **options))(cell, keys)
+    np.testing.assert_array_equal(actual, expected)
     batch = jax.vmap(functools.partial(winners, **options))(np.stack([cell, cell[::-1]]), np.stack([keys] * 2))
     np.testing.assert_array_equal(batch[0], expected)
     none = winners(jnp.full(3, 20), jnp.zeros(3, jnp.uint32), **options)
     np.testing.assert_array_equal(none, np.full((20, 30), -1))
 
 
-def test_a_tpu_needs_no_64_bits_and_no_loop():
+def test_tpu_programs_contain_no_64_bit_types_and_no_loop():
     given = jnp.zeros(9, jnp.int32), jnp.zeros(9, jnp.uint32)
     for platform, wide in (("cpu", True), ("cuda", True), ("tpu", False)):
         program = jax.jit(functools.partial(winners, num_cells=4, num_rounds=3))
@@ -149,14 +149,14 @@ def test_a_tpu_needs_no_64_bits_and_no_loop():
         assert ("ui64" in text, "stablehlo.while" in text) == (wide, wide)
 
 
-def test_unknown_forms_are_refused():
+def test_unknown_forms_are_rejected():
     with pytest.raises((ValueError, TypeError), match="form"):
         winners(jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.uint32), num_cells=1, num_rounds=1, form="heap")
 
 
 @pytest.mark.parametrize("sensor", PRESETS.values(), ids=PRESETS)
-def test_columns_run_clockwise_from_straight_behind(sensor):
-    """Both zeros of y behind the sensor are column 0, and so is a hair to the left; the right is the last one."""
+def test_columns_run_clockwise_from_azimuth_pi(sensor):
+    """Column 0 starts at azimuth pi, for both signs of y = 0, and the last column ends there."""
     x, _, z = sensor.origin_m
     behind, count = np.float32(x - 5), sensor.num_columns
     y = np.array([0.0, -0.0, 1e-3, -1e-3], np.float32)
@@ -167,7 +167,7 @@ def test_columns_run_clockwise_from_straight_behind(sensor):
     assert (np.asarray(cells) % count).tolist() == [0, 0, 0, count - 1, count // 4, (3 * count - 1) // 4]
 
 
-def test_limits_of_the_range_are_open():
+def test_range_limits_are_exclusive():
     ends = [(0, 54), (0, -54), (1, 54), (1, -54), (2, -5), (2, 3)]
     points = np.tile(np.float32([20, 0, 0, 0, 0]), (12, 1))
     for i, (axis, end) in enumerate(ends):
@@ -177,7 +177,7 @@ def test_limits_of_the_range_are_open():
 
 
 @pytest.mark.parametrize("sensor", [NUSCENES_HDL32E, KITTI_HDL64E], ids=lambda s: s.name)
-def test_view_ends_half_a_row_beyond_the_outer_beams(sensor):
+def test_the_field_of_view_ends_half_a_row_beyond_the_outer_beams(sensor):
     table = np.array(sensor.inclinations_rad)
     above, below = (table[0] - table[1]) / 2, (table[-2] - table[-1]) / 2
     phi = [table[0] + 0.99 * above, table[0] + 1.01 * above, table[-1] - 0.99 * below, table[-1] - 1.01 * below]
@@ -188,7 +188,7 @@ def test_view_ends_half_a_row_beyond_the_outer_beams(sensor):
     assert int(image.num_dropped) == 2
 
 
-def test_a_beam_between_uneven_ones_takes_the_nearest():
+def test_points_between_unevenly_spaced_beams_go_to_the_nearest_beam():
     uneven = Sensor("uneven", (0.10, 0.08, -0.10), 8)
     phi = [0.0901, 0.0899, -0.0099, -0.0101]  # around the midpoints 0.09 and -0.01
     points = np.array([[0, 8 * np.cos(a), 8 * np.sin(a), 0, 0] for a in phi], np.float32)
@@ -196,7 +196,7 @@ def test_a_beam_between_uneven_ones_takes_the_nearest():
     assert (np.asarray(cells) // 8).tolist() == [0, 1, 1, 2]
 
 
-def test_current_means_a_lag_of_exactly_zero():
+def test_only_points_with_zero_time_lag_are_current():
     near_old, far_now = [0, 5, 0, 1, 1e-6], [0, 9, 0, 2, -0.0]
     points = np.array([near_old, far_now, [0, 6, 0, 3, 0.4]], np.float32)
     for prioritize, order in ((True, [1, 0, 2]), (False, [0, 2, 1])):
@@ -204,7 +204,7 @@ def test_current_means_a_lag_of_exactly_zero():
         assert image.point_index.max((0, 1)).tolist() == order
 
 
-def test_bad_rows_are_dropped_and_counted_and_harm_nobody():
+def test_unusable_rows_are_dropped_and_counted_and_change_no_other_point():
     good = cloud(3, 50)
     bad = np.array(
         [[np.nan, 1, 0, 0, 0], [1, np.inf, 0, 0, 0], [5, 5, 0, np.nan, 0], [5, 5, 0, 0, np.nan], [60, 0, 0, 0, 0]],
@@ -217,15 +217,15 @@ def test_bad_rows_are_dropped_and_counted_and_harm_nobody():
     assert int(mixed.num_dropped) == int(alone.num_dropped) + 5
 
 
-def test_padding_alone_gives_an_empty_image():
+def test_a_cloud_of_padding_gives_an_empty_image():
     image = project_points(np.full((8, 5), np.nan, np.float32), np.zeros(8, bool), SMALL)
     assert (np.asarray(image.point_index) == -1).all()
     assert not np.asarray(image.features).any()
     assert int(image.num_dropped) == 0
 
 
-def test_too_few_columns_for_the_sensor_are_refused():
-    with pytest.raises(ValueError, match="got 5 columns, sensor 'laser' needs 6"):
+def test_too_few_columns_for_the_sensor_are_rejected():
+    with pytest.raises(ValueError, match="got 5 columns, expected 6 for sensor 'laser'"):
         project_points(cloud(0), np.ones(400, bool), LASER)
 
 
@@ -248,7 +248,7 @@ def test_jit_vmap_and_repetition_are_bit_identical():
     assert_same(plain, jax.tree.map(lambda leaf: leaf[1], batched))
 
 
-def test_order_of_the_input_does_not_matter_where_keys_are_distinct():
+def test_points_with_distinct_keys_can_be_in_any_order():
     points = cloud(4)
     points = points[np.unique(points[:, :3], axis=0, return_index=True)[1]]
     valid = np.ones(len(points), bool)
@@ -299,7 +299,7 @@ def real_cloud(real_data):
         ("all", [227_016, 219_375, 27_195, 12.0, 34.0, 52.2, 65.7, 21_811, 5_418]),
     ],
 )
-def test_real_cloud_gives_the_papers_counts(real_cloud, close, expected):
+def test_real_cloud_gives_the_expected_counts(real_cloud, close, expected):
     sensor = NUSCENES_HDL32E
     valid = np.asarray(remove_close(real_cloud, np.ones(len(real_cloud), bool), sensor, mode=close))
     xyz = np.abs(real_cloud[:, :3])
@@ -314,16 +314,16 @@ def test_real_cloud_gives_the_papers_counts(real_cloud, close, expected):
         current.append(int(((first >= 0) & (real_cloud[np.maximum(first, 0), 4] == 0)).sum()))
         in_view = int(valid.sum()) - int(image.num_dropped)
         shares = [round(100 * kept[r - 1] / in_range, 1) for r in (1, 3, 5, 7)]
-    found = [in_range, in_view, int(kept[0]), *shares, *current]
-    # In range, in view, kept by round 1, % by 1, 3, 5, 7 rounds, current cells with and without priority.
-    for got, wanted in zip(found, expected, strict=True):
-        assert abs(got - wanted) <= (12 if isinstance(wanted, int) else 0.1)
+    actual = [in_range, in_view, int(kept[0]), *shares, *current]
+    # In range, in view, kept by round 1, % kept by 1, 3, 5, 7 rounds, current cells with and without priority.
+    for got, paper in zip(actual, expected, strict=True):
+        assert abs(got - paper) <= (12 if isinstance(paper, int) else 0.1)
 
 
 @pytest.mark.real_data
 @pytest.mark.parametrize("close", ["none", "all"])
 def test_real_cloud_changes_under_permutation_only_where_keys_tie(real_cloud, close):
-    """In round 1 only no-returns within millimetres of the sensor tie: none without the close points."""
+    """In round 1 only no-returns within millimetres of the sensor tie; removing close points removes them all."""
     sensor = NUSCENES_HDL32E
     valid = np.asarray(remove_close(real_cloud, np.ones(len(real_cloud), bool), sensor, mode=close))
     straight = project_points(real_cloud, valid, sensor, num_rounds=7)

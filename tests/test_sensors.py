@@ -1,4 +1,4 @@
-"""Sensors: presets, files, and one line for what cannot be a sensor."""
+"""Check presets, sensor files, and one-line errors for invalid sensors."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ from fcos_lidar_jax.sensors import (
 )
 
 
-def test_presets_are_the_papers_and_the_makers():
+def test_presets_match_the_paper_and_the_data_sheets():
     nuscenes = PRESETS["nuscenes_hdl32e"]
     assert (nuscenes.num_rows, nuscenes.num_columns) == (32, 1086)
     degrees = np.degrees(nuscenes.inclinations_rad)
@@ -31,20 +31,20 @@ def test_presets_are_the_papers_and_the_makers():
     assert PRESETS["kitti_hdl64e"].even_step_rad is None
 
 
-def test_edges_are_midpoints_and_half_a_bin_beyond():
+def test_row_edges_are_midpoints_and_extend_half_a_row_outwards():
     sensor = Sensor("three", (0.3, 0.1, 0.0), 8)
     np.testing.assert_allclose(sensor.row_edges_rad, [0.4, 0.2, 0.05, -0.05])
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_files_give_back_the_sensor(tmp_path, name):
+def test_sensors_survive_a_round_trip_through_files(tmp_path, name):
     path = tmp_path / "sensor.json"
     path.write_text(json.dumps(sensor_to_json(PRESETS[name])))
     assert load_sensor(path) == PRESETS[name] == load_sensor(name)
 
 
 @pytest.mark.parametrize("middle", [math.pi / 2, -math.pi, 3.0, 7.0])
-def test_a_sector_has_columns_as_wide_as_the_turn_s_and_goes_through_files(tmp_path, middle):
+def test_a_sector_keeps_the_column_width_and_survives_a_round_trip(tmp_path, middle):
     part = sector(TINY, middle, 64)
     right, left = part.azimuth_limits_rad
     assert math.remainder((left + right) / 2 - middle, 2 * math.pi) == pytest.approx(0, abs=1e-12)
@@ -54,10 +54,10 @@ def test_a_sector_has_columns_as_wide_as_the_turn_s_and_goes_through_files(tmp_p
     path = tmp_path / "sensor.json"
     path.write_text(json.dumps(sensor_to_json(part)))
     assert load_sensor(path) == part
-    assert "azimuth_limits_rad" not in sensor_to_json(TINY)  # described as before there were sectors
+    assert "azimuth_limits_rad" not in sensor_to_json(TINY)  # the JSON of full-turn sensors is unchanged
 
 
-def test_even_beams_may_be_given_in_degrees():
+def test_evenly_spaced_beams_can_be_given_in_degrees():
     beams = {"lowest": -25, "highest": 3, "rows": 64}
     sensor = sensor_from_json({"name": "a", "num_columns": 1024, "inclinations_deg": beams})
     assert math.degrees(sensor.inclinations_rad[0]) == pytest.approx(3)
@@ -72,7 +72,7 @@ BAD = [
     ({**GOOD, "num_columns": "many"}, "num_columns: got 'many'"),
     ({**GOOD, "num_columns": 1}, "num_columns: got 1"),
     ({**GOOD, "num_columns": True}, "num_columns: got True"),
-    ({**GOOD, "inclinations_rad": [0.0, 0.1]}, "strictly falling"),
+    ({**GOOD, "inclinations_rad": [0.0, 0.1]}, "strictly decreasing"),
     ({**GOOD, "inclinations_rad": [0.1]}, "got 1 beams"),
     ({**GOOD, "inclinations_rad": [3.0, 0.0]}, "within"),
     ({**GOOD, "inclinations_rad": "0.1 0.0"}, "expected a list of numbers"),
@@ -99,7 +99,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("record", "message"), BAD)
-def test_bad_files_get_one_line_with_file_and_field(tmp_path, record, message):
+def test_errors_are_one_line_with_file_and_field(tmp_path, record, message):
     path = tmp_path / "sensor.json"
     path.write_text(json.dumps(record))
     with pytest.raises(ValueError, match=message) as caught:
@@ -108,7 +108,7 @@ def test_bad_files_get_one_line_with_file_and_field(tmp_path, record, message):
     assert "\n" not in str(caught.value)
 
 
-def test_missing_and_garbled_files(tmp_path):
+def test_missing_and_corrupt_files_are_rejected(tmp_path):
     with pytest.raises(ValueError, match=r"no such sensor file, and no preset \(nuscenes_hdl32e"):
         load_sensor(tmp_path / "none.json")
     (tmp_path / "a.json").write_text("{")

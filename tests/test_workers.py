@@ -1,4 +1,4 @@
-"""Worker processes exit with their parent, whatever ends it."""
+"""Check that worker processes exit when their parent is killed."""
 
 import signal
 import time
@@ -21,10 +21,10 @@ if __name__ == "__main__":
 """
 
 
-def test_a_worker_exits_when_its_parent_was_killed(tmp_path):
+def test_a_worker_exits_when_its_parent_is_killed(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(SCRIPT)
     began = time.monotonic()
-    done = run_python(script)  # returns when the worker, too, has closed the outputs
+    done = run_python(script)  # returns only when the worker has closed the outputs, too
     assert done.returncode == -signal.SIGKILL
     assert time.monotonic() - began < 50

@@ -54,7 +54,7 @@ def _make_files(root: Path, samples: int) -> None:
         for scene, number in enumerate(keyframes):
             truths: defaultdict[str, list[tuple[str, Row]]] = defaultdict(list)
             for o in range(TRUTHS):
-                for row in annotations(scene, o, number, number):
+                for row in annotations(scene, o, number):
                     truths[row["sample_token"]].append((class_of(scene, o), row))
             found = {token: list(make_predictions(rng, rows)) for token, rows in truths.items()}
             stream.write(("," if scene else "") + json.dumps(found)[1:-1])

@@ -2,10 +2,7 @@
 
     python -m experiments.benchmarks.full_size --data FOLDER  # on the real keyframe of scene-0061
     python -m experiments.benchmarks.full_size  # on a simulated frame
-    python -m experiments.benchmarks.full_size --peer net_jax.py  # the forward pass against another program too
     python -m experiments.benchmarks.full_size --memory-only --out experiments/results/training_memory.json
-
-Of a peer (see ``peers.py``), ``fwd`` is timed; the variable ``FPN`` gives it the channels of the pyramid.
 
 Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameters; the network is 99 % of the path.
 """
@@ -22,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.benchmarks.peers import turn_by_turn
 from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
@@ -53,7 +49,6 @@ class Args(Options):
     repeats: int = 15  # Turns, of which the median counts.
     memory_only: bool = False
     """Nothing is run: only the memory of a training step is measured, without and with ``model.remat``."""
-    peer: Path | None = None  # Program to time the forward pass against, turn by turn.
 
 
 def training_memory(config: Config) -> dict[str, dict[str, float]]:
@@ -130,11 +125,6 @@ def measure(args: Args) -> dict[str, Any]:
     }
     times = interleaved(calls, args.repeats)
     record["milliseconds"] = {name: times[name]["median_ms"] for name in calls}
-    if args.peer is not None:
-        peer = {"peer": args.peer, "name": "fwd", "environment": {"FPN": config.model.fpn_channels}}
-        record["forward_against_peer_s"] = turn_by_turn(calls["forward"], args.repeats, **peer)
-        print(json.dumps(record["forward_against_peer_s"]), flush=True)
-
     step = training_steps(config, sensor, [frame])
     jax.block_until_ready(step())
     began = time.perf_counter()

@@ -3,15 +3,13 @@
     bash .ci/gpu  # fetches XLA's plugin (0.6 GB) into build/gpu/plugin, then runs this script with its arguments
     bash .ci/gpu --programs train-nuscenes detect-compact
     bash .ci/gpu --all  # every preset
-    bash .ci/gpu --suppression 20
     python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin  # once the plugin is there
 
 Every program is compiled in a process of its own, so that an abort of XLA costs a line and not the check. A line
 per program: seconds, GFLOP per frame, temporary memory, kernels outside of loops, and the loops with their number
 of iterations (``?`` where the data decide) and the kernels of one. ``slow`` counts weight gradients that became a
 convolution with a kernel as large as the image, for which cuDNN has no good algorithm. Exit code 1 where a program
-does not compile, or exchanges anything between devices but sums. ``--suppression`` counts the iterations of the
-only loop that the data decide, the suppression, on simulated clouds with the shipped weights.
+does not compile, or exchanges anything between devices but sums.
 
 There are no times: nothing is run, and the kernels are chosen without measuring them. Cost: about a minute per
 training step and 15 seconds per detection on one core.
@@ -130,7 +128,6 @@ class Args(Options):
     programs: tuple[str, ...] = ()  # Names of programs; default: those of the check.
     all: bool = False  # Every preset too.
     limit_s: int = 900  # Longest time for one program, seconds.
-    suppression: int = 0  # Clouds on which to count the iterations of the suppression.
     one: str | None = None  # Compile this one in this process and print its record; for the script itself.
     text: Path | None = None  # With --one: write the compiled program here.
 
@@ -156,45 +153,7 @@ def measure(args: Args) -> dict[str, Any]:
     for name in args.programs or known:
         records[name] = _compiled(name, args, environment)
         print(_line(name, records[name]), flush=True)
-    record: dict[str, Any] = {"programs": records, "run": False}
-    if args.suppression:
-        counts = list(suppression_iterations(args.suppression))
-        record["suppression_iterations"] = counts
-        print(f"iterations of the suppression on {len(counts)} clouds: {min(counts)} to {max(counts)}", flush=True)
-    return record
-
-
-def suppression_iterations(number: int) -> Iterator[int]:
-    """How often the fixed point of the suppression is iterated in clouds of unseen simulated streets."""
-    import jax
-    import numpy as np
-
-    from fcos_lidar_jax.inference import load_trained
-    from fcos_lidar_jax.inference.cloud import make_cloud
-    from fcos_lidar_jax.inference.detect import make_stages
-    from fcos_lidar_jax.iou import oriented, oriented_overlap
-    from fcos_lidar_jax.simulation.frame_set import unseen_frames
-
-    trained = load_trained("hdl32e")
-    stages, frames = make_stages(trained.model), unseen_frames(trained.sensor, number)
-    threshold, prepare = trained.config.inference.iou_threshold, jax.jit(stages.prepare)
-    find = jax.jit(lambda variables, image: stages.candidates(stages.network(variables, image), image))
-    for index in range(number):
-        cloud = make_cloud(frames.frame(index).points, trained.config, sensor=trained.sensor)
-        found = find(trained.variables, prepare(cloud.points, cloud.valid))
-        boxes, scores, labels = (np.asarray(leaf)[np.asarray(found[3])] for leaf in found[:3])
-        order = np.argsort(-scores, kind="stable")
-        turned, labels = oriented(boxes[order]), labels[order]
-        beats = np.zeros((len(order), len(order)), bool)
-        for row in range(len(order)):
-            shared, union = map(np.asarray, oriented_overlap(turned[row], turned, vertical=False))
-            beats[row] = (shared > threshold * union) & (labels[row] == labels)
-        beats = np.triu(beats, 1)
-        kept, before, iterations = np.ones(len(order), bool), None, 0
-        while before is None or (kept != before).any():
-            kept, before = ~beats[kept].any(axis=0), kept
-            iterations += 1
-        yield iterations
+    return {"programs": records, "run": False}
 
 
 def check(args: Args) -> None:

@@ -20,13 +20,11 @@ MOUNT = {"translation": [0.9, 0.0, 1.8], "rotation": [1.0, 0.0, 0.0, 0.0]}
 _CATEGORIES = {name: category for category, name in reversed(CATEGORY_TO_CLASS.items())}
 
 
-def write_tables(
-    folder: Path, scenes: Mapping[str, int], files: Mapping[str, int], *, objects: int, seen: int | None = None
-) -> None:
+def write_tables(folder: Path, scenes: Mapping[str, int], files: Mapping[str, int], *, objects: int) -> None:
     """Write all tables into a new folder, that of the version.
 
     ``scenes`` maps names to numbers of keyframes, ``files`` channels to files a keyframe, the first of them its
-    own. Each of a scene's ``objects`` is there in ``seen`` keyframes in a row, by default in all.
+    own. Each of a scene's ``objects`` is there in all of its keyframes.
     """
     folder.mkdir(parents=True)
     channels, numbers = list(files), list(scenes.values())
@@ -59,10 +57,7 @@ def write_tables(
             for o in range(objects)
         ),
         "sample_annotation": (
-            row
-            for s, number in enumerate(numbers)
-            for o in range(objects)
-            for row in annotations(s, o, number, seen or number)
+            row for s, number in enumerate(numbers) for o in range(objects) for row in annotations(s, o, number)
         ),
     }
     for name, rows in tables.items():
@@ -79,17 +74,17 @@ def class_of(scene: int, number: int) -> str:
     return str(np.random.default_rng([scene, number]).choice(NUSCENES_CLASSES, p=SHARES))
 
 
-def annotations(scene: int, number: int, keyframes: int, seen: int) -> Iterator[Row]:
+def annotations(scene: int, number: int, keyframes: int) -> Iterator[Row]:
     """Rows of an object in its keyframes; it stands still or moves on a straight line."""
     rng, known = np.random.default_rng([1, scene, number]), CLASS_ATTRIBUTES[class_of(scene, number)]
     start = EGO["translation"] + np.append(rng.normal(0, 22, 2), 0)
     step = rng.choice([0, 2]) * np.append(rng.normal(0, 1, 2), 0)
     size, yaw = rng.uniform(0.5, 4.5, 3).tolist(), rng.uniform(-np.pi, np.pi)
-    rotation, first = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], number % (keyframes - seen + 1)
-    for i, points in enumerate(rng.integers(0, 40, seen).tolist()):
+    rotation = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+    for i, points in enumerate(rng.integers(0, 40, keyframes).tolist()):
         yield {
-            **_link("a", scene, number, i, of=seen),
-            "sample_token": _token("s", scene, first + i),
+            **_link("a", scene, number, i, of=keyframes),
+            "sample_token": _token("s", scene, i),
             "instance_token": _token("i", scene, number),
             "visibility_token": "4",
             "attribute_tokens": [name_token("attribute", known[number % len(known)])] if known else [],

@@ -6,15 +6,11 @@
 Every variant is computed in the fastest of its formulations (see ``Stem``), found by a short run of all of them;
 then all variants run turn by turn. ``needed`` are the operations of the mathematics, ``executed`` what XLA counts
 in the compiled program: without those on the zero padding, with those on the zeros of a block-diagonal kernel.
-Every convolution of ``"split"`` is also timed by itself: what a variant's convolutions take one by one explains
-its place. Cost: 15 turns take about six minutes on two CPU cores. The result is in README.md.
+Cost: 15 turns take some minutes on two CPU cores. The result is in README.md.
 """
 
 import dataclasses
-import functools
-import itertools
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,8 +23,7 @@ from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.locations import image_layout
-from fcos_lidar_jax.models.convolution import convolve
-from fcos_lidar_jax.models.modality import Form, Stem, bundles, channel_groups
+from fcos_lidar_jax.models.modality import Form, Stem, channel_groups
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
@@ -104,47 +99,6 @@ def compiled(stem: StemConfig, precision: str, form: Form) -> tuple[Call, float]
     return lambda: program(variables, image), float(cost.get("flops", 0.0)) / 1e9
 
 
-class Piece(NamedTuple):
-    """One convolution of ``"split"``: a 3x3, or, of dilation 0, the 1x1 that adds a group to the merged image."""
-
-    size: int  # Input channels.
-    out: int  # Output channels.
-    dilation: int
-
-
-def pieces_of(stem: StemConfig) -> Counter[Piece]:
-    """How many convolutions of which kind ``"split"`` makes of a stem.
-
-    >>> pieces_of(StemConfig())[Piece(5, 32, 6)], pieces_of(StemConfig())[Piece(32, 64, 0)]
-    (9, 27)
-    """
-    groups = channel_groups(stem, SHAPE[-1] // 9)
-    together = [groups[cut] for cut in bundles(groups, "split")]
-    groups = [(sum(size for size, _ in some), sum(out for _, out in some)) for some in together]
-    layers = [*groups, *[(out, out) for _, out in groups] * (stem.num_convs - 1)]
-    spatial = [Piece(*channels, dilation) for dilation in stem.dilations for channels in layers]
-    return Counter(spatial + [Piece(out, stem.out_channels, 0) for _, out in groups] * len(stem.dilations))
-
-
-def piece_times(variants: Iterable[Variant], repeats: int) -> dict[Piece, dict[str, float]]:
-    """Every different convolution of the variants by itself: ``median_ms``, ``p99_ms`` and ``gflop_per_s``."""
-    calls, gflop = {}, {}
-    merged = jnp.zeros((*SHAPE[:3], BASE.out_channels))
-    for piece in sorted({piece for variant in variants for piece in pieces_of(variant.stem)}):
-        size = 3 if piece.dilation else 1
-        image = jax.random.normal(jax.random.key(0), (*SHAPE[:3], piece.size))
-        kernel = jax.random.normal(jax.random.key(1), (size, size, piece.size, piece.out))
-        if piece.dilation:
-            convolved = functools.partial(convolve, dilation=piece.dilation)
-            calls[piece] = functools.partial(jax.jit(convolved), image, kernel)
-        else:
-            added = jax.jit(lambda x, k, sum: sum + convolve(x, k))
-            calls[piece] = functools.partial(added, image, kernel, merged)
-        gflop[piece] = 2e-9 * SHAPE[1] * SHAPE[2] * kernel.size
-    found = interleaved(calls, repeats)
-    return {p: {**ms, "gflop_per_s": round(1e3 * gflop[p] / ms["median_ms"], 1)} for p, ms in found.items()}
-
-
 def _paper_times(variant: Variant) -> dict[str, dict[str, float]]:
     times = {}
     for table, row in variant.rows.items():
@@ -161,8 +115,7 @@ def measure(args: Args) -> dict[str, Any]:
     Returns:
         ``variants``, for each: ``form`` (the fastest), ``forms_ms`` (the short run of all), ``median_ms``,
         ``p99_ms``, ``ratio`` to the reference, ``needed_gflop``, ``executed_gflop``, ``executed_gflop_per_s``;
-        ``pieces``, count, time and speed of each convolution by itself, and their sum ``pieces_ms``; ``paper``,
-        ``{"table, row": {"time_ms", "ratio"}}`` if it has any. Beside them ``order_differences`` and options.
+        ``paper``, ``{"table, row": {"time_ms", "ratio"}}`` if it has any. Beside them the options.
 
     Raises:
         ValueError: there is no variant of a name that is asked for.
@@ -181,10 +134,9 @@ def measure(args: Args) -> dict[str, Any]:
         programs[name], executed[name] = tried[chosen[name]]
         print(f"{name}: " + ", ".join(f"{form} {ms:.1f} ms" for form, ms in forms[name].items()), flush=True)
     found = interleaved(programs, args.repeats)
-    alone = piece_times(variants.values(), args.repeats)
     records = {}
     for name, variant in variants.items():
-        ms, pieces = found[name]["median_ms"], sorted(pieces_of(variant.stem).items())
+        ms = found[name]["median_ms"]
         records[name] = {
             "form": chosen[name],
             "forms_ms": forms[name],
@@ -193,43 +145,9 @@ def measure(args: Args) -> dict[str, Any]:
             "needed_gflop": round(needed_gflop(variant.stem), 2),
             "executed_gflop": round(executed[name], 2),
             "executed_gflop_per_s": round(1e3 * executed[name] / ms, 1),
-            "pieces": [{**piece._asdict(), "count": count, **alone[piece]} for piece, count in pieces],
-            "pieces_ms": round(sum(count * alone[piece]["median_ms"] for piece, count in pieces), 3),
             "paper": _paper_times(variant),
         }
-    measured = {"variants": records, "order_differences": order_differences(records)}
-    return {**measured, "precision": args.precision, "repeats": args.repeats}
-
-
-def order_differences(records: dict[str, dict[str, Any]]) -> list[str]:
-    """Pairs that one table of the paper orders the other way, a line each with the numbers of both."""
-
-    def described(name: str) -> str:
-        r = records[name]
-        return (
-            f"{name} {r['needed_gflop']:.1f} GFLOP needed, {r['executed_gflop']:.1f} executed as "
-            f"{r['form']!r} at {r['executed_gflop_per_s']:.0f} GFLOP/s ({told_of(r)})"
-        )
-
-    lines = []
-    for table in ("table3", "table4"):
-        rows, known = PAPER["tables"][table]["rows"], [name for name in records if table in VARIANTS[name].rows]
-        for first, second in itertools.permutations(known, 2):
-            a, b = (rows[VARIANTS[name].rows[table]]["time_ms"] for name in (first, second))
-            if a < b and records[first]["median_ms"] > records[second]["median_ms"]:
-                both = f"{described(first)}; {described(second)}"
-                lines.append(f"{table}: {first} is faster than {second} in the paper, slower here: {both}")
-    return lines
-
-
-def told_of(record: dict[str, Any]) -> str:
-    """The convolutions of a variant by kind, dilations taken together, and what they take one by one."""
-    counts, times = Counter[str](), Counter[str]()
-    for piece in record["pieces"]:
-        kind = f"{piece['size']} to {piece['out']}" + ("" if piece["dilation"] else " merges")
-        counts[kind] += piece["count"]
-        times[kind] += piece["count"] * piece["median_ms"]
-    return ", ".join(f"{counts[kind]} of {kind}: {ms:.1f} ms" for kind, ms in times.items())
+    return {"variants": records, "precision": args.precision, "repeats": args.repeats}
 
 
 def as_text(record: dict[str, Any]) -> str:
@@ -238,18 +156,18 @@ def as_text(record: dict[str, Any]) -> str:
         f"stem alone, {'x'.join(map(str, SHAPE[1:]))}, {record['precision']}, {record['repeats']} turns, "
         f"{hardware_line()}",
         f"{'':24s}{'form':>8s}{'ms':>10s}{'p99':>10s}{'ratio':>7s}{'needed':>9s}{'executed':>10s}{'GFLOP/s':>9s}"
-        f"{'one by one':>12s}   paper, ms (ratio)",
+        f"   paper, ms (ratio)",
     ]
     for name, r in record["variants"].items():
         theirs = ", ".join(f"{where}: {p['time_ms']} ({p['ratio']:.2f})" for where, p in r["paper"].items())
         lines.append(
             f"{name:24s}{r['form']:>8s}{r['median_ms']:10.2f}{r['p99_ms']:10.2f}{r['ratio']:7.2f}"
             f"{r['needed_gflop']:9.1f}{r['executed_gflop']:10.1f}{r['executed_gflop_per_s']:9.0f}"
-            f"{r['pieces_ms']:12.0f}   {theirs or '-'}"
+            f"   {theirs or '-'}"
         )
-    lines.append("needed, executed: GFLOP; GFLOP/s of the executed; one by one: ms of its convolutions")
+    lines.append("needed, executed: GFLOP; GFLOP/s of the executed")
     lines.append(f"paper: {PAPER['times']}: compare the ratios, not the times")
-    return "\n".join(lines + record["order_differences"])
+    return "\n".join(lines)
 
 
 def figures(names: Mapping[str, str], args: Args) -> dict[str, Any]:
@@ -261,7 +179,7 @@ def figures(names: Mapping[str, str], args: Args) -> dict[str, Any]:
         theirs = next(iter(ours["paper"].values()))
         columns[label] = {"module, ms": ours["median_ms"], "ratio": ours["ratio"]}
         columns[label] |= {"module, ms, paper": theirs["time_ms"], "ratio, paper": theirs["ratio"]}
-    return {"columns": columns, "lines": ["```", as_text(measured), "```"], "measured": measured}
+    return {"columns": columns, "lines": ["```", as_text(measured), "```"]}
 
 
 if __name__ == "__main__":

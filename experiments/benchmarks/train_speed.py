@@ -7,23 +7,14 @@ Ours is the whole step: augmentation, projection, network, assignment, losses, g
 the network alone with a plain loss (``torch_net.py``, or any file with ``FNS["train"]``). Both run turn by
 turn, batch 1, float32: ``reduced`` (32x288, five rounds, a quarter of the channels), ``slim`` (32x1088, one
 round, 0.9 M parameters), ``full`` (64x1088, five rounds, the paper's channels) and ``full_64``, whose pyramid
-has 64 channels. Beside it the seconds that the step takes to compile, and those with the library's weight
-gradients, turn by turn as well. Cost: about half an hour on two CPU cores and 12 GB. Expected: at most 1.4 of
-the peer's time when slim, 1.25 at full size, 2 when reduced; at most 1.2 of the library's time to compile.
+has 64 channels. Cost: about half an hour on two CPU cores and 12 GB. Expected: at most 1.4 of the peer's time when
+slim, 1.25 at full size, 2 when reduced.
 """
 
 import dataclasses
-import functools
 import json
-import math
-import statistics
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
-from unittest import mock
-
-import jax
 
 from experiments.benchmarks.peers import turn_by_turn
 from experiments.benchmarks.training_steps import training_steps
@@ -31,7 +22,6 @@ from experiments.changes import change
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import without_close
-from fcos_lidar_jax.models import convolution
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -48,7 +38,6 @@ class Args(Options):
     peer: Path = _PEER  # Program with FNS["train"].
     sizes: tuple[Size, ...] = ("reduced", "slim", "full_64", "full")  # Which to compare.
     repeats: int = 15  # Turns; ten times as many when reduced.
-    compilations: int = 3  # Of each form of the step, also turn by turn.
 
 
 _FULL = {"HEIGHT": 64, "WIDTH": 1088, "ROUNDS": 5, "TYPE": 32, "STEM": 64, "WIDTHS": "64,128,128,128", "HEAD": 64}
@@ -78,26 +67,6 @@ def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
     return config, dataclasses.replace(NUSCENES_HDL32E, num_columns=min(size["WIDTH"], 1086))
 
 
-def compile_seconds(steps: Callable[[], Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Medians of the time to compile the step, as it is and with the library's weight gradients; their ratio."""
-
-    def seconds() -> float:
-        step, times = steps(), []
-        for _ in range(2):
-            began = time.perf_counter()
-            jax.block_until_ready(step())
-            times.append(time.perf_counter() - began)
-        return times[0] - times[1]
-
-    found: dict[str, list[float]] = {"ours": [], "library": []}
-    for _ in range(repeats):
-        found["ours"].append(seconds())
-        with mock.patch.object(convolution, "LARGE", math.inf):
-            found["library"].append(seconds())
-    medians = {name: round(statistics.median(values), 2) for name, values in found.items()}
-    return {**medians, "ratio": round(medians["ours"] / medians["library"], 3)}
-
-
 def measure(args: Args) -> dict[str, Any]:
     """Compare at all sizes."""
     record: dict[str, Any] = {"peer": args.peer.name}
@@ -105,13 +74,12 @@ def measure(args: Args) -> dict[str, Any]:
         size = _SIZES[name]
         config, sensor = of_size(size)
         frames = [without_close(make_frame(0, sensor, num_objects=30), sensor)]
-        steps = functools.partial(training_steps, config, sensor, frames)
         over = 64 // size["STEM"]
         others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
         sizes = {**size, **others, "TRAIN": 1, "CL": 1}  # and what other peers call them
         peer = {"peer": args.peer, "name": "train", "environment": sizes, "python": args.torch_python}
-        figures = turn_by_turn(steps(), args.repeats * (10 if name == "reduced" else 1), **peer)
-        record[name] = {**figures, "compile_s": compile_seconds(steps, args.compilations)}
+        repeats = args.repeats * (10 if name == "reduced" else 1)
+        record[name] = turn_by_turn(training_steps(config, sensor, frames), repeats, **peer)
         print(f"{name}: {json.dumps(record[name])}", flush=True)
     return record
 

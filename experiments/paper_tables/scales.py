@@ -18,7 +18,6 @@ import jax
 import numpy as np
 
 from experiments.changes import change
-from experiments.paper_tables.cell_names import describe_sensor
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
@@ -87,11 +86,10 @@ class Simulated:
             "num_objects": self.num_objects,
             "reach_m": self.reach_m,
             "min_points": self.min_points,
-            "sensor": describe_sensor(self.sensor),
+            "sensor": dataclasses.asdict(self.sensor),
             "train_frames": self.train_frames,
             "test_frames": self.test_frames,
             "sweeps": self.base.num_sweeps,
-            "hurry": False,  # A key that the names of the committed cells were hashed with.
             "close_m": _BONNET_M,
         }
 
@@ -248,8 +246,7 @@ class NuScenesLayout:
             "splits": list(self.splits),
             "fingerprints": [self.frames(split, NUSCENES).fingerprint() for split in self.splits],
             "steps": layout.steps,
-            # Where it is not set, it cannot have changed a thing.
-            **({"allow_missing_sweeps": True} if layout.allow_missing_sweeps else {}),
+            "allow_missing_sweeps": layout.allow_missing_sweeps,
         }
 
     def objects(self, frames: NuScenesFrames) -> GroundTruthDatabase:

@@ -32,7 +32,7 @@ def figures(args: Args) -> dict[str, Any]:
                 column["MRV, ms, paper"] = measured["paper_times"][r]["median_ms"]
             if here:
                 column["points kept, %, this scale"] = here["prioritized"]["percent"][r]
-    return {"columns": columns, "lines": ["```", mrv_figures.as_text(measured), "```"], "measured": measured}
+    return {"columns": columns, "lines": ["```", mrv_figures.as_text(measured), "```"]}
 
 
 def _label(setting: str, rounds: int) -> str:

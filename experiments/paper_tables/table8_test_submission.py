@@ -15,7 +15,7 @@ from typing import Any
 
 from experiments.changes import change
 from experiments.paper import PAPER
-from experiments.paper_tables.cell_names import cell_name
+from experiments.paper_tables.cells import changes_of, read_cells, run_name
 from experiments.paper_tables.scales import NuScenesLayout, write_submission
 from experiments.paper_tables.tables import Args, Row, Table, make_scale, run_table
 from experiments.script import run_script
@@ -58,13 +58,13 @@ def submission(args: Args) -> list[str]:
     """Write the results file of the trained c128 with fade, and say where."""
     scale, seed = make_scale(args), args.seeds[0] if args.seeds else 0
     config = wide(faded(scale.base))
-    name = cell_name(config, scale.describe(), seed)
-    known = args.out / args.scale / "cells" / f"{name}.json"
-    if not known.is_file():
+    changes = changes_of(config, scale.base)
+    known = read_cells(args.out / args.scale, scale).get((changes, seed))
+    if known is None:
         return [f'No results file: the row "{_SUBMITTED}" was not trained with seed {seed}.']
-    if "diverged" in json.loads(known.read_text(encoding="utf-8")):
+    if "diverged" in known:
         return [f"No results file: the training of seed {seed} diverged."]
-    run = args.runs / args.scale / name
+    run = args.runs / args.scale / run_name(changes, seed)
     if not finished(run):
         return [f"No results file: no finished run in {run}, the cell was trained elsewhere."]
     if isinstance(scale, NuScenesLayout):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +14,7 @@ from experiments.benchmarks.latency import real_cloud
 from experiments.changes import Change
 from experiments.hardware import hardware
 from experiments.paper import PAPER
+from experiments.paper_tables.cells import Cell
 from experiments.paper_tables.grid import run_cells
 from experiments.paper_tables.scales import (
     Layout,
@@ -24,6 +24,7 @@ from experiments.paper_tables.scales import (
     quarter,
     smoke,
 )
+from experiments.script import compact_json
 from experiments.statistics import interval
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import config_to_json
@@ -141,23 +142,17 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
     here, folder = hardware(), args.out / args.scale
     seeds = args.seeds or ((0,) if args.scale == "smoke" else (0, 1, 2))
     scale = None if args.only_figures else make_scale(args)
-    cells = {} if scale is None else _cells(table, scale, seeds, folder / "cells", args)
+    cells = {} if scale is None else _cells(table, scale, seeds, folder, args)
     file = folder / f"{table.name}{'_figures' if args.only_figures else ''}"
     # One process at a time: what is timed is not to be disturbed by the others of the same table.
     with file_lock(args.runs / args.scale / f"{file.name}.lock", wait=True):
-        record = {
-            "table": table.name,
-            "scale": args.scale,
-            "seeds": list(seeds) if cells else [],
-            "trained_on": None if scale is None else {**scale.describe(), "base": config_to_json(scale.base)},
-            "rows": [_row_record(table, row, cells) for row in table.rows],
-            "figures": table.figures(args) if table.figures else {},
-            "cells_of": sorted({f"{c['git']} on {c['device']}" for row in cells.values() for c in row}),
-            **here,
-        }
+        record = make_record(table, args.scale, scale, cells, table.figures(args) if table.figures else {})
         text = as_markdown(table, record)
         print(text, flush=True)
-        for suffix, content in ((".json", json.dumps(record, indent=1)), (".md", text)):
+        # Scores and what was trained on are in the files of the cells.
+        rows = [{name: value for name, value in row.items() if name != "scores"} for row in record["rows"]]
+        written = {**{name: value for name, value in record.items() if name != "trained_on"}, "rows": rows, **here}
+        for suffix, content in ((".json", compact_json(written, 3) + "\n"), (".md", text)):
             write = functools.partial(Path.write_text, data=content, encoding="utf-8")
             atomic_write(file.with_suffix(suffix), write)
         picture = file.with_suffix(".png")
@@ -168,6 +163,21 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
         if any(cell and "curve" in cell for row in record["rows"] for cell in row.get("scores", ())):
             draw_learning(table, record, file.with_name(f"{file.name}_curves.png"))
     return record
+
+
+def make_record(
+    table: Table, scale_name: str, scale: Scale | None, cells: dict[str, list[Cell]], figures: dict[str, Any]
+) -> dict[str, Any]:
+    """What a table says, from the cells of its rows and from figures that need no training."""
+    return {
+        "table": table.name,
+        "scale": scale_name,
+        "seeds": [cell["seed"] for cell in next(iter(cells.values()), [])],
+        "trained_on": None if scale is None else {**scale.describe(), "base": config_to_json(scale.base)},
+        "rows": [_row_record(table, row, cells) for row in table.rows],
+        "figures": figures,
+        "cells_of": sorted({f"{cell['git']} on {cell['device']}" for row in cells.values() for cell in row}),
+    }
 
 
 def _check(args: Args) -> None:
@@ -182,9 +192,7 @@ def _check(args: Args) -> None:
                 raise ValueError(f"--{option}: is of --scale nuscenes, got --scale {args.scale}")
 
 
-def _cells(
-    table: Table, scale: Scale, seeds: tuple[int, ...], results: Path, args: Args
-) -> dict[str, list[dict[str, Any]]]:
+def _cells(table: Table, scale: Scale, seeds: tuple[int, ...], results: Path, args: Args) -> dict[str, list[Cell]]:
     """The records of every row's cells, by seed."""
     configs = {row.label: row.change(scale.base) for row in table.rows}
     if isinstance(scale, Simulated):
@@ -196,14 +204,13 @@ def _cells(
     return {label: [next(found) for _ in seeds] for label in configs}
 
 
-def _row_record(table: Table, row: Row, cells: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+def _row_record(table: Table, row: Row, cells: dict[str, list[Cell]]) -> dict[str, Any]:
     """Scores of a row, their difference to the reference, seed by seed, and the paper's."""
     reference = table.reference_of(row)
     record: dict[str, Any] = {"label": row.label, "reference": reference.label}
     record |= {"paper": table.paper_rows.get(row.paper, {}), "paper_difference": table.paper_difference(row)}
     if row.label in cells:
         own, base = cells[row.label], [cell.get("scores") for cell in cells[reference.label]]
-        record["cells"] = [cell["name"] for cell in own]
         record["scores"] = mine = [cell.get("scores") for cell in own]
         record["diverged"] = [f"seed {cell['seed']}: {cell['diverged']}" for cell in own if "diverged" in cell]
         for s in SCORES:
@@ -285,7 +292,6 @@ def _training_text(trained_on: dict[str, Any]) -> str:
     shown = {name: value for name, value in trained_on.items() if isinstance(value, int | float | str)}
     shown |= {
         "scale": None,
-        "hurry": None,
         **{name: trained_on[name]["name"] for name in ("streets", "sensor") if name in trained_on},
         "splits": " and ".join(trained_on.get("splits", ())) or None,
     }

@@ -28,7 +28,6 @@ from experiments.changes import change
 from experiments.real_frames import interval_of, real_frames, scores_by_range
 from experiments.runs import detections, trained
 from experiments.script import Options, real_data, run_script, save
-from experiments.studies.real_scene import TEST, TRAIN
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -45,6 +44,8 @@ from fcos_lidar_jax.training.checkpoints import find_checkpoint
 FROM_SCRATCH = change(copy_paste=None, class_balanced=False)(COMPACT)
 FINE_TUNING = change(optimizer__peak_learning_rate=1e-3)(FROM_SCRATCH)
 REAL = ("scene-0523, even", "scene-0523, odd", "scene-0103", "scene-0061")
+TEST = range(3, 11)  # Keyframes of scene-0523.
+TRAIN = [i for i in range(40) if i not in TEST]
 _SETS = 300  # Of keyframes, drawn for the intervals.
 
 

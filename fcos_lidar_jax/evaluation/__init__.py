@@ -1,4 +1,4 @@
-"""How good detections are."""
+"""Evaluation of detections against ground truth."""
 
 from fcos_lidar_jax.evaluation.summary import evaluate_detections
 

@@ -1,4 +1,4 @@
-"""nuScenes' benchmark on keyframes at hand, without a results file on disk."""
+"""The nuScenes benchmark on keyframes in memory, without a results file."""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,12 +12,12 @@ from fcos_lidar_jax.types import Detections
 def evaluate_keyframes(
     found: Iterable[Detections], data: NuScenes, tokens: Sequence[str], classes: Sequence[str]
 ) -> Evaluation:
-    """The benchmark's numbers for detections in keyframes, the same as those of their results file.
+    """Evaluate detections in keyframes with the benchmark's metrics, equal to those of their results file.
 
     Args:
-        found: NumPy arrays, of each keyframe, in its LiDAR frame.
-        data, tokens: data set and its keyframes.
-        classes: names that the labels index, of the benchmark's.
+        found: NumPy detections of each keyframe, in its LiDAR frame.
+        data, tokens: data set and tokens of the keyframes.
+        classes: class names by label, all from the benchmark.
     """
     results = {
         token: result_entries(boxes, token, data.sensor_to_global(token), classes)

@@ -1,4 +1,4 @@
-"""How far the scores could be chance: samples drawn anew, with replacement."""
+"""Bootstrap intervals of the scores, from samples drawn with replacement."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,15 +7,14 @@ import numpy as np
 
 from fcos_lidar_jax.evaluation.metrics import Evaluation, score
 
-LEVEL = 0.95  # share of the drawn sets whose score lies in the interval
+LEVEL = 0.95  # share of the resampled sets whose score lies in the interval
 
 
 def scores_of_draw(evaluation: Evaluation, copies: np.ndarray) -> dict[str, float]:
-    """``mean_ap``, and ``nd_score`` for the benchmark, of samples drawn anew, each as often as ``copies`` says.
+    """``mean_ap``, and ``nd_score`` for the benchmark, of a resampled set with ``copies`` of each sample.
 
-    Samples without truth of a class say nothing about it: outside of the benchmark it then counts with its AP over
-    all samples, so that the mean is of the same classes in every draw. In the benchmark a class without truth has
-    an AP of 0, here as well.
+    If a resampled set has no truth of a class, the class counts with its AP over all samples, so that the mean is
+    always over the same classes. In the benchmark such a class has an AP of 0.
     """
     rankings = [ranking.resampled(copies) for ranking in evaluation.rankings]
     summary = score(rankings, evaluation.metric)[1]
@@ -33,15 +32,15 @@ def bootstrap(
     groups: Sequence[int] | None = None,
     report: Callable[[int], None] = lambda done: None,
 ) -> dict[str, Any]:
-    """Intervals of the scores over sets of as many samples, drawn from those at hand.
+    """Intervals of the scores over resampled sets with the same number of samples.
 
-    Matching never crosses samples, so it is done once; every set is scored by the metric of the evaluation.
-    Keyframes of a scene resemble each other: unless scenes are drawn as a whole, the true intervals are wider.
+    Matching never crosses samples and is done once. Each set is scored by the metric of the evaluation. Keyframes
+    of a scene resemble each other, so the true intervals are wider unless whole scenes are drawn with ``groups``.
 
     Args:
-        repeats: sets to draw.
-        groups: the group of each sample, counted from 0, such as its scene: groups are drawn instead of samples.
-        report: called with the number of sets that are done.
+        repeats: number of sets.
+        groups: group of each sample, such as its scene, starting at 0; groups are drawn instead of samples.
+        report: called with the number of finished sets.
 
     Returns:
         ``{"repeats", "seed", "level", "mean_ap": {"low", "high"}}``, and ``"nd_score"`` for the benchmark.

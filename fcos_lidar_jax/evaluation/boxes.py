@@ -1,4 +1,4 @@
-"""Boxes of many samples as columns, and the truth that they are measured against."""
+"""Columns of boxes of many samples, and ground truth."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,26 +17,25 @@ CLASS_ATTRIBUTES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("motorcycle", "bicycle"), ("cycle.with_rider", "cycle.without_rider")),
     **dict.fromkeys(("traffic_cone", "barrier"), ()),
 }
-"""The attributes that a box of each class may have: first the likeliest in motion, then the likeliest at rest."""
+"""Attributes of each class: first the likeliest one in motion, then the likeliest one at rest."""
 
 LABELS = {name: i for i, name in enumerate(NUSCENES_CLASSES)}  # nuScenes class name -> label
 _ATTRIBUTES = sorted({name for names in CLASS_ATTRIBUTES.values() for name in names})
 ATTRIBUTE_INDEX = {"": -1, **{name: i for i, name in enumerate(_ATTRIBUTES)}}
-"""Attribute name -> index, -1 for none."""
-
+"""Attribute name -> index, -1 without an attribute."""
 
 Rows = TypeVar("Rows", bound="Columns")
 
 
 @dataclasses.dataclass(frozen=True)
 class Columns:
-    """Arrays of one length: row i of all of them is one thing."""
+    """Arrays of equal length. Row i of all arrays belongs together."""
 
     def __len__(self) -> int:
         return len(getattr(self, dataclasses.fields(self)[0].name))
 
     def take(self: Rows, rows: np.ndarray | slice) -> Rows:
-        """Some rows, by index, mask or slice."""
+        """Select rows by index, mask or slice."""
         return dataclasses.replace(self, **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
 
 
@@ -48,11 +47,11 @@ class BoxColumns(Columns):
     label: np.ndarray  # i16[n]: index into the classes of the metric
     translation: np.ndarray  # f64[n, 3]: centre, metres
     size: np.ndarray  # f64[n, 3]: width, length, height, metres
-    yaw: np.ndarray  # f64[n]: direction of the heading axis in the ground plane, radians
+    yaw: np.ndarray  # f64[n]: heading in the ground plane, radians
     velocity: np.ndarray  # f64[n, 2]: m/s, NaN where unknown
     attribute: np.ndarray  # i8[n]: index by ATTRIBUTE_INDEX
     score: np.ndarray  # f64[n]: -1 for truth
-    num_points: np.ndarray  # i32[n]: LiDAR and radar points inside, -1 where not counted, as in predictions
+    num_points: np.ndarray  # i32[n]: LiDAR and radar points inside, -1 if unknown, as for predictions
 
 
 _UNKNOWN = {"attribute": -1, "score": -1.0, "num_points": -1}
@@ -60,10 +59,10 @@ _WHOLE = {"sample": np.int32, "label": np.int16, "attribute": np.int8, "num_poin
 
 
 def make_columns(**columns: Any) -> BoxColumns:
-    """Columns in their number types; a single value stands for all rows.
+    """Create columns with the right types. A scalar fills all rows.
 
     Args:
-        columns: fields of :class:`BoxColumns`; attribute, score and number of points are unknown where left out.
+        columns: fields of :class:`BoxColumns`; attribute, score and number of points default to unknown.
 
     >>> no_box = np.zeros((0, 3))
     >>> len(make_columns(sample=0, label=0, translation=no_box, size=no_box, yaw=0.0, velocity=no_box[:, :2]))
@@ -75,7 +74,7 @@ def make_columns(**columns: Any) -> BoxColumns:
 
 
 def join(parts: Sequence[BoxColumns]) -> BoxColumns:
-    """All boxes of all parts, at least one part, in their order."""
+    """Concatenate one or more parts in order."""
     names = [field.name for field in dataclasses.fields(BoxColumns)]
     return BoxColumns(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -86,20 +85,20 @@ NO_BOXES = make_columns(sample=0, label=0, translation=_NONE, size=_NONE, yaw=0.
 
 @dataclasses.dataclass(frozen=True)
 class GroundTruth:
-    """The annotations of some samples."""
+    """Annotations of samples."""
 
     tokens: tuple[str, ...]  # names of the samples
-    ego_translation: np.ndarray  # f64[samples, 3]: the ego vehicle, global frame; class ranges count from here
-    boxes: BoxColumns  # of the metric's classes
-    racks: BoxColumns  # bicycle racks of all samples: what stands in one is not evaluated
-    rack_axes: np.ndarray  # f64[r, 3, 3]: rack to global
+    ego_translation: np.ndarray  # f64[samples, 3]: ego vehicle, global frame; origin of the class ranges
+    boxes: BoxColumns  # boxes of the metric's classes
+    racks: BoxColumns  # bicycle racks of all samples; cycles inside a rack are not evaluated
+    rack_axes: np.ndarray  # f64[r, 3, 3]: rotations from rack to global
 
 
 def heading_yaw(rotation: np.ndarray) -> np.ndarray:
-    """Direction of the rotated x axis in the ground plane, f64[n], for unit quaternions and others alike.
+    """Direction of the rotated x axis in the ground plane, f64[n].
 
     Args:
-        rotation: f64[n, 4]: w, x, y, z.
+        rotation: f64[n, 4], quaternions w, x, y, z of any positive norm.
 
     >>> heading_yaw(np.array([[2.0, 0, 0, 2]])).round(4).tolist()
     [1.5708]

@@ -1,4 +1,4 @@
-"""Which samples to look at: the best, a typical one, the worst."""
+"""Example samples of an evaluation: the best, a typical and the worst."""
 
 import dataclasses
 
@@ -7,22 +7,22 @@ import numpy as np
 from fcos_lidar_jax.evaluation.boxes import BoxColumns
 from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation
 
-_EXTREMES = 3  # Of the worst and of the best.
+_EXTREMES = 3  # number of worst and of best samples
 
 
 @dataclasses.dataclass(frozen=True)
 class Examples:
-    """Samples to draw, and the detections to draw in them."""
+    """Samples to plot, and the score threshold of their detections."""
 
-    rows: dict[str, int]  # best, typical and worst -> row of the sample; fewer where there are fewer samples
-    extremes: dict[str, int]  # worst 1 to 3 and best 1 to 3, likewise; none twice
-    min_score: float  # the score from which on the predictions of all samples together have the highest F1
+    rows: dict[str, int]  # best, typical and worst -> row of the sample; fewer entries if there are fewer samples
+    extremes: dict[str, int]  # worst 1 to 3 and best 1 to 3 -> row of the sample, without duplicates
+    min_score: float  # threshold with the highest F1 over all samples
 
 
 def choose_examples(evaluation: Evaluation) -> Examples:
-    """Samples by their F1 at two metres over all classes, at the score that is best for all samples together.
+    """Choose samples by F1 at two metres over all classes, at the threshold with the highest overall F1.
 
-    Among equals the sample with the most truth comes first. Samples without truth are left out.
+    Among samples with equal F1, the sample with the most truth comes first. Samples without truth are skipped.
     """
     rankings, num_samples = evaluation.rankings, len(evaluation.tokens)
     of_class = [(ranking.score, ranking.hit[ERROR_ROW], ranking.sample) for ranking in rankings]
@@ -40,7 +40,7 @@ def choose_examples(evaluation: Evaluation) -> Examples:
         return Examples({}, {}, min_score)
     most = -truth[candidates]
     falling, rising = (candidates[np.lexsort((most, q[candidates]))].tolist() for q in (-quality, quality))
-    # One name a sample, of several the last.
+    # Each sample has one name. The last assignment wins.
     names = {falling[len(falling) // 2]: "typical", rising[0]: "worst", falling[0]: "best"}
     worst = rising[:_EXTREMES]
     ranked = {"worst": worst, "best": [row for row in falling[:_EXTREMES] if row not in worst]}
@@ -51,9 +51,9 @@ def choose_examples(evaluation: Evaluation) -> Examples:
 def sensor_boxes(
     evaluation: Evaluation, sample: int, sensor_to_global: np.ndarray, *, min_score: float
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Predictions (boxes, labels, scores) and truth (boxes, labels) of a sample in a sensor's frame, as evaluated.
+    """Evaluated predictions (boxes, labels, scores) and truth (boxes, labels) of a sample in a sensor's frame.
 
-    The sample is given by its row, the sensor by its pose f64[4, 4]; ``min_score`` is for the predictions alone.
+    ``sensor_to_global`` is the pose of the sensor, f64[4, 4]; ``min_score`` is the threshold of the predictions.
     """
     turn, origin = sensor_to_global[:3, :3], sensor_to_global[:3, 3]
 

@@ -1,4 +1,4 @@
-"""Evaluation of frames from anywhere: boxes in the sensor's frame, no tokens, no racks, no attributes."""
+"""Evaluation of frames of any data set: boxes in the sensor's frame, without tokens, racks and attributes."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -19,16 +19,17 @@ from fcos_lidar_jax.types import Detections
 
 
 def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric: Metric) -> Evaluation:
-    """Evaluate detections against the boxes of their frames; the score is the mAP by centre distance.
+    """Evaluate detections against the boxes of their frames with the mAP by centre distance.
 
-    It differs from the nuScenes benchmark: ranges count from the sensor and not from the ego vehicle, boxes count
-    by their LiDAR points alone, there are no bicycle racks, attributes and NDS, and means are over the classes
-    that occur in the truth.
+    This is not the nuScenes benchmark: ranges are measured from the sensor instead of the ego vehicle, only LiDAR
+    points decide whether a box is evaluated, there are no bicycle racks, attributes or NDS, and means are over the
+    classes that occur in the truth.
 
     Args:
-        found: NumPy arrays, one for each frame, labels by the metric's classes.
-        frames: with the truth, labels likewise; boxes without a point do not count. Points are not looked at.
-        metric: of :func:`fcos_lidar_jax.evaluation.metrics.metric_of`.
+        found: NumPy detections per frame, with labels by the metric's classes.
+        frames: frames with ground truth, with labels by the metric's classes; boxes without points are not
+            evaluated. The points of the frames are not used.
+        metric: from :func:`fcos_lidar_jax.evaluation.metrics.metric_of`.
 
     Raises:
         ValueError: the metric is the benchmark's.
@@ -40,18 +41,16 @@ def evaluate_frames(found: Iterable[Detections], frames: Iterable[Frame], metric
     1.0
     """
     if metric.benchmark:
-        raise ValueError(
-            "metric: got the nuScenes benchmark's, expected one of metric_of: frames have no attributes"
-        )
+        raise ValueError("metric: got the nuScenes benchmark's, expected metric_of(...): frames lack attributes")
     return evaluate(*frame_columns(found, frames), metric)
 
 
 def frame_columns(
     found: Iterable[Detections], frames: Iterable[Frame], names: Sequence[str] = ()
 ) -> tuple[BoxColumns, GroundTruth]:
-    """Detections and truth of frames as columns, with the sensors' frames as the global one.
+    """Convert detections and truth of frames to columns, with the sensor's frame as the global frame.
 
-    The samples are called by the names; by default they are numbered.
+    ``names`` are the names of the samples; by default samples are numbered.
     """
     predictions, truths = [NO_BOXES], [NO_BOXES]
     for sample, (d, frame) in enumerate(zip(found, frames, strict=True)):
@@ -64,7 +63,7 @@ def frame_columns(
 
 
 def _columns(sample: int, boxes: np.ndarray, **columns: np.ndarray) -> BoxColumns:
-    """Boxes ``x, y, z, l, w, h, yaw, vx, vy`` of one sample."""
+    """Columns of the boxes ``x, y, z, l, w, h, yaw, vx, vy`` of one sample."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 9)
     centre, size, yaw, velocity = boxes[:, :3], boxes[:, [4, 3, 5]], boxes[:, 6], boxes[:, 7:9]
     return make_columns(sample=sample, translation=centre, size=size, yaw=yaw, velocity=velocity, **columns)
@@ -74,7 +73,7 @@ def write_detections(path: Path, frames: Iterable[tuple[str, bytes]], classes: S
     """Write detections: ``{"classes", "frames": [{"name", "boxes": [{"label", "score", "box"}]}]}``.
 
     Args:
-        frames: names with their boxes as JSON, see :func:`fcos_lidar_jax.inference.records.as_records`.
+        frames: names and boxes as JSON, see :func:`fcos_lidar_jax.inference.records.as_records`.
     """
     lines = (b'{"name": %s, "boxes": %s}' % (json.dumps(name).encode(), boxes) for name, boxes in frames)
     text = b'{"classes": %s, "frames": [\n%s\n]}\n' % (json.dumps(list(classes)).encode(), b",\n".join(lines))
@@ -97,14 +96,14 @@ class _DetectionsFile(msgspec.Struct, gc=False):
 
 
 def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) -> list[Detections]:
-    """Read what :func:`write_detections` wrote, in the order of the names.
+    """Read a file of :func:`write_detections`, in the order of ``names``.
 
     Args:
-        names: of the frames that it must cover, no more and no less.
-        classes: that the labels shall index.
+        names: names of the frames; the file must cover exactly these frames.
+        classes: class names by label.
 
     Raises:
-        ValueError: naming the file, the frame, the box (from 0) and what is wrong.
+        ValueError: naming the file, the frame, the box (from 0) and the fault.
     """
     by_name: dict[str, list[_Box]] = {}
     for frame in read_json(path, _DetectionsFile)[0].frames:
@@ -115,13 +114,12 @@ def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) ->
     found = []
     for name in names:
         boxes, where = by_name[name], f"{path}: frame {name}"
-        labels = index_of(boxes, "label", {known: label for label, known in enumerate(classes)}, where)
+        labels = index_of(boxes, "label", {name: label for label, name in enumerate(classes)}, where)
         columns = np.array([box.box for box in boxes], np.float64).reshape(-1, 9)
         near = ~(np.abs(columns) > FARTHEST_M).any(axis=1)
         expect(near, boxes, "box", where, f"numbers of at most {FARTHEST_M:g}")
-        expect(
-            (columns[:, 3:6] >= np.finfo(np.float32).tiny).all(axis=1), boxes, "box", where, "three positive sizes"
-        )
+        positive = (columns[:, 3:6] >= np.finfo(np.float32).tiny).all(axis=1)
+        expect(positive, boxes, "box", where, "three positive sizes")
         unknown = np.isnan(columns[:, 7:])
         expect(unknown[:, 0] == unknown[:, 1], boxes, "box", where, "a velocity of two numbers or of two nulls")
         scores = np.array([box.score for box in boxes])

@@ -1,4 +1,4 @@
-"""JSON files with a list of boxes for every sample: read sample by sample, each fault named."""
+"""JSON files with a list of boxes per sample, read sample by sample, with precise error messages."""
 
 import json
 import mmap
@@ -15,7 +15,7 @@ from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation.boxes import heading_yaw
 
 _NOT_FINITE = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|(NaN|-?Infinity)')
-"""Texts are matched too, so that what is in them is left alone."""
+"""Also matches strings, so that their contents are not replaced."""
 _KEY = re.compile(rb'\s*[{,]\s*("(?:[^"\\]|\\.)*")\s*:\s*')
 
 Text = bytes | mmap.mmap | msgspec.Raw
@@ -23,7 +23,7 @@ Vector = tuple[float, float, float]
 
 
 class JsonBox(msgspec.Struct, gc=False):
-    """A box in the global frame, as results and ground truth have it."""
+    """A box in the global frame, with the fields common to results and ground truth."""
 
     translation: Vector
     size: Vector
@@ -34,14 +34,15 @@ class JsonBox(msgspec.Struct, gc=False):
 
 
 def read_json(source: str | Path | dict[str, Any], kind: Any, *, given: str = "") -> tuple[Any, str]:
-    """A JSON file as an object of a type, and its name for messages.
+    """Read a JSON file as an object of a type; also returns its name for messages.
 
     Args:
-        source: the file, or what ``json.load`` gives for it, with NumPy numbers and arrays if you like.
-        given: name of a source that is no file.
+        source: the file, or the result of ``json.load``, optionally with NumPy numbers and arrays.
+        kind: type of the object.
+        given: name of a source that is not a file.
 
     Raises:
-        ValueError: no such file, nothing in it, not JSON, or not of this kind.
+        ValueError: the file does not exist, is empty, is not JSON or does not match the type.
     """
     if isinstance(source, dict):
         text = json.dumps(source, default=lambda array: array.tolist()).encode()
@@ -56,13 +57,13 @@ def read_json(source: str | Path | dict[str, Any], kind: Any, *, given: str = ""
 
 
 def decode_json(text: Text, kind: Any, source: str) -> Any:
-    """A JSON text as an object of a type, with the parts that the type leaves raw.
+    """Decode a JSON text as an object of a type. Parts that the type declares raw stay undecoded.
 
-    NaN and infinities, which Python writes and JSON does not have, are let in: NaN is what ``null`` is. No number
-    of the object is either.
+    Accepts NaN and infinities, which Python writes although JSON excludes them: NaN is read as ``null``, and
+    infinities are rejected where the type expects a number.
 
     Raises:
-        ValueError: naming the source: not JSON, or not of this kind.
+        ValueError: naming the source: it is not JSON or does not match the type.
 
     >>> decode_json(b'{"a": NaN}', dict[str, float | None], "here")
     {'a': None}
@@ -81,29 +82,29 @@ def decode_json(text: Text, kind: Any, source: str) -> Any:
 
 
 def _plain_json(text: Text) -> bytes:
-    """NaN as ``null``, infinities as texts, which no number may be."""
+    """Replace NaN by ``null`` and infinities by strings, which are not valid numbers."""
 
-    def plain(found: re.Match[bytes]) -> bytes:
-        return found[0] if not found[1] else b"null" if found[1] == b"NaN" else b'"%s"' % found[1]
+    def plain(match: re.Match[bytes]) -> bytes:
+        return match[0] if not match[1] else b"null" if match[1] == b"NaN" else b'"%s"' % match[1]
 
     return _NOT_FINITE.sub(plain, bytes(text))
 
 
 def decode_samples(samples: msgspec.Raw, kind: Any, source: str, *, field: str = "") -> Iterator[tuple[str, Any]]:
-    """Sample tokens with their entries as objects of a type, one after the other.
+    """Iterate over sample tokens and their entries, decoded as objects of a type.
 
     Args:
         samples: the JSON object of all samples.
-        kind: of one entry.
-        field: of the file that holds the samples; ``""`` for the whole.
+        kind: type of one entry.
+        field: field of the file that contains the samples; ``""`` for the whole file.
 
     Raises:
-        ValueError: not an object, or a token that occurs twice; an entry of another kind, naming sample, box and
-            field.
+        ValueError: ``samples`` is not an object, a token occurs twice, or an entry does not match the type; names
+            sample, box and field.
     """
     whole = f"{source}: {field}" if field else source
     entries = decode_json(samples, dict[str, msgspec.Raw], whole)
-    # A key that occurs twice keeps its last value alone: the text between two values then holds another value.
+    # Of a repeated key only the last value remains. The text between two values then contains the dropped value.
     text, start, end = memoryview(samples), _address(samples), 0
     for entry in sorted(entries.values(), key=_address):
         first = _address(entry) - start
@@ -117,12 +118,12 @@ def decode_samples(samples: msgspec.Raw, kind: Any, source: str, *, field: str =
 
 
 def _address(raw: msgspec.Raw) -> int:
-    """Where the text lies in memory: entries are views of the whole."""
+    """Memory address of the text. Entries are views of the whole text."""
     return np.frombuffer(raw, np.uint8).ctypes.data
 
 
 def _explain(error: msgspec.ValidationError) -> str:
-    """Place first, then what is wrong: ``box 3: size[1]: expected `float`, got `str```."""
+    """Put the place before the problem: ``box 3: size[1]: expected `float`, got `str```."""
     problem, _, place = str(error).rpartition(" - at `$")
     problem, place = (problem, place.rstrip("`")) if problem else (str(error), "")
     place = re.sub(r"^(\.boxes)?\[(\d+)\]\.?", r"box \2: ", place).lstrip(".").removesuffix(": ")
@@ -132,10 +133,10 @@ def _explain(error: msgspec.ValidationError) -> str:
 
 
 def expect_samples(found: Collection[str], wanted: Sequence[str], source: str, *, of: str) -> None:
-    """Refuse other samples than the wanted ones, which are those of, say, ``of="split 'val'"``.
+    """Check that exactly the wanted samples were found; ``of`` describes them, such as ``"split 'val'"``.
 
     Raises:
-        ValueError: naming the source, missing and extra samples.
+        ValueError: naming the source, missing and unexpected samples.
     """
     present, known = set(found), set(wanted)
     missing = [token for token in wanted if token not in present]
@@ -150,33 +151,31 @@ def expect_samples(found: Collection[str], wanted: Sequence[str], source: str, *
 
 
 def geometry(boxes: Sequence[JsonBox], where: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Translation, size, yaw and velocity of boxes as columns, and their rotations f64[n, 4].
+    """Translation, size, yaw and velocity of boxes as columns, and rotations f64[n, 4].
 
     Raises:
-        ValueError: naming the box and the field; ``where`` are file and sample.
+        ValueError: naming ``where`` (file and sample), the box and the field.
     """
     unknown = (None, None)
     rows = [box.translation + box.size + box.rotation + (box.velocity or unknown) for box in boxes]
-    # One flat list: several times as fast as arrays of tuples. None becomes NaN.
+    # Converting one flat list is several times faster than converting tuples. None becomes NaN.
     table = np.array(list(chain.from_iterable(rows)), np.float64).reshape(-1, 12)
     translation, size, rotation, velocity = np.split(table, (3, 6, 10), axis=1)
     expect((size > 0).all(axis=1), boxes, "size", where, "three positive lengths")
     for name, values in (("translation", translation), ("size", size), ("velocity", velocity)):
         near = ~(np.abs(values) > FARTHEST_M).any(axis=1)
         expect(near, boxes, name, where, f"numbers of at most {FARTHEST_M:g}")
-    largest = np.abs(rotation).max(axis=1, initial=0.0)  # whose square neither vanishes nor overflows
-    expect(
-        (largest > 1e-8) & (largest < 1e8), boxes, "rotation", where, "a quaternion w, x, y, z that is not zero"
-    )
+    largest = np.abs(rotation).max(axis=1, initial=0.0)  # so that squares neither vanish nor overflow
+    expect((largest > 1e-8) & (largest < 1e8), boxes, "rotation", where, "a nonzero quaternion w, x, y, z")
     columns = {"translation": translation, "size": size, "yaw": heading_yaw(rotation), "velocity": velocity}
     return columns, rotation
 
 
 def index_of(boxes: Sequence[msgspec.Struct], field: str, known: Mapping[str, int], where: str) -> np.ndarray:
-    """What is known by the name in a field of each box, i64[n]: numbers of at least -1, ``""`` for no name.
+    """Map the names in a field of the boxes to numbers of at least -1, i64[n]; ``""`` stands for no name.
 
     Raises:
-        ValueError: a name that is not known; ``where`` are file and sample.
+        ValueError: unknown name, with ``where`` (file and sample).
     """
     index = np.array([known.get(getattr(box, field), -2) for box in boxes], np.int64)
     names = ", ".join(filter(None, known))
@@ -187,7 +186,7 @@ def index_of(boxes: Sequence[msgspec.Struct], field: str, known: Mapping[str, in
 def expect(
     good: np.ndarray | np.bool, boxes: Sequence[msgspec.Struct], field: str, where: str, expected: str
 ) -> None:
-    """Refuse the first box whose field is not good."""
+    """Raise a ValueError for the first box whose field is not good."""
     if not good.all():
         box = int(np.argmin(good))
         got = list(value) if isinstance(value := getattr(boxes[box], field), tuple) else value

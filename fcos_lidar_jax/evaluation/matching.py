@@ -1,4 +1,4 @@
-"""Detections against truth by centre distance in the ground plane: in one frame, and ranked over many."""
+"""Match detections to truth by centre distance in the ground plane, in one frame or ranked over many samples."""
 
 import dataclasses
 
@@ -8,15 +8,15 @@ from jaxtyping import Float, Int
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, Columns
 
 TP_ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
-"""The official names of the errors of a hit: metres, 1 - IoU of the aligned boxes, radians, m/s, 0 or 1."""
-DISTANCES_M = (0.5, 1.0, 2.0, 4.0)  # hits are nearer than this; average precision is the mean over the four
-ERROR_ROW = 2  # the errors are those of the hits at the third distance, two metres
-_BLOCK = 1 << 21  # pairs whose distance is computed at once: bounds the memory
+"""Official names of the errors of a hit: metres, 1 - IoU of aligned boxes, radians, m/s, 0 or 1."""
+DISTANCES_M = (0.5, 1.0, 2.0, 4.0)  # matching distances; the AP of a class is the mean over all four
+ERROR_ROW = 2  # errors are measured for the hits within the third distance, two metres
+_BLOCK = 1 << 21  # maximum number of distances computed at once, to bound memory
 
 
 @dataclasses.dataclass(frozen=True)
 class Pairs(Columns):
-    """Detections and truths that could match: by detection, then by distance, then by truth."""
+    """Detections and truths that could match, sorted by detection, distance and truth."""
 
     detection: Int[np.ndarray, "p"]  # index of the detection
     truth: Int[np.ndarray, "p"]  # index of the truth
@@ -31,11 +31,11 @@ def candidate_pairs(
     *,
     max_distance_m: float,
 ) -> Pairs:
-    """All pairs of one group that are strictly nearer than a distance.
+    """Find all pairs within a group whose distance is strictly below a maximum.
 
     Args:
-        group, true_group: of every detection and truth, such as a number for every class in every sample.
-        centres, true_centres: of the detections and of the truths, metres.
+        group, true_group: group of each detection and truth, such as a number per class and sample.
+        centres, true_centres: centres of the detections and truths, metres.
 
     >>> one = np.zeros(1, int)
     >>> pairs = candidate_pairs(one, np.zeros((1, 2)), one, np.ones((1, 2)), max_distance_m=2)
@@ -59,15 +59,15 @@ def candidate_pairs(
         near = distance < max_distance_m
         parts.append((detection[near], truth[near], distance[near]))
     detection, truth, distance = (np.concatenate(column) for column in zip(*parts, strict=True))
-    # Stable: of equal distances the first truth stays first.
+    # The sort is stable: the first truth stays first among equal distances.
     return Pairs(detection, truth, distance).take(np.lexsort((distance, detection)))
 
 
 def greedy(pairs: Pairs, num_detections: int, num_truths: int) -> Int[np.ndarray, "d"]:
-    """The truth of every detection, -1 for none: in their order, each takes the nearest truth that is free.
+    """Match each detection in order to its nearest free truth; -1 for detections without a match.
 
     Args:
-        pairs: that may match; detections in the order in which they choose.
+        pairs: pairs that may match, with detections in order of priority.
 
     >>> greedy(Pairs(np.array([0, 1, 1]), np.array([1, 1, 0]), np.array([0.2, 0.1, 0.3])), 2, 2).tolist()
     [1, 0]
@@ -83,18 +83,18 @@ def greedy(pairs: Pairs, num_detections: int, num_truths: int) -> Int[np.ndarray
 class Match:
     """One-to-one hits of one frame."""
 
-    truth: Int[np.ndarray, "p"]  # index of the truth of every hit, the best detection's first
-    detection: Int[np.ndarray, "p"]  # index of its detection
+    truth: Int[np.ndarray, "p"]  # index of the truth of each hit, by decreasing score
+    detection: Int[np.ndarray, "p"]  # index of the detection of each hit
     centre_error_m: Float[np.ndarray, "p"]  # distance of the centres in the ground plane
 
 
 def heading_error(
     predicted_rad: Float[np.ndarray, "n"], true_rad: Float[np.ndarray, "n"], period_rad: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    """Absolute yaw difference of predictions to truths, row by row.
+    """Absolute yaw difference between predictions and truths, row by row.
 
-    The period is the turn after which a box looks the same: 2 pi, pi for half-turn symmetric classes, 0 for
-    classes without a heading, whose error is 0.
+    The period is the rotation that maps a box onto itself: 2 pi in general, pi for classes with half-turn
+    symmetry, and 0 for classes without a heading, whose error is 0.
 
     >>> heading_error(np.array([3.2]), np.zeros(1), np.array([np.pi])).round(3).tolist()
     [0.058]
@@ -115,15 +115,15 @@ def match_frame(
     max_heading_error_rad: float = np.inf,
     heading_period_rad: Float[np.ndarray, "k"] | None = None,
 ) -> Match:
-    """Greedy one-to-one matching: by falling score, each detection takes the nearest free truth of its class.
+    """Match detections, by decreasing score, to the nearest free truth of their class, one to one.
 
     Args:
         boxes, true_boxes: detections and truths, ``x, y, z, l, w, h, yaw, vx, vy``.
-        labels, true_labels: their classes.
-        scores: of the detections; equal ones in the order given.
-        max_distance_m: hits are strictly nearer, in the ground plane.
-        max_heading_error_rad: hits are at most this far off in yaw.
-        heading_period_rad: of every class, see :func:`heading_error`; default: 2 pi for all.
+        labels, true_labels: classes of the detections and truths.
+        scores: scores of the detections; equal scores keep their order.
+        max_distance_m: exclusive upper limit of the distance of a hit in the ground plane.
+        max_heading_error_rad: inclusive upper limit of the yaw error of a hit.
+        heading_period_rad: period per class, see :func:`heading_error`; by default 2 pi for all classes.
 
     >>> one = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0.0]])
     >>> car = np.array([0])
@@ -138,9 +138,9 @@ def match_frame(
     period = np.full(len(own_labels), 2 * np.pi) if heading_period_rad is None else heading_period_rad[own_labels]
     turn = heading_error(boxes[pairs.detection, 6], true_boxes[pairs.truth, 6], period)
     partner = greedy(pairs.take(turn <= max_heading_error_rad), len(boxes), len(true_boxes))
-    found = np.flatnonzero(partner >= 0)
-    truth = partner[found]
-    return Match(truth, order[found], _length(boxes[found, :2] - true_boxes[truth, :2]))
+    hits = np.flatnonzero(partner >= 0)
+    truth = partner[hits]
+    return Match(truth, order[hits], _length(boxes[hits, :2] - true_boxes[truth, :2]))
 
 
 def _length(vectors: np.ndarray) -> np.ndarray:
@@ -149,17 +149,17 @@ def _length(vectors: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Ranking:
-    """The predictions of one class over all samples, best first, and the truth that they were to find."""
+    """Predictions and truth of one class over all samples, predictions by decreasing score."""
 
-    score: np.ndarray  # f64[p], falling
+    score: np.ndarray  # f64[p], decreasing
     sample: np.ndarray  # i32[p]: row of the sample
-    hit: np.ndarray  # bool[t, p]: for every matching distance
-    errors: np.ndarray  # f64[5, h]: TP_ERRORS of the hits of row ERROR_ROW, NaN where the truth does not tell
-    truth_sample: np.ndarray  # i32[g]: row of the sample of every truth
-    knows_velocity: bool  # whether some truth has a velocity
+    hit: np.ndarray  # bool[t, p]: hits per matching distance
+    errors: np.ndarray  # f64[5, h]: TP_ERRORS of the hits of row ERROR_ROW, NaN where the truth is unknown
+    truth_sample: np.ndarray  # i32[g]: row of the sample of each truth
+    knows_velocity: bool  # whether any truth has a velocity
 
     def resampled(self, copies: np.ndarray) -> "Ranking":
-        """As if every sample had been there so many times, i64[samples]."""
+        """Ranking of a set with i64[samples] ``copies`` of each sample."""
         times = copies[self.sample]
         return Ranking(
             score=np.repeat(self.score, times),
@@ -178,29 +178,30 @@ def rank(
     heading_period_rad: Float[np.ndarray, "k"],
     distances_m: tuple[float, ...] = DISTANCES_M,
 ) -> tuple[Ranking, ...]:
-    """Match predictions to truth, and sort them by score; one ranking a class.
+    """Match predictions to truth and sort them by score; returns one ranking per class.
 
-    By falling score, each prediction takes the nearest free truth of its class in its sample; of equal scores the
-    later prediction comes first, of equal distances the first truth is taken. A hit is strictly nearer than the
-    matching distance, centre to centre in the ground plane.
+    By decreasing score, each prediction is matched to the nearest free truth of its class in its sample. The later
+    prediction wins among equal scores, the first truth among equal distances. A hit is strictly nearer than the
+    matching distance, from centre to centre in the ground plane.
 
     Args:
-        predictions: filtered, in the order of the results.
-        truth: filtered.
-        heading_period_rad: of every class, see :func:`heading_error`; there are as many classes.
-        distances_m: matching distances, those of row :data:`ERROR_ROW` for the errors.
+        predictions: filtered predictions in the order of the results.
+        truth: filtered truth.
+        heading_period_rad: period per class, see :func:`heading_error`; determines the number of classes.
+        distances_m: matching distances; errors are measured within the distance of row :data:`ERROR_ROW`.
     """
     num_classes = len(heading_period_rad)
     predictions = predictions.take(np.argsort(predictions.score, kind="stable")[::-1])
-    # One number for every class in every sample: only boxes of the same can match.
+    # Only boxes of the same class and sample, and thus the same group, can match.
     group, true_group = (b.sample.astype(np.int64) * num_classes + b.label for b in (predictions, truth))
     centres, true_centres = predictions.translation[:, :2], truth.translation[:, :2]
     pairs = candidate_pairs(group, centres, true_group, true_centres, max_distance_m=max(distances_m))
     nearer = (pairs.take(pairs.distance_m < limit) for limit in distances_m)
     partner = np.stack([greedy(near, len(predictions), len(truth)) for near in nearer])
     hit = partner >= 0
-    found = hit[ERROR_ROW]
-    errors = _hit_errors(predictions.take(found), truth.take(partner[ERROR_ROW, found]), heading_period_rad)
+    error_hit = hit[ERROR_ROW]
+    hit_truth = truth.take(partner[ERROR_ROW, error_hit])
+    errors = _hit_errors(predictions.take(error_hit), hit_truth, heading_period_rad)
 
     def of_class(label: int) -> Ranking:
         own, true = predictions.label == label, truth.label == label
@@ -208,7 +209,7 @@ def rank(
             score=predictions.score[own],
             sample=predictions.sample[own],
             hit=hit[:, own],
-            errors=errors[:, own[found]],
+            errors=errors[:, own[error_hit]],
             truth_sample=truth.sample[true],
             knows_velocity=bool(np.isfinite(truth.velocity[true]).all(axis=1).any()),
         )
@@ -217,7 +218,7 @@ def rank(
 
 
 def _hit_errors(predictions: BoxColumns, truth: BoxColumns, heading_period_rad: np.ndarray) -> np.ndarray:
-    """Errors of predictions to their truths, row by row, f64[5, n] in the order of :data:`TP_ERRORS`."""
+    """Errors of predictions relative to their truths, f64[5, n], rows in the order of :data:`TP_ERRORS`."""
     shared = np.minimum(predictions.size, truth.size).prod(axis=1)
     union = truth.size.prod(axis=1) + predictions.size.prod(axis=1) - shared
     centre = _length(predictions.translation[:, :2] - truth.translation[:, :2])

@@ -1,7 +1,7 @@
-"""Average precision by centre distance, the errors of the hits, and for the nuScenes benchmark its NDS.
+"""Average precision by centre distance, errors of the hits, and the NDS of the nuScenes benchmark.
 
-With :data:`NUSCENES_METRIC` every number is that of the official evaluation with its configuration
-``detection_cvpr_2019``; :func:`metric_of` makes the metric of any other classes.
+:data:`NUSCENES_METRIC` reproduces all numbers of the official evaluation with the configuration
+``detection_cvpr_2019``; :func:`metric_of` creates a metric for any other classes.
 """
 
 import dataclasses
@@ -15,43 +15,43 @@ from fcos_lidar_jax.classes import DEFAULT_RANGE_M, NUSCENES_CLASSES, RANGES_M
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
 from fcos_lidar_jax.evaluation.matching import DISTANCES_M, ERROR_ROW, TP_ERRORS, Ranking, candidate_pairs, rank
 
-MIN_RECALL = MIN_PRECISION = 0.1  # what is below counts nothing
-MAX_BOXES = 500  # boxes of a sample that an official results file may hold
-AP_WEIGHT = 5  # of mAP in NDS; each of the five errors has weight 1
+MIN_RECALL = MIN_PRECISION = 0.1  # lower values do not contribute to the AP
+MAX_BOXES = 500  # maximum number of boxes per sample in an official results file
+AP_WEIGHT = 5  # weight of mAP in NDS; each of the five errors has weight 1
 
 _RECALL = np.linspace(0, 1, 101)
 _FIRST = round(100 * MIN_RECALL) + 1
 _WITHOUT = {"traffic_cone": {"orient_err", "vel_err", "attr_err"}, "barrier": {"vel_err", "attr_err"}}
-"""Class -> errors that it does not have."""
+"""Class -> errors that are undefined for it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """Which classes count, and up to which range.
+    """Evaluated classes and their ranges.
 
-    Labels index ``classes``. Properties go by name: a class named as one of nuScenes behaves as it does there.
+    Labels index ``classes``. A class with the name of a nuScenes class has the properties of that class.
     """
 
     classes: tuple[str, ...]  # names of the classes
-    class_ranges_m: tuple[float, ...]  # boxes of a class count when nearer than this
-    benchmark: bool = False  # nuScenes': with NDS and attributes; a class without truth has AP 0 and errors 1
+    class_ranges_m: tuple[float, ...]  # range of each class; farther boxes are not evaluated
+    benchmark: bool = False  # nuScenes benchmark, with NDS and attributes; without truth, AP is 0 and errors are 1
 
     def __post_init__(self) -> None:
         if len(set(self.classes)) != len(self.classes) or not self.classes:
             raise ValueError(f"classes: got {self.classes}, expected at least one name, each once")
         if len(self.class_ranges_m) != len(self.classes) or not all(r > 0 for r in self.class_ranges_m):
-            expected = f"{len(self.classes)} positive lengths, one a class"
+            expected = f"{len(self.classes)} positive lengths, one per class"
             raise ValueError(f"class_ranges_m: got {self.class_ranges_m}, expected {expected}")
 
     @property
     def heading_period_rad(self) -> np.ndarray:
-        """f64[classes]: the turn after which a box of each class looks the same, 0 without a heading."""
+        """Period per class, f64[classes], see :func:`~.matching.heading_error`."""
         periods = {"traffic_cone": 0.0, "barrier": np.pi}
         return np.array([periods.get(name, 2 * np.pi) for name in self.classes])
 
     @property
     def settings(self) -> dict[str, Any]:
-        """As ``cfg`` of ``metrics_summary.json`` has them."""
+        """Settings as in the field ``cfg`` of ``metrics_summary.json``."""
         matching = {
             "class_range": dict(zip(self.classes, self.class_ranges_m, strict=True)),
             "dist_fcn": "center_distance",
@@ -67,18 +67,18 @@ class Metric:
 
 
 NUSCENES_METRIC = Metric(NUSCENES_CLASSES, tuple(int(RANGES_M[name]) for name in NUSCENES_CLASSES), benchmark=True)
-"""The benchmark's own, ``detection_cvpr_2019``; ranges count from the ego vehicle and not from its sensor."""
+"""The benchmark's metric, ``detection_cvpr_2019``; ranges are measured from the ego vehicle, not the sensor."""
 
 
 def metric_of(classes: Sequence[str], class_ranges_m: Sequence[float] = ()) -> Metric:
-    """The metric of any classes: the benchmark's average precision and errors, without attributes and NDS.
+    """Create a metric for any classes: the benchmark's average precision and errors without attributes and NDS.
 
     Args:
         classes: names, in the order of the labels.
-        class_ranges_m: one a class; default: by the class's name, see ``classes.RANGES_M``.
+        class_ranges_m: range per class; by default from the class name, see ``classes.RANGES_M``.
 
     Raises:
-        ValueError: no class, a name twice, or not one positive range a class.
+        ValueError: no classes, a repeated name, or not exactly one positive range per class.
 
     >>> metric_of(["pedestrian", "forklift"]).class_ranges_m
     (40.0, 50.0)
@@ -88,48 +88,48 @@ def metric_of(classes: Sequence[str], class_ranges_m: Sequence[float] = ()) -> M
 
 @dataclasses.dataclass(frozen=True)
 class Curves:
-    """What the numbers of one class are made of, at the recalls 0, 0.01 ... 1."""
+    """Curves of one class at the recalls 0, 0.01, ..., 1."""
 
-    precision: np.ndarray  # f64[t, 101]: for every matching distance; 0 beyond the highest recall
-    confidence: np.ndarray  # f64[t, 101]: the score at which a recall is reached; 0 beyond the highest
+    precision: np.ndarray  # f64[t, 101]: precision per matching distance; 0 beyond the highest recall
+    confidence: np.ndarray  # f64[t, 101]: score at which a recall is reached; 0 beyond the highest recall
     errors: np.ndarray  # f64[5, 101]: mean TP_ERRORS of the hits up to a recall
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """The numbers, and what they were made of."""
+    """Result of an evaluation."""
 
-    metric: Metric  # by which it was evaluated
-    tokens: tuple[str, ...]  # the samples
+    metric: Metric
+    tokens: tuple[str, ...]  # names of the samples
     summary: dict[str, Any]  # see score
     curves: dict[str, Curves]  # by class
     rankings: tuple[Ranking, ...]  # by label
-    predictions: BoxColumns  # those that count
-    truth: BoxColumns  # the boxes that count
-    seconds: float  # how long filtering, matching and scoring took
+    predictions: BoxColumns  # after filtering
+    truth: BoxColumns  # after filtering
+    seconds: float  # time of filtering, matching and scoring
 
 
 def evaluate(predictions: BoxColumns, truth: GroundTruth, metric: Metric = NUSCENES_METRIC) -> Evaluation:
-    """Filter, match and score.
+    """Filter, match and score predictions.
 
     Args:
-        predictions: in the order of the results file, ``sample`` counting the truth's samples.
-        truth: of the same samples.
-        metric: whose classes the labels of both index.
+        predictions: predictions in the order of the results file; ``sample`` is the index into ``truth.tokens``.
+        truth: ground truth of the same samples.
+        metric: the metric; labels of predictions and truth index its classes.
     """
     began = time.perf_counter()
-    counted, true = (filter_boxes(boxes, truth, metric) for boxes in (predictions, truth.boxes))
-    rankings = rank(counted, true, heading_period_rad=metric.heading_period_rad)
+    predictions, true = (filter_boxes(boxes, truth, metric) for boxes in (predictions, truth.boxes))
+    rankings = rank(predictions, true, heading_period_rad=metric.heading_period_rad)
     curves, summary = score(rankings, metric)
     seconds = time.perf_counter() - began
-    return Evaluation(metric, truth.tokens, summary, curves, rankings, counted, true, seconds)
+    return Evaluation(metric, truth.tokens, summary, curves, rankings, predictions, true, seconds)
 
 
 def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxColumns:
-    """The boxes, truth or predictions, that are evaluated, in their order.
+    """Select the evaluated boxes, truth or predictions, in order.
 
-    Left out is what lies at or beyond its class's range, what holds not a single LiDAR or radar point, and
-    bicycles and motorcycles whose centre is in a bicycle rack, boundary included.
+    Drops boxes at or beyond the range of their class, boxes without LiDAR or radar points, and bicycles and
+    motorcycles whose centre lies in a bicycle rack, boundary included.
     """
     near = within_range(boxes, truth, metric)
     boxes, racks = boxes.take(near & (boxes.num_points != 0)), truth.racks
@@ -144,15 +144,15 @@ def filter_boxes(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> BoxCo
 
 
 def within_range(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> np.ndarray:
-    """bool[n]: whether a box is nearer to the ego vehicle, or to the sensor of frames, than its class's range."""
+    """Whether boxes are nearer to ``truth.ego_translation`` than the range of their class, bool[n]."""
     offset = boxes.translation[:, :2] - truth.ego_translation[boxes.sample, :2]
     return np.sqrt((offset**2).sum(axis=1)) < np.array(metric.class_ranges_m, float)[boxes.label]
 
 
 def class_curves(ranking: Ranking) -> Curves:
-    """The curves of one class.
+    """Curves of one class.
 
-    A distance without a hit, for want of truth or of predictions, has precision and score 0 and errors 1.
+    For a distance without hits, precision and score are 0 and errors are 1.
     """
     shape = (len(DISTANCES_M), len(_RECALL))
     precision, confidence, errors = np.zeros(shape), np.zeros(shape), np.ones((len(TP_ERRORS), len(_RECALL)))
@@ -160,9 +160,9 @@ def class_curves(ranking: Ranking) -> Curves:
     for row, hit in enumerate(ranking.hit):
         if not hit.any():
             continue
-        found = np.cumsum(hit)
-        recall = found / len(ranking.truth_sample)
-        precision[row] = np.interp(_RECALL, recall, found / rank_from_one, right=0)
+        num_hits = np.cumsum(hit)
+        recall = num_hits / len(ranking.truth_sample)
+        precision[row] = np.interp(_RECALL, recall, num_hits / rank_from_one, right=0)
         confidence[row] = np.interp(_RECALL, recall, ranking.score, right=0)
         if row == ERROR_ROW:
             hit_score = ranking.score[hit][::-1]
@@ -172,7 +172,7 @@ def class_curves(ranking: Ranking) -> Curves:
 
 
 def running_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the values so far that are not NaN; 0 before the first, and 1 throughout if there is none.
+    """Running mean of the values that are not NaN: 0 before the first such value, 1 throughout if there is none.
 
     >>> running_mean(np.array([np.nan, 2.0, 4.0])).tolist()
     [0.0, 2.0, 3.0]
@@ -185,7 +185,7 @@ def running_mean(values: np.ndarray) -> np.ndarray:
 
 
 def average_precision(precision: np.ndarray) -> float:
-    """Area under a curve f64[101] above the floors of recall and precision, 1 at best.
+    """Area under a precision curve f64[101] above the minimum recall and precision, scaled to at most 1.
 
     >>> round(average_precision(np.ones(101)), 9)
     1.0
@@ -195,19 +195,21 @@ def average_precision(precision: np.ndarray) -> float:
 
 
 def mean_error(error: np.ndarray, confidence: np.ndarray) -> float:
-    """Mean of an error curve f64[101] from the recall floor to the highest recall, beyond which confidence is 0;
-    1 if the floor is not reached.
+    """Mean of an error curve f64[101] from the minimum to the highest recall; 1 if the minimum is not reached.
+
+    ``confidence`` is 0 beyond the highest recall.
     """
     last = int(np.max(np.flatnonzero(confidence), initial=0))
     return 1.0 if last < _FIRST else float(np.mean(error[_FIRST : last + 1]))
 
 
 def score(rankings: Sequence[Ranking], metric: Metric) -> tuple[dict[str, Curves], dict[str, Any]]:
-    """The curves of every class, and the scores: AP by class and distance, its means, and the errors of the hits.
+    """Curves per class, and the scores: AP per class and distance, its means, and the errors of the hits.
 
-    For the benchmark the official summary, without ``eval_time``, ``cfg`` and ``meta``. Other metrics have neither
-    NDS nor attribute errors, velocity errors only of classes whose truth has a velocity, and take all means over
-    the classes that occur in the truth; the others are named in ``absent_classes``. No truth at all has mAP NaN.
+    For the benchmark, the scores are the official summary without ``eval_time``, ``cfg`` and ``meta``. Other
+    metrics have neither NDS nor attribute errors, and have velocity errors only for classes whose truth has
+    velocities. Their means are over the classes that occur in the truth; ``absent_classes`` lists the other
+    classes. Without any truth the mAP is NaN.
     """
     benchmark, all_errors = metric.benchmark, {}
     of_class = dict(zip(metric.classes, rankings, strict=True))

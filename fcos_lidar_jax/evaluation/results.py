@@ -1,4 +1,4 @@
-"""The official results file of detections: read and checked to the last field, and written."""
+"""Read, check and write official results files of detections."""
 
 import dataclasses
 import json
@@ -26,13 +26,13 @@ from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.types import Detections
 
 USE_FLAGS = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
-"""What ``meta`` tells of the input that was used."""
-LIDAR_META = {flag: flag == "use_lidar" for flag in USE_FLAGS}  # meta of a detector that sees the LiDAR alone
+"""Flags of ``meta`` for the inputs of the detector."""
+LIDAR_META = {flag: flag == "use_lidar" for flag in USE_FLAGS}  # meta of a LiDAR-only detector
 _ALLOWED = {name: {"", *attributes} for name, attributes in CLASS_ATTRIBUTES.items()}
 
 
 class ResultsFile(msgspec.Struct, gc=False):
-    """The file: what was used, and boxes by sample."""
+    """Contents of the file: the inputs of the detector, and boxes by sample."""
 
     meta: dict[str, Any]
     results: msgspec.Raw
@@ -47,11 +47,11 @@ class Box(json_io.JsonBox, gc=False):
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """A results file that may be evaluated."""
+    """A valid results file."""
 
-    meta: dict[str, Any]  # as in the file
-    boxes: BoxColumns  # in the order of the file, sample counting the wanted tokens
-    warnings: tuple[str, ...]  # what was accepted and should not be: a line each
+    meta: dict[str, Any]  # unchanged from the file
+    boxes: BoxColumns  # boxes in the order of the file; sample is the index into the expected tokens
+    warnings: tuple[str, ...]  # one line per accepted irregularity
 
 
 def read_results(
@@ -60,9 +60,9 @@ def read_results(
     """Read and check detections.
 
     Args:
-        source: the file, or what ``json.load`` gives for it.
-        tokens: the samples that it must cover, no more and no less.
-        of: what they are the samples of, for the messages.
+        source: the file, or the result of ``json.load``.
+        tokens: expected samples; the file must cover exactly these samples.
+        of: description of the expected samples, for messages.
 
     Raises:
         ValueError: naming the file, the sample, the box (from 0) and the field.
@@ -70,26 +70,27 @@ def read_results(
     file, name = json_io.read_json(source, ResultsFile, given="results")
     warnings = _check_meta(file.meta, name)
     row = {token: i for i, token in enumerate(tokens)}
-    found, parts, odd = list[str](), [NO_BOXES], {"rotation": list[str](), "attribute": list[str]()}
+    found, parts = list[str](), [NO_BOXES]
+    irregular = {"rotation": list[str](), "attribute": list[str]()}
     for token, boxes in json_io.decode_samples(file.results, list[Box], name, field="results"):
         found.append(token)
         if boxes and token in row:
             where = f"{name}: sample {token}"
             columns, norm = _columns(row[token], boxes, where=where, token=token)
             parts.append(columns)
-            odd["rotation"] += [
+            irregular["rotation"] += [
                 f"{where}: box {i}: rotation: normalised, got a quaternion of norm {norm[i]:.6g}"
                 for i in np.flatnonzero(np.abs(norm - 1) > 1e-3)
             ]
-            odd["attribute"] += [
+            irregular["attribute"] += [
                 f"{where}: box {i}: attribute_name: counted as wrong, got {box.attribute_name!r} for a "
                 f"{box.detection_name}"
                 for i, box in enumerate(boxes)
                 if box.attribute_name not in _ALLOWED[box.detection_name]
             ]
     json_io.expect_samples(found, tokens, name, of=of)
-    for lines in filter(None, odd.values()):
-        warnings.append(lines[0] + (f"; so were {len(lines) - 1} more" if len(lines) > 1 else ""))
+    for lines in filter(None, irregular.values()):
+        warnings.append(lines[0] + (f", and {len(lines) - 1} more" if len(lines) > 1 else ""))
     return Results(file.meta, join(parts), tuple(warnings))
 
 
@@ -98,11 +99,11 @@ def _check_meta(meta: dict[str, Any], name: str) -> list[str]:
         if flag in meta and not isinstance(meta[flag], bool):
             raise ValueError(f"{name}: meta: {flag}: got {meta[flag]!r}, expected true or false")
     absent = [flag for flag in USE_FLAGS if flag not in meta]
-    return [f"{name}: meta: {', '.join(absent)}: missing; the benchmark's server wants all five"] if absent else []
+    return [f"{name}: meta: {', '.join(absent)}: missing; the benchmark's server needs all five"] if absent else []
 
 
 def _columns(sample: int, boxes: list[Box], *, where: str, token: str) -> tuple[BoxColumns, np.ndarray]:
-    """One sample's boxes and the norms of their quaternions."""
+    """Boxes of one sample and the norms of their quaternions."""
     if len(boxes) > MAX_BOXES:
         raise ValueError(f"{where}: box {MAX_BOXES}: got {len(boxes)} boxes, expected at most {MAX_BOXES}")
     columns, rotation = json_io.geometry(boxes, where)
@@ -116,11 +117,11 @@ def _columns(sample: int, boxes: list[Box], *, where: str, token: str) -> tuple[
     return rows, np.linalg.norm(rotation, axis=1)
 
 
-MOVING_MPS = 0.2  # faster objects have a moving attribute
+MOVING_MPS = 0.2  # objects above this speed get a moving attribute
 
 
 def attribute_of(name: str, speed_mps: float) -> str:
-    """The likeliest attribute of a detection, which has none of its own; ``''`` for barriers and cones.
+    """Likeliest attribute of a detection from its speed; ``''`` for barriers and cones.
 
     >>> attribute_of("bus", 0.1), attribute_of("bicycle", 3.0), attribute_of("barrier", 0.0)
     ('vehicle.stopped', 'cycle.with_rider', '')
@@ -131,12 +132,13 @@ def attribute_of(name: str, speed_mps: float) -> str:
 def result_entries(
     found: Detections, token: str, sensor_to_global: np.ndarray, classes: Sequence[str] = NUSCENES_CLASSES
 ) -> list[dict[str, Any]]:
-    """Detections of one sample as entries of the results file, best first, 500 at most.
+    """Convert detections of one sample to entries of the results file, best first, at most 500.
 
     Args:
-        found: in the sample's LiDAR frame.
-        sensor_to_global: f64[4, 4].
-        classes: names that the labels index, of the benchmark's.
+        found: detections in the sample's LiDAR frame.
+        token: token of the sample.
+        sensor_to_global: f64[4, 4], pose of the sensor.
+        classes: class names by label, all from the benchmark.
 
     >>> one = np.ones(1, bool)
     >>> car = Detections(np.array([[1.0, 0, 0, 4, 2, 1, 0, 3, 0]]), np.ones(1), np.zeros(1, int), one, np.zeros(0))
@@ -170,10 +172,10 @@ def result_entries(
 
 
 def write_results(path: str | Path, samples: Iterable[tuple[str, bytes]]) -> None:
-    """Write an official results file of a detector that sees the LiDAR alone.
+    """Write an official results file of a LiDAR-only detector.
 
     Args:
-        samples: every token of the split with its entries as JSON, ``[]`` where nothing was found.
+        samples: tokens of the whole split with entries as JSON, ``[]`` for samples without detections.
     """
 
     def write(file: Path) -> None:

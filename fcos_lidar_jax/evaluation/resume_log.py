@@ -1,4 +1,4 @@
-"""Detections of finished samples, kept so that an interrupted run resumes."""
+"""Log of the detections of finished samples, from which an interrupted run resumes."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -9,14 +9,14 @@ from fcos_lidar_jax.files import naming
 
 
 class ResumeLog:
-    """Entries of the samples that are done, one line each, in a file that is only appended to.
+    """Append-only file of the entries of finished samples, one line per sample.
 
-    A line that an interruption truncated, or that is damaged, is dropped with all behind it. The first line is the
-    fingerprint of detector and data: a file with another one is begun anew, but not before the first entry.
+    A truncated or corrupt line and all lines after it are dropped. The first line is a fingerprint of detector and
+    data. A file with a different fingerprint is overwritten when the first entry is added.
 
     Args:
-        path: of the file.
-        fingerprint: of the detector and the data.
+        path: log file.
+        fingerprint: fingerprint of detector and data.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "resume_log"
@@ -39,7 +39,7 @@ class ResumeLog:
                 name, separator, entries = line.partition(b"\t")
                 try:
                     token = json.loads(name)
-                except (ValueError, RecursionError):  # damaged, as is what follows
+                except (ValueError, RecursionError):  # corrupt
                     break
                 if not isinstance(token, str) or not separator or not line.endswith(b"\n"):
                     break
@@ -69,7 +69,7 @@ class ResumeLog:
         self.places[token] = start, len(text)
 
     def entries(self, tokens: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """Samples with their entries as JSON, in the order asked for."""
+        """Iterate over samples and their entries as JSON, in the order of ``tokens``."""
         for token in tokens:
             start, length = self.places[token]
             self._stream.seek(start)

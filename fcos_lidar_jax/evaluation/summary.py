@@ -1,4 +1,4 @@
-"""An evaluation as files and as lines of text, the official ``metrics_summary.json`` among them."""
+"""Files and text lines of an evaluation, including the official ``metrics_summary.json``."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -17,21 +17,21 @@ from fcos_lidar_jax.files import atomic_write
 
 
 def evaluate_detections(predictions: dict[str, Any] | str | Path, ground_truth: Any) -> dict[str, Any]:
-    """The official metrics of detections, all in the global frame.
+    """Official metrics of detections. All boxes are in the global frame.
 
     Args:
-        predictions: an official results file, or what ``json.load`` gives for it: ``{"meta", "results"}``.
+        predictions: an official results file, or the result of its ``json.load``: ``{"meta", "results"}``.
         ground_truth: ``{sample_token: {"ego_translation": [x, y, z], "boxes": [{"translation", "size" (w, l, h),
-            "rotation" (w, x, y, z), "velocity" [vx, vy] or null, "detection_name" of the ten or
-            "static_object.bicycle_rack", "attribute_name" ('' for none), "num_pts" (LiDAR and radar)}]}}``, or a
-            JSON file of it.
+            "rotation" (w, x, y, z), "velocity" [vx, vy] or null, "detection_name" (one of the ten or
+            "static_object.bicycle_rack"), "attribute_name" ('' without one), "num_pts" (LiDAR and radar)}]}}``, or
+            a JSON file with this content.
 
     Returns:
-        what ``json.load`` gives for the official ``metrics_summary.json``: plain dictionaries, distances as keys
-        ``"0.5"`` ... ``"4.0"``, NaN for the errors that a class does not have.
+        content of the official ``metrics_summary.json``: plain dictionaries, with distances as keys ``"0.5"`` to
+        ``"4.0"`` and NaN for undefined errors of a class.
 
     Raises:
-        ValueError: naming the sample, the box and the field that is wrong.
+        ValueError: naming the sample, the box and the invalid field.
 
     >>> box = {"translation": [5, 0, 0], "size": [2, 4, 1.5], "rotation": [1, 0, 0, 0], "velocity": [0, 0],
     ...        "detection_name": "car", "attribute_name": "vehicle.parked"}
@@ -46,14 +46,14 @@ def evaluate_detections(predictions: dict[str, Any] | str | Path, ground_truth: 
 
 
 def full_summary(evaluation: Evaluation, meta: Mapping[str, Any]) -> dict[str, Any]:
-    """All that ``metrics_summary.json`` holds; ``meta``, of the results file, is the benchmark's alone."""
+    """Content of ``metrics_summary.json``; ``meta`` of the results file is included only for the benchmark."""
     metric = evaluation.metric
     summary = {**evaluation.summary, "eval_time": evaluation.seconds, "cfg": metric.settings}
     return {**summary, "meta": meta} if metric.benchmark else summary
 
 
 def _curves(evaluation: Evaluation) -> dict[str, Any]:
-    """Precision by class, distance and recall, and errors by class, error and recall: those of the summary."""
+    """Curves behind the summary: precision by class and distance, errors by class and error."""
     classes = {}
     for name, defined in evaluation.summary["label_tp_errors"].items():
         curves = evaluation.curves[name]
@@ -73,16 +73,16 @@ def write_evaluation(
     repeats: int = 0,
     report: Callable[[int], None] = lambda done: None,
 ) -> dict[str, Any] | None:
-    """Write ``metrics_summary.json``, ``curves.json`` and, where there are repeats, ``bootstrap.json``.
+    """Write ``metrics_summary.json``, ``curves.json`` and, with ``repeats``, ``bootstrap.json``.
 
     Args:
-        out: folder; an older ``bootstrap.json`` in it is removed.
+        out: destination folder; without ``repeats``, an existing ``bootstrap.json`` is removed.
         meta: see :func:`full_summary`.
-        repeats: sets of samples to draw for the intervals of the scores; 0 for none.
-        report: called with the number of sets that are done.
+        repeats: number of resampled sets for the intervals of the scores; 0 for no intervals.
+        report: called with the number of finished sets.
 
     Returns:
-        the intervals, see :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`; None without.
+        the intervals, see :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`, or None without ``repeats``.
     """
 
     def write(name: str, value: Any) -> None:
@@ -99,7 +99,7 @@ def write_evaluation(
 
 
 def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None) -> str:
-    """The scores, and their intervals where there are some, as lines of text, named as what they are."""
+    """Text lines of the scores and, if given, their intervals."""
     summary, benchmark = evaluation.summary, evaluation.metric.benchmark
     names = {"nd_score": "NDS", "mean_ap": "mAP"} if benchmark else {"mean_ap": "mAP by centre distance"}
     scores = "  ".join(f"{name} {summary[key]:.4f}" for key, name in names.items())
@@ -112,35 +112,35 @@ def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None)
 
 
 def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None = None) -> list[str]:
-    """What the scores must not be mistaken for: lines for truth and for detections that are missing.
+    """Warnings about missing truth and missing detections, which affect the meaning of the scores.
 
     Args:
-        num_found: boxes that were to be evaluated, before the filters.
-        truth: before the filters. Truth that is too far to count gets a line, unless the benchmark says so.
+        num_found: number of detections before filtering.
+        truth: truth before filtering, to warn about boxes beyond their class range; not used for the benchmark.
     """
     benchmark, lines = evaluation.metric.benchmark, []
     rankings = zip(evaluation.metric.classes, evaluation.rankings, strict=True)
     absent = [name for name, ranking in rankings if not len(ranking.truth_sample)]
     if not len(evaluation.truth):
         effect = "every AP is 0 and every error 1" if benchmark else "no score"
-        lines.append(f"no ground truth counts here: {effect}")
+        lines.append(f"no ground truth is evaluated: {effect}")
     elif absent:
-        rule = "AP 0 and errors 1, as in the benchmark" if benchmark else "left out of the means"
-        lines.append(f"no ground truth counts of {', '.join(absent)}: {rule}")
+        rule = "AP 0 and errors 1, as in the benchmark" if benchmark else "excluded from the means"
+        lines.append(f"no ground truth is evaluated for {', '.join(absent)}: {rule}")
     if truth is not None and not benchmark:
         lines += _beyond_range(truth, evaluation.metric)
     if not num_found:
-        lines.append("the results hold not a single box: every AP is 0 and every error 1")
+        lines.append("the results contain no boxes: every AP is 0 and every error 1")
     elif not len(evaluation.predictions):
         lines.append("no box of the results is within the range of its class: every AP is 0")
     return lines
 
 
 def _beyond_range(truth: GroundTruth, metric: Metric) -> list[str]:
-    """A line for boxes with points that their class's range leaves out, if there are some."""
+    """Warning about boxes with points beyond the range of their class, if there are any."""
     far = ~within_range(truth.boxes, truth, metric) & (truth.boxes.num_points != 0)
     labels = np.unique(truth.boxes.label[far])
     if not len(labels):
         return []
     ranges = ", ".join(f"{metric.classes[label]} {metric.class_ranges_m[label]:g} m" for label in labels)
-    return [f"{far.sum()} boxes of the truth are beyond the range of their class and do not count: {ranges}"]
+    return [f"{far.sum()} boxes of the truth are beyond the range of their class and are not evaluated: {ranges}"]

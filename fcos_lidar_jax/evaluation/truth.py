@@ -1,4 +1,4 @@
-"""Ground truth for the metric, from a file or from a data set in the nuScenes layout."""
+"""Ground truth from a file or from a data set in the nuScenes layout."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ from fcos_lidar_jax.evaluation.boxes import (
 )
 from fcos_lidar_jax.geometry import rotation_matrix
 
-_RACK = -1  # label of bicycle racks while they are among the boxes
+_RACK = -1  # temporary label of bicycle racks
 
 
 class Box(json_io.JsonBox, gc=False):
@@ -33,7 +33,7 @@ class Box(json_io.JsonBox, gc=False):
 
 
 class Sample(msgspec.Struct, gc=False):
-    """What is at one keyframe."""
+    """Annotations of one keyframe."""
 
     ego_translation: json_io.Vector
     boxes: list[Box]
@@ -43,7 +43,7 @@ def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
     """Ground truth as ``{sample_token: {"ego_translation", "boxes"}}``.
 
     Args:
-        source: the JSON file, or what ``json.load`` gives for it.
+        source: the JSON file, or the result of ``json.load``.
 
     Raises:
         ValueError: naming the file, the sample, the box (from 0) and the field.
@@ -64,33 +64,33 @@ def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
         parts.append(make_columns(sample=row, label=label, attribute=attribute, num_points=points, **columns))
         rotations.append(rotation)
     if not ego:
-        raise ValueError(f"{name}: got no sample, expected at least one")
+        raise ValueError(f"{name}: got no samples, expected at least one")
     return _ground_truth(ego, list(ego.values()), join(parts), np.concatenate(rotations))
 
 
 def _ground_truth(tokens: Any, ego: Sequence[Any], boxes: BoxColumns, rotation: np.ndarray) -> GroundTruth:
-    """Boxes apart from racks."""
+    """Separate bicycle racks from the other boxes."""
     rack = boxes.label == _RACK
     axes, where = rotation_matrix(rotation[rack]), np.array(ego).reshape(-1, 3)
     return GroundTruth(tuple(tokens), where, boxes.take(~rack), boxes.take(rack), axes)
 
 
 def split_truth(data: NuScenes, tokens: Sequence[str]) -> GroundTruth:
-    """Ground truth of some keyframes, those of the ten classes and the bicycle racks.
+    """Ground truth of keyframes: boxes of the ten classes and bicycle racks.
 
     Raises:
-        ValueError: an attribute that the benchmark does not know.
+        ValueError: an attribute that is unknown to the benchmark.
     """
     index = data.index
     own = [data.annotations(token) for token in tokens]
     rows = np.concatenate([np.arange(part.start, part.stop) for part in own])
     sample = np.repeat(np.arange(len(tokens)), [part.stop - part.start for part in own])
     names = [str(name) for name in index.category_name]
-    counted = np.array([label_of(name) >= 0 or name == BICYCLE_RACK for name in names], bool)
-    kept = counted[index.box_category[rows]]
+    used = np.array([label_of(name) >= 0 or name == BICYCLE_RACK for name in names], bool)
+    kept = used[index.box_category[rows]]
     rows, sample = rows[kept], sample[kept]
-    attributes = [*map(str, index.attribute_name), ""]  # the last for -1
-    for name in (attributes[used] for used in np.unique(index.box_attribute[rows])):
+    attributes = [*map(str, index.attribute_name), ""]  # the last entry is for index -1
+    for name in (attributes[i] for i in np.unique(index.box_attribute[rows])):
         if name not in ATTRIBUTE_INDEX:
             raise ValueError(f"{data.tables / 'attribute.json'}: name: got {name!r}, expected a known attribute")
     boxes = make_columns(

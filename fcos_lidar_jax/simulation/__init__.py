@@ -1,1 +1,1 @@
-"""A seeded simulated world, seen by a ray-cast LiDAR."""
+"""Seeded simulated worlds and a ray-cast LiDAR."""

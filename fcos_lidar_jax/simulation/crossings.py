@@ -1,23 +1,23 @@
-"""Where rays meet solids, and at what angle: one vectorised test for each kind of solid."""
+"""Intersections of rays with solids and angles of incidence, with one vectorised test per kind of solid."""
 
 import numpy as np
 
 from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, WHEEL, unit_map
 
-_POROUS_COSINE = 0.5  # incidence on leaves and wires, which have no surface to speak of
+_POROUS_COSINE = 0.5  # incidence on leaves and wires, which have no proper surface
 
 
 def crossings(
     solids: np.ndarray, which: np.ndarray, rays: np.ndarray, d: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Way along each pair's ray to where the solid stops it, f32[k], inf where it does not.
+    """Distance along the ray of each pair to the point where the solid stops it, f32[k]; inf if it does not.
 
     Args:
-        solids: [s], centres relative to the rays' origin.
+        solids: [s], centres relative to the origin of the rays.
         which: i32[k], solid of each pair.
         rays: i32[k], ray of each pair.
         d: f32[3, n], unit vectors.
-        rng: how deep rays get into porous solids.
+        rng: source of the penetration depths into porous solids.
     """
     maps = unit_map(solids)
     start = -np.einsum("sij,sj->is", maps, solids["center"]).astype(np.float32)
@@ -25,7 +25,7 @@ def crossings(
     taper = solids["taper"].astype(np.float32)
     density = solids["density"].astype(np.float32)
     reach = np.full(len(which), np.inf, np.float32)
-    # Straight cuboids, the most frequent, have a test of their own.
+    # Straight cuboids are the most frequent solids and have their own, faster test.
     straight = (solids["kind"] == BOX) & (solids["taper"] == 1).all(axis=1)
     shape = np.where(straight, -1, solids["kind"])[which]
     for name, crossing in _CROSSINGS.items():
@@ -44,10 +44,10 @@ def crossings(
 
 
 def incidence(solids: np.ndarray, which: np.ndarray, points: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Cosine of the angle between rays and the surfaces that they meet, f32[k].
+    """Cosine of the angle of incidence of rays on solids, f32[k].
 
     Args:
-        solids: [s], centres relative to the rays' origin.
+        solids: [s], centres relative to the origin of the rays.
         which: i32[k], solid of each ray.
         points: f32[3, k], on the solids.
         d: f32[3, k], unit vectors.
@@ -56,13 +56,13 @@ def incidence(solids: np.ndarray, which: np.ndarray, points: np.ndarray, d: np.n
     center = np.ascontiguousarray(solids["center"].T, np.float32)
     taper = np.ascontiguousarray(solids["taper"].T, np.float32)
     u = _to_unit(maps, which, points - center.take(which, axis=1))
-    normal = np.array(u)  # that of a ball
+    normal = np.array(u)  # the normal of a ball
     slope = (taper.take(which, axis=1) - 1) / 2
     bound = np.maximum((1 + slope) + slope * u[2], np.float32(1e-9))
     kind = solids["kind"][which]
     share = np.abs(normal)
     share[:2] /= bound
-    face = np.where(kind == BOX, np.argmax(share, axis=0), -1)  # of a box, on which the point lies
+    face = np.where(kind == BOX, np.argmax(share, axis=0), -1)  # the face of the box that contains the point
     for axis in range(3):
         on = np.flatnonzero(face == axis)
         sign = np.sign(normal[axis, on])
@@ -90,7 +90,7 @@ def incidence(solids: np.ndarray, which: np.ndarray, points: np.ndarray, d: np.n
 
 
 def _to_unit(maps: np.ndarray, which: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vectors in the unit shapes' axes; the maps' other entries are 0."""
+    """Vectors in the axes of the unit shapes. The omitted entries of the maps are 0."""
     return (
         maps[0, 0].take(which) * d[0] + maps[0, 1].take(which) * d[1] + maps[0, 2].take(which) * d[2],
         maps[1, 0].take(which) * d[0] + maps[1, 1].take(which) * d[1],
@@ -99,7 +99,7 @@ def _to_unit(maps: np.ndarray, which: np.ndarray, d: np.ndarray) -> tuple[np.nda
 
 
 def _slab(o: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays enter and leave ``|o + t v| <= 1``."""
+    """Parameters t where rays enter and leave ``|o + t v| <= 1``."""
     inverse = 1 / np.where(v == 0, np.float32(1e-20), v)
     first, second = (-1 - o) * inverse, (1 - o) * inverse
     return np.minimum(first, second), np.maximum(first, second)
@@ -115,7 +115,7 @@ def _cross_box(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> t
     enter, leave = _slab(o[2], v[2])
     for axis in (0, 1):
         ratio = taper[:, axis]
-        # |u| <= middle + slope * height: two half-spaces, each entered or left.
+        # |u| <= middle + slope * height is the intersection of two half-spaces. A ray enters or leaves each.
         middle, slope = (1 + ratio) / 2, (ratio - 1) / 2
         bound, gain = middle + slope * o[2], slope * v[2]
         for sign in (np.float32(1), np.float32(-1)):
@@ -128,7 +128,7 @@ def _cross_box(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> t
 
 
 def _cross_ball(o: np.ndarray, v: tuple[np.ndarray, ...], _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    # About the point of the ray nearest to the centre: from far away the squares would cancel.
+    # Expand about the point of the ray nearest to the centre, because the squares would cancel far from it.
     a = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     nearest = -(o[0] * v[0] + o[1] * v[1] + o[2] * v[2]) / a
     p = [o[i] + nearest * v[i] for i in range(3)]
@@ -148,7 +148,7 @@ def _cross_wheel(o: np.ndarray, v: tuple[np.ndarray, ...], _: np.ndarray) -> tup
 def _cross_drum(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     near, far = _slab(o[2], v[2])
     ratio = taper[:, 0]
-    # A cone: x^2 + y^2 <= (middle + slope z)^2, about the point of the ray nearest to its axis.
+    # A cone, x^2 + y^2 <= (middle + slope z)^2, expanded about the point of the ray nearest to its axis.
     middle, slope = (1 + ratio) / 2, (ratio - 1) / 2
     at = -(o[0] * v[0] + o[1] * v[1]) / np.maximum(v[0] * v[0] + v[1] * v[1], np.float32(1e-20))
     p, q, radius = o[0] + at * v[0], o[1] + at * v[1], middle + slope * (o[2] + at * v[2])
@@ -158,13 +158,13 @@ def _cross_drum(o: np.ndarray, v: tuple[np.ndarray, ...], taper: np.ndarray) -> 
     c = p * p + q * q - radius * radius
     root = np.sqrt(b * b - a * c)
     early, late = (-b - root) / a, (-b + root) / a
-    # A ray steeper than the cone's side crosses it once: inwards where the cone widens ahead, else outwards.
+    # A ray steeper than the side of the cone crosses it once: inwards if the cone widens ahead, else outwards.
     steep = a <= 0
     begin = np.where(steep & (gain < 0), np.float32(-np.inf), early)
     end = np.where(steep & (gain > 0), np.float32(np.inf), late)
     return np.maximum(near, at + begin), np.minimum(far, at + end)
 
 
-# By kind, -1 for straight cuboids: where rays (origins and directions in a unit shape's axes, tapers) enter and
-# leave the shape; leave < enter or NaN where they miss.
+# Intersection tests by kind, -1 for straight cuboids. Arguments are origins and directions in the axes of the unit
+# shape and tapers; results are the parameters of entry and exit, with exit < entry or NaN for a miss.
 _CROSSINGS = {-1: _cross_cuboid, BOX: _cross_box, DRUM: _cross_drum, BALL: _cross_ball, WHEEL: _cross_wheel}

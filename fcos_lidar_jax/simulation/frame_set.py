@@ -1,4 +1,4 @@
-"""Simulated frames as a data set, made as they are asked for."""
+"""Simulated frames as a data set, computed on access."""
 
 import dataclasses
 
@@ -14,12 +14,12 @@ from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedFrames(FrameSet):
-    """Frames of :func:`make_frame`, each of another street, without the points on the ego vehicle.
+    """Frames of :func:`make_frame`, each of a different street, without points on the ego vehicle.
 
-    The objects are near, and only those that enough points show are annotated: what a small detector can learn.
-    Ten sweeps of fast traffic are a stress set for the fusion of sweeps: ego vehicle and objects move fast, and
-    most cells hold points of several sweeps. What is annotated depends on the points that show it,
-    so :meth:`truth` makes the whole frame.
+    By default objects are near, and only objects with enough points are annotated, so that a small detector can
+    learn from them. Ten sweeps of fast traffic are a stress test for sweep fusion: the ego vehicle and the objects
+    move fast, and most cells hold points of several sweeps. Annotations depend on the points, so :meth:`truth`
+    computes the whole frame.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> frames = SimulatedFrames(TINY, number=2)
@@ -29,8 +29,8 @@ class SimulatedFrames(FrameSet):
 
     sensor: Sensor
     number: int
-    first_seed: int = 0  # of the first frame; the others follow
-    num_objects: int = 14  # this and the others as of make_frame
+    first_seed: int = 0  # seed of frame 0; frame i has seed first_seed + i
+    num_objects: int = 14  # for this and the following fields see make_frame
     reach_m: float = 10.0
     min_points: int = 5
     close_m: float = 1.0
@@ -43,7 +43,6 @@ class SimulatedFrames(FrameSet):
         return self.number
 
     def frame(self, index: int) -> Frame:
-        """One frame, simulated anew."""
         return make_frame(
             self.first_seed + index,
             self.sensor,
@@ -60,12 +59,12 @@ class SimulatedFrames(FrameSet):
         return f"seed {self.first_seed + index}"
 
     def fingerprint(self) -> str:
-        """Checksum of the fields and the package's version, which decide every byte of the frames."""
+        """Checksum of the fields and the package version, which determine all bytes of the frames."""
         return checksum(repr((__version__, self)).encode())
 
 
 def city_frames(sensor: Sensor, number: int, first_seed: int = 0, *, streets: Streets = CITY) -> SimulatedFrames:
-    """Training frames for a sensor that sees far: varied streets with objects in all of its view.
+    """Training frames for a long-range sensor: varied streets with objects in the whole field of view.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
     >>> city_frames(NUSCENES_HDL32E, 10).reach_m
@@ -75,16 +74,18 @@ def city_frames(sensor: Sensor, number: int, first_seed: int = 0, *, streets: St
     return SimulatedFrames(sensor, number, first_seed, **extent, streets=streets)
 
 
-UNSEEN_SEED = 1_000_000  # seeds of test frames start here; training frames never get that far
+UNSEEN_SEED = 1_000_000  # first seed of test frames; seeds of training frames are smaller
 
 
 def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config, SimulatedFrames]:
-    """Training frames of which none is shown twice, up to half a million, and a configuration for them.
+    """Training frames without repetition, up to half a million, and a configuration for them.
 
     Args:
-        config: what makes more of few frames is taken out: class balance, copy-paste, augmentation.
-        seed: for the same number of steps, fewer than half a million samples in all, another seed gives other
-            streets: frames ``seed * steps * batch_size`` and on. Runs of other lengths may share some.
+        config: configuration to adapt. The result has no class balance, copy-paste or augmentation, which are
+            meant for few frames.
+        seed: selects the frames from ``seed * steps * batch_size`` on. Different seeds give different streets for
+            the same number of steps and fewer than half a million samples in total. Runs of different lengths may
+            share streets.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> config, frames = fresh_streets(QUICKSTART, steps=10)
@@ -98,7 +99,7 @@ def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config,
 
 
 def unseen_frames(sensor: Sensor, number: int) -> SimulatedFrames:
-    """Streets that no training gets to see.
+    """Frames of streets that :func:`fresh_streets` never uses.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> unseen_frames(TINY, 3).first_seed

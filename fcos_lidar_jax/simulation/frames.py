@@ -1,4 +1,4 @@
-"""Simulated frames: a sweep, or several fused, with the boxes of the current moment."""
+"""Simulated frames: one sweep or several fused sweeps, with the boxes at the time of the current sweep."""
 
 import numpy as np
 
@@ -25,19 +25,18 @@ def make_frame(
     close_m: float = 0.0,
     streets: Streets = PLAIN,
 ) -> Frame:
-    """A simulated frame of a street; the same seed gives the same bytes, in whatever order frames are made.
+    """Simulate a frame of a street. The bytes depend only on the arguments, not on the order of calls.
 
-    In plain streets all ten classes occur equally often; rays without a return are left out.
+    In plain streets all ten classes are equally frequent. Rays without a return are omitted.
 
     Args:
         seed: any non-negative integer.
-        num_objects: to place, on average where the streets are crowded or empty; fewer where there is no room.
-        reach_m: greatest distance along the street at which they are placed; default: four fifths of the sensor's.
-        min_points: objects that fewer points of the current sweep show are not annotated.
-        num_sweeps: fused, the current one included; with more than one the world moves.
-        fast_traffic: as of :func:`~.world.sample_world`.
-        close_m: as of :func:`scan_sweeps`.
-        streets: how varied they are.
+        num_objects: number of objects, or their mean with ``streets.setting``; objects without room are omitted.
+        reach_m: maximum distance of the objects along the street; by default 80 % of the sensor's range limit.
+        min_points: objects with fewer points in the current sweep are not annotated.
+        num_sweeps: number of fused sweeps, including the current one; the world moves between sweeps.
+        fast_traffic: see :func:`~.world.sample_world`.
+        close_m: see :func:`scan_sweeps`.
 
     Raises:
         ValueError: fewer than one sweep.
@@ -50,11 +49,11 @@ def make_frame(
     if num_sweeps < 1:
         raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
     rng = np.random.default_rng([seed, 0xF0C5])
-    mixed = rng.spawn(1)[0]
+    mix = rng.spawn(1)[0]
     if streets.setting:
-        num_objects = round(num_objects * np.clip(mixed.lognormal(-0.15, 0.6), 0.05, 2.5))
+        num_objects = round(num_objects * np.clip(mix.lognormal(-0.15, 0.6), 0.05, 2.5))
     if streets.city_classes:
-        shares = class_shares(streets.city_classes) * np.exp(streets.class_mix * mixed.standard_normal(10))
+        shares = class_shares(streets.city_classes) * np.exp(streets.class_mix * mix.standard_normal(10))
         labels = rng.choice(len(NUSCENES_CLASSES), num_objects, p=shares / shares.sum())
     else:
         labels = rng.permutation(np.resize(rng.permutation(len(NUSCENES_CLASSES)), num_objects))
@@ -66,8 +65,8 @@ def make_frame(
     points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, num_sweeps=num_sweeps, close_m=close_m)
     boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, now_s), now_s).astype(np.float32)
     counts = count_inside(points[points[:, 4] == 0], boxes)
-    shown = counts >= max(min_points, 1)
-    return Frame(points, boxes[shown], world.traffic.labels[shown], counts[shown], num_close)
+    visible = counts >= max(min_points, 1)
+    return Frame(points, boxes[visible], world.traffic.labels[visible], counts[visible], num_close)
 
 
 def scan_sweeps(
@@ -80,18 +79,19 @@ def scan_sweeps(
     num_sweeps: int,
     close_m: float = 0.0,
 ) -> tuple[np.ndarray, int]:
-    """The sweeps up to a moment in the sensor's frame of that moment, the current one first, then by age.
+    """Fuse the sweeps up to a moment in the sensor's frame at that moment, current sweep first, then by age.
 
     Args:
-        mount: f64[4, 4], as of :func:`~.lidar.sample_mount`.
-        time_s: of the current sweep; the others are ``SWEEP_S`` apart.
-        rng: noise and dropout.
-        num_sweeps: how many, the current one included.
-        close_m: points with ``|x|, |y|`` below it around the sensor, in their own sweep's frame, are left out.
+        mount: f64[4, 4], from :func:`~.lidar.sample_mount`.
+        time_s: time of the current sweep; sweeps are ``SWEEP_S`` apart.
+        rng: source of noise and dropout.
+        num_sweeps: number of sweeps, including the current one.
+        close_m: points with ``|x|`` and ``|y|`` below this value around the sensor, in the frame of their own
+            sweep, are removed.
 
     Returns:
-        f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, the lag exactly 0 for the current sweep; and how
-        many points were left out.
+        points f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, with lag exactly 0 for the current sweep,
+        and the number of removed points.
     """
 
     def take_sweep(age: int) -> Sweep:
@@ -108,10 +108,7 @@ def scan_sweeps(
 
 
 def boxes_in_sensor_frame(world: World, pose: np.ndarray, time_s: float) -> np.ndarray:
-    """``x, y, z, l, w, h, yaw, vx, vy`` of all objects in the points' frame, f64[m, 9].
-
-    ``pose``, f64[4, 4], is the points' frame in the street's.
-    """
+    """Boxes ``x, y, z, l, w, h, yaw, vx, vy`` of all objects, f64[m, 9], in the point frame at ``pose``."""
     placed, sizes = world.object_poses(time_s), world.traffic.sizes
     center = placed[:, :3] + sizes * (0, 0, 0.5)
     heading = np.stack([np.cos(placed[:, 3]), np.sin(placed[:, 3]), 0 * placed[:, 3]], axis=1) @ pose[:3, :3]

@@ -1,4 +1,4 @@
-"""A turning LiDAR in the simulated world: rays, noise, dropout, intensity, and the rows of its files."""
+"""A rotating LiDAR in the simulated world: rays, noise, dropout, intensity and file rows."""
 
 import dataclasses
 import itertools
@@ -14,39 +14,39 @@ from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.world import World
 
 SWEEP_S = 0.05  # duration of a turn
-_HEIGHT_M = 1.84  # the sensor stands this far above the ground
-_FORWARD_M = 0.94  # and this far before the rear axle
-_SURPLUS = 1.0009  # a file's columns span slightly more than a turn
-_SECTORS = 10  # parts of a sweep with a time of their own, with rolling shutter
-_TILT_RAD = 0.1  # the sensor leans by less
+_HEIGHT_M = 1.84  # height of the sensor above the ground
+_FORWARD_M = 0.94  # distance of the sensor ahead of the rear axle
+_SURPLUS = 1.0009  # the columns of a file span slightly more than a turn
+_SECTORS = 10  # number of parts of a sweep with separate times, with rolling shutter
+_TILT_RAD = 0.1  # upper bound of the sensor's tilt
 _FARTHEST_M = 105.0
 _RANGE_STEP_M = 0.002
-_LOST = 0.015  # of strong returns
+_LOST = 0.015  # share of strong returns that are lost
 _NO_RETURN_NOISE_M = 0.02
-_NO_RETURN_INTENSITY = 12.0  # mean of the noise that is written where nothing came back
-_ROUGH_BESIDE = 3.0  # as rough as the carriageways is what lies beyond the pavements
-# The ego vehicle's outline in nuScenes: the lowest free beam of an HDL-32E at every 8 degrees clockwise from 176
-# degrees left of ahead, the lowest of all being 0.
+_NO_RETURN_INTENSITY = 12.0  # mean intensity noise of rays without a return
+_ROUGH_BESIDE = 3.0  # roughness of the ground beyond the pavements, relative to the streets
+# Outline of the ego vehicle in nuScenes: lowest unblocked beam of an HDL-32E (0 is the lowest beam) every 8
+# degrees, clockwise from 176 degrees left of straight ahead.
 _OUTLINE = (
     *(10, 8, 7, 7, 5, 3, 2, 1, 0, 0, 0, 0.5, 2, 2, 2, 3.5, 5, 8, 6, 6, 7, 7, 8),
     *(7, 7, 6, 6, 8, 4.5, 3, 2, 1, 2, 0.5, 0, 0, 0, 0, 1, 3, 4.5, 6, 7, 8, 9.5),
 )
-_EDGES_M = (1.4, 1.0), (1.75, 1.15)  # least and greatest distance of nuScenes' vehicles' bonnet, and of their roof
+_EDGES_M = (1.4, 1.0), (1.75, 1.15)  # least and greatest distances of (bonnet, roof) of nuScenes vehicles
 _EDGE_HALVES_M = 0.62, 0.35
 _EDGE_RETURNS = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
 class Scan:
-    """One turn, ray by ray: columns in the order of time, in each the lowest laser first, as in nuScenes files."""
+    """One turn, ray by ray: columns in order of time, each from the lowest laser up, as in nuScenes files."""
 
-    points: np.ndarray  # f32[w * h, 5]: x, y, z in the points' frame, intensity 0-255, laser (0 lowest)
-    returned: np.ndarray  # bool[w * h]: False where nothing came back; such points lie about the sensor
-    seen_share: np.ndarray  # f64[m]: share of the rays towards each object that nothing else stops; 0 without any
+    points: np.ndarray  # f32[w * h, 5]: x, y, z in the point frame, intensity 0-255, laser (0 lowest)
+    returned: np.ndarray  # bool[w * h]: False for rays without a return, whose points lie around the sensor
+    seen_share: np.ndarray  # f64[m]: share of the rays towards each object that reach it; 0 without such rays
 
 
 def sample_mount(rng: Generator, sensor: Sensor, *, level: bool = False, streets: Streets = PLAIN) -> np.ndarray:
-    """The points' frame in the ego vehicle's, f64[4, 4]: y forward, x right, tilted a little unless level."""
+    """Random pose of the point frame in the ego frame, f64[4, 4]: x right, y forward, slightly tilted."""
     tilt, roll, turn = (0.0, 0.0, 0.0) if level else np.clip(rng.normal(0, (0.016, 0.01, 0.005)), -0.04, 0.04)
     tilt -= 0.0 if level else streets.pitch_rad
     height = _HEIGHT_M + streets.mount_m * rng.spawn(1)[0].standard_normal()
@@ -60,7 +60,7 @@ def sample_mount(rng: Generator, sensor: Sensor, *, level: bool = False, streets
 
 
 def sensor_pose(world: World, mount: np.ndarray, time_s: float) -> np.ndarray:
-    """The points' frame in the street's, f64[4, 4]; ``mount`` as of :func:`sample_mount`."""
+    """Pose of the point frame in the street frame, f64[4, 4]; ``mount`` is from :func:`sample_mount`."""
     return world.ego_pose(time_s) @ mount
 
 
@@ -73,14 +73,14 @@ def scan(
     *,
     rolling_shutter: bool = False,
 ) -> Scan:
-    """One turn of the sensor, which ends at a moment.
+    """Simulate one turn of the sensor.
 
     Args:
-        mount: f64[4, 4], as of :func:`sample_mount`.
-        time_s: moment of the sweep, and of the frame that its points are in.
-        rng: noise and dropout.
-        rolling_shutter: ego vehicle and objects move during the turn; the points are then compensated for the ego
-            motion, as nuScenes' are. Otherwise the turn takes no time.
+        mount: f64[4, 4], from :func:`sample_mount`.
+        time_s: time at the end of the turn; the points are in the point frame at this time.
+        rng: source of noise and dropout.
+        rolling_shutter: the ego vehicle and the objects move during the turn, and the points are compensated for
+            the ego motion, as in nuScenes. Otherwise the turn takes no time.
 
     >>> from fcos_lidar_jax.simulation.world import sample_world
     >>> from fcos_lidar_jax.sensors import TINY
@@ -93,7 +93,7 @@ def scan(
     begin = rng.uniform(-1, 1)
     rings = _sample_rings(world, sensor)
     edges = np.linspace(0, sensor.num_columns, (_SECTORS if rolling_shutter else 1) + 1).astype(int)
-    # Columns of a whole turn, and of its part before the first one.
+    # Number of columns of a full turn, and of the part of the turn before column 0.
     turn, before = float(sensor.num_columns), 0.0
     if sensor.azimuth_limits_rad is not None:
         turn = 2 * np.pi / sensor.column_rad
@@ -109,13 +109,13 @@ def scan(
 
 @dataclasses.dataclass(frozen=True)
 class _Rings:
-    """What differs from laser to laser, the highest first, and is the same in all sweeps of a world."""
+    """Properties of the lasers, from the highest down, that are constant over all sweeps of a world."""
 
-    elevation_rad: np.ndarray  # f64[h]: to add
-    range_m: np.ndarray  # f32[h]: to add
-    gain: np.ndarray  # f32[h]: of the intensity
-    faint: np.float32  # strength at which 63 % return
-    edges_m: np.ndarray  # f64[2]: from the sensor to the edges of the bonnet ahead and of the roof behind
+    elevation_rad: np.ndarray  # f64[h]: offset of the inclination
+    range_m: np.ndarray  # f32[h]: offset of the range
+    gain: np.ndarray  # f32[h]: factor of the intensity
+    faint: np.float32  # strength at which 63 % of the rays return
+    edges_m: np.ndarray  # f64[2]: distances from the sensor to the edges of the bonnet ahead and the roof behind
 
 
 def _sample_rings(world: World, sensor: Sensor) -> _Rings:
@@ -140,24 +140,24 @@ def _scan_sector(
     now: np.ndarray,
     rng: Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points, which of them returned, and for every object the rays towards it and those that reach it."""
+    """Points, mask of returns, and the number of rays towards each object and of rays that reach it."""
     streets = world.streets
     pose = sensor_pose(world, mount, time_s)
     rotation, eye = pose[:3, :3], pose[:3, 3] + pose[:3, :3] @ np.array(sensor.origin_m)
     farthest = min(_FARTHEST_M, 2 * sensor.limit_xy_m)
-    everything = world.solids(time_s)
+    solids = world.solids(time_s)
     if not streets.ego_outline:
-        everything = np.concatenate([everything, _ego_solids(rotation, eye)])
-    solids = _in_view(everything, fan, rotation, eye, farthest)
+        solids = np.concatenate([solids, _ego_solids(rotation, eye)])
+    solids = _in_view(solids, fan, rotation, eye, farthest)
     hits = cast(fan, rotation, eye, solids, world.ground, rng)
     range_m, shape = hits.range_m, (fan.num_columns, sensor.num_rows)
     if streets.ego_outline:
         blocked = _behind_ego(fan)
         range_m[blocked], hits.solid[blocked] = np.inf, -1
         if streets.ego_edges:
-            edge, away = _ego_edges(fan, blocked, rings.edges_m)
+            edge, edge_range_m = _ego_edges(fan, blocked, rings.edges_m)
             edge &= rng.random(len(edge)) < _EDGE_RETURNS
-            range_m[edge] = away[edge]
+            range_m[edge] = edge_range_m[edge]
     albedo = np.append(solids["albedo"], 0.0).astype(np.float32)[hits.solid]
     ground = np.flatnonzero((hits.solid < 0) & np.isfinite(range_m))
     towards = rotation.astype(np.float32) @ fan.directions
@@ -172,7 +172,7 @@ def _scan_sector(
         struck = np.flatnonzero(hits.solid >= 0)
         x, y, z = eye[:, None] + towards[:, struck] * range_m[struck]
         albedo[struck] *= np.exp(world.ground.shading.at(x + z, y + z))
-    # Strong rays come back nearly all, faint ones (far, grazing) in part.
+    # Nearly all strong rays return, but only some faint ones (far away or at a grazing angle).
     strength = albedo * hits.cosine / np.maximum(range_m / 100, np.float32(1e-3)) ** 2
     chance = (1 - _LOST) * -np.expm1(-strength / rings.faint)
     returned = (rng.random(len(range_m), np.float32) < chance) & (range_m < farthest)
@@ -184,26 +184,26 @@ def _scan_sector(
         motion = np.linalg.inv(now) @ pose
         local = motion[:3, :3].astype(np.float32) @ local + motion[:3, 3:].astype(np.float32)
     intensity = rng.standard_exponential(len(albedo), np.float32) * np.float32(_NO_RETURN_INTENSITY)
-    back = np.flatnonzero(returned)
-    speckle = np.exp(np.float32(streets.speckle) * rng.standard_normal(len(back), np.float32))
-    speckle *= rings.gain[back % sensor.num_rows]
-    intensity[back] = 255 * albedo[back] * (0.35 + 0.65 * hits.cosine[back]) * speckle
+    rays = np.flatnonzero(returned)
+    speckle = np.exp(np.float32(streets.speckle) * rng.standard_normal(len(rays), np.float32))
+    speckle *= rings.gain[rays % sensor.num_rows]
+    intensity[rays] = 255 * albedo[rays] * (0.35 + 0.65 * hits.cosine[rays]) * speckle
 
     points = np.empty((*shape, 5), np.float32)
     points[:, ::-1, :3] = local.T.reshape(*shape, 3)
     points[:, ::-1, 3] = np.minimum(np.floor(intensity), 255).reshape(shape)
     points[..., 4] = np.arange(sensor.num_rows)
-    number = len(world.traffic.labels)
-    reachable = np.bincount(hits.reachable // range_m.size, minlength=number)
-    struck = solids["owner"][hits.solid[hits.solid >= 0]]
-    seen = np.bincount(struck[struck >= 0], minlength=number)
+    num_objects = len(world.traffic.labels)
+    reachable = np.bincount(hits.reachable // range_m.size, minlength=num_objects)
+    owner = solids["owner"][hits.solid[hits.solid >= 0]]
+    seen = np.bincount(owner[owner >= 0], minlength=num_objects)
     return points.reshape(-1, 5), returned.reshape(shape)[:, ::-1].ravel(), reachable, seen
 
 
 def _measure(
     d: np.ndarray, range_m: np.ndarray, returned: np.ndarray, noise_m: float, rng: Generator
 ) -> np.ndarray:
-    """Measured points about the sensor, f32[3, n]; those without a return lie where it is, and a little off."""
+    """Measured points in the sensor's frame, f32[3, n]. Points without a return scatter around the origin."""
     noise = rng.standard_normal(len(range_m), np.float32) * np.float32(noise_m)
     noisy = np.round((range_m + noise) / np.float32(_RANGE_STEP_M)) * np.float32(_RANGE_STEP_M)
     points = d * np.where(returned, noisy, np.float32(0))
@@ -215,7 +215,7 @@ def _measure(
 def _make_fan(sensor: Sensor, rings: _Rings, begin: float, first: int, last: int) -> Fan:
     rows = sensor.num_rows
     step = sensor.column_rad * _SURPLUS
-    # The lasers fire in turn, one of the lower half and one of the upper half alternately.
+    # The lasers fire one by one, alternating between the lower and the upper half.
     rising = np.arange(rows)
     slot = np.where(rising < rows // 2, 2 * rising, 2 * (rising - rows // 2) + 1)
     start = sensor.first_azimuth_rad - step * (0.1 + begin + first)
@@ -224,7 +224,7 @@ def _make_fan(sensor: Sensor, rings: _Rings, begin: float, first: int, last: int
 
 
 def _behind_ego(fan: Fan) -> np.ndarray:
-    """Rays that the ego vehicle stops, bool[w * h]."""
+    """Mask of the rays that the ego vehicle blocks, bool[w * h]."""
     right, ahead, up = fan.directions
     clockwise = np.degrees(np.arctan2(right, ahead))
     lowest = np.interp(clockwise, np.linspace(-176, 176, len(_OUTLINE)), _OUTLINE, period=360)
@@ -232,7 +232,7 @@ def _behind_ego(fan: Fan) -> np.ndarray:
 
 
 def _ego_edges(fan: Fan, blocked: np.ndarray, edges_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The highest of the blocked rays of each column that meet an edge, bool[w * h], and the range of the edge."""
+    """Mask of the highest blocked ray of each column if it hits an edge, bool[w * h], and range of the edge."""
     right, ahead, _ = fan.directions
     high = blocked.reshape(fan.num_columns, -1).copy()
     high[:, 1:] &= ~high[:, :-1].copy()  # the highest ray comes first
@@ -242,7 +242,7 @@ def _ego_edges(fan: Fan, blocked: np.ndarray, edges_m: np.ndarray) -> tuple[np.n
 
 
 def _in_view(solids: np.ndarray, fan: Fan, rotation: np.ndarray, eye: np.ndarray, farthest: float) -> np.ndarray:
-    """The solids that are near enough, and not surely outside the fan."""
+    """Solids within range, without those that certainly lie outside the fan."""
     radius = np.linalg.norm(solids["half"], axis=1) + np.abs(solids["lean"]) * solids["half"][:, 2]
     x, y = (solids["center"] - eye)[:, :2].T
     distance = np.hypot(x, y)
@@ -257,7 +257,7 @@ def _in_view(solids: np.ndarray, fan: Fan, rotation: np.ndarray, eye: np.ndarray
 
 
 def _ego_solids(rotation: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """Roof, rack and bonnet of the ego vehicle, under the sensor."""
+    """Roof, rack and bonnet of the ego vehicle below the sensor."""
     center = [[0, -0.45, -0.6], [0, 0.5, -0.34], [0, 1.75, -0.9]]
     half = [[0.54, 0.75, 0.22], [0.42, 0.13, 0.1], [0.6, 0.25, 0.23]]
     solids = make_solids(BOX, center, half, albedo=0.03, owner=EGO)

@@ -1,23 +1,23 @@
-"""How things move: along a straight line, round one bend, and on, with a steady change of speed."""
+"""Motions along a straight line, one bend and another straight line, with constant acceleration."""
 
 import numpy as np
 
 MOTION = np.dtype(
     [
-        ("x", np.float64),  # where it is at time 0, metres
+        ("x", np.float64),  # position at time 0, metres
         ("y", np.float64),
         ("yaw", np.float64),  # heading at time 0, radians
         ("speed", np.float64),  # at time 0, m/s
-        ("acceleration", np.float64),  # m/s^2; one that brakes stays where it comes to rest
-        ("straight", np.float64),  # metres before the bend
-        ("curvature", np.float64),  # of the bend, 1/m, positive to the left; 0 without one
-        ("turn", np.float64),  # of the whole bend, radians
+        ("acceleration", np.float64),  # m/s^2; a braking motion stops at speed 0
+        ("straight", np.float64),  # distance before the bend, metres
+        ("curvature", np.float64),  # curvature of the bend, 1/m, positive to the left; 0 without a bend
+        ("turn", np.float64),  # angle of the whole bend, radians
     ]
 )
 
 
 def make_motion(**fields: float) -> np.ndarray:
-    """One motion, [1] of :data:`MOTION`; fields that are not given are 0."""
+    """Create one motion, [1] of :data:`MOTION`. Fields default to 0."""
     motion = np.zeros(1, MOTION)
     for name, value in fields.items():
         motion[name] = value
@@ -25,7 +25,7 @@ def make_motion(**fields: float) -> np.ndarray:
 
 
 def travelled(motion: np.ndarray, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Metres gone and speed at a time not before 0.
+    """Distance travelled in metres and speed at a non-negative time.
 
     >>> [v.tolist() for v in travelled(make_motion(speed=4, acceleration=-2), 10.0)]
     [[4.0], [0.0]]
@@ -37,23 +37,23 @@ def travelled(motion: np.ndarray, time_s: np.ndarray | float) -> tuple[np.ndarra
 
 
 def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
-    """Positions and headings, f64[..., 3]: x, y, yaw; motions [...] and times broadcast.
+    """Positions and headings ``x, y, yaw``, f64[..., 3]. Motions [...] and times broadcast.
 
     >>> pose_at(make_motion(speed=1, curvature=1, turn=np.pi / 2), np.pi / 2 + 3).round(6).tolist()
     [[1.0, 4.0, 1.570796]]
     """
-    way, _ = travelled(motion, time_s)
+    distance, _ = travelled(motion, time_s)
     curvature = motion["curvature"]
     bends = curvature != 0
     c, s = np.cos(motion["yaw"]), np.sin(motion["yaw"])
-    if not bends.any():  # most motions are straight; the same bits as below, in less time
-        x, y, yaw = np.broadcast_arrays(motion["x"] + c * way, motion["y"] + s * way, motion["yaw"])
+    if not bends.any():  # shortcut for the many straight motions, bit-identical with the general case
+        x, y, yaw = np.broadcast_arrays(motion["x"] + c * distance, motion["y"] + s * distance, motion["yaw"])
         return np.stack([x, y, yaw], axis=-1)
     safe = np.where(bends, curvature, 1.0)
     length = np.where(bends, motion["turn"] / safe, 0.0)
-    before = np.where(bends, np.minimum(way, motion["straight"]), way)
-    angle = curvature * np.clip(way - before, 0, length)
-    after = np.maximum(way - before - length, 0)
+    before = np.where(bends, np.minimum(distance, motion["straight"]), distance)
+    angle = curvature * np.clip(distance - before, 0, length)
+    after = np.maximum(distance - before - length, 0)
     along = before + np.sin(angle) / safe + after * np.cos(angle)
     across = (1 - np.cos(angle)) / safe + after * np.sin(angle)
     x, y = motion["x"] + c * along - s * across, motion["y"] + s * along + c * across
@@ -61,7 +61,7 @@ def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
 
 
 def velocity_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
-    """Velocities, f64[..., 2], m/s."""
+    """Velocities ``vx, vy`` in m/s, f64[..., 2]."""
     yaw = pose_at(motion, time_s)[..., 2]
     _, speed = travelled(motion, time_s)
     return np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], axis=-1)

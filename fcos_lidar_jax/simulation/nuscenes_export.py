@@ -1,7 +1,7 @@
-"""A synthetic data set on disk: scenes one by one, tables last, resumable at any moment.
+"""Resumable export of a synthetic data set: first the scenes, then the tables.
 
-While it is being made, ``OUT/.synthesize`` holds what was asked for and the rows of the scenes that are done. The
-tables appear at once, when all scenes are there.
+``OUT/.synthesize`` contains the specification of the data set and the rows of finished scenes. The folder of
+tables appears in one step when all scenes are finished.
 """
 
 import contextlib
@@ -26,30 +26,31 @@ from fcos_lidar_jax.workers import end_with_parent
 
 _WORK = ".synthesize"
 _ORDER, _TABLES = f"{_WORK}/order.json", f"{_WORK}/tables.json"  # checksums of the tables
-_FORMAT = 2  # rises when the same data set gets other bytes
+_FORMAT = 2  # increases when the bytes of the same specification change
 _POLL_S = 0.5
 
 
 def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callable[[int], object]) -> bool:
-    """Write a data set in the official layout, or go on with one that was begun.
+    """Write a data set in the official layout, or resume an unfinished one.
 
     Args:
-        root: the data set's folder: new, empty, or one where the same data set was begun.
-        workers: processes; the bytes do not depend on it.
-        report: called with the number of sweeps that are done, now and then.
+        root: folder of the data set: new, empty, or with an unfinished data set of the same specification.
+        workers: number of processes; the bytes do not depend on it.
+        report: called repeatedly with the number of finished sweeps.
 
     Returns:
-        False where everything was there already.
+        False if the data set was already complete.
 
     Raises:
-        ValueError: the folder holds something else; one line that says what.
-        OSError: what cannot be written, or another process writes there.
+        ValueError: the folder contains other files or another data set.
+        OSError: a file cannot be written, or another process writes to the folder.
     """
-    if _finished(spec, root, _check_order(spec, root)):  # before anything is written
+    _check_order(spec, root)  # reject before writing anything
+    if _finished(spec, root):
         return False
     with folder_lock(root / _WORK, "synthesizing"):
         order = _check_order(spec, root)
-        if _finished(spec, root, order):  # another process was faster
+        if _finished(spec, root):  # another process finished it meanwhile
             return False
         atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
         _write_rest(spec, root, workers, report)
@@ -71,33 +72,31 @@ def _write_rest(spec: DatasetSpec, root: Path, workers: int, report: Callable[[i
 
 
 def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
-    """What decides the bytes of this data set, as JSON; refuses a folder of anything else."""
-    asked = {"format": _FORMAT, **dataclasses.asdict(spec), "sensor": sensor_to_json(spec.sensor)}
-    wanted = json.loads(json.dumps(asked))
+    """Specification of the data set as JSON; rejects a folder with other contents."""
+    order = {"format": _FORMAT, **dataclasses.asdict(spec), "sensor": sensor_to_json(spec.sensor)}
+    order = json.loads(json.dumps(order))
     if root.exists() and not root.is_dir():
         raise ValueError(f"{root}: found a file, expected a folder")
     file = root / _ORDER
     if not file.is_file():
         if root.is_dir() and any(p.name != _WORK for p in root.iterdir()):
-            raise ValueError(f"{root}: not empty, and not begun by this command: expected a new folder")
-        return wanted
-    found = read_json(file, dict[str, Any])
-    for name, value in wanted.items():
-        before = found.get(name)
+            raise ValueError(f"{root}: found other files, expected an empty folder or a data set of this command")
+        return order
+    previous = read_json(file, dict[str, Any])
+    for name, value in order.items():
+        before = previous.get(name)
         if isinstance(value, dict) and isinstance(before, dict):
             fields = ("name", *sorted(value.keys() | before.keys()))
-            differing = [field for field in fields if value.get(field) != before.get(field)]
-            if differing:
-                field = differing[0]
-                name = name if field == "name" else f"{name}.{field}"
-                value, before = value.get(field), before.get(field)
+            field = next((field for field in fields if value.get(field) != before.get(field)), "name")
+            name = name if field == "name" else f"{name}.{field}"
+            value, before = value.get(field), before.get(field)
         if before != value:
-            raise ValueError(f"{root}: {name}: got {value}, but the data set there was begun with {before}")
-    return wanted
+            raise ValueError(f"{root}: {name}: got {value}, expected {before} as in the data set begun there")
+    return order
 
 
-def _finished(spec: DatasetSpec, root: Path, order: dict[str, Any]) -> bool:
-    """Whether all is there; refuses a finished data set of which something was lost or altered later."""
+def _finished(spec: DatasetSpec, root: Path) -> bool:
+    """Whether the data set is complete; rejects a data set with files that are missing or changed since."""
     folder = root / spec.version
     if not folder.is_dir():
         return False
@@ -105,28 +104,25 @@ def _finished(spec: DatasetSpec, root: Path, order: dict[str, Any]) -> bool:
     size = spec.sensor.num_rows * spec.sensor.num_columns * 5 * 4
     clouds = itertools.product(range(spec.scenes), range(spec.sweeps))
     files = (root / sweep_file(spec.seed, index, number) for index, number in clouds)
+    tables = ((folder / name, checksum) for name, checksum in written.items())
     damaged = itertools.chain(
         (file for file in files if not file.is_file() or file.stat().st_size != size),
-        (
-            folder / n
-            for n, c in written.items()
-            if not os.path.isfile(folder / n) or file_checksum(folder / n) != c
-        ),
+        (file for file, checksum in tables if not file.is_file() or file_checksum(file) != checksum),
     )
     if (file := next(damaged, None)) is not None:
-        found = "another content" if os.path.isfile(file) else "nothing"
-        raise ValueError(f"{file}: found {found}, expected the file as written: remove {root}, and run again")
+        found = "other content" if file.is_file() else "nothing"
+        raise ValueError(f"{file}: found {found}, expected the file as written: remove {root} and run again")
     return True
 
 
 def _shard(root: Path, index: int) -> Path:
-    """Folder of the rows of a scene that is done."""
+    """Folder with the rows of a finished scene."""
     return root / _WORK / scene_name(index)
 
 
 @contextlib.contextmanager
 def _new_folder(folder: Path, root: Path) -> Iterator[Path]:
-    """A folder to fill, which gets its name when it is complete."""
+    """Yield a temporary folder that is renamed to ``folder`` on success."""
     unfinished = root / _WORK / f"{folder.name}.part"
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
@@ -142,14 +138,14 @@ def _write_text(path: Path, text: str) -> None:
 def _write_scene(spec: DatasetSpec, root: Path, index: int, advance: Callable[[], object]) -> None:
     rows = render_scene(spec, index, root, advance)
     with _new_folder(_shard(root, index), root) as folder:
-        for name, table in rows.items():  # as they are written in the end, without the brackets around
+        for name, table in rows.items():  # the text of the final table without its brackets
             _write_text(folder / f"{name}.json", json.dumps(table, indent=0)[1:-1].strip("\n"))
 
 
 def _write_in_processes(
     spec: DatasetSpec, root: Path, todo: list[int], workers: int, report: Callable[[int], object]
 ) -> None:
-    """Scenes in processes of their own; whatever ends this one ends them."""
+    """Write scenes in worker processes, which end when this process ends."""
     context = multiprocessing.get_context("spawn")
     counter, others = context.Value("q", 0), set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(workers, len(todo)), context, initializer=_begin_worker, initargs=(counter,))
@@ -162,7 +158,7 @@ def _write_in_processes(
                     future.result()
                 report(counter.value)
         except BrokenProcessPool:
-            raise OSError("a worker died, perhaps for want of memory: try fewer workers") from None
+            raise OSError("a worker process died, possibly out of memory: try fewer workers") from None
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(multiprocessing.active_children()) - others:
@@ -170,7 +166,7 @@ def _write_in_processes(
             raise
 
 
-_counter: Any = None  # in a worker process: the sweeps that all of them have done
+_counter: Any = None  # in worker processes, number of sweeps finished by all workers
 
 
 def _advance() -> None:
@@ -181,12 +177,12 @@ def _advance() -> None:
 def _begin_worker(counter: Any) -> None:
     global _counter
     _counter = counter
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interruption is the parent's affair
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles interruptions
     end_with_parent()
 
 
 def _write_tables(spec: DatasetSpec, root: Path) -> None:
-    """All tables, from the rows of the scenes; never those of all scenes in memory."""
+    """Write all tables from the rows of the scenes, one scene in memory at a time."""
     with _new_folder(root / spec.version, root) as folder:
         for name in [file.name for file in _shard(root, 0).iterdir()]:
             texts = ((_shard(root, i) / name).read_text(encoding="utf-8") for i in range(spec.scenes))
@@ -208,9 +204,9 @@ def _write_tables(spec: DatasetSpec, root: Path) -> None:
 
 
 def splits(scenes: int) -> dict[str, list[str]]:
-    """Split name -> scenes: the last fifth, at least one, is for validation; a single scene is for training.
+    """Scenes by split: the last fifth, at least one scene, is for validation; a single scene is for training.
 
-    Each split has two names, since the official devkit wants ``train`` and ``val`` to be its own scenes.
+    Each split has two names, because the official devkit requires ``train`` and ``val`` to contain its own scenes.
 
     >>> splits(2)
     {'train': ['scene-0001'], 'synthetic_train': ['scene-0001'],

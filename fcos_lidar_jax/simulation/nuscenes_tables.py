@@ -1,4 +1,4 @@
-"""Rows of the official nuScenes tables: those that are the same in every data set, and those of one scene."""
+"""Rows of the official nuScenes tables: rows common to all data sets, and rows of one scene."""
 
 import hashlib
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ CATEGORIES = sorted(
         *(f"vehicle.emergency.{kind}" for kind in ("ambulance", "police")),
     }
 )
-"""The official categories; their index counts from 1."""
+"""Official categories; indices in the table start at 1."""
 ATTRIBUTES = (
     *("vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider"),
     *("pedestrian.sitting_lying_down", "pedestrian.standing", "pedestrian.moving"),
@@ -38,7 +38,7 @@ _MOVING_MPS = 0.2
 
 
 def token(*name: object) -> str:
-    """32 hexadecimal digits that follow from a name.
+    """Derive 32 hexadecimal digits from a name.
 
     >>> token("sample", 0, 1)
     '19be9df9c5a728e4f1980077f6da86b8'
@@ -47,7 +47,7 @@ def token(*name: object) -> str:
 
 
 def fixed_tables(logs: list[str]) -> dict[str, list[Row]]:
-    """The tables without scenes: one map for all logs, as the official reader wants it, with nothing on it."""
+    """Tables without scenes. All logs share one empty map, which the official reader requires."""
     return {
         "category": [
             {"token": token("category", name), "name": name, "description": "", "index": i}
@@ -61,7 +61,7 @@ def fixed_tables(logs: list[str]) -> dict[str, list[Row]]:
 
 
 def scene_name(index: int) -> str:
-    """Name of a scene, counted from 0.
+    """Name of a scene from its index, starting at 0.
 
     >>> scene_name(0)
     'scene-0001'
@@ -70,7 +70,7 @@ def scene_name(index: int) -> str:
 
 
 def sweep_file(seed: int, index: int, number: int) -> str:
-    """Name of a sweep's point file in its data set.
+    """Path of the point file of a sweep in its data set.
 
     >>> sweep_file(0, 0, 10)
     'samples/LIDAR_TOP/sim-0-0001__LIDAR_TOP__1700000600500000.pcd.bin'
@@ -80,11 +80,12 @@ def sweep_file(seed: int, index: int, number: int) -> str:
 
 
 def scene_rows(seed: int, index: int, mount: Row, ego_poses: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of a scene (its index, and the seed of the data set) but for its objects.
+    """Rows of a scene without its objects, from the seed of the data set and the index of the scene.
 
     Args:
-        mount: of the sensor, as of :func:`pose_fields`.
-        ego_poses: likewise, one a sweep, the first and the last of a keyframe.
+        mount: pose of the sensor in the ego frame, from :func:`pose_fields`.
+        ego_poses: pose of the ego vehicle per sweep, from :func:`pose_fields`; the first and the last sweep are
+            keyframes.
     """
     key = (seed, scene_name(index))
     log, scene, calibration = (token(table, *key) for table in ("log", "scene", "calibrated_sensor"))
@@ -141,14 +142,14 @@ def object_rows(
     seen_shares: np.ndarray,
     counts: np.ndarray,
 ) -> dict[str, list[Row]]:
-    """Rows of a scene's objects, each annotated from the first keyframe to the last in which a point shows it.
+    """Rows of the objects of a scene, annotated from the first to the last keyframe in which they have points.
 
     Args:
-        categories: [m] of the objects.
-        boxes: f64[k, m, 7] in every keyframe, in the global frame, ``x, y, z, l, w, h, yaw``.
-        attributes: [k][m] names, None for objects that have none.
-        seen_shares: f64[k, m], of the rays towards each.
-        counts: i32[k, m], points inside.
+        categories: [m], categories of the objects.
+        boxes: f64[k, m, 7], boxes ``x, y, z, l, w, h, yaw`` in the global frame, per keyframe.
+        attributes: [k][m], attribute names, None for objects without an attribute.
+        seen_shares: f64[k, m], share of the rays towards each object that reach it.
+        counts: i32[k, m], number of points in each box.
     """
     key = (seed, scene_name(index))
     rows: dict[str, list[Row]] = {"instance": [], "sample_annotation": []}
@@ -187,7 +188,7 @@ def object_rows(
 
 
 def attribute_of(name: str, speed_mps: float, *, rider: bool, parked: bool) -> str | None:
-    """Attribute of an object of a class, None for cones and barriers.
+    """Attribute of an object, None for traffic cones and barriers.
 
     >>> attribute_of("car", 3.0, rider=False, parked=False)
     'vehicle.moving'
@@ -203,7 +204,7 @@ def attribute_of(name: str, speed_mps: float, *, rider: bool, parked: bool) -> s
 
 
 def visibility_of(share: float) -> str:
-    """Token of the visibility level of an object of which this share of the rays is free.
+    """Token of the visibility level of an object, from the share of rays that reach it.
 
     >>> [visibility_of(share) for share in (0.0, 0.5, 0.7, 1.0)]
     ['1', '2', '3', '4']
@@ -212,7 +213,7 @@ def visibility_of(share: float) -> str:
 
 
 def pose_fields(pose: np.ndarray) -> Row:
-    """Translation and rotation (w, x, y, z) of a 4x4 pose, as tables hold them."""
+    """Table fields of a 4x4 pose: translation and rotation (w, x, y, z)."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
     return {"translation": pose[:3, 3].tolist(), "rotation": quaternion.tolist()}
 

@@ -1,4 +1,4 @@
-"""What objects of the ten classes look like: models from ``objects.toml``, and the solids that they consist of."""
+"""Object models of the ten classes, from ``objects.toml``, and the solids of objects."""
 
 import dataclasses
 import tomllib
@@ -9,10 +9,10 @@ import numpy as np
 
 from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, WHEEL, make_solids
 
-_MARGIN_M = 0.04  # an annotated box stands off from the solids by this on every side, as hand-drawn boxes do
+_MARGIN_M = 0.04  # gap between solids and their annotated box on each side, as in manual annotations
 _KINDS = {"box": BOX, "drum": DRUM, "ball": BALL, "wheel": WHEEL}
-_FULL = 0.96  # parts that reach this share of a side of the box are what it is drawn around
-_MATERIALS = {  # albedo (None: the object's own paint) and density
+_FULL = 0.96  # parts that reach this share of the box determine its extent
+_MATERIALS = {  # albedo (None for the object's paint) and density
     "paint": (None, np.inf),
     "glass": (0.03, 0.5),
     "rubber": (0.03, np.inf),
@@ -38,7 +38,7 @@ class ObjectModel:
     spread: list[float]
     share: float
     solids: np.ndarray  # [s], in fractions of the box
-    painted: np.ndarray  # bool[s]: which of them bear the object's own colour
+    painted: np.ndarray  # bool[s]: True for solids in the object's paint
     speed_mps: tuple[float, float] = (0.0, 0.0)
     paint: tuple[float, float] = (0.1, 0.7)
     rider: bool = False
@@ -71,46 +71,43 @@ def _read_models(file: str) -> dict[str, tuple[ObjectModel, ...]]:
 
 
 OBJECT_MODELS = _read_models("objects.toml")
-"""The models of every class."""
+"""Models by class."""
 
 CLUTTER_MODELS = _read_models("clutter.toml")
-"""Things that are no objects, by where they stand."""
+"""Models of clutter, which is not annotated, by location."""
 
 
 def sample_object_model(
     rng: np.random.Generator, name: str, *, moving: bool = False, city: bool = False
 ) -> ObjectModel:
-    """A model of a class, by their shares; ``moving``: one that moves, where the class has one."""
+    """Sample a model of a class by share; with ``moving``, a model that can move if the class has any."""
     models = OBJECT_MODELS[name]
     in_city = [model.share if model.city_share is None else model.city_share for model in models]
     shares = np.cumsum(in_city if city else [model.share for model in models])
     able = [model.speed_mps[1] > 0 for model in models]
     while True:
-        drawn = int(np.searchsorted(shares, rng.random() * shares[-1], side="right"))
-        if able[drawn] or not (moving and any(able)):
-            return models[drawn]
+        index = int(np.searchsorted(shares, rng.random() * shares[-1], side="right"))
+        if able[index] or not (moving and any(able)):
+            return models[index]
 
 
 def sample_size(rng: np.random.Generator, model: ObjectModel, factor: float = 1.0) -> np.ndarray:
-    """Length, width and height of a box, metres, within two and a half deviations of the mean.
-
-    ``factor`` is that of the model's deviations.
-    """
+    """Sample length, width, height in metres, up to 2.5 deviations from the mean; ``factor`` scales deviations."""
     return np.array(model.size_m) + factor * np.array(model.spread) * np.clip(rng.standard_normal(3), -2.5, 2.5)
 
 
 def sample_paint(rng: np.random.Generator, model: ObjectModel) -> float:
-    """Albedo of the painted or woven parts of an object."""
+    """Sample the albedo of the painted or cloth parts of an object."""
     median, deviation = model.paint
     return float(np.clip(median * np.exp(deviation * rng.standard_normal()), 0.005, 0.8))
 
 
 def object_solids(model: ObjectModel, size_m: np.ndarray, paint: float) -> np.ndarray:
-    """The solids of an object in the frame of its box: origin on the ground in the middle, x forward.
+    """Solids of an object in the frame of its box: origin at the middle of the bottom face, x forward.
 
     Args:
         size_m: f64[3], length, width, height of the annotated box.
-        paint: albedo of its painted or woven parts.
+        paint: albedo of the painted or cloth parts.
 
     >>> cone = OBJECT_MODELS["traffic_cone"][0]
     >>> object_solids(cone, np.array([0.48, 0.48, 0.84]), 0.4)["half"][0].round(3).tolist()
@@ -128,15 +125,15 @@ def object_solids(model: ObjectModel, size_m: np.ndarray, paint: float) -> np.nd
 
 
 def vary_shape(rng: np.random.Generator, solids: np.ndarray, size_m: np.ndarray, deviation: float) -> None:
-    """Change the extents of an object's parts in place, each for itself, so that the box stays as tight.
+    """Vary the extents of an object's parts in place and independently, such that the box stays tight.
 
-    Sides of parts at a side of the box stay there; wheels, and what stands out of the box, such as the fence on a
-    barrier, keep their shapes.
+    Sides of parts at a side of the box do not move. Wheels and parts that extend beyond the box, such as the fence
+    on a barrier, keep their shapes.
 
     Args:
         solids: [s], in the frames of their boxes.
-        size_m: f64[3] or f64[s, 3], of the annotated box.
-        deviation: of a side, in fractions of the part's own extent.
+        size_m: f64[3] or f64[s, 3], size of the annotated boxes.
+        deviation: standard deviation of a side, as a fraction of the part's extent.
     """
     low, high = solids["center"] - solids["half"], solids["center"] + solids["half"]
     least, most = size_m * (-0.5, -0.5, 0), size_m * (0.5, 0.5, 1)

@@ -1,7 +1,7 @@
-"""First hits of a turning fan of rays on solids and ground.
+"""First hits of a rotating fan of rays on solids and ground.
 
-Each solid meets few rays: the window of columns and rows that its bounding cuboid spans. The windows of all
-solids are laid out as one flat list of (solid, ray) pairs, and every kind of solid is one vectorised test.
+Only rays in the window of columns and rows spanned by a solid's bounding cuboid can hit the solid. The windows of
+all solids form one flat list of (solid, ray) pairs, which is tested in one vectorised operation per kind of solid.
 """
 
 import dataclasses
@@ -23,11 +23,11 @@ class Fan:
     Ray (column, row) has azimuth ``start - step * (column + delay[row])`` and the inclination of its row.
     """
 
-    inclinations: np.ndarray  # f64[h], radians, falling: row 0 is the highest
-    num_columns: int  # columns of the turn; their width times their number may be more than a full turn
+    inclinations: np.ndarray  # f64[h], radians, decreasing: row 0 is the highest
+    num_columns: int  # columns of the fan, which may span more than a full turn
     start: float  # azimuth of column 0, radians
     step: float  # width of a column, radians
-    delay: np.ndarray  # f64[h]: when each laser of a column fires, as part of the column's width
+    delay: np.ndarray  # f64[h]: firing time of each laser of a column, as a fraction of the column
 
     @functools.cached_property
     def directions(self) -> np.ndarray:
@@ -40,12 +40,12 @@ class Fan:
 
 @dataclasses.dataclass(frozen=True)
 class Hits:
-    """What every ray meets first."""
+    """First hit of each ray."""
 
-    range_m: np.ndarray  # f32[w * h], column by column, inf where nothing is met
-    solid: np.ndarray  # i32[w * h]: row of the solids, -1 for ground or nothing
-    cosine: np.ndarray  # f32[w * h]: of the angle of incidence
-    reachable: np.ndarray  # i64[k]: owner * w * h + ray of every ray that would meet an owned object alone
+    range_m: np.ndarray  # f32[w * h], column by column, inf without a hit
+    solid: np.ndarray  # i32[w * h]: row of the solids, -1 for ground or no hit
+    cosine: np.ndarray  # f32[w * h]: cosine of the angle of incidence
+    reachable: np.ndarray  # i64[k]: owner * w * h + ray for each ray that would hit an owned object if unoccluded
 
 
 def cast(
@@ -54,10 +54,10 @@ def cast(
     """First hits of all rays.
 
     Args:
-        rotation: f64[3, 3], sensor axes to world axes.
-        origin: f64[3], the sensor in the world, above the ground.
-        solids: [s] in the world.
-        rng: how deep each ray gets into porous solids.
+        rotation: f64[3, 3], from sensor axes to world axes.
+        origin: f64[3], position of the sensor in the world, above the ground.
+        solids: [s], in the world frame.
+        rng: source of the penetration depths into porous solids.
 
     >>> fan = Fan(np.radians([0.0]), 4, np.pi, np.pi / 2, np.zeros(1))
     >>> from fcos_lidar_jax.simulation.solids import BALL, make_solids
@@ -72,8 +72,8 @@ def cast(
     solids["center"] -= origin
     which, rays = _candidate_pairs(fan, rotation, solids)
     reach = crossings(solids, which, rays, d, rng)
-    met = np.flatnonzero(np.isfinite(reach))
-    which, rays, reach = which[met], rays[met], reach[met]
+    hit = np.flatnonzero(np.isfinite(reach))
+    which, rays, reach = which[hit], rays[hit], reach[hit]
     owner = solids["owner"][which]
     owned = owner >= 0
     reachable = np.unique(owner[owned].astype(np.int64) * d.shape[1] + rays[owned])
@@ -88,7 +88,7 @@ def cast(
 
 
 def _candidate_pairs(fan: Fan, rotation: np.ndarray, solids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(solid, ray) indices i32[k] whose cell lies in the solid's window."""
+    """Indices (solid, ray), i32[k], of the rays in the window of each solid."""
     low, high, left, right = _angular_bounds(rotation, solids)
     rising = fan.inclinations[::-1]
     last_row = len(rising) - 1 - np.searchsorted(rising, low - 1e-6)
@@ -96,7 +96,7 @@ def _candidate_pairs(fan: Fan, rotation: np.ndarray, solids: np.ndarray) -> tupl
     turn = 2 * np.pi / fan.step
     first = (fan.start - left) / fan.step - float(fan.delay.max(initial=0)) - 1e-3
     last = (fan.start - right) / fan.step + 1e-3
-    # The same solid one turn earlier and later: where a window crosses the seam, and in the surplus columns.
+    # Repeat each solid one turn earlier and later for windows that cross the first or last column.
     shift = turn * (np.array([[-1], [0], [1]]) - np.floor(first / turn))
     begin = np.ceil(np.maximum(first + shift, 0)).astype(np.int64).ravel()
     end = np.floor(np.minimum(last + shift, fan.num_columns - 1)).astype(np.int64).ravel()
@@ -112,31 +112,31 @@ def _candidate_pairs(fan: Fan, rotation: np.ndarray, solids: np.ndarray) -> tupl
 
 
 def _ranges(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """``first[0], first[0] + 1, ...`` (counts[0] of them), then those of the next."""
+    """Concatenate the ranges ``first[i], ..., first[i] + counts[i] - 1``."""
     ends = np.cumsum(counts)
     return np.arange(ends[-1] if len(ends) else 0) + np.repeat(first - ends + counts, counts)
 
 
 def _angular_bounds(rotation: np.ndarray, solids: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Lowest and highest inclination, left and right azimuth of each solid's cuboid, in the sensor's frame."""
-    seen = corners(solids) @ rotation
-    flat = np.hypot(seen[..., 0], seen[..., 1])
-    # The nearest the cuboid comes to the sensor's axis, from its footprint in the world.
+    """Lowest and highest inclination, left and right azimuth of each solid's cuboid in the sensor's frame."""
+    local = corners(solids) @ rotation
+    flat = np.hypot(local[..., 0], local[..., 1])
+    # Least distance of the cuboid from the sensor's axis, from its footprint in the world.
     half = solids["half"][:, :2].copy()
     half[:, 0] += np.abs(solids["lean"]) * solids["half"][:, 2]
     c, s = np.cos(solids["yaw"]), np.sin(solids["yaw"])
     x, y = solids["center"][:, 0], solids["center"][:, 1]
-    off = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x], axis=1)) - half, 0)
-    height = np.abs(seen[..., 2]).max(axis=1)
+    offset = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x], axis=1)) - half, 0)
+    height = np.abs(local[..., 2]).max(axis=1)
     tilt = np.arccos(min(rotation[2, 2], 1.0))
-    near = np.maximum(np.hypot(*off.T) * np.cos(tilt) - height * np.sin(tilt), 1e-6)
+    near = np.maximum(np.hypot(*offset.T) * np.cos(tilt) - height * np.sin(tilt), 1e-6)
     far = flat.max(axis=1)
-    bottom, top = seen[..., 2].min(axis=1), seen[..., 2].max(axis=1)
+    bottom, top = local[..., 2].min(axis=1), local[..., 2].max(axis=1)
     low = np.arctan2(bottom, np.where(bottom < 0, near, far))
     high = np.arctan2(top, np.where(top > 0, near, far))
-    middle = seen.mean(axis=1)
+    middle = local.mean(axis=1)
     toward = np.arctan2(middle[:, 1], middle[:, 0])
-    away = wrap_angle(np.arctan2(seen[..., 1], seen[..., 0]) - toward[:, None])
+    away = wrap_angle(np.arctan2(local[..., 1], local[..., 0]) - toward[:, None])
     around = near < 1e-3
     left = toward + np.where(around, np.pi, away.max(axis=1))
     right = toward + np.where(around, -np.pi, away.min(axis=1))

@@ -1,4 +1,4 @@
-"""Smooth random fields over the plane: undulating ground, shades of surfaces."""
+"""Smooth random fields over the plane, for undulating ground and shading of surfaces."""
 
 import dataclasses
 
@@ -10,12 +10,12 @@ _CELL_M = 0.5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Relief:
-    """A periodic field with a mean of 0, known on a grid and bilinear between."""
+    """A periodic field with mean 0, bilinear between the points of a grid."""
 
     values: np.ndarray  # f32[n, n], x first
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Values at places in metres, f32[...].
+        """Values at positions in metres, f32[...].
 
         >>> field = Relief(np.eye(4, dtype=np.float32))
         >>> field.at(np.array([0.0, 0.25, 0.5]), np.array([0.0, 0.0, 0.5])).tolist()
@@ -33,7 +33,7 @@ class Relief:
 
 
 def sample_relief(rng: np.random.Generator, deviation: float, power: float) -> Relief:
-    """A field with a standard deviation; waves of a length have amplitudes as its ``power``.
+    """Sample a field with a given standard deviation; amplitudes grow with wavelength to the ``power``.
 
     >>> field = sample_relief(np.random.default_rng(0), 0.05, 2.0)
     >>> round(float(field.values.std()), 4)

@@ -1,4 +1,4 @@
-"""One scene of a synthetic data set: its point files and its rows of the tables."""
+"""Scenes of a synthetic data set: point files and table rows."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,17 +18,17 @@ from fcos_lidar_jax.simulation.nuscenes_tables import SWEEPS_PER_KEYFRAME, Row, 
 from fcos_lidar_jax.simulation.streets import CITY, Streets
 from fcos_lidar_jax.simulation.world import World, sample_labels, sample_world
 
-_OBJECTS = 150  # around an ego vehicle that stands; one that drives meets more
-_OBJECTS_PER_M = 0.6
+_OBJECTS = 150  # number of objects around a parked ego vehicle
+_OBJECTS_PER_M = 0.6  # additional objects per metre driven
 
 
 @dataclasses.dataclass(frozen=True)
 class DatasetSpec:
-    """What decides every byte of a data set."""
+    """Specification that determines all bytes of a data set."""
 
     scenes: int
     seed: int
-    keyframes: int  # of a scene
+    keyframes: int  # per scene
     sensor: Sensor
     rolling_shutter: bool
     version: str  # folder of the tables
@@ -36,20 +36,20 @@ class DatasetSpec:
 
     @property
     def sweeps(self) -> int:
-        """Of a scene."""
+        """Number of sweeps per scene."""
         return (self.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1
 
 
 def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[], object]) -> dict[str, list[Row]]:
-    """Write a scene's point files; the same bytes whatever the other scenes are.
+    """Write the point files of a scene. Their bytes do not depend on the other scenes.
 
     Args:
-        root: of the data set; ``samples/LIDAR_TOP`` and ``sweeps/LIDAR_TOP`` are there.
-        advance: called after every sweep.
+        root: folder of the data set, with existing folders ``samples/LIDAR_TOP`` and ``sweeps/LIDAR_TOP``.
+        advance: called after each sweep.
 
     Returns:
-        the scene's rows, by table. Every object is annotated from the first keyframe to the last in which a point
-        shows it.
+        rows of the scene by table. Each object is annotated from the first to the last keyframe in which it has
+        points.
 
     Raises:
         OSError: a file cannot be written; the message names it.
@@ -84,7 +84,7 @@ def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[]
 
 
 def sample_scene(rng: np.random.Generator, spec: DatasetSpec) -> World:
-    """The world of one scene of a data set."""
+    """Sample the world of a scene."""
     duration = (spec.sweeps - 1) * SWEEP_S
     crowd = np.clip(rng.spawn(1)[0].lognormal(-0.6, 0.5), 0.2, 1.5) if spec.streets.setting else 1
     labels = sample_labels(rng, int(crowd * (_OBJECTS + int(_OBJECTS_PER_M * 7 * duration))))
@@ -95,7 +95,7 @@ def sample_scene(rng: np.random.Generator, spec: DatasetSpec) -> World:
 
 
 def _sample_placement(rng: np.random.Generator) -> np.ndarray:
-    """The street's frame in the global one: turned about the vertical and moved in the plane, f64[4, 4]."""
+    """Random pose of the street frame in the global frame, with rotation about z only, f64[4, 4]."""
     yaw = rng.uniform(-np.pi, np.pi)
     placement = np.eye(4)
     placement[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -104,7 +104,6 @@ def _sample_placement(rng: np.random.Generator) -> np.ndarray:
 
 
 def _pose(row: Row) -> np.ndarray:
-    """The 4x4 pose of a table's row."""
     return pose_matrix(np.array(row["rotation"]), np.array(row["translation"]))
 
 
@@ -113,12 +112,12 @@ def _write_points(path: Path, points: np.ndarray) -> None:
         with naming(path):
             path.write_bytes(points.tobytes())
     except OSError:
-        path.unlink(missing_ok=True)  # rather than half a file
+        path.unlink(missing_ok=True)  # leaves no partial file
         raise
 
 
 def _global_boxes(world: World, street_to_global: np.ndarray, time_s: float) -> np.ndarray:
-    """Boxes of all objects at a moment, f64[m, 7]: ``x, y, z, l, w, h, yaw``, as written in whole millimetres."""
+    """Boxes ``x, y, z, l, w, h, yaw`` of all objects, f64[m, 7], rounded to millimetres as in the tables."""
     pose, sizes = world.object_poses(time_s), world.traffic.sizes
     center = pose[:, :3] + sizes * (0, 0, 0.5)
     turn = np.arctan2(street_to_global[1, 0], street_to_global[0, 0])

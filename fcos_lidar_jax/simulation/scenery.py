@@ -1,4 +1,4 @@
-"""What stands along the streets: buildings, fences, walls, trees, poles."""
+"""Scenery along the streets: buildings, fences, walls, trees and poles."""
 
 import numpy as np
 from numpy.random import Generator
@@ -8,9 +8,9 @@ from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, SOLID, make_solids
 from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.surroundings import Side, sample_setting, sample_surroundings
 
-_LEAVES = 0.55  # rays stopped by a metre of foliage
+_LEAVES = 0.55  # density of foliage
 _FENCES = ((0.08, 5.0), (0.24, np.inf), (0.24, np.inf), (0.8, 2.5))
-"""Thickness in metres, and rays stopped by a metre of it: a fence, walls, a hedge."""
+"""Thickness in metres and density of a fence, walls and a hedge."""
 
 
 def sample_scenery(
@@ -23,17 +23,17 @@ def sample_scenery(
     beyond_m: float,
     streets: Streets = PLAIN,
 ) -> np.ndarray:
-    """Scenery on both sides of both streets.
+    """Sample scenery on both sides of both streets.
 
     Args:
-        rng: for houses, fences, trees and poles.
-        surroundings: for what the streets have besides.
-        low: f64[2], least x and y that the sensor comes to.
-        high: f64[2], greatest.
-        beyond_m: how far around that there is anything.
+        rng: random source for houses, fences, trees and poles.
+        surroundings: random source for everything else.
+        low: f64[2], least x and y of the sensor's path.
+        high: f64[2], greatest x and y of the sensor's path.
+        beyond_m: extent of the scenery around the path.
 
     Returns:
-        solids [s] of :data:`SOLID` in the street's frame.
+        solids [s] of :data:`SOLID` in the street frame.
     """
     parts = [np.zeros(0, SOLID)]
     setting = sample_setting(surroundings) if streets.setting else "city"
@@ -44,7 +44,7 @@ def sample_scenery(
         if not low[1 - along] - beyond_m < across < high[1 - along] + beyond_m:
             continue
         for side in (-1, 1):
-            parts += [draw(rng, ground, along, side, half, span) for draw in plain]
+            parts += [sample(rng, ground, along, side, half, span) for sample in plain]
             parts.append(sample_surroundings(surroundings, Side(ground, along, side, span), streets, setting))
     return np.concatenate(parts)
 
@@ -52,7 +52,7 @@ def sample_scenery(
 def _positions(
     ground: Ground, along: int, side: int, s: np.ndarray, d: np.ndarray | float, clear: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ground points ``s`` along a street and ``d`` beside its middle, those off the other street by ``clear``."""
+    """Ground points at ``s`` along and ``d`` beside a street, off carriageways by ``clear``; and their indices."""
     s, d = np.broadcast_arrays(s, d)
     x, y = (s, side * d) if along == 0 else (ground.crossing_x + side * d, s)
     free = np.flatnonzero(~ground.on_road(x, y, clear))
@@ -68,13 +68,12 @@ def _spaced(rng: Generator, span: tuple[float, float], mean: float) -> np.ndarra
 def _houses(
     rng: Generator, ground: Ground, along: int, side: int, half: float, span: tuple[float, float]
 ) -> np.ndarray:
-    """A row of houses with gaps."""
     s, width = _row_of(rng, span, (8, 26), (20, 90))
     depth, height = rng.uniform(7, 14, len(s)), np.clip(rng.lognormal(2.1, 0.5, len(s)), 3, 40)
     front = half + ground.pavement + rng.choice([2.0, 8.0, 18.0, 30.0], len(s))
     center, free = _positions(ground, along, side, s, front + depth / 2, np.maximum(width, depth) / 2 + 1)
     halves = np.stack([width, depth, height], axis=1)[free] / 2
-    center[:, 2] += halves[:, 2] - 1  # footings go below the slope
+    center[:, 2] += halves[:, 2] - 1  # foundations extend below sloping ground
     halves[:, 2] += 1
     return make_solids(BOX, center, halves, yaw=np.pi / 2 * along, albedo=rng.uniform(0.06, 0.3, len(free)))
 
@@ -82,7 +81,6 @@ def _houses(
 def _fences(
     rng: Generator, ground: Ground, along: int, side: int, half: float, span: tuple[float, float]
 ) -> np.ndarray:
-    """Fences, walls and hedges behind the pavement."""
     s, length = _row_of(rng, span, (4, 24), (3, 12))
     beside = half + ground.pavement + rng.uniform(0.2, 0.45)
     center, free = _positions(ground, along, side, s, beside, length / 2 + ground.pavement)
@@ -98,7 +96,7 @@ def _fences(
 def _row_of(
     rng: Generator, span: tuple[float, float], length: tuple[float, float], gap: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Middles and lengths of things in a row; half of them follow the one before closely."""
+    """Middles and lengths of elements in a row, half of them with narrow gaps."""
     number = int((span[1] - span[0]) / length[0]) + 1
     lengths = rng.uniform(*length, number)
     gaps = np.where(rng.random(number) < 0.5, rng.uniform(*gap, number), rng.uniform(0, 3, number))
@@ -110,7 +108,7 @@ def _row_of(
 def _trees(
     rng: Generator, ground: Ground, along: int, side: int, half: float, span: tuple[float, float]
 ) -> np.ndarray:
-    """Trees at the kerb and further back, and bushes."""
+    """Sample trees at the kerb and further back, and bushes."""
     kerb, back = _spaced(rng, span, 45), _spaced(rng, span, 25)
     far = ground.pavement + rng.uniform(1, 12, len(back))
     s, d = np.concatenate([kerb, back]), half + np.concatenate([np.full(len(kerb), 1.0), far])
@@ -131,7 +129,6 @@ def _trees(
 def _poles(
     rng: Generator, ground: Ground, along: int, side: int, half: float, span: tuple[float, float]
 ) -> np.ndarray:
-    """Lamp posts and signs."""
     s = _spaced(rng, span, 14)
     center, _ = _positions(ground, along, side, s, np.full(len(s), half + 0.45), 0.3)
     lamp = rng.random(len(center)) < 0.5

@@ -1,26 +1,26 @@
-"""The primitives of the simulated world, as rows of one structured array.
+"""Primitives of the simulated world, as rows of one structured array.
 
-A solid is a unit shape under a linear map: scaled by half extents, leaned along its own x with height, turned
-about the vertical, moved. Everything opaque or porous in a scene is a row of :data:`SOLID`.
+A solid is a unit shape that is scaled by half extents, sheared along its own x with height, rotated about the
+vertical and translated. Each row of :data:`SOLID` is one opaque or porous solid.
 """
 
 import numpy as np
 
 BOX, DRUM, BALL, WHEEL = range(4)
-"""Kinds: a cuboid whose top may be smaller than its base, an upright elliptic cylinder whose top may be smaller
-(a cone, at the end), an ellipsoid, and a cylinder that lies across the heading."""
+"""Kinds: a cuboid that may taper towards the top, an upright elliptic cylinder that may taper down to a cone, an
+ellipsoid, and a cylinder with its axis across the heading."""
 
 SOLID = np.dtype(
     [
         ("kind", np.int8),
         ("center", np.float64, 3),  # metres
-        ("half", np.float64, 3),  # half extents along its own x, y, z, metres
+        ("half", np.float64, 3),  # half extents along the solid's x, y, z, metres
         ("yaw", np.float64),  # radians, counter-clockwise from +x
-        ("lean", np.float64),  # metres of its own x a metre of height
-        ("taper", np.float64, 2),  # top over base, along and across; drums use the first
+        ("lean", np.float64),  # metres along the solid's x per metre of height
+        ("taper", np.float64, 2),  # ratio of top to base along x and y; drums use the first
         ("albedo", np.float64),  # 0-1
-        ("density", np.float64),  # stopped rays a metre of the way through, inf where opaque
-        ("owner", np.int32),  # object it belongs to, -1 for scenery, -2 for the ego vehicle
+        ("density", np.float64),  # stopped rays per metre inside, inf for opaque solids
+        ("owner", np.int32),  # index of the object, -1 for scenery, -2 for the ego vehicle
     ]
 )
 
@@ -28,9 +28,9 @@ SCENERY, EGO = -1, -2
 
 
 def make_solids(kind: int, center: object, half: object, **fields: object) -> np.ndarray:
-    """Solids [s] of one kind; all fields broadcast, ``center`` and ``half`` are [..., 3].
+    """Create solids [s] of one kind. All fields broadcast; ``center`` and ``half`` are [..., 3].
 
-    The other fields of :data:`SOLID` are by default those of upright, untapered, opaque scenery of albedo 0.3.
+    The defaults of the other fields describe upright, untapered, opaque scenery with albedo 0.3.
 
     >>> make_solids(BALL, [[0, 0, 1], [4, 0, 1]], 0.5, albedo=0.1)["half"].tolist()
     [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
@@ -44,11 +44,11 @@ def make_solids(kind: int, center: object, half: object, **fields: object) -> np
 
 
 def place_solids(solids: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Solids given in frames of their own, in the world.
+    """Transform solids from local frames to the world frame.
 
     Args:
         solids: [s].
-        pose: f64[s, 4], ``x, y, z, yaw`` of each solid's frame, or [4] for one frame.
+        pose: f64[s, 4], ``x, y, z, yaw`` of the frame of each solid, or [4] for a common frame.
 
     >>> ball = make_solids(BALL, [1, 0, 0], 1.0)
     >>> place_solids(ball, np.array([5, 0, 0, np.pi / 2]))["center"].round(6).tolist()
@@ -64,7 +64,7 @@ def place_solids(solids: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def corners(solids: np.ndarray) -> np.ndarray:
-    """Corners of a cuboid around each solid, f64[s, 8, 3]: what it leans or tapers to stays inside.
+    """Corners of a cuboid that encloses each solid, including lean and taper, f64[s, 8, 3].
 
     >>> corners(make_solids(BOX, [0, 0, 0], [1, 1, 1], lean=0.5))[0, :, 0].max().item()
     1.5
@@ -78,7 +78,7 @@ def corners(solids: np.ndarray) -> np.ndarray:
 
 
 def unit_map(solids: np.ndarray) -> np.ndarray:
-    """Matrices f64[s, 3, 3] that turn offsets from the centre, in the world's axes, into the unit shape's.
+    """Matrices f64[s, 3, 3] from offsets to the centre in world axes to the axes of the unit shape.
 
     >>> unit_map(make_solids(BOX, [0, 0, 0], [2, 1, 1]))[0].diagonal().tolist()
     [0.5, 1.0, 1.0]

@@ -1,14 +1,14 @@
-"""What the streets and the sensor above them are like: every randomisation is a field."""
+"""Variety of the simulated streets, objects and sensor, with one field per randomisation."""
 
 import dataclasses
 
 
 @dataclasses.dataclass(frozen=True)
 class Streets:
-    """How varied simulated streets are; with the default values a randomisation is off.
+    """Parameters of simulated streets. By default, every randomisation is off.
 
-    A value says everything that decides the frames beside their seed, size and traffic, so it enters caches and
-    the records of data sets as it is.
+    Together with seed, size and traffic these parameters determine all frames. Caches and data set records
+    therefore contain them unchanged.
 
     >>> level = dataclasses.replace(CITY, slopes=False)
     >>> level.clutter, PLAIN.clutter
@@ -17,40 +17,40 @@ class Streets:
 
     name: str = "plain"
     # The sensor.
-    pitch_rad: float = 0.0  # mean angle by which it looks down ahead
-    mount_m: float = 0.0  # deviation of its height
+    pitch_rad: float = 0.0  # mean downward pitch
+    mount_m: float = 0.0  # deviation of the mounting height
     range_noise_m: float = 0.012
-    speckle: float = 0.3  # deviation of the logarithm of single intensities
-    ring_gain: float = 0.0  # the same of whole rings
-    ring_range_m: float = 0.0  # deviation of rings' range offsets
-    ring_elevation_rad: float = 0.0  # deviation of rings' elevation offsets
-    shading: float = 0.0  # deviation of the logarithm of albedo within a surface, smooth over metres
+    speckle: float = 0.3  # deviation of the log intensity per point
+    ring_gain: float = 0.0  # deviation of the log intensity per ring
+    ring_range_m: float = 0.0  # deviation of the range offset per ring
+    ring_elevation_rad: float = 0.0  # deviation of the elevation offset per ring
+    shading: float = 0.0  # deviation of the log albedo within a surface, smooth over metres
     faint: float = 0.07  # strength at which 63 % of the rays return
-    weather: float = 0.0  # deviation of the logarithm of that strength from world to world
-    rolling_shutter: bool = False  # frames take the time of a turn
-    ego_outline: bool = False  # the ego vehicle hides what nuScenes' vehicles hide
-    ego_edges: bool = False  # where its outline does, the edges of bonnet and roof return rays
+    weather: float = 0.0  # deviation of log ``faint`` per world
+    rolling_shutter: bool = False  # a frame takes the time of a turn
+    ego_outline: bool = False  # the ego vehicle blocks the same rays as in nuScenes
+    ego_edges: bool = False  # with ``ego_outline``, the edges of bonnet and roof return rays
     # The ground.
-    slopes: bool = False  # frames have sloping planes, as drives always do
+    slopes: bool = False  # frames have sloping ground; drives always have
     relief_m: float = 0.0  # median deviation of undulations
-    roughness_m: float = 0.0  # of single points
-    crown_m: float = 0.0  # greatest fall from the middle of a street to its kerb
-    # What stands about.
-    clutter: float = 0.0  # things that are no objects, a metre of street side
+    roughness_m: float = 0.0  # deviation of the height per point
+    crown_m: float = 0.0  # maximum fall from the middle of a street to its kerb
+    # The scenery.
+    clutter: float = 0.0  # unannotated things per metre of street side
     facades: bool = False  # buildings with entrances, columns, bays and balconies
-    setting: bool = False  # built-up, green, empty and crowded places
+    setting: bool = False  # built-up, green, empty and crowded surroundings
     # The objects.
-    city_classes: float = 0.0  # 1 as often as in cities, 0 all classes equally often
-    class_mix: float = 0.0  # deviation of the logarithm of how often from frame to frame
-    spread: float = 1.0  # power of an even number that says how far off they are; 0.5 even over an area
+    city_classes: float = 0.0  # class frequencies: 1 as in cities, 0 all equal
+    class_mix: float = 0.0  # deviation of the log class frequencies per frame
+    spread: float = 1.0  # distances are uniform numbers to this power; 0.5 is uniform over an area
     round_cars: bool = False  # most cars have rounded ends
-    groups: float = 0.0  # share of the pedestrians that are near another
-    shape: float = 0.0  # deviation of the sizes of their parts
-    sizes: float = 1.0  # factor of the deviations of their boxes
+    groups: float = 0.0  # share of pedestrians next to another pedestrian
+    shape: float = 0.0  # deviation of the sizes of object parts
+    sizes: float = 1.0  # factor of the deviations of box sizes
 
 
 PLAIN = Streets()
-"""Level frames of ten equally frequent classes, few other things: those of the quickstart."""
+"""Level ground, ten equally frequent classes and little clutter, as in the quickstart."""
 
 CITY = Streets(
     "city",
@@ -82,7 +82,7 @@ CITY = Streets(
     shape=0.06,
     sizes=1.4,
 )
-"""Varied streets for detectors of real sensors; the sensor's mount, noise and view are those of nuScenes."""
+"""Varied streets for detectors of real sensors, with the mount, noise and view of the nuScenes sensor."""
 
 STREETS = {streets.name: streets for streets in (PLAIN, CITY)}
-"""Name -> streets."""
+"""Streets by name."""

@@ -1,4 +1,4 @@
-"""What stands along varied streets: buildings with depth, gardens, trees, and things that are no objects."""
+"""Surroundings of varied streets: detailed buildings, trees and clutter."""
 
 import dataclasses
 from typing import NamedTuple
@@ -19,10 +19,11 @@ from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, SOLID, make_solids
 from fcos_lidar_jax.simulation.streets import Streets
 
 _STOREY_M = 3.2
-_VARIED = 0.08  # deviation of the sides of clutter's parts
-_GROUPS = (1, 1, 1, 2, 3, 5)  # equal things in a row
+_VARIED = 0.08  # deviation of the sides of clutter parts
+_GROUPS = (1, 1, 1, 2, 3, 5)  # sizes of groups of equal things
 _SETTINGS = {"city": 0.4, "suburb": 0.3, "works": 0.15, "open": 0.15}
-# By setting: how closely built up; how far back fronts stand, metres; trees and clutter a metre of street side.
+# By setting: share of the street side with buildings, setback of their fronts in metres, trees per metre of street
+# side, and factor of the clutter.
 _BUILT = {"city": 0.95, "suburb": 0.7, "works": 0.4, "open": 0.08}
 _SETBACK_M = {"city": (0.3, 4.0), "suburb": (3.0, 14.0), "works": (4.0, 25.0), "open": (10.0, 35.0)}
 _TREES = {"city": 0.03, "suburb": 0.07, "works": 0.02, "open": 0.05}
@@ -31,16 +32,16 @@ _DENSITY = {"city": 1.3, "suburb": 1.0, "works": 1.2, "open": 0.5}
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """One side of a street, between two places along it."""
+    """A section of one side of a street."""
 
     ground: Ground
-    along: int  # 0 main street, 1 the other
-    side: int  # 1 to the left of the street's direction
+    along: int  # 0 main street, 1 crossing street
+    side: int  # 1 to the left of the street's direction, -1 to the right
     span: tuple[float, float]  # metres along the street
 
     @property
     def edge_m(self) -> float:
-        """How far the kerb is beside the street's middle."""
+        """Distance of the kerb from the middle of the street."""
         return self.ground.crossing_half_width if self.along else self.ground.half_width
 
     @property
@@ -48,8 +49,7 @@ class Side:
         return self.span[1] - self.span[0]
 
     def poses(self, s: np.ndarray, beyond: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses ``x, y, 0, yaw`` of places ``s`` along and ``beyond`` the kerb, f64[k, 4], facing the street: of
-        those that are off the carriageways by ``clear``; and which these are."""
+        """Poses ``x, y, 0, yaw`` that face the street, off the carriageways by ``clear``; and their indices."""
         beside = self.side * (self.edge_m + beyond)
         x, y = (s, beside) if self.along == 0 else (self.ground.crossing_x + beside, s)
         free = np.flatnonzero(~self.ground.on_road(x, y, clear))
@@ -58,13 +58,13 @@ class Side:
         return np.stack([x, y, np.zeros(len(x)), np.full(len(x), facing)], axis=1), free
 
     def grounded(self, poses: np.ndarray) -> np.ndarray:
-        """Poses of :meth:`poses` with the ground's height."""
+        """Set the height of poses from :meth:`poses` to the ground, in place."""
         poses[:, 2] = self.ground.height(poses[:, 0], poses[:, 1])
         return poses
 
 
 def sample_surroundings(rng: Generator, side: Side, streets: Streets, setting: str) -> np.ndarray:
-    """Solids [s] of everything beside one side of a street, in the street's frame."""
+    """Sample everything along one side of a street, as solids [s] in the street frame."""
     built, cluttered = rng.spawn(2)
     parts = [np.zeros(0, SOLID)]
     setback = float(built.uniform(*_SETBACK_M[setting]))
@@ -79,12 +79,12 @@ def sample_surroundings(rng: Generator, side: Side, streets: Streets, setting: s
 
 
 def sample_setting(rng: Generator) -> str:
-    """What kind of place a world is."""
+    """Sample the setting of a world, such as ``"city"``."""
     return str(rng.choice(list(_SETTINGS), p=list(_SETTINGS.values())))
 
 
 def _buildings(rng: Generator, side: Side, setback: float, built: float) -> list[np.ndarray]:
-    """A row of buildings along a common line, with gaps."""
+    """Sample a row of buildings with gaps along a common front line."""
     parts, s = [], side.span[0] + rng.uniform(0, 10)
     while s < side.span[1]:
         width = rng.uniform(6, 28)
@@ -101,7 +101,7 @@ def _buildings(rng: Generator, side: Side, setback: float, built: float) -> list
 
 
 def _building(rng: Generator, width: float, depth: float, height: float) -> np.ndarray:
-    """One building: its front in the plane x = 0, the street towards +x."""
+    """Sample one building with its front in the plane x = 0 and the street towards +x."""
     albedo, stone = rng.uniform(0.06, 0.35), rng.uniform(0.1, 0.4)
     solids = [
         make_solids(BOX, [-depth / 2, 0, height / 2 - 1], [depth / 2, width / 2, height / 2 + 1], albedo=albedo)
@@ -109,7 +109,7 @@ def _building(rng: Generator, width: float, depth: float, height: float) -> np.n
     bay = rng.uniform(2.2, 4.5)
     y = np.arange(-width / 2 + bay / 2, width / 2 - bay / 4, bay)
     pilasters, windows, style = rng.uniform(0.1, 0.5), rng.uniform(0.9, 1.6), rng.random(5)
-    if style[0] < 0.6:  # glass, which sends little back; storeys of it
+    if style[0] < 0.6:  # storeys of windows; glass reflects little
         floors = np.arange(_STOREY_M / 2 + 0.3, height, _STOREY_M)
         solids.append(make_solids(BOX, _places(0.0, y[:, None], floors), [0.03, windows / 2, 0.7], albedo=0.008))
     if style[1] < 0.45:  # columns or pilasters
@@ -117,8 +117,7 @@ def _building(rng: Generator, width: float, depth: float, height: float) -> np.n
         half = [pilasters / 2, pilasters / 2, height / 2]
         solids.append(make_solids(kind, _places(pilasters / 2, edges, height / 2), half, albedo=stone))
     if style[2] < 0.35:  # bays
-        out = rng.uniform(0.5, 1.3)
-        low = rng.choice([0.0, _STOREY_M])
+        out, low = rng.uniform(0.5, 1.3), rng.choice([0.0, _STOREY_M])
         center = _places(out / 2, y[::2], (low + height * 0.9) / 2)
         half = [out / 2, bay * 0.35, max(height * 0.9 - low, 1) / 2]
         solids.append(make_solids(BOX, center, half, albedo=albedo))
@@ -129,8 +128,8 @@ def _building(rng: Generator, width: float, depth: float, height: float) -> np.n
             solids.append(make_solids(BOX, center, [out / 2, bay * 0.4, 0.08], albedo=stone))
             railing = center + np.array([out / 2, 0, 0.55])
             solids.append(make_solids(BOX, railing, [0.03, bay * 0.4, 0.5], albedo=0.15, density=8.0))
-    for place in rng.choice(y, min(len(y), int(rng.integers(1, 4))), replace=False) if len(y) else ():
-        solids += _entrance(rng, float(place), stone)
+    for position in rng.choice(y, min(len(y), int(rng.integers(1, 4))), replace=False) if len(y) else ():
+        solids += _entrance(rng, float(position), stone)
     if style[4] < 0.3:  # an awning along the front
         out = rng.uniform(0.8, 2.0)
         solids.append(make_solids(BOX, [out / 2, 0, 3.0], [out / 2, width * 0.4, 0.12], albedo=0.3))
@@ -138,12 +137,12 @@ def _building(rng: Generator, width: float, depth: float, height: float) -> np.n
 
 
 def _places(x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float) -> np.ndarray:
-    """All places of coordinates that broadcast, f64[k, 3]."""
+    """Broadcast coordinates and list all positions, f64[k, 3]."""
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1).reshape(-1, 3)
 
 
 def _entrance(rng: Generator, y: float, stone: float) -> list[np.ndarray]:
-    """Steps, a door frame, perhaps a canopy on columns."""
+    """Sample steps, a door frame and, in half of the cases, a canopy on columns."""
     wide, out = rng.uniform(0.7, 1.6), rng.uniform(0.2, 1.6)
     steps = make_solids(BOX, [out / 2, y, 0.1], [out / 2, wide, rng.uniform(0.1, 0.35)], albedo=stone)
     posts = [[0.15, y - wide, 1.3], [0.15, y + wide, 1.3]]
@@ -156,7 +155,7 @@ def _entrance(rng: Generator, y: float, stone: float) -> list[np.ndarray]:
 
 
 def _trees(rng: Generator, side: Side, density: float) -> list[np.ndarray]:
-    """Trees at the kerb in a row, and anywhere behind."""
+    """Sample trees in a row at the kerb and scattered trees behind the pavement."""
     number = int(rng.poisson(density * side.length_m))
     s = rng.uniform(*side.span, number)
     behind = side.ground.pavement + rng.uniform(0.5, 25, number)
@@ -167,22 +166,20 @@ def _trees(rng: Generator, side: Side, density: float) -> list[np.ndarray]:
     radius, tall = rng.uniform(1.0, 3.8, number), rng.uniform(1.0, 3.6, number)
     middle, half = center + clear[:, None] / 2 * (0, 0, 1), np.stack([trunk, trunk, clear / 2 + 0.8], axis=1)
     stems = make_solids(DRUM, middle, half, taper=(0.75, 1), albedo=0.15, lean=rng.normal(0, 0.05, number))
-    # A crown of three parts of different density.
+    # A crown has three parts of different density.
     crowns = []
     for share in (1.0, 0.7, 0.6):
         off = np.stack(
             [*rng.normal(0, 0.3, (2, number)) * radius, clear + tall * rng.uniform(0.7, 1.3, number)], axis=1
         )
         size = share * np.stack([radius, radius, tall], axis=1)
-        density_of = rng.uniform(0.25, 1.6, number)
-        crowns.append(
-            make_solids(BALL, center + off, size, albedo=rng.uniform(0.08, 0.3, number), density=density_of)
-        )
+        leaves = rng.uniform(0.25, 1.6, number)
+        crowns.append(make_solids(BALL, center + off, size, albedo=rng.uniform(0.08, 0.3, number), density=leaves))
     return [stems, *crowns]
 
 
 def _clutter(rng: Generator, side: Side, density: float, setback: float) -> list[np.ndarray]:
-    """Things of all three kinds of places, some of them in groups of equals."""
+    """Sample clutter at all three locations, partly in groups of equal things."""
     pavement, things = side.ground.pavement, []
     beyond = {
         "kerb": (0.25, 0.9),
@@ -204,8 +201,6 @@ def _clutter(rng: Generator, side: Side, density: float, setback: float) -> list
 
 
 class _Group(NamedTuple):
-    """Equal things."""
-
     model: ObjectModel
     size_m: np.ndarray  # f64[3]
     poses: np.ndarray  # f64[k, 4]
@@ -214,7 +209,7 @@ class _Group(NamedTuple):
 def _sample_group(
     rng: Generator, side: Side, model: ObjectModel, number: int, beyond: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Size of things that stand in line along the street, and their poses."""
+    """Sample the size and poses of equal things in line along the street."""
     size = np.maximum(sample_size(rng, model), 0.4 * np.array(model.size_m))
     s = rng.uniform(*side.span) + np.arange(number) * (size[1] + rng.uniform(0.1, 3)) + rng.normal(0, 0.1, number)
     away = rng.uniform(*beyond) + size[0] / 2 + rng.normal(0, 0.05, number)
@@ -224,21 +219,21 @@ def _sample_group(
 
 
 def _vary(rng: Generator, side: Side, groups: list[_Group]) -> np.ndarray:
-    """The solids of all things, each of another shape, colour and density."""
+    """Solids of all groups, with an individual shape, albedo and density per thing."""
     solids = [object_solids(group.model, group.size_m, sample_paint(rng, group.model)) for group in groups]
     each = [len(group.poses) for group in groups]
-    parts = np.concatenate([np.tile(of, number) for of, number in zip(solids, each, strict=True)])
-    number_of = np.repeat([len(of) for of in solids], each)  # parts of every thing
+    parts = np.concatenate([np.tile(thing, number) for thing, number in zip(solids, each, strict=True)])
+    num_parts = np.repeat([len(thing) for thing in solids], each)
     sizes = np.repeat([group.size_m for group in groups], each, axis=0)
-    vary_shape(rng, parts, np.repeat(sizes, number_of, axis=0), _VARIED)
-    parts["albedo"] *= np.repeat(np.exp(0.3 * rng.standard_normal(len(number_of))), number_of)
-    parts["density"] *= np.repeat(np.exp(0.5 * rng.standard_normal(len(number_of))), number_of)
+    vary_shape(rng, parts, np.repeat(sizes, num_parts, axis=0), _VARIED)
+    parts["albedo"] *= np.repeat(np.exp(0.3 * rng.standard_normal(len(num_parts))), num_parts)
+    parts["density"] *= np.repeat(np.exp(0.5 * rng.standard_normal(len(num_parts))), num_parts)
     poses = side.grounded(np.concatenate([group.poses for group in groups]))
-    return place_solids(parts, np.repeat(poses, number_of, axis=0))
+    return place_solids(parts, np.repeat(poses, num_parts, axis=0))
 
 
 def _wires(rng: Generator, side: Side) -> list[np.ndarray]:
-    """Wires along the street, in some places."""
+    """Sample wires along the street, on 30 % of the sides."""
     if rng.random() > 0.3:
         return []
     number = int(rng.integers(1, 4))

@@ -1,4 +1,4 @@
-"""The objects of a world: which, how large, where they stand (lanes, kerbs, yards, pavements), how they move."""
+"""The objects of a world: their models, sizes, places (lanes, kerbs, yards, pavements) and motions."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, trave
 from fcos_lidar_jax.simulation.objects import ObjectModel, sample_object_model, sample_size
 from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 
-# Where objects of a class are, and how often; first where they move, if they do.
+# Places of each class with their probabilities. The first place is the one with moving objects, if there is any.
 _PLACES: dict[str, tuple[tuple[str, float], ...]] = {
     "car": (("lane", 0.5), ("row", 0.42), ("yard", 0.08)),
     "truck": (("lane", 0.4), ("kerb", 0.3), ("yard", 0.3)),
@@ -27,28 +27,28 @@ _PLACES: dict[str, tuple[tuple[str, float], ...]] = {
     "barrier": (("row", 1.0),),
 }
 _PARKED = ("row", "kerb", "yard")
-_ROW_LENGTH = {"car": 8, "trailer": 5, "traffic_cone": 8, "barrier": 14}  # objects in a row, at most
-_FAST = 0.7  # share of the objects in fast traffic that get the first of their class's places
-_FLOWING = {0: 0.8, 1: 0.4}  # how often traffic moves in a lane of the main street and of the other
-_CLEARANCE_M = 0.35  # objects keep this from each other, at all times
-_ROW_CLEARANCE_M = 0.08  # but in a row only this
-_STEP_S = 0.5  # they are compared at moments so far apart
-_FUSED_STEP_S = 0.025  # but in worlds of a few sweeps so often that nothing slips through between two of them
-_ROUNDING_M = 1e-6  # of a distance, so that no disc is taken for further away than its rectangle
+_ROW_LENGTH = {"car": 8, "trailer": 5, "traffic_cone": 8, "barrier": 14}  # maximum number of objects in a row
+_FAST = 0.7  # share of the objects in fast traffic that use the first place of their class
+_FLOWING = {0: 0.8, 1: 0.4}  # probability that a lane moves, in the main street and the crossing street
+_CLEARANCE_M = 0.35  # minimum gap between objects at all times
+_ROW_CLEARANCE_M = 0.08  # minimum gap within a row
+_STEP_S = 0.5  # interval between the times at which gaps are checked
+_FUSED_STEP_S = 0.025  # interval in worlds of a few sweeps, short enough that no object passes through another
+_ROUNDING_M = 1e-6  # tolerance, so that rounding cannot reject a disc whose rectangle is in reach
 _TRIES = 25
 EGO_SIZE_M = (4.6, 2.0)  # length and width of the ego vehicle
-EGO_MIDDLE_M = 1.35  # its middle is this far before its rear axle
+EGO_MIDDLE_M = 1.35  # distance of its middle ahead of its rear axle
 
 
 @dataclasses.dataclass(frozen=True)
 class Traffic:
-    """The objects of a world, in the street's frame."""
+    """The objects of a world, in the street frame."""
 
     labels: np.ndarray  # i32[m]: index into NUSCENES_CLASSES
-    models: tuple[ObjectModel, ...]  # model of each
+    models: tuple[ObjectModel, ...]  # model of each object
     sizes: np.ndarray  # f64[m, 3]: length, width, height of the annotated boxes
     motions: np.ndarray  # [m] of motion.MOTION
-    parked: np.ndarray  # bool[m]: stands where vehicles are left, rather than in traffic
+    parked: np.ndarray  # bool[m]: True for objects at parking places, False for objects in traffic
 
 
 def sample_traffic(
@@ -64,24 +64,24 @@ def sample_traffic(
     fast_traffic: bool,
     streets: Streets = PLAIN,
 ) -> Traffic:
-    """Objects that never touch each other, the ego vehicle or what stands already.
+    """Sample objects that never touch each other, the ego vehicle or the scenery.
 
-    Every object is within reach of the sensor at some moment, at a distance drawn evenly or as the streets say.
-    Options are those of :func:`~.world.sample_world`.
+    Each object is within ``reach_m`` of the ego vehicle at some time, at a distance distributed by
+    ``streets.spread``. For the other options see :func:`~.world.sample_world`.
 
     Args:
         ego: [1] of ``motion.MOTION``.
-        labels: wanted, in this order; those without room are left out.
-        occupied: f64[k, 5], ``x, y, l, w, yaw`` of what stands already.
+        labels: classes of the objects, placed in this order; objects without room are omitted.
+        occupied: f64[k, 5], ``x, y, l, w, yaw`` of the scenery.
     """
     times = np.arange(0, duration_s + 1e-6, _FUSED_STEP_S if fused else _STEP_S)
-    taken = _Taken(times, occupied)
+    occupancy = _Occupancy(times, occupied)
     vehicle = pose_at(ego, times)
     vehicle[:, :2] += EGO_MIDDLE_M * np.stack([np.cos(vehicle[:, 2]), np.sin(vehicle[:, 2])], axis=1)
-    taken.add(vehicle, EGO_SIZE_M)
+    occupancy.add(vehicle, EGO_SIZE_M)
     places = _Places(rng, ground, ego, reach_m, fast_traffic, streets.spread)
-    groups, walker = rng.spawn(1)[0], None
-    found: list[tuple[int, ObjectModel, np.ndarray, np.ndarray, bool]] = []
+    groups, pedestrian = rng.spawn(1)[0], None
+    objects: list[tuple[int, ObjectModel, np.ndarray, np.ndarray, bool]] = []
     for label in labels:
         name = NUSCENES_CLASSES[label]
         for _ in range(_TRIES):
@@ -91,32 +91,33 @@ def sample_traffic(
             moment = rng.uniform(duration_s if fused else 0.0, duration_s)
             if place == "row":
                 row, clearance = places.row_for(name, moment, model, size), _ROW_CLEARANCE_M
-                if row.model is not model and name in ("traffic_cone", "barrier"):  # in a row all are alike
+                if row.model is not model and name in ("traffic_cone", "barrier"):  # rows of equal objects
                     model = row.model
                     size = sample_size(rng, model, streets.sizes)
                 motion = places.next_in_row(row, size)
-            elif walker is not None and name == "pedestrian" and groups.random() < streets.groups:
-                motion, clearance = walker.copy(), _ROW_CLEARANCE_M
+            elif pedestrian is not None and name == "pedestrian" and groups.random() < streets.groups:
+                motion, clearance = pedestrian.copy(), _ROW_CLEARANCE_M
                 motion["x"] += groups.normal(0, 1.2)
                 motion["y"] += groups.normal(0, 0.8)
             else:
                 motion = places.sample_motion(place, moment, model, size)
-            if motion is not None and taken.has_room(pose_at(motion, times), size, clearance):
-                taken.add(pose_at(motion, times), size)
-                found.append((label, model, size, motion, place in _PARKED))
-                walker = motion if name == "pedestrian" else walker
+            if motion is not None and occupancy.has_room(pose_at(motion, times), size, clearance):
+                occupancy.add(pose_at(motion, times), size)
+                objects.append((label, model, size, motion, place in _PARKED))
+                pedestrian = motion if name == "pedestrian" else pedestrian
                 break
+    placed_labels, models, sizes, motions, parked = zip(*objects, strict=True) if objects else [()] * 5
     return Traffic(
-        np.array([f[0] for f in found], np.int32),
-        tuple(f[1] for f in found),
-        np.array([f[2] for f in found]).reshape(-1, 3),
-        np.concatenate([np.zeros(0, MOTION), *(f[3] for f in found)]),
-        np.array([f[4] for f in found], bool),
+        np.array(placed_labels, np.int32),
+        models,
+        np.array(sizes).reshape(-1, 3),
+        np.concatenate([np.zeros(0, MOTION), *motions]),
+        np.array(parked, bool),
     )
 
 
-class _Taken:
-    """Rectangles on the ground that are taken, at a few moments."""
+class _Occupancy:
+    """Occupied rectangles on the ground at given times."""
 
     def __init__(self, times: np.ndarray, occupied: np.ndarray) -> None:
         self._poses = np.repeat(occupied[:, None, [0, 1, 4]], len(times), axis=1)
@@ -130,10 +131,10 @@ class _Taken:
         self._discs = np.concatenate([self._discs, _discs(poses[None], sizes)])
 
     def has_room(self, poses: np.ndarray, size: np.ndarray, clearance: float) -> bool:
-        # Most are too far away at every moment, which takes less to see than where they are at each.
+        # Enclosing discs quickly exclude rectangles that are too far away at all times.
         x, y, radius = _discs(poses[None], size[None])[0]
-        there_x, there_y, radii = self._discs.T
-        near = np.hypot(there_x - x, there_y - y) < radii + radius + clearance + _ROUNDING_M
+        other_x, other_y, radii = self._discs.T
+        near = np.hypot(other_x - x, other_y - y) < radii + radius + clearance + _ROUNDING_M
         others, sizes = self._poses[near], self._sizes[near]
         reach = np.hypot(sizes[:, 0], sizes[:, 1])[:, None] / 2 + np.hypot(size[0], size[1]) / 2 + clearance
         which, when = np.nonzero(np.hypot(*(others[..., :2] - poses[:, :2]).transpose(2, 0, 1)) < reach)
@@ -142,14 +143,14 @@ class _Taken:
 
 
 def _discs(poses: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Discs that hold rectangles at all their moments, f64[k, 3], ``x, y, radius``, of poses [k, moments, 3]."""
+    """Discs ``x, y, radius`` that enclose rectangles at all times, f64[k, 3], from poses [k, times, 3]."""
     low, high = poses[..., :2].min(axis=1), poses[..., :2].max(axis=1)
     radii = (np.hypot(*(high - low).T) + np.hypot(sizes[:, 0], sizes[:, 1])) / 2
     return np.column_stack([(low + high) / 2, radii])
 
 
 def _footprints(poses: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Boxes without a height, f64[k, 7], of poses ``x, y, yaw`` and of length and width."""
+    """Boxes of zero height, f64[k, 7], from poses ``x, y, yaw`` and length and width."""
     boxes = np.zeros((len(poses), 7))
     boxes[:, [0, 1, 6]], boxes[:, 3:5] = poses, sizes
     return boxes
@@ -157,50 +158,50 @@ def _footprints(poses: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass
 class _Row:
-    """Cones or barriers of a work zone, or parked cars or trailers, in line along one side of a street."""
+    """A row of cones or barriers of a work zone, or of parked cars or trailers, along one side of a street."""
 
-    along: int  # 0 main street, 1 the other
-    end: float  # where the last one ends, along the street
-    beside: float  # left of the street's middle, metres
-    gap: float  # between one and the next
-    left: int  # how many more it takes
-    across: bool  # they face the street, as barriers do; otherwise along it
-    model: ObjectModel  # of its cones or barriers
+    along: int  # 0 main street, 1 crossing street
+    end: float  # end of the last object, metres along the street
+    beside: float  # metres to the left of the middle of the street
+    gap: float  # gap between objects, metres
+    left: int  # number of objects still to place
+    across: bool  # objects face the street, as barriers do; otherwise they face along it
+    model: ObjectModel  # model of the cones or barriers
 
 
 @dataclasses.dataclass
 class _Places:
-    """Samples places and motions of objects in the streets."""
+    """Samples places and motions of objects."""
 
     rng: Generator
     ground: Ground
     ego: np.ndarray
-    reach_m: float  # greatest distance from the ego vehicle
-    fast_traffic: bool  # every lane flows, fast and steadily, and few stand
-    spread: float  # power of an even number that says how far off an object is
-    # Class -> the row that is being filled.
+    reach_m: float  # maximum distance from the ego vehicle
+    fast_traffic: bool  # all lanes flow fast and steadily, and few objects stand
+    spread: float  # see streets.Streets
+    # The unfinished row of each class.
     rows: dict[str, _Row] = dataclasses.field(default_factory=dict)
-    # Street, side and lane -> speed and acceleration, the same for all in the lane: they keep their distances.
+    # Speed and acceleration by (street, side, lane). Vehicles of a lane share them, which keeps their gaps.
     flows: dict[tuple[int, int, int], tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     def sample_place(self, name: str, model: ObjectModel) -> str:
-        """A place that suits the model: what is ridden is on the road, a cycle without a rider stands."""
+        """Sample a place that suits the model: cycles are on the road with a rider and parked without one."""
         names, shares = zip(*_PLACES[name], strict=True)
         if name in ("motorcycle", "bicycle"):
             return names[0] if model.rider else names[1]
         if self.fast_traffic and self.rng.random() < _FAST:
             return names[0]
-        drawn = np.searchsorted(np.cumsum(shares), self.rng.random(), side="right")
-        return names[min(int(drawn), len(names) - 1)]
+        index = np.searchsorted(np.cumsum(shares), self.rng.random(), side="right")
+        return names[min(int(index), len(names) - 1)]
 
     def row_for(self, name: str, moment: float, model: ObjectModel, size: np.ndarray) -> _Row:
-        """The row of a class with room for one more; a new one for this model and size where there is none."""
+        """Row of a class with room for another object; a new row for this model and size if there is none."""
         if name not in self.rows or self.rows[name].left == 0:
             self.rows[name] = self._sample_row(name, moment, model, size)
         return self.rows[name]
 
     def next_in_row(self, row: _Row, size: np.ndarray) -> np.ndarray:
-        """The next place of a row, [1] of ``motion.MOTION``."""
+        """Motion at the next place of a row, [1] of ``motion.MOTION``."""
         extent = size[1] if row.across else size[0]
         s = row.end + row.gap + extent / 2
         row.end, row.left = s + extent / 2, row.left - 1
@@ -209,12 +210,12 @@ class _Places:
         return self._motion(row.along, s, row.beside + noise[0], turn + noise[1])
 
     def sample_motion(self, place: str, moment: float, model: ObjectModel, size: np.ndarray) -> np.ndarray | None:
-        """A motion that is at such a place at a moment, [1] of ``motion.MOTION``; None where that fails."""
+        """Sample a motion that is at a place at a moment, [1] of ``motion.MOTION``; None on failure."""
         rng, ground = self.rng, self.ground
         along, s = self._sample_station(moment)
         half = self._half(along)
         side = int(rng.choice([-1, 1]))
-        turn = 0.0 if side < 0 else np.pi  # traffic keeps to the right
+        turn = 0.0 if side < 0 else np.pi  # right-hand traffic
         speed, change = 0.0, 0.0
         if place == "lane":
             lane = int(rng.integers(max(int((half - 2.4) // LANE_M), 1)))
@@ -239,9 +240,9 @@ class _Places:
             speed = rng.uniform(*model.speed_mps) if moves else 0.0
             turn = rng.choice([0.0, np.pi]) + rng.normal(0, 0.15) if moves else rng.uniform(-np.pi, np.pi)
         motion = self._motion(along, s, beside, turn, speed, change)
-        way, _ = travelled(motion, moment)
-        motion["x"] -= way * np.cos(motion["yaw"])
-        motion["y"] -= way * np.sin(motion["yaw"])
+        distance, _ = travelled(motion, moment)
+        motion["x"] -= distance * np.cos(motion["yaw"])
+        motion["y"] -= distance * np.sin(motion["yaw"])
         if place in ("pavement", "yard") and ground.on_road(motion["x"], motion["y"]).any():
             return None
         return motion
@@ -250,7 +251,7 @@ class _Places:
         return self.ground.crossing_half_width if along else self.ground.half_width
 
     def _flow(self, along: int, side: int, lane: int) -> tuple[float, float]:
-        """Speed and acceleration in a lane; in the ego vehicle's lane they are its own."""
+        """Speed and acceleration of a lane. The lane of the ego vehicle follows the ego vehicle."""
         if (along, side, lane) not in self.flows:
             rng = self.rng
             if self.fast_traffic:
@@ -272,21 +273,21 @@ class _Places:
         if name in ("traffic_cone", "barrier"):
             beside = half - rng.uniform(0.6, 2.6)
             gap = rng.uniform(1.0, 3.5) if name == "traffic_cone" or rng.random() < 0.3 else gap
-        elif name == "trailer" or rng.random() < 0.6:  # side by side off the street
+        elif name == "trailer" or rng.random() < 0.6:  # side by side, off the street
             beside, gap = half + pavement + size[0] / 2 + rng.uniform(1.5, 14), rng.uniform(0.5, 1.2)
-        else:  # one after the other at the kerb
+        else:  # in line, at the kerb
             beside, gap, across = half - size[1] / 2 - rng.uniform(0.1, 0.4), rng.uniform(0.5, 2.5), False
         return _Row(along, s, side * beside, gap, left, across, model)
 
     def _sample_station(self, moment: float) -> tuple[int, float]:
-        """A street (0 main, 1 the other) and a place along it, by its distance from the sensor at a moment."""
+        """Sample a street (0 main, 1 crossing) and a position along it, by distance from the ego vehicle."""
         x, y, _ = pose_at(self.ego, moment)[0]
         distance = self.reach_m * self.rng.uniform(0.05, 1) ** self.spread
         stations = []
-        for along, (here, off) in enumerate(((x, y), (y, x - self.ground.crossing_x))):
-            if distance > abs(off):
-                way = np.sqrt(distance**2 - off**2)
-                stations += [(along, here - way), (along, here + way)]
+        for along, (position, offset) in enumerate(((x, y), (y, x - self.ground.crossing_x))):
+            if distance > abs(offset):
+                ahead = np.sqrt(distance**2 - offset**2)
+                stations += [(along, position - ahead), (along, position + ahead)]
         if not stations:
             return 0, x + self.rng.choice([-1, 1]) * distance
         return stations[int(self.rng.integers(len(stations)))]
@@ -294,6 +295,6 @@ class _Places:
     def _motion(
         self, along: int, s: float, beside: float, turn: float, speed: float = 0.0, change: float = 0.0
     ) -> np.ndarray:
-        """A straight motion from a place along a street and beside its middle (left of its direction)."""
+        """Straight motion from a position ``s`` along a street and ``beside`` its middle."""
         x, y = (s, beside) if along == 0 else (self.ground.crossing_x - beside, s)
         return make_motion(x=x, y=y, yaw=turn + along * np.pi / 2, speed=speed, acceleration=change)

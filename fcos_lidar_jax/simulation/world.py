@@ -1,4 +1,4 @@
-"""A simulated world: streets, scenery, traffic, and the ego vehicle."""
+"""A simulated world of streets, scenery, traffic and the ego vehicle."""
 
 import dataclasses
 
@@ -16,34 +16,34 @@ from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.traffic import Traffic, sample_traffic
 
 _SHARES = np.array([0.36, 0.08, 0.02, 0.04, 0.015, 0.17, 0.015, 0.02, 0.09, 0.19])
-"""Of the classes, in their order; every class has one object or more."""
+"""Shares of the classes in nuScenes, in the order of NUSCENES_CLASSES."""
 _MANOEUVRES = ("straight", "straight", "left", "right", "stopped", "braking", "starting")
 
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """All that there is, in the street's frame: x along the main street, y left of it, z up."""
+    """All contents of a world in the street frame: x along the main street, y to the left, z up."""
 
     ground: Ground
-    scenery: np.ndarray  # [s] solids that never move
+    scenery: np.ndarray  # [s], static solids
     traffic: Traffic
-    parts: np.ndarray  # [s] solids of the objects, each in the frame of the object that it names as its owner
-    ego: np.ndarray  # [1] of motion.MOTION: the rear axle of the ego vehicle
+    parts: np.ndarray  # [s], solids of the objects, each in the frame of its owner
+    ego: np.ndarray  # [1] of motion.MOTION: motion of the rear axle of the ego vehicle
     streets: Streets = PLAIN
-    unit_seed: int = 0  # of what is particular to the sensor's lasers
+    unit_seed: int = 0  # seed of the properties of the sensor's lasers
 
     def object_poses(self, time_s: float) -> np.ndarray:
-        """``x, y, z, yaw`` of the middles of all objects' undersides, f64[m, 4]."""
+        """Poses ``x, y, z, yaw`` of the middle of the bottom face of each object, f64[m, 4]."""
         x, y, yaw = pose_at(self.traffic.motions, time_s).T
         return np.stack([x, y, self.ground.height(x, y), yaw], axis=1)
 
     def solids(self, time_s: float) -> np.ndarray:
-        """Everything but the ground and the ego vehicle, at a moment."""
+        """Solids at a time, without the ground and the ego vehicle."""
         objects = place_solids(self.parts, self.object_poses(time_s)[self.parts["owner"]])
         return np.concatenate([self.scenery, objects])
 
     def ego_pose(self, time_s: float) -> np.ndarray:
-        """The ego vehicle at a moment, f64[4, 4]: its axes (x forward, z off the ground) in the street's frame."""
+        """Pose of the ego vehicle (x forward, z normal to the ground) in the street frame, f64[4, 4]."""
         x, y, yaw = pose_at(self.ego, time_s)[0]
         a, b, _ = max(self.ground.planes, key=lambda p: p[0] * x + p[1] * y + p[2])
         up = np.array([-a, -b, 1]) / np.sqrt(1 + a * a + b * b)
@@ -67,17 +67,17 @@ def sample_world(
     fast_traffic: bool = False,
     streets: Streets = PLAIN,
 ) -> World:
-    """A random world.
+    """Sample a world.
 
     Args:
-        reach_m: every object is within this distance of the ego vehicle at some moment.
-        beyond_m: scenery reaches this far beyond where the ego vehicle goes.
-        duration_s: how long it lasts.
-        labels: i32[m], objects wanted; those without room are left out.
-        level: without slopes.
-        fused: seen at its end alone, in a few sweeps before: every object is within reach then.
-        fast_traffic: the ego vehicle drives straight on at 10 to 20 m/s, every lane flows, and nearly all that can
-            move does.
+        reach_m: each object is within this distance of the ego vehicle at some time.
+        beyond_m: extent of the scenery around the path of the ego vehicle.
+        duration_s: duration of the world.
+        labels: i32[m], classes of the objects; objects without room are omitted.
+        level: ground without slopes.
+        fused: the world is scanned at its end only, as a few fused sweeps. Each object is within reach then.
+        fast_traffic: the ego vehicle drives straight at 10 to 20 m/s, all lanes flow, and nearly all objects that
+            can move do.
 
     >>> labels = np.arange(10)
     >>> world = sample_world(np.random.default_rng(0), reach_m=30, beyond_m=40, duration_s=0.0, labels=labels)
@@ -114,7 +114,7 @@ def sample_world(
 
 
 def class_shares(power: float) -> np.ndarray:
-    """How often objects are of each class, f64[10]: 1 as in the streets of nuScenes, 0 all equally often.
+    """Class frequencies, f64[10]: ``power`` 1 gives the frequencies of nuScenes, 0 equal frequencies.
 
     >>> class_shares(0.0).round(6).tolist()
     [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]
@@ -124,7 +124,7 @@ def class_shares(power: float) -> np.ndarray:
 
 
 def sample_labels(rng: Generator, number: int) -> np.ndarray:
-    """Classes of a street's objects, i32: all ten, the rest as often as in the streets of nuScenes.
+    """Sample the classes of a street's objects, i32: one of each class, the rest with nuScenes frequencies.
 
     >>> len(np.unique(sample_labels(np.random.default_rng(0), 40)))
     10
@@ -159,7 +159,7 @@ def _sample_ground(rng: Generator, level: bool) -> Ground:
 
 
 def _uneven(rng: Generator, ground: Ground, streets: Streets) -> Ground:
-    """The ground with undulations, crowns, other kerbs and shades; as it is where the streets have none."""
+    """Add the undulations, crowns, kerbs and shading of the streets to the ground."""
     height, shade = rng.spawn(2)
     if streets.relief_m:
         deviation = streets.relief_m * np.exp(0.5 * rng.standard_normal())

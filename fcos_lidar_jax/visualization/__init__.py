@@ -1,1 +1,1 @@
-"""Pictures and reports. Matplotlib is imported when one is drawn."""
+"""Pictures and reports. Matplotlib is imported on first use."""

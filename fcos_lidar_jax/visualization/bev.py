@@ -1,4 +1,4 @@
-"""Bird's-eye views: points, detections, truth."""
+"""Bird's-eye views of points, detections and truth."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ _SIZE_IN = 9.0
 _DASHES = (0, (3, 2))
 _TEXT_POINTS = 7.0
 _LEGEND_CLASSES = 30
-_HIGH_M = 3.0  # Points this high above the ground, and higher ones, are darkest.
+_HIGH_M = 3.0  # height above ground from which points have the darkest colour
 
 
 def draw_bev(
@@ -25,16 +25,16 @@ def draw_bev(
     truth: tuple[np.ndarray, np.ndarray] | None = None,
     title: str | None = None,
 ) -> None:
-    """Draw a cloud from above, x to the right and y up, higher points darker, a cross at the origin.
+    """Plot a cloud from above: x to the right, y up, higher points darker, a cross at the origin.
 
-    Detections have solid outlines in their class's colour, and the score beside them where there is room, the
-    best first. Truth has thin dashed black outlines, filled in its class's colour. A line from the centre through
-    the front shows the heading.
+    Detections have solid outlines in the colour of their class, with scores where there is room, highest scores
+    first. Truth has thin dashed black outlines filled with the colour of its class. A line from the centre through
+    the front marks the heading.
 
     Args:
-        points: f32[n, >= 3], metres; non-finite rows do not show.
-        limit_m: half the side of the square that is shown.
-        classes: names that the labels index.
+        points: f32[n, >= 3], metres; non-finite rows are omitted.
+        limit_m: half the side of the plotted square.
+        classes: class names by label.
         detections: boxes f32[d, 9], labels i32[d], scores f32[d].
         truth: boxes f32[m, 9], labels i32[m].
     """
@@ -56,7 +56,7 @@ def bev_on(
     truth: tuple[np.ndarray, np.ndarray] | None = None,
     scores: bool = True,
 ) -> set[int]:
-    """As :func:`draw_bev`, on an axis of a figure, with or without scores; returns the labels that show."""
+    """Plot the view of :func:`draw_bev` on an axis, optionally without scores; returns the visible labels."""
     _draw_points(axis, points, limit_m)
     axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
     present: set[int] = set()
@@ -65,14 +65,14 @@ def bev_on(
             axis.fill(*_corners(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
             _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
             present.add(int(label))
-    shown = [d for d in zip(*(detections or ()), strict=True) if _in_view(d[0], limit_m)]
-    for box, label, _ in shown:
+    visible = [d for d in zip(*(detections or ()), strict=True) if _in_view(d[0], limit_m)]
+    for box, label, _ in visible:
         _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
         present.add(int(label))
     if scores:
-        _write_scores(axis, shown, limit_m)
+        _write_scores(axis, visible, limit_m)
     axis.set(xlim=(-limit_m, limit_m), ylim=(-limit_m, limit_m), aspect="equal")
-    axis.set(xlabel="x [m]", ylabel="y [m]")  # which of them is ahead, the data decide
+    axis.set(xlabel="x [m]", ylabel="y [m]")  # the forward axis depends on the data set
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
     return present
@@ -81,9 +81,9 @@ def bev_on(
 def _draw_points(axis: Any, points: np.ndarray, limit_m: float) -> None:
     cloud = points[np.isfinite(points[:, :3]).all(axis=1) & (np.abs(points[:, :2]) < limit_m).all(axis=1)]
     if len(cloud):
-        # The ground stays light, what stands on it is dark, whatever the height of the frame's origin.
+        # Heights are relative to the ground: the ground is light and objects on it are dark.
         ground = np.quantile(cloud[:, 2], 0.1)
-        dot = float(np.clip(3e4 / len(cloud), 1.6, 7))  # sparse clouds get larger dots
+        dot = float(np.clip(3e4 / len(cloud), 1.6, 7))  # larger dots for sparse clouds
         colors = {"c": cloud[:, 2] - ground, "cmap": _height_colors(), "vmin": 0, "vmax": _HIGH_M}
         axis.scatter(*cloud[:, :2].T, s=dot, linewidths=0, zorder=2, **colors)
 
@@ -100,7 +100,7 @@ def _in_view(box: np.ndarray, limit_m: float) -> bool:
 
 
 def _corners(box: np.ndarray) -> np.ndarray:
-    """The closed outline seen from above, f64[2, 5]: x and y, metres."""
+    """x and y of the closed outline from above, f64[2, 5], metres."""
     x, y, _, l, w, _, yaw = map(float, box[:7])
     cos, sin = np.cos(yaw), np.sin(yaw)
     along, across = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * [[l / 2], [w / 2]]
@@ -109,24 +109,24 @@ def _corners(box: np.ndarray) -> np.ndarray:
 
 def _outline(axis: Any, box: np.ndarray, limit_m: float, **style: Any) -> None:
     axis.plot(*_corners(box), **style)
-    # The mark sticks out a little, so that it also shows on a pedestrian.
+    # The heading line extends beyond the front to stay visible on small boxes.
     x, y, reach, yaw = float(box[0]), float(box[1]), float(box[3]) / 2 + 0.008 * limit_m, float(box[6])
     axis.plot([x, x + np.cos(yaw) * reach], [y, y + np.sin(yaw) * reach], **{**style, "linestyle": "-"})
 
 
-def _write_scores(axis: Any, shown: list[tuple[np.ndarray, int, float]], limit_m: float) -> None:
-    """Scores beside their boxes, the best first; left out where no side has room."""
+def _write_scores(axis: Any, detections: list[tuple[np.ndarray, int, float]], limit_m: float) -> None:
+    """Write scores beside their boxes, highest first; omits scores without room."""
     from matplotlib.patheffects import withStroke
 
-    half = np.array([1.5, 0.7]) * _TEXT_POINTS * 2 * limit_m / (0.9 * 72 * _SIZE_IN)  # half a text, metres
-    taken: list[np.ndarray] = []
-    for box, _, score in sorted(shown, key=lambda d: -d[2]):
+    half = np.array([1.5, 0.7]) * _TEXT_POINTS * 2 * limit_m / (0.9 * 72 * _SIZE_IN)  # half a label, metres
+    placed: list[np.ndarray] = []
+    for box, _, score in sorted(detections, key=lambda d: -d[2]):
         reach = np.ptp(_corners(box), axis=1) / 2 + half
         beside = (box[:2] + reach * side for side in ((1, 0), (-1, 0), (0, 1), (0, -1)))
         inside = (p for p in beside if (np.abs(p) + half < limit_m).all())
-        place = next((p for p in inside if all((np.abs(p - t) > 2 * half).any() for t in taken)), None)
+        place = next((p for p in inside if all((np.abs(p - q) > 2 * half).any() for q in placed)), None)
         if place is not None:
-            taken.append(place)
+            placed.append(place)
             text = axis.text(*place, f"{score:.2f}", fontsize=_TEXT_POINTS, ha="center", va="center", zorder=6)
             text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
@@ -134,12 +134,12 @@ def _write_scores(axis: Any, shown: list[tuple[np.ndarray, int, float]], limit_m
 def class_legend(
     figure: Any, present: Sequence[int], classes: Sequence[str], *, detections: bool, truth: bool
 ) -> None:
-    """The colours of the classes that are present, and how detections and truth are drawn, below the figure."""
+    """Add a legend below the figure with the colours of the present classes and the styles of the outlines."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    shown, rest = present[:_LEGEND_CLASSES], len(present[_LEGEND_CLASSES:])
-    entries: list[Any] = [Patch(color=class_color(k), label=classes[k].replace("_", " ")) for k in shown]
+    listed, rest = present[:_LEGEND_CLASSES], len(present[_LEGEND_CLASSES:])
+    entries: list[Any] = [Patch(color=class_color(k), label=classes[k].replace("_", " ")) for k in listed]
     entries += [Patch(color="white", label=f"and {rest} more")] if rest else []
     if detections:
         entries.append(Line2D([], [], color="#444444", linewidth=1.7, label="detection"))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fcos_lidar_jax.visualization.figure import LINE_COLORS, new_axis, save_png
 
-_FEW = 40  # up to so many points are marked one by one; a single one would not show otherwise
+_FEW = 40  # series up to this length get markers, without which a single point is invisible
 
 
 def draw_curves(
@@ -17,13 +17,13 @@ def draw_curves(
     title: str,
     log_y: bool = False,
 ) -> None:
-    """Draw named series of (x, y) into one PNG.
+    """Plot named series of (x, y) in one PNG file.
 
-    Points that are not finite leave a gap, and with a logarithmic ordinate those that are not positive.
+    Non-finite points leave a gap, as do non-positive points on a logarithmic y axis.
     """
     figure, axis = new_axis(8, 4.5)
     for i, (name, points) in enumerate(series.items()):
-        # A second turn through the colours is dashed.
+        # When the colours repeat, lines are dashed.
         axis.plot(
             [x for x, _ in points],
             [y for _, y in points],

@@ -1,4 +1,4 @@
-"""A drive as an animation: range image and bird's-eye view of one keyframe after another."""
+"""Animation of a drive with the range image and the bird's-eye view of each keyframe."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -16,12 +16,12 @@ from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
 
 _SIZE_IN = (8.0, 9.6)
 _DPI = 90
-_COLORS = 96  # Of the GIF; more make it larger and hardly better.
+_COLORS = 96  # colours of the GIF; more colours increase its size but hardly its quality
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A keyframe to draw, in its sensor's frame."""
+    """A keyframe in its sensor's frame."""
 
     points: np.ndarray  # f32[n, >= 3]
     detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f32[d, 9], labels, scores
@@ -39,20 +39,18 @@ def draw_drive(
     seconds_a_scene: float = 0.5,
     report: Callable[[int], object] = lambda done: None,
 ) -> list[Path]:
-    """Draw an animated GIF, and every scene as a PNG beside it.
+    """Write an animated GIF, and one PNG file per scene beside it.
 
-    Above the range image from behind over the left, ahead in the middle, and the right to behind; below it the
-    view from above with detections, and the truth dashed.
+    The top shows the range image, with the forward direction in the middle. Below is the bird's-eye view with
+    detections and dashed truth.
 
     Args:
-        path: of the GIF; the PNG files are named ``NAME_00.png`` and so on.
-        scenes: in their order.
-        sensor: of the range image.
-        classes: names that the labels index.
-        title: of all pictures.
-        limit_m: half the side of the square that is shown from above.
-        seconds_a_scene: how long each stays.
-        report: called with the number of scenes that are drawn.
+        path: GIF file; the PNG files are named ``NAME_00.png``, ``NAME_01.png`` and so on.
+        sensor: sensor of the range image.
+        classes: class names by label.
+        limit_m: half the side of the bird's-eye view.
+        seconds_a_scene: duration of each scene.
+        report: called with the number of finished scenes.
 
     Returns:
         the PNG files.
@@ -62,12 +60,12 @@ def draw_drive(
     path = Path(path)
     files = [path.with_name(f"{path.stem}_{number:02d}.png") for number in range(len(scenes))]
     labels = {int(k) for scene in scenes for k in (*scene.detections[1], *scene.truth[1])}
-    most = max(len(scene.points) for scene in scenes)  # of one size, so that the projection is compiled once
+    size = max(len(scene.points) for scene in scenes)  # one size, so that the projection is compiled once
     pictures = []
     for number, (scene, file) in enumerate(zip(scenes, files, strict=True)):
         figure = new_figure(*_SIZE_IN)
         strip, view = figure.subplots(2, 1, height_ratios=(1, 7.4))
-        _draw_ranges(strip, scene.points, most, sensor)
+        _draw_ranges(strip, scene.points, size, sensor)
         bev_on(view, scene.points, limit_m=limit_m, detections=scene.detections, truth=scene.truth, scores=False)
         class_legend(figure, sorted(labels), classes, detections=True, truth=True)
         strip.set_title(f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
@@ -81,23 +79,22 @@ def draw_drive(
 
 
 def _draw_ranges(axis: Any, points: np.ndarray, size: int, sensor: Sensor) -> None:
-    """The first round of the range image, the direction of travel in the middle."""
+    """Plot the first round of the range image with the forward direction in the middle."""
     import matplotlib as mpl
     from matplotlib.colors import LogNorm
 
     padded = np.pad(points, ((0, size - len(points)), (0, 0)))
-    image = np.asarray(project_points(padded, np.arange(size) < len(points), sensor, num_rounds=1).features)[
-        ..., 0
-    ]
-    range_m, exists = (image[..., CHANNELS.index(name)] for name in ("range", "existence"))
-    # Columns run clockwise from azimuth 180 degrees; ahead, +y, is at 90.
-    shown, left, right = np.ma.masked_where(exists == 0, range_m), -180.0, 180.0
+    image = project_points(padded, np.arange(size) < len(points), sensor, num_rounds=1)
+    first_round = np.asarray(image.features)[..., 0]
+    range_m, exists = (first_round[..., CHANNELS.index(name)] for name in ("range", "existence"))
+    # Columns run clockwise from azimuth 180 degrees. The forward direction, +y, is at 90 degrees.
+    ranges, left, right = np.ma.masked_where(exists == 0, range_m), -180.0, 180.0
     if sensor.azimuth_limits_rad is None:
-        shown = np.roll(shown, sensor.num_columns // 4, axis=1)
+        ranges = np.roll(ranges, sensor.num_columns // 4, axis=1)
     else:
         right, left = 90 - np.degrees(sensor.azimuth_limits_rad)
     axis.imshow(
-        shown,
+        ranges,
         cmap=mpl.colormaps["viridis_r"].with_extremes(bad=EMPTY),
         norm=LogNorm(2, sensor.limit_xy_m),
         aspect="auto",

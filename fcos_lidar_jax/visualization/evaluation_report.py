@@ -1,4 +1,4 @@
-"""The report of an evaluation: curves, example pictures and one HTML page, from the files that it wrote."""
+"""Report of an evaluation from its files: curves, example pictures and one HTML page."""
 
 import dataclasses
 import json
@@ -24,17 +24,17 @@ ERROR_NAMES = {
     "attr_err": ("AAE", "attribute [1 - accuracy]"),
 }
 """Errors of the hits: abbreviation, name and unit."""
-PAGE = "frames.html"  # The worst and the best frames, to look at.
-_MARGIN_M = 2.0  # shown beyond the largest class range
+PAGE = "frames.html"  # interactive page of the worst and the best frames
+_MARGIN_M = 2.0  # margin of the bird's-eye views beyond the largest class range
 
 
 @dataclasses.dataclass(frozen=True)
 class Example:
-    """One sample of an evaluation to draw, in its sensor's frame."""
+    """An example sample of an evaluation, in its sensor's frame."""
 
     kind: str  # best, typical or worst
-    name: str  # of the sample
-    points: np.ndarray  # f32[n, >= 5]: the cloud; without points there is no range image
+    name: str  # name of the sample
+    points: np.ndarray  # f32[n, >= 5]: the cloud; if it is empty, there is no range image
     detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f64[d, 9], labels and scores
     truth: tuple[np.ndarray, np.ndarray]  # boxes f64[m, 9] and labels
 
@@ -49,16 +49,17 @@ def write_evaluation_report(
     pictures: Sequence[Picture] = (),
     links: Sequence[tuple[str, str]] = (),
 ) -> None:
-    """Write ``report.html``, one file that needs nothing else, and its pictures into ``pictures/``.
+    """Write the self-contained ``report.html``, and its pictures to ``pictures/``.
 
-    All scores, errors and curves are read from ``metrics_summary.json``, ``curves.json`` and, where there is one,
-    ``bootstrap.json``, of the nuScenes benchmark or of another metric.
+    Reads scores, errors and curves from ``metrics_summary.json``, ``curves.json`` and, if it exists,
+    ``bootstrap.json``, of the nuScenes benchmark or any other metric.
 
     Args:
-        out: folder that holds these files.
-        sensor: of their range images.
-        pictures: more of them, which stand first.
-        links: text and name of files beside the report.
+        out: folder with these files.
+        examples: samples to plot.
+        sensor: sensor of the range images.
+        pictures: additional pictures, placed first.
+        links: text and file name of links to files beside the report.
     """
     summary, curves = (json.loads((out / f"{name}.json").read_text()) for name in ("metrics_summary", "curves"))
     file, folder = out / "bootstrap.json", out / "pictures"
@@ -100,7 +101,7 @@ def clear_report(out: Path) -> None:
 
 
 def _lead(summary: Mapping[str, Any], num_samples: int, defined: Sequence[str]) -> str:
-    """What was evaluated, and by which rules."""
+    """Introduction: the evaluated samples and the metric."""
     rules = f"over {num_samples} samples: average precision (AP) by matching distance"
     if defined:
         names = ", ".join(ERROR_NAMES[error][1].split(" [")[0] for error in defined)
@@ -129,12 +130,12 @@ def _scores(
 def _draw_class_curves(
     folder: Path, summary: Mapping[str, Any], curves: Mapping[str, Any]
 ) -> tuple[list[Picture], list[Picture]]:
-    """Precision and error curves of every class, as pictures with captions."""
+    """Plot precision and error curves of each class; returns pictures with captions."""
     recall, distance = curves["recall"], str(summary["cfg"]["dist_th_tp"])
     first = round(100 * summary["cfg"]["min_recall"]) + 1
     precisions, errors = list[Picture](), list[Picture]()
     for row, (name, curve) in enumerate(curves["classes"].items()):
-        plain = re.sub(r"[^\w-]", "_", name)  # class names may hold what file names may not
+        plain = re.sub(r"[^\w-]", "_", name)  # class names may contain characters that file names must not
         above, below = (folder / f"{kind}_{row:02d}_{plain}.png" for kind in ("precision", "errors"))
         _draw_precision(above, recall, curve["precision"])
         precisions.append((f"{_words(name)}: AP {summary['mean_dist_aps'][name]:.3f}", above))
@@ -146,11 +147,10 @@ def _draw_class_curves(
 
 
 def _draw_precision(path: str | Path, recall: Sequence[float], precision: Mapping[str, Sequence[float]]) -> None:
-    """Precision over recall of one class; ``precision`` is matching distance -> values."""
+    """Plot precision over recall of one class; ``precision`` contains values by matching distance."""
     figure, axis = new_axis(4.2, 3.5)
     for rank, (distance, values) in enumerate(precision.items()):
-        # What is beyond the highest recall is not drawn along the bottom. Curves that coincide still all show: the
-        # larger the distance, the wider the line and the lower.
+        # Curves end at the highest recall. Wide lines below narrow ones keep coinciding curves visible.
         end = int(np.max(np.flatnonzero(values), initial=0)) + 1
         style = {"color": LINE_COLORS[rank], "linewidth": 1.2 + rank, "zorder": 9 - rank}
         axis.plot(recall[:end], values[:end], label=f"{float(distance):g} m", **style)
@@ -161,7 +161,7 @@ def _draw_precision(path: str | Path, recall: Sequence[float], precision: Mappin
 def _draw_errors(
     path: str | Path, recall: Sequence[float], errors: Mapping[str, Sequence[float]], *, last: int, first: int
 ) -> None:
-    """Mean errors of the hits up to each recall, from the lowest that counts to the highest that was reached."""
+    """Plot mean errors of the hits up to each recall, from the minimum to the highest recall."""
     figure, axis = new_axis(4.2, 3.5)
     span, marker = slice(first, last + 1), "o" if last == first else None
     if last >= first:
@@ -175,7 +175,7 @@ def _draw_errors(
 
 
 def _save(figure: Any, path: str | Path, y_label: str, **legend: Any) -> None:
-    """Recall below, and the legend below that, where no curve runs."""
+    """Label the axes, put the legend below the plot and save the figure."""
     axis = figure.axes[0]
     axis.set(xlim=(0, 1), xlabel="recall", ylabel=y_label)
     if handles := axis.get_lines():
@@ -187,7 +187,7 @@ def _save(figure: Any, path: str | Path, y_label: str, **legend: Any) -> None:
 def _draw_examples(
     folder: Path, examples: Iterable[Example], ranges_m: Mapping[str, float], sensor: Sensor
 ) -> tuple[list[Picture], list[Picture]]:
-    """Samples from above, and their range images where there are points."""
+    """Plot bird's-eye views of samples, and their range images if they have points."""
     views, images = list[Picture](), list[Picture]()
     for example in examples:
         points, kind = example.points, example.kind

@@ -1,4 +1,4 @@
-"""Matplotlib without a screen and without global state, and the colours of all figures."""
+"""Matplotlib figures without a display or global state, and the colours of all figures."""
 
 import colorsys
 from pathlib import Path
@@ -7,17 +7,17 @@ from typing import Any
 from fcos_lidar_jax.files import atomic_write
 
 LINE_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-"""Okabe and Ito's, which colour-blind readers tell apart."""
-EMPTY = "#d9d9d9"  # cells without a point
+"""The colours of Okabe and Ito, which colour-blind readers can distinguish."""
+EMPTY = "#d9d9d9"  # colour of empty cells
 _CLASS_COLORS = (
     *("#1f77b4", "#d62728", "#9467bd", "#8c564b", "#e6a000"),
     *("#e377c2", "#17becf", "#2ca02c", "#ff6f00", "#5b5b5b"),
 )
-_GOLDEN = 0.6180339887  # hues that are this far apart never meet
+_GOLDEN = 0.6180339887  # hue step, the golden ratio, for which hues never repeat
 
 
 def class_color(label: int) -> str:
-    """Colour of a class, for any number of classes; the first ten are told apart most easily.
+    """Colour of a class, for any number of classes. The first ten colours are the most distinct.
 
     >>> class_color(0), class_color(10)
     ('#1f77b4', '#b83d91')
@@ -30,14 +30,14 @@ def class_color(label: int) -> str:
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """An empty figure, drawn off screen."""
+    """Create an empty figure that needs no display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def new_axis(width_in: float, height_in: float) -> tuple[Any, Any]:
-    """A figure with one axis for curves: grid, and no frame above and on the right."""
+    """Create a figure with one axis for curves, with a grid and without top and right frame."""
     figure = new_figure(width_in, height_in)
     axis = figure.add_subplot()
     axis.grid(color="#e5e5e5", linewidth=0.6)
@@ -46,11 +46,11 @@ def new_axis(width_in: float, height_in: float) -> tuple[Any, Any]:
 
 
 def set_title(place: Any, title: str, **style: Any) -> None:
-    """Write a title over a figure or an axis as it is: ``$`` begins no formula, and any file name will do."""
+    """Set the title of a figure or an axis verbatim: no math after ``$``, and any file name is valid."""
     write = place.suptitle if hasattr(place, "suptitle") else place.set_title
     write(title.encode("utf-8", "replace").decode(), **style).set_parse_math(False)
 
 
 def save_png(figure: Any, path: str | Path, *, dpi: int = 110) -> None:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as a PNG file atomically."""
     atomic_write(path, lambda file: figure.savefig(file, dpi=dpi, format="png"))

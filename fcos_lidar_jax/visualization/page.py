@@ -1,4 +1,4 @@
-"""Frames as one HTML file that asks for nothing else: points, boxes, truth and the way of the ego vehicle."""
+"""Self-contained HTML page of frames with points, boxes, truth and the path of the ego vehicle."""
 
 import base64
 import dataclasses
@@ -15,25 +15,25 @@ from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference.cloud import MAX_TIME_LAG_S
 from fcos_lidar_jax.visualization.figure import class_color
 
-STEP_M = 0.02  # Points are rounded to multiples of it.
-_LIMIT = 2**15 - 1  # int16: points up to 655 m away.
+STEP_M = 0.02  # resolution of the points
+_LIMIT = 2**15 - 1  # int16, for points up to 655 m
 
 
 @dataclasses.dataclass(frozen=True)
 class PageFrame:
-    """A cloud with its boxes, as the page holds it."""
+    """A cloud with its boxes, encoded for the page. Optional fields are None if unknown."""
 
     name: str
-    time_us: int | None  # None where it is not known.
-    pose: list[float] | None  # 16 numbers, row by row, from the sensor to the world; likewise.
-    num_points: int  # Finite ones within reach, each cell of the size STEP_M of a sweep counted once.
-    max_lag_s: float  # Of the points; 0 for those of one sweep.
-    points: str  # See encode_points.
-    boxes: list[list[float | None]]  # x, y, z, l, w, h, yaw, vx, vy; None for what is not finite.
+    time_us: int | None
+    pose: list[float] | None  # 16 numbers in row-major order, from the sensor to the world
+    num_points: int  # finite points within range, one per sweep and cell of size STEP_M
+    max_lag_s: float  # largest time lag of the points; 0 for a single sweep
+    points: str  # see encode_points
+    boxes: list[list[float | None]]  # x, y, z, l, w, h, yaw, vx, vy; None for non-finite numbers
     labels: list[int]
     scores: list[float]
-    ids: list[int] | None  # Over time, None where they are not known.
-    truth: list[list[float | None]] | None  # As the boxes, None where it is not known.
+    ids: list[int] | None  # identities over time
+    truth: list[list[float | None]] | None  # same format as boxes
     truth_labels: list[int] | None
 
 
@@ -47,13 +47,12 @@ def page_frame(
     ids: np.ndarray | None = None,
     truth: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> PageFrame:
-    """A cloud and its boxes, encoded, so that many fit into memory.
+    """Encode a cloud and its boxes compactly, so that many frames fit into memory.
 
     Args:
-        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), time lag in seconds (else 0).
+        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
         found: boxes f32[m, 9] in the frame of the points, labels i32[m], scores f32[m].
-        name: of the frame.
-        time_us, pose: when, and f64[4, 4] to the world; for the frames of one drive alone.
+        time_us, pose: time, and pose f64[4, 4] in the world; only for frames of the same drive.
         ids: i32[m], identities over time.
         truth: boxes f32[k, 9], labels i32[k].
     """
@@ -73,24 +72,24 @@ def page_frame(
 
 
 def _numbers(values: np.ndarray) -> list[Any]:
-    """Nested lists; None for NaN, which JSON has not."""
+    """Nested lists with None for non-finite numbers, which JSON excludes."""
     plain = np.array(values, object)
     plain[~np.isfinite(values)] = None
     return plain.tolist()
 
 
 def encode_points(points: np.ndarray) -> tuple[int, float, str]:
-    """Points in few bytes: rounded, each place of a sweep once, sorted by time lag and x, compressed.
+    """Encode points compactly: rounded, without duplicates within a sweep, sorted by time lag and x, compressed.
 
-    The bytes are planes, one behind another: x as int16 differences, y and z as int16, the low bytes of each
-    before its high bytes, then as uint8 the intensity and the time lag, 255 for the largest; compressed by gzip,
-    written in base64.
+    The data consist of consecutive planes: x as int16 differences, y and z as int16, each with all low bytes
+    before all high bytes, then intensity and time lag as uint8, with 255 for the largest lag. The planes are
+    compressed with gzip and encoded in base64.
 
     Args:
-        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), time lag in seconds (else 0).
+        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
 
     Returns:
-        how many points are left, their largest time lag in seconds, and the text.
+        number of remaining points, their largest time lag in seconds, and the text.
 
     >>> encode_points(np.array([[1, 2, 3, 9], [1, 2, 3.001, 9], [np.nan, 0, 0, 0]], np.float32))[:2]
     (1, 0.0)
@@ -100,7 +99,7 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
     lags = np.clip(np.nan_to_num(lags), 0, MAX_TIME_LAG_S)
     longest = float(lags.max(initial=0))
     age = np.round(lags * (255 / longest if longest else 0)).astype(np.int64)
-    # Sorted as one integer each: many times faster than as rows.
+    # Sorting one integer per point is many times faster than sorting rows.
     x, y, z = np.round(points[:, :3].T / STEP_M).astype(np.int64) - np.iinfo(np.int16).min
     _, first = np.unique(age << 48 | x << 32 | y << 16 | z, return_index=True)
     places = np.stack([np.diff(x[first], prepend=2**15), y[first] - 2**15, z[first] - 2**15]).astype("<i2")
@@ -113,19 +112,16 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
 def write_page(
     path: str | Path, frames: Sequence[PageFrame], *, classes: Sequence[str], title: str, min_score: float = 0.3
 ) -> None:
-    """Write the page.
+    """Write the HTML page.
 
     Args:
-        path: of the HTML file.
-        frames: in their order.
-        classes: names that the labels index.
-        title: of the page.
-        min_score: of the boxes that show at first.
+        classes: class names by label.
+        min_score: initial threshold of the visible boxes.
     """
     content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}
     content |= {"colors": [class_color(label) for label in range(len(classes))]}
     content |= {"frames": [dataclasses.asdict(frame) for frame in frames]}
-    # Names may hold anything, even the end of a script.
+    # Names may contain anything, even "</script>".
     text = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
     template = files("fcos_lidar_jax.visualization").joinpath("page.html").read_text(encoding="utf-8")
     atomic_write(path, lambda file: file.write_text(template.replace("{{drive}}", text), encoding="utf-8"))

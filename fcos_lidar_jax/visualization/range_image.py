@@ -15,7 +15,7 @@ from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set
 _RANGE, _INCLINATION, _INTENSITY, _EXISTENCE, _LAG = (
     CHANNELS.index(c) for c in ("range", "inclination", "intensity", "existence", "time_lag")
 )
-_BOX = "#ff1f1f"  # outlines of boxes: a colour that neither the map of the range nor the empty cells have
+_BOX = "#ff1f1f"  # outlines of boxes, distinct from the range colours and empty cells
 
 
 def draw_range_image(
@@ -27,24 +27,24 @@ def draw_range_image(
     detections: np.ndarray | None = None,
     azimuth_limits_rad: tuple[float, float] | None = None,
 ) -> None:
-    """Draw the range of every round, and below the first round its intensity and time lag.
+    """Plot the range of each round, and intensity and time lag of the first round.
 
-    Columns run clockwise, in a full turn from azimuth +180 degrees, the highest beam is on top, empty cells are
-    grey. Ranges are coloured by their logarithm, since most cells are near. The time lag is left out where all
-    points are current.
+    Columns run clockwise, in a full turn from azimuth +180 degrees. The highest beam is on top, and empty cells
+    are grey. The range scale is logarithmic, because most cells are near. The time lag is omitted if all points
+    are current.
 
     Args:
-        boxes: f32[m, >= 7], metres, in the frame of the points; each is outlined in round 1 around the cells
-            whose point lies in it, so a box without such a cell does not show.
-        detections: likewise, on a panel of their own below.
-        azimuth_limits_rad: of the sensor.
+        boxes: f32[m, >= 7], metres, in the frame of the points. Each box is outlined in round 1 around the cells
+            whose points lie in it; boxes without such a cell are not visible.
+        detections: same format as ``boxes``, in a separate panel.
+        azimuth_limits_rad: sector of the sensor.
     """
     view = _View.of(azimuth_limits_rad)
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
     lags = features[:, :, _LAG].any()
-    outlined = [(k, those) for k, those in (("boxes", boxes), ("detections", detections)) if those is not None]
-    panels = [(_RANGE, 0, pair) for pair in outlined or [None]]
+    outlines = [(k, given) for k, given in (("boxes", boxes), ("detections", detections)) if given is not None]
+    panels = [(_RANGE, 0, outline) for outline in outlines or [None]]
     panels += [(channel, 0, None) for channel in (_INTENSITY, _LAG) if channel == _INTENSITY or lags]
     panels += [(_RANGE, r, None) for r in range(1, rounds)]
     figure = new_figure(13, 1.5 * len(panels) + 0.6)
@@ -53,11 +53,11 @@ def draw_range_image(
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     ticks = np.unique(np.linspace(0, rows - 1, 5).round().astype(int))
     degrees = np.degrees(_row_inclinations(features))[ticks]
-    for axis, (channel, r, pair) in zip(axes, panels, strict=True):
+    for axis, (channel, r, outline) in zip(axes, panels, strict=True):
         name = _draw_channel(figure, axis, features, channel, r, view)
-        if pair is not None:
-            kind, those = pair
-            name += f"; {_outline(axis, features, those, view)} of {len(those)} {kind} have a cell"
+        if outline is not None:
+            kind, given = outline
+            name += f"; {_outline(axis, features, given, view)} of {len(given)} {kind} have a cell"
         axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
         axis.set_ylabel("inclination", fontsize=9)
         axis.set(xlim=(view.left, view.right), ylim=(rows, 0))
@@ -70,7 +70,7 @@ def draw_range_image(
 
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """The azimuths that a picture spans, degrees."""
+    """Azimuth span of a picture, degrees."""
 
     left: float
     right: float
@@ -89,15 +89,15 @@ class _View:
 
 
 def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r: int, view: _View) -> str:
-    """One channel of one round with its colour bar; returns what it shows."""
+    """Plot one channel of one round with its colour bar; returns a description."""
     import matplotlib as mpl
     from matplotlib.colors import LogNorm, Normalize
 
     filled = features[:, :, _EXISTENCE, r] > 0
     shades = {_RANGE: "viridis_r", _INTENSITY: "magma", _LAG: "cividis"}[channel]
-    # All rounds of a channel share their colours; a few far or bright points do not take them all.
-    everything = features[:, :, channel][features[:, :, _EXISTENCE] > 0]
-    low, high = np.quantile(everything, (0.01, 1 if channel == _LAG else 0.99)) if everything.size else (1, 2)
+    # All rounds of a channel share a colour scale. Quantiles keep outliers from dominating it.
+    values = features[:, :, channel][features[:, :, _EXISTENCE] > 0]
+    low, high = np.quantile(values, (0.01, 1 if channel == _LAG else 0.99)) if values.size else (1, 2)
     norm = LogNorm(max(low, 0.1), max(high, 1.1 * low, 0.2)) if channel == _RANGE else Normalize(0, high or 1)
     picture = axis.imshow(
         np.ma.masked_where(~filled, features[:, :, channel, r]),
@@ -119,7 +119,7 @@ def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r:
 
 
 def _row_inclinations(features: np.ndarray) -> np.ndarray:
-    """Inclination of every row, radians: the median of its points, between them for rows without."""
+    """Inclination of each row in radians: the median of its points, interpolated for empty rows."""
     rows = np.arange(features.shape[0])
     filled = features[:, :, _EXISTENCE] > 0
     known = [i for i in rows if filled[i].any()]
@@ -127,19 +127,19 @@ def _row_inclinations(features: np.ndarray) -> np.ndarray:
         return np.zeros(len(rows))
     medians = [float(np.median(features[i, :, _INCLINATION][filled[i]])) for i in known]
     step = (medians[-1] - medians[0]) / max(known[-1] - known[0], 1)
-    beyond = np.minimum(rows - known[0], 0) + np.maximum(rows - known[-1], 0)  # the outermost known rows
+    beyond = np.minimum(rows - known[0], 0) + np.maximum(rows - known[-1], 0)  # extrapolates by this many rows
     return np.interp(rows, known, medians) + beyond * step
 
 
 def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray, view: _View) -> int:
-    """Rectangles around the first-round cells of each box; returns how many boxes have any."""
+    """Draw rectangles around the first-round cells of each box; returns the number of boxes with cells."""
     from matplotlib.patches import Rectangle
 
     columns = features.shape[1]
     first_round = features[..., 0].reshape(-1, features.shape[2])
     filled = np.flatnonzero(first_round[:, _EXISTENCE] > 0)
-    found = [filled[rows] for rows in points_in_boxes(first_round[filled, :3], boxes) if len(rows)]
-    for cells in found:
+    boxes_cells = [filled[rows] for rows in points_in_boxes(first_round[filled, :3], boxes) if len(rows)]
+    for cells in boxes_cells:
         rows_in, columns_in = np.divmod(cells, columns)
         top, bottom = rows_in.min(), rows_in.max() + 1
         spans = _spans(columns_in, columns) if view.full_turn else [(columns_in.min(), columns_in.max())]
@@ -147,11 +147,11 @@ def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray, view: _View) ->
         for first, last in spans:
             left, width = view.left - degrees * first, -degrees * (last + 1 - first)
             axis.add_patch(Rectangle((left, top), width, bottom - top, fill=False, edgecolor=_BOX, linewidth=1.2))
-    return len(found)
+    return len(boxes_cells)
 
 
 def _spans(columns_in: np.ndarray, columns: int) -> Iterator[tuple[int, int]]:
-    """First and last column of a box's cells: two spans where it lies across the seam."""
+    """First and last column of a box's cells, as two spans if the box crosses azimuth 180 degrees."""
     left, right = columns_in[columns_in < columns // 2], columns_in[columns_in >= columns // 2]
     across = len(left) and len(right) and right.min() - left.max() > columns // 2
     for part in (left, right) if across else (columns_in,):

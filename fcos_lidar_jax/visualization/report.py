@@ -1,4 +1,4 @@
-"""A report as one HTML file that needs nothing else."""
+"""Self-contained HTML reports."""
 
 import base64
 import html
@@ -45,16 +45,18 @@ def write_report(
     pictures: Sequence[Picture] = (),
     wide_pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write a self-contained report: one file, no outside address, light or dark as the reader's system is.
+    """Write a self-contained report in one file, without external links, in the system's light or dark theme.
+
+    Floats in the summary and in tables have three decimals; NaN is a dash.
 
     Args:
-        summary: named values; of all numbers, those with a point are shown with three decimals, NaN as a dash.
+        summary: values by name.
         lead: one paragraph below the heading.
-        links: text and name of files that lie beside the report.
-        tables: caption, header and rows each; the first column names the row.
-        galleries: heading and small pictures each, as many side by side as there is room for.
-        pictures: caption and PNG or GIF each, curves too; the files are embedded.
-        wide_pictures: more of them, which a narrow screen scrolls sideways instead of shrinking.
+        links: text and file name of links to files beside the report.
+        tables: (caption, header, rows) of each table; the first column names the row.
+        galleries: (heading, small pictures) of each gallery, arranged side by side.
+        pictures: (caption, PNG or GIF file) of each picture; the files are embedded.
+        wide_pictures: pictures that scroll horizontally on narrow screens instead of shrinking.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "report.html"
@@ -68,8 +70,8 @@ def write_report(
     parts += [f'<p><a href="{_text(file)}">{_text(text)}</a></p>' for text, file in links]
     parts.append(_table("Summary", ("", "value"), list(summary.items())))
     parts += [_table(*table) for table in tables]
-    for heading, shown in galleries:
-        figures = "".join(_figure(*picture) for picture in shown)
+    for heading, gallery in galleries:
+        figures = "".join(_figure(*picture) for picture in gallery)
         parts.append(f'<h2>{_text(heading)}</h2><div class="gallery">{figures}</div>')
     parts += [_figure(*picture) for picture in pictures]
     parts += [_figure(*picture, wide=True) for picture in wide_pictures]
@@ -84,7 +86,7 @@ def write_report(
 def _text(value: Cell) -> str:
     if isinstance(value, float):
         return "–" if value != value else f"{value:.3f}"
-    return html.escape(str(value).encode("utf-8", "replace").decode())  # Paths may hold what is no UTF-8.
+    return html.escape(str(value).encode("utf-8", "replace").decode())  # paths may contain invalid UTF-8
 
 
 def _figure(caption: str, file: str | Path, *, wide: bool = False) -> str:

@@ -1,4 +1,4 @@
-"""A drive as a recording for the viewer rerun (extra ``viz``)."""
+"""Recording of a drive for the rerun viewer (extra ``viz``)."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -10,11 +10,11 @@ import numpy as np
 from fcos_lidar_jax.files import atomic_path
 from fcos_lidar_jax.visualization.figure import class_color
 
-_HIGH_M = 4.0  # Above the ground, where the colours of the points end.
+_HIGH_M = 4.0  # height above ground at the end of the colour scale
 
 
 def check_rerun() -> None:
-    """Refuse, in one line, to go on without rerun.
+    """Check that rerun is installed.
 
     Raises:
         ValueError: it is not installed.
@@ -22,19 +22,18 @@ def check_rerun() -> None:
     try:
         import rerun  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
-        line = "rerun is not installed, which writes it: pip install 'fcos-lidar-jax[viz]'"
-        raise ValueError(f"--rrd: {line}") from None
+        raise ValueError("--rrd: rerun is not installed: pip install 'fcos-lidar-jax[viz]'") from None
 
 
 @contextlib.contextmanager
 def rerun_recording(path: Path | None, classes: Sequence[str]) -> Iterator[Callable[..., None]]:
-    """A function that records frames, with the arguments of :func:`fcos_lidar_jax.visualization.page.page_frame`.
+    """Yield a function that records frames, with the arguments of :func:`~.page.page_frame`.
 
-    What it records is written as it comes; the file is there when the context ends, and only if nothing failed.
+    Frames are written immediately. The file appears when the context ends without an error.
 
     Args:
-        path: of the recording (.rrd); with None nothing is recorded.
-        classes: names that the labels index.
+        path: recording (.rrd), or None to record nothing.
+        classes: class names by label.
 
     >>> with rerun_recording(None, ("car",)) as record:
     ...     record(np.zeros((0, 4)), (np.zeros((0, 9)), np.zeros(0), np.zeros(0)), name="a")
@@ -65,7 +64,7 @@ def _record(
     pose: np.ndarray | None = None,
     ids: np.ndarray | None = None,
 ) -> None:
-    """Points by height, boxes with class, score and identity, in the frame of the sensor, which has its pose."""
+    """Record points coloured by height, and boxes with class, score and identity, in the sensor's frame."""
     import matplotlib as mpl
     import rerun as rr  # pyright: ignore[reportMissingImports]
 

@@ -202,8 +202,8 @@ def test_empty_sides_are_told_in_words(home, tmp_path, capsys, empty):
         results["results"] = {token: [] for token in truth}
     by_files(tmp_path, results, truth, bootstrap=3)
     shown = capsys.readouterr().err
-    assert ("no ground truth counts here" in shown) == (empty != "results")
-    assert ("the results hold not a single box" in shown) == (empty != "truth")
+    assert ("no ground truth is evaluated:" in shown) == (empty != "results")
+    assert ("the results contain no boxes" in shown) == (empty != "truth")
     assert read(tmp_path / "out" / "metrics_summary.json")["nd_score"] == 0
     assert (tmp_path / "out" / "report.html").is_file()
 
@@ -213,7 +213,7 @@ def test_classes_without_truth_are_named(home, tmp_path, capsys):
     for sample in truth.values():
         sample["boxes"] = [box for box in sample["boxes"] if box["detection_name"] not in ("bus", "barrier")]
     by_files(tmp_path, read(home / "results.json"), truth, report=False)
-    assert re.search("no ground truth counts of .*bus.*barrier", capsys.readouterr().err)
+    assert re.search("no ground truth is evaluated for .*bus.*barrier", capsys.readouterr().err)
 
 
 def test_a_class_map_changes_the_truth_that_a_detector_is_compared_with(home, tmp_path):

@@ -1,4 +1,4 @@
-"""Metrics of other classes than the benchmark's: plain loops as oracle, files read back, the report of them."""
+"""Check metrics of classes other than the benchmark's against loops, and their files and reports."""
 
 import dataclasses
 import itertools
@@ -26,11 +26,11 @@ from fcos_lidar_jax.visualization.evaluation_report import Example, write_evalua
 
 OWN = ("crate/box", "traffic_cone", "fork$lift", "barrier", "never_seen")
 MANY = tuple(f"kind_{k}" for k in range(150))
-"""More than an int8 counts."""
+"""More classes than an int8 can index."""
 
 
 def made(classes, used, frames=8, objects=25):
-    """Frames with objects of some classes, the first of which has no velocity, and detections near them."""
+    """Frames with objects of some classes, the first without velocities, and detections near the objects."""
     rng = np.random.default_rng(0)
     truths, found = [], []
     for _ in range(frames):
@@ -49,7 +49,7 @@ def made(classes, used, frames=8, objects=25):
 
 
 def as_dicts(classes, boxes, labels, values, of="detection_score"):
-    """Boxes as the oracle takes them."""
+    """Convert boxes to the input format of the oracle."""
     return [
         {
             "translation": box[:3].tolist(),
@@ -69,7 +69,7 @@ def as_dicts(classes, boxes, labels, values, of="detection_score"):
     [(OWN, [0, 1, 2, 3], (30.0, 20.0, 70.0, 45.0, 10.0)), (MANY, [2, 149, 77, 130, 128], (40.0,) * 150)],
     ids=["own", "many"],
 )
-def test_every_number_is_that_of_plain_loops(classes, used, ranges):
+def test_all_numbers_match_loops(classes, used, ranges):
     found, truths = made(classes, used)
     summary = evaluate_frames(found, truths, metric_of(classes, ranges)).summary
     expected = score_frames(
@@ -86,7 +86,7 @@ def test_every_number_is_that_of_plain_loops(classes, used, ranges):
     assert summary["mean_ap"] > 0.1
 
 
-def test_other_metrics_say_what_they_are():
+def test_other_metrics_state_that_they_are_not_the_benchmark():
     found, truths = made(OWN, [0, 1])
     settings = metric_of(OWN).settings
     assert settings["metric"] == settings["dist_fcn"] == "center_distance"
@@ -97,8 +97,8 @@ def test_other_metrics_say_what_they_are():
         evaluate_frames(found, truths, NUSCENES_METRIC)
 
 
-def test_properties_go_by_name_and_not_by_order():
-    """The benchmark with its classes in another order gives every class the same numbers."""
+def test_class_properties_depend_on_the_name_and_not_on_the_order():
+    """Compares the benchmark with a permutation of its classes."""
     tables, results = make_task(1, samples=8, objects=80)
     truth = read_truth(truth_of(tables))
     boxes = read_results(results, truth.tokens).boxes
@@ -115,28 +115,28 @@ def test_properties_go_by_name_and_not_by_order():
     assert shuffled["nd_score"] == pytest.approx(straight["nd_score"], abs=1e-12)
 
 
-def test_truth_that_is_too_far_to_count_is_told():
+def test_truth_beyond_the_range_is_reported():
     found, truths = made(OWN, [0, 1])
-    near, all_of_it = metric_of(OWN, (5.0,) * len(OWN)), metric_of(OWN, (1000.0,) * len(OWN))
+    near, unlimited = metric_of(OWN, (5.0,) * len(OWN)), metric_of(OWN, (1000.0,) * len(OWN))
     predictions, truth = frame_columns(found, truths, names := [f"frame {i}" for i in range(len(truths))])
-    counted = {each: evaluate(predictions, truth, each) for each in (near, all_of_it)}
+    counted = {each: evaluate(predictions, truth, each) for each in (near, unlimited)}
     assert counted[near].tokens == tuple(names)
     far = sum(
         np.hypot(*box[:2]) >= 5 and points != 0
         for frame in truths
         for box, points in zip(frame.boxes, frame.num_points, strict=True)
     )
-    told = {each: [line for line in warnings(counted[each], 9, truth) if "beyond" in line] for each in counted}
+    lines = {each: [line for line in warnings(counted[each], 9, truth) if "beyond" in line] for each in counted}
     named = ", ".join(f"{name} 5 m" for name in OWN[:2])
-    assert told[near] == [
-        f"{far} boxes of the truth are beyond the range of their class and do not count: {named}"
+    assert lines[near] == [
+        f"{far} boxes of the truth are beyond the range of their class and are not evaluated: {named}"
     ]
-    assert told[all_of_it] == []
-    assert len(counted[near].truth) + far == len(counted[all_of_it].truth)
+    assert lines[unlimited] == []
+    assert len(counted[near].truth) + far == len(counted[unlimited].truth)
 
 
-def test_the_benchmarks_sums_over_frames_count_absent_classes_and_attributes():
-    """What studies on simulated frames report beside the metric by centre distance."""
+def test_the_benchmark_on_frames_includes_absent_classes_and_attributes():
+    """Studies on simulated frames report these scores in addition to the centre-distance metric."""
     classes = NUSCENES_METRIC.classes
     found, truths = made(classes, [0, 5])
     official = evaluate(*frame_columns(found, truths)).summary
@@ -147,7 +147,7 @@ def test_the_benchmarks_sums_over_frames_count_absent_classes_and_attributes():
         assert official["label_aps"][name] == own["label_aps"][name]
 
 
-def test_classes_that_make_no_metric_are_refused():
+def test_invalid_classes_are_rejected():
     for classes, ranges, message in (
         ((), (), "classes: got .*expected at least one name"),
         (("a", "b", "a"), (), "classes: got .*each once"),
@@ -158,47 +158,47 @@ def test_classes_that_make_no_metric_are_refused():
             metric_of(classes, ranges)
 
 
-def test_without_truth_there_is_no_score_and_no_interval_breaks(tmp_path):
+def test_without_truth_there_is_no_score_and_intervals_stay_defined(tmp_path):
     found, truths = made(OWN, [0, 1], frames=2)
     empty = [dataclasses.replace(frame, num_points=frame.num_points * 0) for frame in truths]
     evaluation = evaluate_frames(found, empty, metric_of(OWN))
     assert np.isnan(evaluation.summary["mean_ap"])
     assert evaluation.summary["absent_classes"] == list(OWN)
-    assert warnings(evaluation, 3) == ["no ground truth counts here: no score"]
+    assert warnings(evaluation, 3) == ["no ground truth is evaluated: no score"]
     write_evaluation(tmp_path, evaluation, {}, repeats=3)
     write_evaluation_report(tmp_path, title="t", num_samples=2, examples=(), sensor=TINY)
     page = (tmp_path / "report.html").read_text()
     assert "average precision (AP) by matching distance. This is not the nuScenes benchmark" in page
     assert "<td>–</td>" in page
-    # Of two frames one has truth: a set of the other alone says nothing about it.
+    # Only one of two frames has truth. Resampled sets without this frame must not break the interval.
     half = evaluate_frames(found, [truths[0], empty[1]], metric_of(OWN))
     drawn = bootstrap(half, repeats=40)
     assert set(drawn) == {"repeats", "seed", "level", "mean_ap"}
     assert 0 < drawn["mean_ap"]["low"] <= half.summary["mean_ap"] <= drawn["mean_ap"]["high"]
 
 
-def test_an_interval_is_over_the_same_classes_in_every_draw():
-    """One class is found alike in all frames; another, never found, is in two frames alone."""
+def test_all_resampled_sets_are_scored_over_the_same_classes():
+    """One class is detected equally well in all frames; another one occurs in two frames and is never detected."""
     found, truths = made(OWN, [0], frames=12)
     rare = dataclasses.replace(truths[0], labels=np.ones_like(truths[0].labels))
     missed = dataclasses.replace(found[0], valid=np.zeros_like(found[0].valid))
     evaluation = evaluate_frames([*found, missed, missed], [*truths, rare, rare], metric_of(OWN))
     assert [*evaluation.summary["mean_dist_aps"].values()][1] == 0
     drawn = bootstrap(evaluation, repeats=60)["mean_ap"]
-    alone = evaluation.summary["mean_dist_aps"][OWN[0]]
-    assert drawn["high"] < 0.75 * alone  # and not the AP of the one class, in draws without the other
+    ap = evaluation.summary["mean_dist_aps"][OWN[0]]
+    assert drawn["high"] < 0.75 * ap  # sets without the second class must not score the AP of the first class
     other = evaluate_frames([*found, missed, missed], [*truths, rare, rare], metric_of(OWN))
     assert paired_difference(evaluation, other, repeats=20) == (0, 0)
 
 
-def test_groups_of_samples_are_drawn_as_a_whole():
+def test_groups_of_samples_are_drawn_together():
     found, truths = made(OWN, [0, 1], frames=6)
     groups = [0, 0, 1, 1, 2, 2]
     evaluation = evaluate_frames(found, truths, metric_of(OWN))
     drawn = bootstrap(evaluation, repeats=50, groups=groups)["mean_ap"]
     possible = []
-    for chosen in itertools.product(range(3), repeat=3):
-        rows = [row for group in chosen for row in (2 * group, 2 * group + 1)]
+    for drawn_groups in itertools.product(range(3), repeat=3):
+        rows = [row for group in drawn_groups for row in (2 * group, 2 * group + 1)]
         again = evaluate_frames([found[r] for r in rows], [truths[r] for r in rows], metric_of(OWN))
         possible.append(again.summary["mean_ap"])
     assert min(possible) - 1e-9 <= drawn["low"] < drawn["high"] <= max(possible) + 1e-9
@@ -207,7 +207,7 @@ def test_groups_of_samples_are_drawn_as_a_whole():
     assert one["low"] == one["high"] == pytest.approx(evaluation.summary["mean_ap"])
 
 
-def test_scores_are_named_as_what_they_are():
+def test_scores_and_warnings_name_the_metric():
     found, truths = made(OWN, [0, 1])
     evaluation = evaluate_frames(found, truths, metric_of(OWN))
     lines = describe(evaluation, bootstrap(evaluation, repeats=20)).splitlines()
@@ -215,10 +215,10 @@ def test_scores_are_named_as_what_they_are():
     assert lines[1].startswith("trans_err ")
     assert re.fullmatch(r"95% intervals over samples: mAP by centre distance 0\.\d+ to 0\.\d+", lines[2])
     absent = ", ".join(OWN[2:])
-    assert warnings(evaluation, 9) == [f"no ground truth counts of {absent}: left out of the means"]
+    assert warnings(evaluation, 9) == [f"no ground truth is evaluated for {absent}: excluded from the means"]
     invalid = [dataclasses.replace(d, valid=d.valid & False) for d in found]
     nothing = evaluate_frames(invalid, truths, metric_of(OWN))
-    assert "not a single box" in warnings(nothing, 0)[1]
+    assert "contain no boxes" in warnings(nothing, 0)[1]
     assert "within the range" in warnings(nothing, 5)[1]
 
 
@@ -261,7 +261,7 @@ def one_box(label="barrier", score=1, size=1):
         ("ab", [one_box(score=-1)], "frame b: box 0: score: got -1.0, expected a number of at least 0"),
     ],
 )
-def test_bad_detections_are_named(names, boxes, message, tmp_path):
+def test_invalid_detections_are_named(names, boxes, message, tmp_path):
     file = tmp_path / "detections.json"
     entries = [{"name": name, "boxes": boxes if name == "b" else []} for name in names]
     file.write_text(json.dumps({"frames": entries}))
@@ -270,7 +270,7 @@ def test_bad_detections_are_named(names, boxes, message, tmp_path):
 
 
 def test_files_and_report_of_own_classes(tmp_path):
-    """Class names that no file name may hold, a class without truth, and nothing of the benchmark's."""
+    """Uses class names that are invalid file names, and a class without truth."""
     found, truths = made(OWN, [0, 1, 2, 3])
     evaluation = evaluate_frames(found, truths, metric_of(OWN))
     write_evaluation(tmp_path, evaluation, {}, repeats=5)

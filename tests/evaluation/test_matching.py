@@ -1,4 +1,4 @@
-"""Matching: values worked out by hand."""
+"""Check matching against values calculated by hand."""
 
 import numpy as np
 
@@ -14,14 +14,14 @@ def box(x, y, yaw=0.0):
 
 def test_matching_is_one_to_one_by_score_and_nearest_first():
     truth = np.array([box(0, 0), box(1, 0)])
-    found = np.array([box(0.6, 0), box(0.1, 0), box(0.2, 0)])
+    boxes = np.array([box(0.6, 0), box(0.1, 0), box(0.2, 0)])
     scores, labels = np.array([0.5, 0.9, 0.8]), np.zeros(3, int)
-    match = match_frame(found, labels, scores, truth, labels[:2], max_distance_m=1.0)
+    match = match_frame(boxes, labels, scores, truth, labels[:2], max_distance_m=1.0)
     assert dict(zip(match.detection.tolist(), match.truth.tolist(), strict=True)) == {1: 0, 2: 1}
     np.testing.assert_allclose(match.centre_error_m, [0.1, 0.8])
 
 
-def test_matching_is_strict_and_knows_classes_and_headings():
+def test_matching_excludes_the_limit_and_respects_classes_and_headings():
     truth, labels = np.array([box(0, 0)]), np.array([CAR])
     args = np.array([0.9]), truth, labels
     assert len(match_frame(np.array([box(0.5, 0)]), labels, *args, max_distance_m=0.5).truth) == 0
@@ -40,11 +40,11 @@ def test_heading_error():
     np.testing.assert_allclose(error, [np.pi, 0, np.pi - 2.0, 0, 0.1], atol=1e-9)
 
 
-def test_pairs_are_those_of_a_double_loop(monkeypatch):
+def test_pairs_match_a_double_loop(monkeypatch):
     monkeypatch.setattr("fcos_lidar_jax.evaluation.matching._BLOCK", 50)  # many blocks
     rng = np.random.default_rng(0)
     group, true_group = rng.integers(0, 6, 90), rng.integers(0, 6, 40)
-    # On a grid, so that distances are equal and at the limit.
+    # Centres on a grid give equal distances and distances at the limit.
     centres, true_centres = (rng.integers(0, 6, (n, 2)).astype(float) for n in (90, 40))
     pairs = candidate_pairs(group, centres, true_group, true_centres, max_distance_m=3.0)
     expected = []
@@ -55,6 +55,6 @@ def test_pairs_are_those_of_a_double_loop(monkeypatch):
     np.testing.assert_allclose(pairs.distance_m, [e[2] for e in expected])
 
 
-def test_greedy_leaves_a_detection_without_partner_when_all_near_it_are_taken():
+def test_a_detection_without_a_free_truth_stays_unmatched():
     pairs = Pairs(np.array([0, 1, 2, 2]), np.array([0, 0, 0, 2]), np.array([0.1, 0.1, 0.1, 0.2]))
     assert greedy(pairs, 4, 3).tolist() == [0, -1, 2, -1]

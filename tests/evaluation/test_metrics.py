@@ -1,4 +1,4 @@
-"""The detection metric: the official unit-test value, values by hand, plain loops as oracle, empty cases."""
+"""Check the detection metric against the official unit test, values by hand and loops, and in empty cases."""
 
 import random
 
@@ -19,7 +19,7 @@ from fcos_lidar_jax.geometry import rotation_matrix
 
 
 def ranked(found, truth):
-    """One ranking a class, with two metres in place of all four distances."""
+    """Return one ranking per class, with two metres in place of all four distances."""
     return rank(found, truth, heading_period_rad=NUSCENES_METRIC.heading_period_rad, distances_m=(2.0,) * 4)
 
 
@@ -29,7 +29,7 @@ def columns(rows):
 
 
 def official_boxes():
-    """The random boxes of the devkit's own test of the score."""
+    """Random boxes of the devkit's unit test of the score."""
     random.seed(42)
     numpy_draws = np.random.RandomState(42)
     truth, found = [], []
@@ -49,14 +49,14 @@ def official_box(draws, sample, label, attributes, reach):
     return box
 
 
-def test_the_official_value():
+def test_the_score_matches_the_official_unit_test():
     truth, found = official_boxes()
     _, summary = metrics.score(ranked(found, truth), NUSCENES_METRIC)
     assert abs(summary["nd_score"] - 0.08606662159639042) < 1e-12
 
 
 def cars(*rows):
-    """Cars at x with a score; for no car a box of another class."""
+    """Cars at x with a score, or a box of another class if there are no cars."""
     still = {"sample": 0, "size": [2.0] * 3, "rotation": [1, 0, 0, 0], "velocity": [0, 0], "attribute": -1}
     boxes = [{**still, "label": 0, "score": score, "translation": [x, 0, 0]} for x, score in rows]
     return columns(boxes or [{**still, "label": 1, "score": 0.5, "translation": [0, 0, 0]}])
@@ -67,17 +67,17 @@ def cars(*rows):
     [
         ([0], [(0, 0.9)], 1.0),
         ([0, 30], [(0, 0.9)], 0.4 / 0.9),
-        # A false positive first: precision is half the recall; officially ((0.8 * 0.4) / 2) / (0.9 * 0.9), the
-        # triangle of which 90 recalls are these bars.
+        # A false positive ranks first, so precision is half the recall. The official test expects the area of the
+        # triangle, ((0.8 * 0.4) / 2) / (0.9 * 0.9); the sum over 90 recalls approximates it.
         ([0], [(30, 0.9), (0, 0.8)], sum(max(r / 200 - 0.1, 0) for r in range(11, 101)) / 90 / 0.9),
         ([], [(0, 0.9)], 0.0),
         ([0], [], 0.0),
-        # Two metres are two metres away, not nearer.
+        # The matching distance is exclusive.
         ([0], [(2.0, 0.9)], 0.0),
         ([0], [(np.nextafter(2.0, 0), 0.9)], 1.0),
-        # Two boxes on one truth: the curve ends in the second, a false positive, at full recall.
+        # Of two boxes on one truth, the second is a false positive at full recall.
         ([0], [(0, 0.9), (0.1, 0.8)], (89 * 0.9 + 0.4) / 90 / 0.9),
-        # Of equal scores the later box comes first.
+        # The later box wins among equal scores.
         ([0], [(9, 0.5), (0, 0.5)], (89 * 0.9 + 0.4) / 90 / 0.9),
         ([0], [(0, 0.5), (9, 0.5)], sum(max(r / 200 - 0.1, 0) for r in range(11, 101)) / 90 / 0.9),
     ],
@@ -88,14 +88,14 @@ def test_single_class_values(truth, found, expected):
 
 
 @pytest.mark.parametrize(("number", "expected"), [(9, 0.3), (10, 1.0), (11, 1.0)])
-def test_errors_count_from_a_recall_above_a_tenth(number, expected):
+def test_errors_require_a_recall_above_a_tenth(number, expected):
     curves = class_curves(ranked(cars((0.3, 0.9)), cars(*((20.0 * i, -1.0) for i in range(number))))[0])
     assert metrics.mean_error(curves.errors[0], curves.confidence[2]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("near", "expected"), [([-1, 1], 0), ([1, -1], 0.75)])
-def test_of_equal_distances_the_first_truth_is_taken(near, expected):
-    """The truth at 1 is four times as wide as the detection."""
+def test_the_first_truth_wins_among_equal_distances(near, expected):
+    """The truth at x = 1 is four times as wide as the detection."""
     truth = cars(*((x, -1.0) for x in near))
     truth.size[near.index(1), 0] *= 4
     ranking = ranked(cars((0, 0.9)), truth)[0]
@@ -105,14 +105,14 @@ def test_of_equal_distances_the_first_truth_is_taken(near, expected):
 
 @pytest.mark.parametrize("ties", [True, False])
 @pytest.mark.parametrize("seed", range(4))
-def test_every_number_is_that_of_plain_loops(seed, ties):
+def test_all_numbers_match_loops(seed, ties):
     tables, results = make_task(seed, ties=ties, absent=("bus", "traffic_cone") if seed == 3 else ())
     truth = truth_of(tables)
     assert_numbers(evaluate_detections(results, truth), score(results["results"], truth))
 
 
-def test_the_tasks_hold_every_case():
-    """Else the comparisons with the loops and the devkit would show less than they claim."""
+def test_the_tasks_cover_every_case():
+    """Otherwise the comparisons with loops and the devkit prove less than they claim."""
     seen = {"in a rack": 0, "beyond": 0, "no points": 0, "velocity": 0, "attribute": 0, "tie": 0, "empty": 0}
     for seed in range(4):
         tables, results = make_task(seed)
@@ -139,7 +139,7 @@ def task(seed=0, **options):
     return results, truth_of(tables)
 
 
-def test_without_truth_or_predictions_everything_is_defined():
+def test_all_numbers_are_defined_without_truth_or_predictions():
     results, truth = task()
     no_truth = {token: {**sample, "boxes": []} for token, sample in truth.items()}
     nothing = {**results, "results": {token: [] for token in truth}}
@@ -166,7 +166,7 @@ def test_perfect_detections_have_the_highest_score():
     assert summary["nd_score"] == pytest.approx(1)
 
 
-def test_numpy_numbers_and_arrays_are_welcome():
+def test_numpy_numbers_and_arrays_are_accepted():
     results, truth = task()
     for boxes in results["results"].values():
         for box in boxes:
@@ -176,7 +176,7 @@ def test_numpy_numbers_and_arrays_are_welcome():
     assert evaluate_detections(results, truth)["nd_score"] == evaluate_detections(plain, truth)["nd_score"]
 
 
-def test_yaw_and_axes_of_quaternions_of_any_length():
+def test_yaw_and_axes_of_quaternions_of_any_norm():
     rotation = np.random.default_rng(0).normal(0, 2, (20, 4))
     for q, angle, axes in zip(rotation, heading_yaw(rotation), rotation_matrix(rotation), strict=True):
         assert angle == pytest.approx(yaw({"rotation": q}))
@@ -188,7 +188,7 @@ def evaluated(results, truth):
     return evaluate(read_results(results, read.tokens).boxes, read)
 
 
-def test_a_resampled_set_is_scored_as_if_its_samples_had_been_copied():
+def test_a_resampled_set_has_the_score_of_copied_samples():
     results, truth = task(2, ties=False)
     evaluation = evaluated(results, truth)
     copies = np.random.default_rng(0).integers(0, 3, len(truth))
@@ -198,7 +198,7 @@ def test_a_resampled_set_is_scored_as_if_its_samples_had_been_copied():
     assert_numbers(ours, score(found, true))
 
 
-def test_bootstrap_intervals_hold_the_score_and_depend_on_the_seed_alone():
+def test_bootstrap_intervals_contain_the_score_and_depend_only_on_the_seed():
     evaluation = evaluated(*task(1, samples=10, objects=80))
     first, again, other = (bootstrap(evaluation, repeats=60, seed=s) for s in (0, 0, 1))
     assert first == again != other
@@ -206,7 +206,7 @@ def test_bootstrap_intervals_hold_the_score_and_depend_on_the_seed_alone():
         assert first[key]["low"] < evaluation.summary[key] < first[key]["high"]
 
 
-def test_examples_run_from_best_to_worst():
+def test_examples_are_ordered_by_quality():
     evaluation = evaluated(*task(1, samples=10, objects=80))
     chosen = choose_examples(evaluation)
     shown = {}

@@ -20,6 +20,7 @@ from experiments.paper import PAPER
 from experiments.paper_tables import __main__ as all_tables
 from experiments.paper_tables import table1_mrv_rounds, table2_priority, table6_untied_heads, tables
 from experiments.paper_tables import table8_test_submission as table8
+from experiments.paper_tables.cells import add_cell, run_name
 from experiments.paper_tables.grid import run_cell
 from experiments.paper_tables.scales import smoke
 from experiments.paper_tables.tables import Args, Row, Table, run_table
@@ -120,8 +121,9 @@ def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
             return {**super().score(config, seed, folder), "curve": [[10, 0.1], [20, 0.2 + 0.1 * seed]]}
 
     for scale in (Pretended(), Looked(name="looked")):
-        train_table(table6_untied_heads.TABLE, scale=scale, seeds=(0, 1))
-        drawn = tmp_path / "smoke" / "table6_curves.png"
+        folder = tmp_path / scale.name
+        train_table(table6_untied_heads.TABLE, scale=scale, seeds=(0, 1), out=folder, runs=folder)
+        drawn = folder / "smoke" / "table6_curves.png"
         assert drawn.exists() == isinstance(scale, Looked)
     assert drawn.read_bytes().startswith(b"\x89PNG")
 
@@ -261,15 +263,17 @@ def test_table_8_submits_nothing_of_a_run_that_did_not_end(tmp_path, monkeypatch
     monkeypatch.setattr(table8, "make_scale", lambda _: scale)
     other_row = 'No results file: the row "c128 and fade" was not trained with seed 0.'
     assert table8.submission(args) == [other_row]
-    folders = {"results": tmp_path / "smoke" / "cells", "runs": args.runs / "smoke"}
-    run = folders["runs"] / run_cell(config, scale, 0, **folders)["name"]
+    folders = {"results": tmp_path / "smoke", "runs": args.runs / "smoke"}
+    cell = run_cell(config, scale, 0, **folders)
+    run = folders["runs"] / run_name(cell["changes"], 0)
     said = f"No results file: no finished run in {run}, the cell was trained elsewhere."
     assert table8.submission(args) == [said]
     (run / "run.json").write_text('{"steps": 20}')
     for step, ended in (("00000010", False), ("00000020", True)):
         (run / "checkpoints" / step).mkdir(parents=True)
         assert table8.finished(run) is ended
-    next(folders["results"].iterdir()).write_text('{"seed": 0, "diverged": "step 7: loss/l1 is not finite"}')
+    gone = {**cell, "diverged": "step 7: loss/l1 is not finite"}
+    add_cell(folders["results"], scale, gone, locks=tmp_path)
     assert table8.submission(args) == ["No results file: the training of seed 0 diverged."]
 
 

@@ -1,18 +1,13 @@
 """The paper's figures as data, and the experiments that measure those that need no training."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import test_projection
-from toy_frames import ToyFrames
 
 from experiments.benchmarks import latency, loader_speed, module_latency, mrv_figures
 from experiments.paper import PAPER
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.config import CopyPasteConfig, StemConfig
-from fcos_lidar_jax.input_pipeline.database import prepare_database
-from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
 ROWS = {name: table["rows"] for name, table in PAPER["tables"].items()}
@@ -96,20 +91,6 @@ def test_needed_operations_of_the_stem_by_hand():
     assert module_latency.needed_gflop(StemConfig()) == pytest.approx(3 * 2 * types / 1e9)
 
 
-def test_another_order_than_the_papers_is_explained_in_numbers():
-    pieces = [{"size": 6, "out": 6, "dilation": d, "count": 45, "median_ms": 2.0} for d in (1, 3, 6)]
-    alike = {"form": "split", "needed_gflop": 1.0, "executed_gflop": 2.0, "executed_gflop_per_s": 3.0}
-
-    def records(one_group, types, rounds_apart):
-        times = {"one group": one_group, "9 types": types, "9 types, rounds apart": rounds_apart}
-        return {name: {**alike, "pieces": pieces, "median_ms": ms} for name, ms in times.items()}
-
-    assert module_latency.order_differences(records(3.0, 1.0, 2.0)) == []
-    (line,) = module_latency.order_differences(records(3.0, 1.0, 4.0))
-    assert "9 types, rounds apart is faster than one group in the paper" in line
-    assert "2.0 executed as 'split' at 3 GFLOP/s (135 of 6 to 6: 270.0 ms)" in line
-
-
 @pytest.mark.real_data
 @pytest.mark.parametrize(("close", "expected"), REAL_COUNTS)
 def test_counts_of_the_real_cloud(real_data, close, expected):
@@ -127,19 +108,3 @@ def test_counts_of_the_real_cloud(real_data, close, expected):
 def test_the_papers_gpus_need_the_samples_of_class_balanced_epochs():
     """40 epochs of the 123,580 samples that class balance makes of 28,130 keyframes, in 26 hours."""
     assert loader_speed._needs(train_step=False)["nuscenes, the paper's 8 GPUs"] == pytest.approx(52.8, abs=0.05)
-
-
-def test_both_ways_of_feeding_a_device_bring_it_all_samples(tmp_path):
-    config = dataclasses.replace(
-        QUICKSTART, num_sweeps=3, max_points=3000, max_boxes=64, copy_paste=CopyPasteConfig()
-    )
-    config = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, batch_size=2))
-    objects = prepare_database(ToyFrames(4), tmp_path)
-    found = loader_speed.feeds(ToyFrames(4), config, objects, turns=1, samples=4)
-    boxes, lags = 64 * (9 * 4 + 4 + 1), 3 * (1 + sum(config.paste_targets))
-    index = 1 if lags <= 256 else 2
-    plain, packed = 3000 * 21 + boxes, 3000 * (12 + 4 + index) + 4 * lags + 4 + boxes  # intensities of four bytes
-    assert found["plain, main thread"]["bytes_a_batch"] == 2 * plain
-    assert found["packed, background"]["bytes_a_batch"] == 2 * packed
-    assert found["bytes_a_batch_ratio"] == pytest.approx(packed / plain, abs=5e-4)
-    assert found["samples_per_s_ratio"] > 0

@@ -2,14 +2,13 @@
 
 import contextlib
 import dataclasses
-import json
 
 import pytest
 from pretended import Pretended
 
 from experiments.changes import change
 from experiments.paper_tables import grid
-from experiments.paper_tables.cell_names import cell_name
+from experiments.paper_tables.cells import run_name
 from experiments.paper_tables.grid import run_cell, run_cells
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import QUICKSTART
@@ -24,9 +23,8 @@ def test_a_finished_cell_is_never_run_again(tmp_path):
     assert scale.asked == 1
     run_cell(three, scale, 2, **folders)
     assert scale.asked == 2
-    record = json.loads((tmp_path / f"{first['name']}.json").read_text())
-    assert record["config"]["projection"]["num_rounds"] == 3
-    assert {"jax", "git", "device", "seed"} <= set(record)
+    assert first["changes"] == "projection.num_rounds=3"
+    assert {"jax", "git", "device", "seed"} <= set(first)
 
 
 def test_a_cell_names_the_revisions_of_all_who_trained_it(tmp_path, monkeypatch):
@@ -45,14 +43,14 @@ def test_a_cell_names_the_revisions_of_all_who_trained_it(tmp_path, monkeypatch)
     record = run_cell(QUICKSTART, scale, 0, **folders)
     assert record["git"] == "a1, then b2"
     assert record == run_cell(QUICKSTART, scale, 0, **folders)
-    assert record["name"] == cell_name(QUICKSTART, scale.describe(), 0)
+    assert (tmp_path / run_name("base", 0) / "revisions.txt").read_text() == "a1\nb2"
 
 
 def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path, monkeypatch):
     held, free = (change(projection__num_rounds=n)(QUICKSTART) for n in (3, 5))
     scale, folders = Pretended(), {"results": tmp_path / "cells", "runs": tmp_path}
     with contextlib.ExitStack() as other:
-        assert other.enter_context(file_lock(tmp_path / f"{cell_name(held, scale.describe(), 0)}.lock"))
+        assert other.enter_context(file_lock(tmp_path / f"{run_name('projection.num_rounds=3', 0)}.lock"))
         assert run_cell(held, scale, 0, **folders) is None
         # The other ends while this one waits: its cell is free again.
         monkeypatch.setattr(grid.time, "sleep", lambda _: other.close())

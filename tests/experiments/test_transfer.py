@@ -13,15 +13,13 @@ from refusal import refused
 from tiny_run import TINY_CONFIG, untrained
 
 from experiments.real_frames import SPANS_M, scores_by_range, within
-from experiments.studies import compact_additions, model_card, shipped_weights, transfer
+from experiments.studies import model_card, shipped_weights, transfer
 from experiments.studies.shipped_weights import earlier_trainings, half_precision
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.checkpoint import CheckpointError
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
-from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Detections
 
 CONFIG = dataclasses.replace(TINY_CONFIG, sensor="tiny")
@@ -228,45 +226,13 @@ def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
         load_checkpoint(package / "hdl32e")
 
 
-def test_compact_is_compared_with_trainings_that_differ_in_one_addition(tmp_path, monkeypatch):
-    model = dataclasses.replace(CONFIG.model, regression_axes="ray", circular_width=True)
-    base = dataclasses.replace(CONFIG, model=model)
-    made = {name: changed(base) for name, changed in compact_additions.VARIANTS.items()}
-    assert made.pop("compact") == base
-    fields = ("regression_axes", "circular_width", "quality")
-    differing = [
-        [f for f in fields if getattr(base.model, f, None) != getattr(other.model, f, None)]
-        + [f for f in fields if getattr(base.loss, f, None) != getattr(other.loss, f, None)]
-        for other in made.values()
-    ]
-    assert differing == [[field] for field in fields]
-
-    chosen = {name: compact_additions.VARIANTS[name] for name in ("compact", "zero padding")}
-    monkeypatch.setattr(compact_additions, "VARIANTS", chosen)
-    monkeypatch.setitem(shipped_weights.CONFIGS, "hdl32e", base)
-    args = compact_additions.Args(steps=2, test_frames=2, repeats=1, work=tmp_path)
-    record = compact_additions.measure(args)
-    for name in chosen:
-        run, own = tmp_path / f"{name.replace(' ', '_')}_2_0", record[name]
-        last = [r["positive_iou"] for r in read_metrics(run) if r["step"] == 2]
-        assert own["IoU of the last positives"] == round(last[0], 4)
-        assert own["network, ms"] > 0
-        assert own["parameters"] == record["compact"]["parameters"]
-    config = load_checkpoint(find_checkpoint(tmp_path / "zero_padding_2_0")).config
-    assert config == chosen["zero padding"](base) != base
-    own = record["zero padding"]
-    assert own["difference"] == pytest.approx(own["mAP"] - record["compact"]["mAP"], abs=2e-4)
-    assert own["interval"][0] <= own["difference"] <= own["interval"][1]
-
-
-def test_recall_towards_the_seam_counts_objects_on_both_of_its_sides():
-    degrees, none = np.radians([179.0, -170.0, 0.0, 160.0]), np.zeros((0, 9), np.float32)
-    boxes = np.zeros((4, 9), np.float32)
-    boxes[:, 0], boxes[:, 1] = 10 * np.cos(degrees), 10 * np.sin(degrees)
-    frame = Frame(np.zeros((0, 5), np.float32), boxes, np.array([0, 1, 0, 0]), np.ones(4, np.int32))
-    near = boxes + np.array([1.9] + 8 * [0.0], np.float32)  # of the first, the second's class being another
-    found = Detections(near, np.ones(4), np.zeros(4, int), np.array([True, True, False, True]), np.int32(0))
-    assert compact_additions.recall_towards(np.pi, [found], [frame]) == (0.5, 2)
-    assert compact_additions.recall_towards(0.0, [found], [frame]) == (0.0, 1)
-    empty = Frame(np.zeros((0, 5), np.float32), none, np.zeros(0, int), np.zeros(0, np.int32))
-    assert compact_additions.recall_towards(0.0, [found], [empty])[1] == 0
+def test_scores_by_range_see_what_lies_there():
+    boxes = np.array([[10, 0, 0, 4, 2, 1.5, 0, 0, 0], [30, 0, 0, 4, 2, 1.5, 0, 0, 0]], np.float32)
+    frame = Frame(np.zeros((0, 5), np.float32), boxes, np.zeros(2, np.int32), np.full(2, 9, np.int32))
+    none = np.zeros(0)
+    found = Detections(boxes[:1], np.ones(1), np.zeros(1, int), np.ones(1, bool), none)
+    scores = scores_by_range([found], [frame])
+    assert scores["0-20 m"]["AP"] == {"car": pytest.approx(1, abs=1e-6)}
+    assert scores["20-40 m"]["AP"] == {"car": 0}
+    assert scores["all"]["truths"] == {"car": 2}
+    assert 0.3 < scores["all"]["AP"]["car"] < 0.6

@@ -1,4 +1,4 @@
-"""Synthetic data sets: the official layout, exact annotations, the same bytes whatever happens on the way."""
+"""Check synthetic data sets: official layout, exact annotations, and identical bytes after interruptions."""
 
 import itertools
 import json
@@ -24,7 +24,7 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, sensor_to_json
 
 VERSION = "v1.0-synthetic"
 ORDER = ["--scenes", "3", "--keyframes", "2", "--sensor", "tiny", "--seed", "4"]
-KEYS = {  # of the official tables, where the devkit and others look for them
+KEYS = {  # keys of the official tables
     "attribute": "token name description",
     "calibrated_sensor": "token sensor_token translation rotation camera_intrinsic",
     "category": "token name description index",
@@ -67,12 +67,12 @@ def made(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory) -> Path:
-    """Two scenes with the full sensor, long enough for ten sweeps."""
+    """A data set of two scenes with the full sensor, long enough for ten sweeps."""
     order = ["--scenes", "2", "--keyframes", "4", "--sensor", "nuscenes_hdl32e", "--seed", "10"]
     return synthesize(tmp_path_factory.mktemp("street") / "data", *order)
 
 
-def test_layout_is_the_official_one(made):
+def test_the_layout_is_official(made):
     found = tables(made)
     assert set(found) == {*KEYS, "splits"}
     for name, keys in KEYS.items():
@@ -92,7 +92,7 @@ def test_layout_is_the_official_one(made):
     assert (made / found["map"][0]["filename"]).is_file()
 
 
-def test_tokens_and_chains_refer_to_what_is_there(made):
+def test_tokens_and_chains_refer_to_existing_rows(made):
     found = tables(made)
     by_token = {name: {row["token"]: row for row in rows} for name, rows in found.items() if name != "splits"}
     for name, rows in by_token.items():
@@ -113,8 +113,8 @@ def test_tokens_and_chains_refer_to_what_is_there(made):
         assert chain[0]["num_lidar_pts"] > 0 < chain[-1]["num_lidar_pts"]
 
 
-def test_points_inside_every_box_number_exactly_what_is_annotated(street):
-    """By the quaternions of the files, the cloud in the global frame; no-returns lie about the sensor."""
+def test_annotated_point_counts_are_exact(street):
+    """Counts points in the global frame with the quaternions of the files."""
     found, data = tables(street), NuScenes(street, VERSION)
     counted = 0
     for sample in data.sample_tokens:
@@ -130,7 +130,7 @@ def test_points_inside_every_box_number_exactly_what_is_annotated(street):
     assert sum(row["num_lidar_pts"] for row in found["sample_annotation"]) > 10_000
 
 
-def test_our_reader_sees_all_boxes_with_velocities_by_the_central_rule(street):
+def test_the_reader_finds_all_boxes_with_velocities_by_central_differences(street):
     data, found = NuScenes(street, VERSION), tables(street)
     rows = {row["token"]: row for row in found["sample_annotation"]}
     attribute_of = {row["token"]: row["name"] for row in found["attribute"]}
@@ -152,7 +152,7 @@ def test_our_reader_sees_all_boxes_with_velocities_by_the_central_rule(street):
             speeds.append(np.hypot(*box[7:9]))
             if attribute in ("vehicle.moving", "pedestrian.moving", "cycle.with_rider"):
                 assert speeds[-1] > 0.05
-            elif attribute != "vehicle.stopped":  # which may have come to rest just now
+            elif attribute != "vehicle.stopped":  # stopped vehicles may have stopped only just now
                 assert speeds[-1] < 0.01, (name, attribute)
             assert (attribute == "") == (name in ("traffic_cone", "barrier"))
             kinds.add(attribute)
@@ -162,8 +162,8 @@ def test_our_reader_sees_all_boxes_with_velocities_by_the_central_rule(street):
     assert {row["visibility_token"] for row in found["sample_annotation"]} == {"1", "2", "3", "4"}
 
 
-def test_old_points_stay_in_the_boxes_of_what_stands_and_leave_those_of_what_moves(street):
-    """Points of the tenth sweep against those of the first, off the ground."""
+def test_old_points_stay_in_boxes_of_static_objects_and_leave_boxes_of_moving_objects(street):
+    """Compares points above the ground of the tenth and the first sweep."""
     data = NuScenes(street, VERSION)
     stands, unposed, moves = [], [], []
     for scene in ("train", "val"):
@@ -173,12 +173,12 @@ def test_old_points_stay_in_the_boxes_of_what_stands_and_leave_those_of_what_mov
             newest, oldest = (cloud[cloud[:, 4] == lag, :3] for lag in (0, cloud[:, 4].max()))
             motion = np.linalg.inv(data.sensor_to_global(last)) @ data.sensor_to_global(token)
             assert np.linalg.norm(motion[:3, 3]) > 1
-            wrong = oldest @ motion[:3, :3].T + motion[:3, 3]  # about undoes what the reader composed
+            wrong = oldest @ motion[:3, :3].T + motion[:3, 3]  # approximately undoes the reader's transformation
             truth = data.boxes(token)
             for box in truth.boxes[truth.num_lidar_pts > 50]:
                 box = box + np.array([0, 0, 0.3, 0.2, 0.2, -0.6, 0, 0, 0])
                 speed = np.hypot(*box[7:9])
-                if speed > 4:  # the part that it has just driven into
+                if speed > 4:  # keep the part of the box that the object has just entered
                     gone = min(0.45 * speed, box[3])
                     box[:2] += (box[3] - gone) / 2 * box[7:9] / speed
                     box[3] = gone
@@ -194,19 +194,19 @@ def test_old_points_stay_in_the_boxes_of_what_stands_and_leave_those_of_what_mov
     assert np.median(moves) < 0.4 * np.median(stands), moves
 
 
-def test_workers_and_the_number_of_scenes_change_no_byte_and_another_seed_changes_them_all(made, tmp_path):
-    wanted = contents(made)
-    assert contents(synthesize(tmp_path / "again", "--workers", "2")) == wanted
+def test_bytes_depend_on_the_seed_but_not_on_workers_or_the_number_of_scenes(made, tmp_path):
+    expected = contents(made)
+    assert contents(synthesize(tmp_path / "again", "--workers", "2")) == expected
     other = contents(synthesize(tmp_path / "other", "--seed", "5"))
-    assert all(other[name] != wanted[name] for name in wanted if name in other and name.endswith(".bin"))
+    assert all(other[name] != expected[name] for name in expected if name in other and name.endswith(".bin"))
     assert tables(tmp_path / "other")["sample"] != tables(made)["sample"]
     alone = contents(synthesize(tmp_path / "one", "--scenes", "1"))
     points = {name: data for name, data in alone.items() if name.endswith(".bin")}
     assert len(points) == 11
-    assert points.items() <= wanted.items()
+    assert points.items() <= expected.items()
 
 
-def test_a_second_run_changes_nothing_and_says_so(made, capsys):
+def test_a_second_run_reports_that_the_data_set_is_complete(made, capsys):
     stamps = {file: file.stat().st_mtime_ns for file in made.rglob("*")}
     synthesize(made)
     printed = capsys.readouterr()
@@ -226,7 +226,7 @@ def test_a_damaged_data_set_is_not_called_finished(made, tmp_path, capsys, damag
     else:
         content = file.read_bytes()
         file.write_bytes(content[:-20] if damage == "cut" else content.replace(b"0", b"1", 1))
-    found = "nothing" if "lost" in damage else "another content"
+    found = "nothing" if "lost" in damage else "other content"
     assert f"{file}: found {found}, expected the file as written" in refusal(capsys, root)
 
 
@@ -251,7 +251,7 @@ def written(root):
     folders = [Path(root, kind, "LIDAR_TOP") for kind in ("samples", "sweeps")]
     return sum(len(os.listdir(folder)) for folder in folders if folder.is_dir())
 for trial, moments in enumerate([(1, 14), (8, 22), (33, 33)]):
-    for moment in moments:  # files that there are when it is killed
+    for moment in moments:  # number of files at which the process is killed
         child = os.fork()
         if not child:
             os._exit(main([*command, "--out", f"{out}-{trial}"]))
@@ -262,21 +262,21 @@ for trial, moments in enumerate([(1, 14), (8, 22), (33, 33)]):
 """
 
 
-def test_killed_runs_end_in_the_same_bytes(made, tmp_path):
-    wanted = contents(made)
-    # Forked from a process that has imported everything, so that the kills hit the work.
+def test_killed_runs_resume_to_the_same_bytes(made, tmp_path):
+    expected = contents(made)
+    # Fork from a process that has imported everything, so that the kills hit the actual work.
     killed = [sys.executable, "-c", KILLED, str(tmp_path / "killed"), *command(tmp_path / "none")]
     subprocess.run(killed, check=True, capture_output=True)
     states = set()
     for trial in range(3):
         root = tmp_path / f"killed-{trial}"
         states.add(len(list(root.rglob("*.bin"))))
-        assert not (root / VERSION).is_dir() or contents(root) == wanted  # tables only when all is there
-        assert contents(synthesize(root)) == wanted
-    assert len(states) == 3  # the kills came at different moments
+        assert not (root / VERSION).is_dir() or contents(root) == expected  # tables appear last
+        assert contents(synthesize(root)) == expected
+    assert len(states) == 3  # the kills hit different states
 
 
-def test_workers_die_with_the_command_and_the_rest_is_done_later(made, tmp_path):
+def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, tmp_path):
     root = tmp_path / "data"
     started = [sys.executable, "-m", "fcos_lidar_jax", *command(root, "--workers", "2")]
     with subprocess.Popen(started, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
@@ -288,12 +288,12 @@ def test_workers_die_with_the_command_and_the_rest_is_done_later(made, tmp_path)
     before = contents(root)
     time.sleep(0.5)
     assert before
-    assert contents(root) == before  # nobody writes any more
+    assert contents(root) == before  # no process writes any more
     assert contents(synthesize(root)) == contents(made)
 
 
 def refusal(capsys, out: Path, *more: str) -> str:
-    """The one line of a command that fails."""
+    """Run a command that must fail and return its single line of output."""
     assert cli.main(command(out, *more)) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()
     return line
@@ -313,30 +313,30 @@ def refusal(capsys, out: Path, *more: str) -> str:
         (["--sensor", "none.json"], "none.json: no such sensor file, and no preset"),
     ],
 )
-def test_bad_options_get_one_line(options, message, tmp_path, capsys):
+def test_invalid_options_get_one_line(options, message, tmp_path, capsys):
     assert message in refusal(capsys, tmp_path / "new", *options)
     assert not (tmp_path / "new").exists()
 
 
-def test_another_order_in_the_same_folder_is_refused(made, tmp_path, capsys):
+def test_another_specification_in_the_same_folder_is_rejected(made, tmp_path, capsys):
     before = contents(made)
     changed = {"seed": ("5", "4"), "scenes": ("4", "3"), "keyframes": ("4", "2"), "version": ("v2", VERSION)}
     changed |= {"sensor": (NUSCENES_HDL32E.name, "tiny"), "rolling_shutter": ("False", "True")}
     changed |= {"streets": ("plain", "city")}
     for name, (got, begun) in changed.items():
         line = refusal(capsys, made, *(["--no-rolling-shutter"] if got == "False" else [f"--{name}", got]))
-        assert f"{name}: got {got}, but the data set there was begun with {begun}" in line
+        assert f"{name}: got {got}, expected {begun} as in the data set begun there" in line
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
     line = refusal(capsys, made, "--sensor", str(tmp_path / "near.json"))
-    assert f"sensor.limit_xy_m: got 9.0, but the data set there was begun with {TINY.limit_xy_m}" in line
+    assert f"sensor.limit_xy_m: got 9.0, expected {TINY.limit_xy_m} as in the data set begun there" in line
     assert contents(made) == before
 
 
-def test_folders_of_others_are_refused(made, tmp_path, capsys):
+def test_folders_with_other_contents_are_rejected(made, tmp_path, capsys):
     own = tmp_path / "own"
     own.mkdir()
     (own / "thesis.txt").write_text("mine")
-    assert "not empty, and not begun by this command" in refusal(capsys, own)
+    assert "found other files, expected an empty folder" in refusal(capsys, own)
     assert contents(own) == {"thesis.txt": b"mine"}
     assert "thesis.txt: found a file, expected a folder" in refusal(capsys, own / "thesis.txt")
     copy = tmp_path / "copy"
@@ -346,7 +346,7 @@ def test_folders_of_others_are_refused(made, tmp_path, capsys):
         assert message in refusal(capsys, copy)
 
 
-def test_a_full_disk_gets_one_line_and_the_rest_is_done_later(made, tmp_path, capsys):
+def test_a_full_disk_gets_one_line_and_a_later_run_completes_the_work(made, tmp_path, capsys):
     mount = ["mount", "-t", "tmpfs", "-o", "size=1500k", "t", str(tmp_path)]
     if os.geteuid() or subprocess.run(mount, check=False, stderr=subprocess.DEVNULL).returncode:
         pytest.skip("no right to mount a small tmpfs")
@@ -365,7 +365,7 @@ def test_a_full_disk_gets_one_line_and_the_rest_is_done_later(made, tmp_path, ca
     assert whole == contents(made)
 
 
-def test_a_rolling_shutter_gives_other_points_and_exact_counts(tmp_path):
+def test_a_rolling_shutter_changes_points_and_keeps_counts_exact(tmp_path):
     still = contents(synthesize(tmp_path / "still", "--scenes", "1", "--no-rolling-shutter"))
     rolling = contents(synthesize(tmp_path / "rolling", "--scenes", "1"))
     assert still.keys() == rolling.keys()

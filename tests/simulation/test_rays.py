@@ -1,4 +1,4 @@
-"""The ray-caster against a slow oracle: marching through level functions written from the shapes' definitions."""
+"""Compare the ray caster with ray marching through level functions of the shapes."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ SLACK_M = 4e-3
 
 
 def level(solid, points):
-    """How far out points [n, 3] are, of the surface's 1; by the definition of each kind, in float64."""
+    """Level function of a solid at points [n, 3] in float64: 1 on the surface, smaller inside."""
     offset = points - solid["center"]
     c, s = np.cos(solid["yaw"]), np.sin(solid["yaw"])
     along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
@@ -32,7 +32,7 @@ def level(solid, points):
 
 
 def ground_height(ground, x, y):
-    """Planes, the highest of them, and a kerb's height more off the two carriageways."""
+    """Height of the highest plane, plus the kerb off the two carriageways."""
     plane = np.max([a * x + b * y + c for a, b, c in ground.planes], axis=0)
     road = (np.abs(y) < ground.half_width) | (np.abs(x - ground.crossing_x) < ground.crossing_half_width)
     return plane + np.where(road, 0, ground.kerb)
@@ -46,18 +46,18 @@ def random_solids(rng, number):
     solids["yaw"] = rng.uniform(-4, 4, number)
     solids["lean"] = rng.choice([0, 0.3, -0.6], number)
     solids["taper"] = rng.choice([1.0, 0.8, 0.3, 1.2], (number, 2))
-    flat = rng.random(number) < 0.3  # so that rays are steeper than cones
+    flat = rng.random(number) < 0.3  # flat cones, so that some rays are steeper
     solids["half"][flat] *= [2, 2, 0.2]
     return solids
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("ground", [FAR_BELOW, HILLS], ids=["air", "hills"])
-def test_rays_end_where_marching_first_meets_something(seed, ground):
+def test_first_hits_match_ray_marching(seed, ground):
     rng = np.random.default_rng(seed)
     solids, eye = random_solids(rng, 25), np.array([0.3, -0.4, 0.2])
     turn = Rotation.from_euler("XZ", [0.05, 1.0]).as_matrix()
-    # More than a full turn, and lasers that fire one after the other.
+    # The fan spans more than a full turn, and its lasers fire one after another.
     fan = Fan(np.radians(np.linspace(50, -50, 12)), 90, 2.9, 2 * np.pi / 90 * 1.02, np.linspace(0, 0.8, 12))
     hits = cast(fan, turn, eye, solids, ground, rng)
     directions = turn @ fan.directions.astype(np.float64)
@@ -75,7 +75,7 @@ def test_rays_end_where_marching_first_meets_something(seed, ground):
         met += 1
         end = (eye + reach * d)[None]
         if winner >= 0:
-            # In metres: a level is at least the distance over the largest half extent, leaning included.
+            # Convert the level to metres: it changes by at least distance / (largest half extent with lean).
             assert abs(level(solids[winner], end)[0] - 1) < SLACK_M / solids["half"][winner].min() * 2
         else:
             drop = end[0, 2] - ground_height(ground, *end.T[:2])[0]
@@ -86,7 +86,7 @@ def test_rays_end_where_marching_first_meets_something(seed, ground):
     assert met > 30
 
 
-def test_every_kind_is_met_and_the_nearest_wins():
+def test_rays_hit_every_kind_and_the_nearest_solid():
     solids = make_solids(BOX, [[6 + 4 * k, 0, 0] for k in range(4)], [1, 1, 1])
     solids["kind"] = BOX, DRUM, BALL, WHEEL
     straight = Fan(np.array([0.0]), 1, 0.0, 1e-3, np.zeros(1))
@@ -100,7 +100,7 @@ def test_every_kind_is_met_and_the_nearest_wins():
 
 
 @pytest.mark.parametrize("kind", [BOX, DRUM, BALL, WHEEL])
-def test_incidence_is_that_of_the_level_functions_gradient(kind):
+def test_incidence_matches_the_gradient_of_the_level_function(kind):
     rng = np.random.default_rng(kind)
     checked = 0
     for solid in (random_solids(rng, 1) for _ in range(12)):
@@ -123,7 +123,7 @@ def test_incidence_is_that_of_the_level_functions_gradient(kind):
     assert checked > 50
 
 
-def test_porous_solids_let_rays_through_by_their_depth():
+def test_porous_solids_stop_rays_according_to_depth():
     ball = make_solids(BALL, [10, 0, 0], 2.0, density=0.4)
     fan = Fan(np.zeros(1), 4000, 1e-3, 1e-9, np.zeros(1))
     hits = cast(fan, np.eye(3), np.zeros(3), ball, FAR_BELOW, np.random.default_rng(0))
@@ -134,13 +134,13 @@ def test_porous_solids_let_rays_through_by_their_depth():
     assert hits.range_m[stopped].max() <= 12 + 1e-3
 
 
-def test_reachable_counts_rays_that_others_stop():
-    """A post before a wall takes rays that would reach it."""
+def test_reachable_includes_occluded_rays():
+    """A post in front of a wall stops rays that would reach the wall."""
     solids = make_solids(BOX, [[20, 0, 0], [10, 1, 0]], [[0.1, 4, 4], [0.1, 1, 4]], owner=np.array([0, 1]))
     fan = Fan(np.zeros(1), 400, 0.35, 0.7 / 400, np.zeros(1))
     hits = cast(fan, np.eye(3), np.zeros(3), solids, FAR_BELOW, np.random.default_rng(0))
     owners, seen = np.bincount(hits.reachable // 400, minlength=2), (hits.solid == 0).sum()
-    # In steps between rays; behind the post's far edge, for its near one is straight ahead.
+    # Numbers of rays. The post hides the wall from straight ahead to its outer edge.
     wide, behind = 2 * np.arctan2(4, 19.9) / (0.7 / 400), np.arctan2(2, 9.9) / (0.7 / 400)
     np.testing.assert_allclose(owners, [wide, behind], atol=1.01)
     assert seen == pytest.approx(wide - behind, abs=1.51)

@@ -1,4 +1,4 @@
-"""Simulated frames: the same bytes for the same seed, exact counts, one cell a beam, all classes, fused sweeps."""
+"""Check simulated frames: reproducible bytes, exact counts, one cell per ray, all classes, fused sweeps."""
 
 import numpy as np
 import oracles
@@ -24,7 +24,7 @@ def assert_equal(a, b):
 
 
 @pytest.mark.parametrize("sensor", [TINY, NUSCENES_HDL32E, WAYMO_TOP, ARGOVERSE2], ids=lambda s: s.name)
-def test_frames_repeat_count_and_fill_one_cell_a_beam(sensor):
+def test_frames_are_reproducible_with_exact_counts_and_one_cell_per_ray(sensor):
     frame = make_frame(11, sensor)
     make_frame(12, sensor)
     assert_equal(frame, make_frame(11, sensor))
@@ -35,12 +35,12 @@ def test_frames_repeat_count_and_fill_one_cell_a_beam(sensor):
     assert inside == frame.num_points[box] > 20
     cells = np.asarray(image_cells(frame.points, np.ones(len(frame.points), bool), sensor)[0])
     seen = cells[cells < sensor.num_rows * sensor.num_columns]
-    # A turn is slightly more than a full one, and lasers fire one after the other: a few columns are met twice.
+    # A scan spans slightly more than a turn, and lasers fire one after another: a few cells get two points.
     assert len(np.unique(seen)) > 0.95 * len(seen)
     assert len(seen) > 0.3 * sensor.num_rows * sensor.num_columns
 
 
-def test_frames_are_level_and_show_all_classes_apart_from_each_other():
+def test_frames_are_level_with_separate_objects_of_all_classes():
     labels, moving = [], 0
     for seed in range(40):
         frame = make_frame(seed, TINY)
@@ -54,14 +54,14 @@ def test_frames_are_level_and_show_all_classes_apart_from_each_other():
         moving += (speed > 0.5).sum()
         bottom = boxes[:, 2] - boxes[:, 5] / 2
         ground = np.median(frame.points[frame.points[:, 2] < -1.5, 2])
-        assert ((bottom > ground - 0.15) & (bottom < ground + 0.2)).all()  # on the road or on the pavement
+        assert ((bottom > ground - 0.15) & (bottom < ground + 0.2)).all()  # on the road or the pavement
     counts = np.bincount(labels, minlength=10)
     assert counts.min() >= 15, dict(zip(NUSCENES_CLASSES, counts, strict=True))
     assert counts.max() < 4 * counts.min(), dict(zip(NUSCENES_CLASSES, counts, strict=True))
     assert 0.1 < moving / len(labels) < 0.6
 
 
-def test_batches_pad_and_refuse_to_drop():
+def test_batches_are_padded_and_never_truncated():
     frames = [make_frame(i, TINY) for i in range(2)]
     batch = make_batch(frames, max_points=4096, max_boxes=16)
     for i, frame in enumerate(frames):
@@ -73,18 +73,18 @@ def test_batches_pad_and_refuse_to_drop():
         make_batch(frames, max_points=4096, max_boxes=2)
 
 
-def test_simulated_frames_are_near_and_annotated_where_enough_points_show():
-    near, all_of_them = SimulatedFrames(TINY, 6, reach_m=8.0), SimulatedFrames(TINY, 6, reach_m=8.0, min_points=1)
+def test_simulated_frames_annotate_near_objects_with_enough_points():
+    near, complete = SimulatedFrames(TINY, 6, reach_m=8.0), SimulatedFrames(TINY, 6, reach_m=8.0, min_points=1)
     hidden = 0
     for i in range(6):
-        frame, whole = near.frame(i), all_of_them.frame(i)
+        frame, whole = near.frame(i), complete.frame(i)
         np.testing.assert_array_equal(frame.points, whole.points)
         np.testing.assert_array_equal(frame.boxes, whole.boxes[whole.num_points >= 5])
         np.testing.assert_array_equal(near.labels(i), frame.labels)
         hidden += len(whole.boxes) - len(frame.boxes)
         assert not (np.abs(frame.points[:, :2]) < 1).all(axis=1).any()  # the ego vehicle
     assert hidden > 0
-    sets = all_of_them, SimulatedFrames(TINY, 6, reach_m=20.0, min_points=1)
+    sets = complete, SimulatedFrames(TINY, 6, reach_m=20.0, min_points=1)
     boxes = (np.concatenate([frames.frame(i).boxes for i in range(6)]) for frames in sets)
     distance, far = (np.median(np.hypot(*b[:, :2].T)) for b in boxes)
     assert distance < 0.8 * far
@@ -95,7 +95,7 @@ def fast_frames() -> list[Frame]:
     return [make_frame(seed, SHORT_RANGE, **FUSED) for seed in range(12)]
 
 
-def test_fused_frames_repeat_and_are_annotated_as_the_current_sweep_shows(fast_frames):
+def test_fused_frames_are_reproducible_and_annotated_by_the_current_sweep(fast_frames):
     assert_equal(fast_frames[3], make_frame(3, SHORT_RANGE, **FUSED))
     for frame in fast_frames:
         lags = frame.points[:, 4]
@@ -113,7 +113,7 @@ def test_fused_frames_repeat_and_are_annotated_as_the_current_sweep_shows(fast_f
         make_frame(0, TINY, num_sweeps=0)
 
 
-def test_most_of_fast_traffic_moves_and_moves_fast(fast_frames):
+def test_most_objects_in_fast_traffic_move_fast(fast_frames):
     boxes, labels = (np.concatenate([getattr(f, name) for f in fast_frames]) for name in ("boxes", "labels"))
     names, speed = np.array(NUSCENES_CLASSES)[labels], np.hypot(boxes[:, 7], boxes[:, 8])
     moving = speed > 0.5
@@ -128,12 +128,14 @@ def test_most_of_fast_traffic_moves_and_moves_fast(fast_frames):
     assert speed[driven].max() <= 20.01
     assert moving[np.isin(names, ["pedestrian", "motorcycle", "bicycle"])].all()
     assert not moving[np.isin(names, ["traffic_cone", "barrier"])].any()
-    assert min((boxes[driven, 8] > 0).sum(), (boxes[driven, 8] < 0).sum()) > 5  # same way, and oncoming
+    assert min((boxes[driven, 8] > 0).sum(), (boxes[driven, 8] < 0).sum()) > 5  # same direction and oncoming
 
 
-def test_moving_objects_trail_behind_their_boxes_by_speed_times_lag_and_the_rest_stays(fast_frames):
-    """Boxes put back by velocity x lag hold more of a sweep's points than a twentieth of a second to either side;
-    those of what stands hold more than half a metre before and behind."""
+def test_old_points_of_moving_objects_trail_by_velocity_times_lag(fast_frames):
+    """A moving box shifted back by velocity x lag contains more points than with a lag of 0.05 s more or less.
+
+    A static box contains more points than when it is shifted by half a metre.
+    """
     trails, stays = np.zeros((10, 3), int), np.zeros((10, 3), int)
     around = np.array([-1.0, 0, 1])
     for frame in fast_frames:
@@ -151,7 +153,7 @@ def test_moving_objects_trail_behind_their_boxes_by_speed_times_lag_and_the_rest
         np.testing.assert_array_equal(counts.argmax(axis=1), np.ones(10))
 
 
-def test_sets_of_fused_frames_drop_close_points_in_each_sweeps_own_frame():
+def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep():
     frames = SimulatedFrames(SHORT_RANGE, 3, 5, num_sweeps=10, fast_traffic=True)
     passed = 0
     for i in range(3):
@@ -162,8 +164,8 @@ def test_sets_of_fused_frames_drop_close_points_in_each_sweeps_own_frame():
         np.testing.assert_array_equal(frame.num_points, whole.num_points[shown])
         np.testing.assert_array_equal(frames.labels(i), whole.labels[shown])
         dropped = [(whole.points[:, 4] == lag).sum() - (frame.points[:, 4] == lag).sum() for lag in LAGS]
-        assert 0 < 0.9 * max(dropped) < min(dropped)  # the ego vehicle looks the same from each sweep
+        assert 0 < 0.9 * max(dropped) < min(dropped)  # each sweep sees the same ego vehicle
         close, old = (np.abs(frame.points[:, :2]) < 1).all(axis=1), frame.points[:, 4] > 0
         assert not (close & ~old).any()
-        passed += (close & old).sum()  # what stood before the ego vehicle is under it now
+        passed += (close & old).sum()  # points ahead of the ego vehicle that it has since reached
     assert passed > 20

@@ -1,4 +1,4 @@
-"""Varied streets: each randomisation against a closed form or a count, and plain streets as they were."""
+"""Check each randomisation of varied streets, and that plain streets are unchanged."""
 
 import dataclasses
 
@@ -36,24 +36,24 @@ def wave(x):
 
 
 def wavy_ground() -> Ground:
-    """One plane with waves along x, a crowned street, kerbs."""
+    """Ground of one plane with waves along x, a crowned street and kerbs."""
     grid = np.arange(256) * 0.5
     relief = Relief(np.tile(wave(grid)[:, None], (1, 256)).astype(np.float32))
     return Ground(PLANE, 6, 900, 5, 0.13, 3, (0.1, 0.2, 0.3), crown=CROWN_M, relief=relief)
 
 
 def wavy_height(x, y):
-    """What :func:`wavy_ground` is meant to be, in float64."""
+    """Expected height of :func:`wavy_ground` in float64."""
     side = np.minimum(np.abs(y) / 6, 1)
     return 0.01 * x - 0.02 * y - 1.8 + wave(x) - CROWN_M * side**2 + 0.13 * (np.abs(y) >= 6)
 
 
-def test_heights_of_uneven_ground_are_the_sum_of_its_parts():
+def test_the_height_of_uneven_ground_is_the_sum_of_its_parts():
     x, y = default_rng(0).uniform(-150, 150, (2, 2000))
     np.testing.assert_allclose(wavy_ground().height(x, y), wavy_height(x, y), atol=2e-4)
 
 
-def test_rays_meet_uneven_ground_where_marching_first_finds_it():
+def test_hits_on_uneven_ground_match_ray_marching():
     rng, eye = default_rng(1), np.array([0.3, -0.4, 0.2])
     azimuth, falling = rng.uniform(-np.pi, np.pi, 400), np.radians(rng.uniform(-30, 3, 400))
     d = np.stack([np.cos(falling) * np.cos(azimuth), np.cos(falling) * np.sin(azimuth), np.sin(falling)])
@@ -65,7 +65,7 @@ def test_rays_meet_uneven_ground_where_marching_first_finds_it():
         if not len(under):
             assert found[ray] > 100
             continue
-        # A ray that only just passes a crest or not may end on either side of it.
+        # A ray that grazes a crest may end on either side of it.
         end = eye + d[:, ray].astype(float) * found[ray]
         clear = (path[2] - wavy_height(path[0], path[1]))[: under[0]]
         assert abs(end[2] - wavy_height(*end[:2])) < 0.02 or abs(abs(end[1]) - 6) < 0.05
@@ -75,7 +75,7 @@ def test_rays_meet_uneven_ground_where_marching_first_finds_it():
     assert ((cosine >= 0) & (cosine <= 1)).all()
 
 
-def test_relief_has_its_deviation_repeats_itself_and_falls_with_frequency():
+def test_relief_is_periodic_with_given_deviation_and_decreasing_spectrum():
     field = sample_relief(default_rng(3), 0.05, 2.0)
     x, y = default_rng(0).uniform(-60, 60, (2, 500))
     np.testing.assert_allclose(field.at(x, y), field.at(x + 128, y - 256), atol=1e-4)
@@ -101,11 +101,11 @@ def changed(**fields):
 
 
 def by_laser(values: np.ndarray) -> np.ndarray:
-    """Of a scan's rays: columns, lasers (the lowest first), whatever there is of each."""
+    """Reshape values of a scan's rays to [columns, lasers, ...], lowest laser first."""
     return values.reshape(-1, SENSOR.num_rows, *values.shape[1:])
 
 
-def test_the_mount_looks_down_ahead_and_has_another_height_each_time():
+def test_the_mount_has_a_downward_pitch_and_a_random_height():
     streets = changed(pitch_rad=0.03, mount_m=0.05)
     mounts = [sample_mount(default_rng(s), SENSOR, streets=streets) for s in range(300)]
     ahead, heights = np.array([m[2, 1] for m in mounts]), np.array([m[2, 3] for m in mounts])
@@ -115,11 +115,11 @@ def test_the_mount_looks_down_ahead_and_has_another_height_each_time():
     assert all((m[:3, 2] == [0, 0, 1]).all() for m in level_mounts)
 
 
-def test_the_ego_vehicle_hides_what_it_hides_in_nuscenes():
-    """To the right the lowest beam is free, behind the eleventh is the lowest, ahead the eighth."""
+def test_the_ego_vehicle_blocks_the_same_rays_as_in_nuscenes():
+    """The lowest unblocked beam is the first to the right, the eighth ahead and the eleventh behind."""
     sweep = scan_of(empty_world(changed(ego_outline=True)))
     points, returned = sweep.points.reshape(-1, 32, 5), by_laser(sweep.returned)
-    azimuth = np.degrees(np.arctan2(points[:, 13, 0], points[:, 13, 1]))  # clockwise from ahead, of a free beam
+    azimuth = np.degrees(np.arctan2(points[:, 13, 0], points[:, 13, 1]))  # clockwise from straight ahead
     for towards, lowest in ((90, 0), (-104, 0), (0, 7), (176, 9.5)):
         there = np.abs((azimuth - towards + 180) % 360 - 180) < 2
         free = returned[there].any(axis=0)
@@ -128,7 +128,7 @@ def test_the_ego_vehicle_hides_what_it_hides_in_nuscenes():
 
 
 def test_the_edges_of_bonnet_and_roof_return_some_rays():
-    """As in nuScenes: about 70 points ahead and 60 to 130 behind, in a line across, low and dark."""
+    """In nuScenes, these are about 70 points ahead and 60 to 130 behind, in a line across, low and dark."""
     without, found = (
         scan_of(empty_world(changed(ego_outline=True, ego_edges=edges))).points[:, :4] for edges in (False, True)
     )
@@ -144,7 +144,7 @@ def test_the_edges_of_bonnet_and_roof_return_some_rays():
 
 
 def of_rings(streets, unit, seed) -> np.ndarray:
-    """Mean intensity and range offset of the lasers that rise to walls at 19 m on both sides."""
+    """Mean intensity and range offset of the upper lasers on walls at 19 m on both sides."""
     walls = make_solids(BOX, [[0, 20, 3], [0, -20, 3]], [30, 1, 9], albedo=0.3)
     points = by_laser(scan_of(empty_world(streets, seed=unit, scenery=walls), seed).points.astype(float))
     across = np.abs(points[..., 0])
@@ -155,7 +155,7 @@ def of_rings(streets, unit, seed) -> np.ndarray:
     return np.array([[v[:, k][face[:, k]].mean() for k in rows] for v in (points[..., 3], offset)])
 
 
-def test_gains_and_offsets_are_those_of_rings_and_stay_through_a_drive():
+def test_ring_gains_and_offsets_are_constant_within_a_drive():
     plain = changed(speckle=0.0, range_noise_m=0.0)
     ringed = dataclasses.replace(plain, ring_gain=0.4, ring_range_m=0.05)
     even = of_rings(plain, 5, 0)
@@ -170,7 +170,7 @@ def test_gains_and_offsets_are_those_of_rings_and_stay_through_a_drive():
 
 
 @pytest.mark.parametrize("name", OBJECT_MODELS)
-def test_varied_shapes_differ_and_keep_the_box_as_tight(name):
+def test_varied_shapes_keep_the_box_tight(name):
     rng = default_rng(1)
     for model in OBJECT_MODELS[name]:
         size = sample_size(rng, model, CITY.sizes)
@@ -201,7 +201,7 @@ def test_clutter_stands_on_the_ground_within_its_size(place):
 
 
 @pytest.mark.parametrize(("along", "side"), [(0, -1), (0, 1), (1, -1), (1, 1)])
-def test_surroundings_stand_beside_their_street_and_on_neither_carriageway(along, side):
+def test_surroundings_are_beside_their_street_and_off_both_carriageways(along, side):
     ground = Ground(np.zeros((1, 3)), 7, 30, 6, 0.13, 3, (0.1, 0.1, 0.1))
     here = Side(ground, along, side, (-60.0, 80.0))
     found = np.concatenate([sample_surroundings(default_rng(s), here, CITY, "city") for s in range(4)])
@@ -215,13 +215,13 @@ def test_surroundings_stand_beside_their_street_and_on_neither_carriageway(along
 
 
 def test_fronts_of_buildings_have_depth():
-    """Parts stand out of the plane of a front by decimetres to metres."""
+    """Parts extend beyond the plane of a front by decimetres to metres."""
     ground = Ground(np.zeros((1, 3)), 7, 900, 6, 0.13, 3, (0.1, 0.1, 0.1))
     streets = changed(facades=True)
     depths = []
     for seed in range(12):
         found = sample_surroundings(default_rng(seed), Side(ground, 0, 1, (-60.0, 60.0)), streets, "city")
-        fronts = np.abs(found["center"][:, 1]) - found["half"][:, 0]  # turned by a right angle
+        fronts = np.abs(found["center"][:, 1]) - found["half"][:, 0]  # buildings are rotated by 90 degrees
         bodies = found["half"][:, 0] > 3
         if not bodies.all():
             depths += [float(fronts[bodies].min() - fronts[~bodies].min())]
@@ -234,27 +234,27 @@ def frames() -> list:
     return [city_frames(SENSOR, 10_000).frame(i) for i in range(16)]
 
 
-def test_city_frames_are_the_same_in_any_order(frames):
+def test_city_frames_do_not_depend_on_the_order_of_access(frames):
     again = city_frames(SENSOR, 10_000).frame(3)
     for field in ("points", "boxes", "labels", "num_points"):
         np.testing.assert_array_equal(getattr(again, field), getattr(frames[3], field))
 
 
-def test_every_annotated_object_of_a_city_shows_a_point(frames):
+def test_all_annotated_objects_of_a_city_have_points(frames):
     for frame in frames:
         assert (frame.num_points >= 1).all()
         assert np.isfinite(frame.points).all()
         assert (frame.points[:, 3] <= 255).all()
 
 
-def test_cities_are_crowded_and_empty_and_mostly_no_objects(frames):
+def test_cities_vary_in_density_and_most_points_are_background(frames):
     numbers = [len(frame.labels) for frame in frames]
     assert max(numbers) > 2 * min(numbers)
     shares = [frame.num_points.sum() / len(frame.points) for frame in frames]
-    assert np.mean(shares) < 0.2  # in nuScenes three to ten in a hundred
+    assert np.mean(shares) < 0.2  # 3 to 10 % in nuScenes
 
 
-def test_classes_are_as_frequent_as_the_streets_say():
+def test_class_frequencies_match_the_shares():
     shares = class_shares(1.0)
     drawn = np.bincount(sample_labels(default_rng(0), 20_010), minlength=10) - 1
     np.testing.assert_allclose(drawn / drawn.sum(), shares, atol=0.02)
@@ -262,7 +262,7 @@ def test_classes_are_as_frequent_as_the_streets_say():
     np.testing.assert_allclose(flat[0] / flat[2], np.sqrt(shares[0] / shares[2]))
 
 
-def test_the_power_of_distances_moves_objects_away():
+def test_a_smaller_spread_moves_objects_away():
     options = {"reach_m": 50, "beyond_m": 20, "duration_s": 0.0, "labels": np.full(40, 5), "level": True}
     medians = []
     for streets in (changed(spread=0.5), PLAIN):
@@ -273,8 +273,8 @@ def test_the_power_of_distances_moves_objects_away():
     assert medians[1] == pytest.approx(50 * 0.525, rel=0.15)
 
 
-def test_a_frame_of_a_moving_ego_vehicle_takes_the_time_of_a_turn():
-    """Compensated rings: the first and the last column are from places that lie apart as far as it drove."""
+def test_a_frame_with_rolling_shutter_takes_the_time_of_a_turn():
+    """Between the first and the last column, the ego vehicle drives on for the duration of a turn."""
     still, moving = (
         by_laser(
             scan(
@@ -288,7 +288,7 @@ def test_a_frame_of_a_moving_ego_vehicle_takes_the_time_of_a_turn():
         )[..., :2]
         for speed in (0.0, 12.0)
     )
-    shift = (moving - still)[:, 12:16].mean(axis=1)  # beams that meet the road
+    shift = (moving - still)[:, 12:16].mean(axis=1)  # beams that hit the road
     assert shift[5, 1] == pytest.approx(-12 * 0.95 * SWEEP_S, abs=0.02)
     assert shift[-8, 1] == pytest.approx(-12 * 0.05 * SWEEP_S, abs=0.02)
     frames = [make_frame(seed, SENSOR, streets=streets) for seed in (1, 2) for streets in (CITY, still_city())]
@@ -299,7 +299,7 @@ def still_city():
     return dataclasses.replace(CITY, rolling_shutter=False)
 
 
-def test_streets_enter_fingerprints_caches_and_data_sets(tmp_path):
+def test_streets_are_part_of_fingerprints_and_caches(tmp_path):
     plain, city = SimulatedFrames(TINY, 3), SimulatedFrames(TINY, 3, streets=CITY)
     finer = SimulatedFrames(TINY, 3, streets=dataclasses.replace(CITY, clutter=0.2))
     assert len({frames.fingerprint() for frames in (plain, city, finer)}) == 3
@@ -308,8 +308,8 @@ def test_streets_enter_fingerprints_caches_and_data_sets(tmp_path):
         CachedFrames(city, tmp_path / "cache")
 
 
-def test_plain_streets_are_those_of_the_shipped_quickstart():
-    """Frames that the weights in the package were trained on, as they were before there were others."""
+def test_plain_frames_of_the_shipped_quickstart_are_unchanged():
+    """The shipped weights were trained on these frames."""
     for seed, (number, labels, mean) in PLAIN_FRAMES.items():
         frame = make_frame(seed, TINY)
         assert len(frame.points) == number

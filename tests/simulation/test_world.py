@@ -1,4 +1,4 @@
-"""The simulated world: motion against integration, traffic, sweeps of worlds made by hand."""
+"""Check the simulated world: motion against integration, traffic, and sweeps of constructed worlds."""
 
 import functools
 import itertools
@@ -19,7 +19,7 @@ from fcos_lidar_jax.simulation.motion import MOTION, make_motion, pose_at, trave
 from fcos_lidar_jax.simulation.nuscenes_tables import attribute_of, visibility_of
 from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_size
 from fcos_lidar_jax.simulation.solids import BOX, SOLID, corners, make_solids
-from fcos_lidar_jax.simulation.traffic import EGO_MIDDLE_M, EGO_SIZE_M, Traffic, _Taken
+from fcos_lidar_jax.simulation.traffic import EGO_MIDDLE_M, EGO_SIZE_M, Traffic, _Occupancy
 from fcos_lidar_jax.simulation.world import World, sample_labels, sample_world
 
 FLAT = Ground(np.zeros((1, 3)), 300, 900, 7, 0.0, 3, (0.3, 0.3, 0.3))
@@ -35,7 +35,7 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
-def test_positions_are_the_integral_of_speed_along_the_heading(motion):
+def test_positions_match_the_integral_of_the_velocity(motion):
     m, times = motion[0], np.linspace(0, 8, 8001)
     integral = functools.partial(cumulative_trapezoid, x=times, initial=0)
     end = m["straight"] + (m["turn"] / m["curvature"] if m["curvature"] else 0)
@@ -52,15 +52,15 @@ def test_positions_are_the_integral_of_speed_along_the_heading(motion):
     assert (travelled(motion, times)[1] >= 0).all()
 
 
-def test_a_straight_motion_is_computed_alone_as_beside_one_that_bends():
-    """What is straight takes a shorter way, which must not change a bit of any street."""
+def test_the_shortcut_for_straight_motions_is_bit_identical():
+    """Straight motions only are computed by a shortcut, unlike straight motions together with a bend."""
     times = np.linspace(0, 8, 50)
     for name in ("still", "straight", "braking to rest", "starting"):
         both = np.concatenate([MOTIONS[name], MOTIONS["left"]])[:, None]
         np.testing.assert_array_equal(pose_at(MOTIONS[name], times), pose_at(both, times)[0], err_msg=name)
 
 
-def test_there_is_room_where_shapely_sees_no_rectangle_near_at_any_moment():
+def test_room_for_objects_matches_shapely():
     rng, times, clearance = default_rng(0), np.linspace(0, 1, 6), 0.3
 
     def moving(number):
@@ -75,16 +75,16 @@ def test_there_is_room_where_shapely_sees_no_rectangle_near_at_any_moment():
 
     (standing, sizes), (added, added_sizes) = moving(4), moving(4)
     occupied = np.concatenate([standing[:, 0, :2], sizes[:, :2], standing[:, 0, 2:]], axis=1)
-    taken = _Taken(times, occupied)
+    occupancy = _Occupancy(times, occupied)
     for poses, size in zip(added, added_sizes, strict=True):
-        taken.add(poses, size)
+        occupancy.add(poses, size)
     stay = np.repeat(standing[:, :1], len(times), axis=1)
     there = np.concatenate([shapes(stay, sizes), shapes(added, added_sizes)])
     found = []
     for pose, size in zip(*moving(500), strict=True):
         distance = shapely.distance(shapes(pose[None], size[None]), there).min()
-        if distance == 0 or distance > np.sqrt(2) * clearance:  # Between these it depends on the corners.
-            found.append(taken.has_room(pose, size, clearance))
+        if distance == 0 or distance > np.sqrt(2) * clearance:  # between these limits it depends on the corners
+            found.append(occupancy.has_room(pose, size, clearance))
             assert found[-1] == (distance > 0), distance
     assert 50 < np.sum(found) < len(found) - 50
 
@@ -97,14 +97,14 @@ def worlds() -> list[World]:
 
 @pytest.fixture(scope="module")
 def fast_worlds() -> list[World]:
-    """Streets of ten sweeps, the last four of them with a crossing within reach."""
+    """Worlds of ten sweeps, of which the last four have a crossing within reach."""
     options = {"beyond_m": 20, "duration_s": 0.45, "fused": True, "fast_traffic": True}
     near, far = ({"reach_m": m, "labels": np.tile(np.arange(10), n), **options} for m, n in ((12, 2), (50, 6)))
     return [sample_world(default_rng(seed), **(near if seed < 10 else far)) for seed in range(14)]
 
 
 def test_objects_never_touch_each_other_or_the_ego_vehicle(worlds, fast_worlds):
-    """Fast ones not between two sweeps either."""
+    """Fast objects are also checked between sweeps."""
     slow = itertools.product(worlds, (0.0, 2.5, 6.0))
     for world, time_s in [*slow, *itertools.product(fast_worlds, np.linspace(0, 0.45, 24))]:
         boxes = np.zeros((len(world.traffic.labels) + 1, 7))
@@ -117,7 +117,7 @@ def test_objects_never_touch_each_other_or_the_ego_vehicle(worlds, fast_worlds):
         assert (one == other).all(), time_s
 
 
-def test_fast_traffic_drives_straight_every_lane_flows_and_objects_are_near_at_the_end(fast_worlds):
+def test_fast_traffic_flows_in_all_lanes_and_objects_are_near_at_the_end(fast_worlds):
     speeds = np.array([np.linalg.norm(pose_at(w.ego, 0.45) - pose_at(w.ego, 0.0)) / 0.45 for w in fast_worlds])
     assert ((speeds >= 10) & (speeds <= 20)).all()
     assert np.ptp(speeds) > 4
@@ -129,13 +129,13 @@ def test_fast_traffic_drives_straight_every_lane_flows_and_objects_are_near_at_t
         assert ((fast["speed"] >= 8) & (fast["speed"] <= 20)).all()
         assert (fast["acceleration"] == 0).all()
         crossing += (np.abs(np.sin(fast["yaw"])) > 0.9).sum()
-        singles = world.object_poses(0.45)[~np.isin(world.traffic.labels, [0, 3, 8, 9])]  # others stand in rows
+        singles = world.object_poses(0.45)[~np.isin(world.traffic.labels, [0, 3, 8, 9])]  # the others form rows
         away = np.hypot(*(singles[:, :2] - pose_at(world.ego, 0.45)[0, :2]).T)
         assert (away < (12 if len(world.traffic.labels) <= 20 else 50) + 30).all()
     assert crossing > 5
 
 
-def test_streets_hold_all_classes_moving_and_parked_cars_and_every_manoeuvre(worlds):
+def test_worlds_contain_all_classes_moving_and_parked_cars_and_all_manoeuvres(worlds):
     for world in worlds:
         assert len(np.unique(world.traffic.labels)) >= 9
     cars = np.concatenate([w.traffic.motions["speed"][w.traffic.labels == 0] for w in worlds])
@@ -150,22 +150,22 @@ def test_streets_hold_all_classes_moving_and_parked_cars_and_every_manoeuvre(wor
 
 
 @pytest.mark.parametrize("name", OBJECT_MODELS)
-def test_solids_stay_in_the_boxes_that_are_annotated(name):
-    """But for a fence on a barrier, which real annotations leave out too."""
+def test_solids_stay_within_annotated_boxes(name):
+    """The exception is a fence on a barrier, which real annotations exclude, too."""
     rng = default_rng(0)
     for model in OBJECT_MODELS[name]:
         for _ in range(20):
             size = sample_size(rng, model)
             solids = object_solids(model, size, 0.2)
             ends = corners(solids[solids["density"] != 40.0])
-            reach = np.array([0.62, 0.62, 1]) * size + 1e-9  # those are cuboids around what leans
+            reach = np.array([0.62, 0.62, 1]) * size + 1e-9  # corners are of cuboids that enclose leaning solids
             assert (np.abs(ends[..., :2]).max(axis=(0, 1)) <= reach[:2]).all(), size
             assert ends[..., 2].min() >= -1e-9
             assert 0.85 * size[2] < ends[..., 2].max() <= reach[2], size
 
 
-def test_a_truck_is_not_a_big_car():
-    """Seen from the side, shapes of one size differ by class in how much of the box they fill."""
+def test_side_views_of_cars_and_trucks_differ():
+    """Models of the same size fill different parts of the side view, depending on the class."""
     x, z = np.linspace(-3.4, 3.4, 60)[:, None, None], np.linspace(0.1, 2.5, 40)[:, None]
     fills = {}
     for name in ("car", "truck", "bus", "construction_vehicle"):
@@ -198,7 +198,7 @@ def test_attributes_follow_class_and_speed():
 
 
 def made_by_hand(ego, objects=(), scenery=None) -> World:
-    """A flat world of cuboids: ``objects`` are (x, y, speed, size) of what heads along x."""
+    """A flat world of cuboids; ``objects`` are (x, y, speed, size) with heading +x."""
     nothing = np.zeros(0, SOLID)
     number, sizes = len(objects), np.array([size for *_, size in objects], float).reshape(-1, 3)
     parts = [make_solids(BOX, [0, 0, size[2] / 2], size / 2, owner=k, albedo=0.8) for k, size in enumerate(sizes)]
@@ -209,7 +209,7 @@ def made_by_hand(ego, objects=(), scenery=None) -> World:
 
 
 WALL = make_solids(BOX, [10, 30, 4], [60, 0.5, 6], albedo=0.8)
-"""Its face is at y = 29.5 m."""
+"""The face of the wall is at y = 29.5 m."""
 LEVEL = sample_mount(default_rng(0), FINE, level=True)
 
 
@@ -224,7 +224,7 @@ def assert_wall_is_sharp(points, least=0):
     assert np.abs(on_wall - 29.5).max() < 0.08
 
 
-def test_fused_sweeps_begin_with_the_current_one_meet_at_what_stands_and_trail_behind_what_moves():
+def test_fused_sweeps_align_static_objects_and_trail_behind_moving_objects():
     ego = make_motion(speed=14.0, straight=4, curvature=1 / 30, turn=np.pi / 2)
     world = made_by_hand(ego, [(8, 12, 8.0, (4, 2, 3))], WALL)
     points, _ = scan_sweeps(world, FINE, LEVEL, 1.0, default_rng(7), num_sweeps=10)
@@ -238,18 +238,18 @@ def test_fused_sweeps_begin_with_the_current_one_meet_at_what_stands_and_trail_b
         there = points[points[:, 4] == lag, :3].astype(float) @ now[:3, :3].T + now[:3, 3]
         assert_wall_is_sharp(there, least=500)
         x = there[(there[:, 2] > 0.5) & (there[:, 1] < 14) & (there[:, 1] > 10), 0]
-        # Within a ray's spacing and the noise.
+        # The tolerance covers ray spacing and noise.
         assert (x.min() + x.max()) / 2 == pytest.approx(8 + 8 * (1 - lag), abs=0.12)
         then = sensor_pose(world, LEVEL, 1.0 - age * SWEEP_S)
         own = (there - then[:3, 3]) @ then[:3, :3]
-        unmoved = own @ now[:3, :3].T + now[:3, 3]  # as a fusion without poses has it
+        unmoved = own @ now[:3, :3].T + now[:3, 3]  # result of a fusion without poses
         off.append(np.median(np.abs(unmoved[there[:, 1] > 28] - there[there[:, 1] > 28]).max(axis=1)))
     assert off[0] < 1e-3
-    assert off[-1] > 4  # metres: the poses decide
+    assert off[-1] > 4  # metres; shows the effect of the poses
 
 
 @pytest.mark.parametrize("speed", [0.0, 10.0])
-def test_a_rolling_shutter_smears_what_moves_and_leaves_the_rest_in_place(speed):
+def test_a_rolling_shutter_shifts_only_moving_objects(speed):
     starts = (-12, 0, 12)
     world = made_by_hand(make_motion(speed=speed), [(x, -9.0, 12.0, (4, 2, 3)) for x in starts], WALL)
     found, pose = [], sensor_pose(world, LEVEL, 1.0)
@@ -260,31 +260,31 @@ def test_a_rolling_shutter_smears_what_moves_and_leaves_the_rest_in_place(speed)
         objects = points[(points[:, 1] < -7) & (points[:, 2] > 0.5)]
         found.append([objects[np.abs(objects[:, 0] - x - 12) < 4, 0].mean() for x in starts])
     still, rolled = np.array(found)
-    shift = still - rolled  # metres that the objects were behind when the beam passed
+    shift = still - rolled  # shift of the objects in metres when the beam passes
     assert ((shift > -0.05) & (shift < 12 * SWEEP_S + 0.05)).all(), shift
-    assert np.ptp(shift) > 0.05  # the beam passes one after the other
+    assert np.ptp(shift) > 0.05  # the beam passes the objects one after another
     if speed == 0:
         assert shift.max() > 0.1
 
 
-def test_the_share_that_is_seen_is_that_of_the_free_rays():
+def test_the_seen_share_is_the_share_of_unblocked_rays():
     objects = [(20, 0, 0, (0.2, 8, 3)), (10, 1, 0, (0.2, 2, 3)), (-15, 0, 0, (2, 2, 2))]
     world = made_by_hand(make_motion(), objects)
     share = scan_fine(world).seen_share
     eye = sensor_pose(world, LEVEL, 0.0)[:3, 3]
     wide, hidden = 2 * np.arctan2(4, 19.9 - eye[0]), np.arctan2(2, 9.9 - eye[0])
-    # Every ray that the far one's three metres can take meets the near one where that stands.
+    # The near object blocks all rays to the far object within its own azimuth span.
     assert share[0] == pytest.approx(1 - hidden / wide, abs=0.04)
     assert share[1] == share[2] == 1
     assert [visibility_of(s) for s in share] == ["2", "4", "4"]
 
 
-def test_far_dark_and_grazing_returns_are_lost():
+def test_returns_from_far_dark_and_grazing_surfaces_are_lost():
     kept = []
     for x, albedo in ((10, 0.5), (55, 0.5), (55, 0.01)):
         wall = make_solids(BOX, [x, 0, 0], [0.5, 40, 8], albedo=albedo)
         sweep = scan_fine(made_by_hand(make_motion(), scenery=wall))
-        kept.append(sweep.returned.reshape(-1, FINE.num_rows)[:, 5:].sum())  # the rays that rise
+        kept.append(sweep.returned.reshape(-1, FINE.num_rows)[:, 5:].sum())  # rising rays
     near, far, dark = kept
     assert near > 1.5 * far > 1.5 * dark
     lasers = scan_fine(made_by_hand(make_motion())).returned.reshape(-1, FINE.num_rows)
@@ -302,7 +302,7 @@ def test_intensity_follows_material_and_angle():
     assert means["oblique"] < 0.85 * means["bright"]
 
 
-def test_rays_without_return_lie_about_the_sensor_and_points_tell_their_laser():
+def test_points_without_return_surround_the_sensor_and_points_have_laser_numbers():
     mount = sample_mount(default_rng(0), TINY, level=True)
     sweep = scan(made_by_hand(make_motion()), TINY, mount, 0.0, default_rng(0))
     lost = sweep.points[~sweep.returned]
@@ -317,7 +317,7 @@ def test_rays_without_return_lie_about_the_sensor_and_points_tell_their_laser():
 
 
 @pytest.mark.parametrize("middle", [np.pi / 2, -3.0])
-def test_a_sector_is_scanned_alone_and_in_its_part_of_the_turn(middle):
+def test_a_sector_is_scanned_at_its_part_of_the_turn(middle):
     part = sector(TINY, middle, 64)
     world, mount = made_by_hand(make_motion()), sample_mount(default_rng(0), TINY, level=True)
     found, whole = (

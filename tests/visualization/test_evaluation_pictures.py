@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: what is drawn where, read back from the figures and the page."""
+"""Check the contents of evaluation pictures by inspecting the figures."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ RECALL = np.linspace(0, 1, 101).tolist()
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures, instead of files."""
+    """Collect figures instead of writing files."""
     figures = []
     for module in (evaluation_report, range_image, bev):
         monkeypatch.setattr(module, "save_png", lambda figure, path: figures.append(figure))
@@ -28,12 +28,12 @@ def test_precision_ends_at_the_highest_recall(drawn):
     lengths = {name: len(line.get_xdata()) for name, line in lines.items()}
     assert lengths == {"0.5 m": 1, "1 m": 41, "2 m": 41, "4 m": 101}
     np.testing.assert_allclose(lines["2 m"].get_ydata(), 0.9)
-    # Equal curves: the one below is wider.
+    # Of two equal curves, the lower one is wider.
     assert lines["2 m"].get_linewidth() > lines["1 m"].get_linewidth()
     assert lines["2 m"].get_zorder() < lines["1 m"].get_zorder()
 
 
-def test_errors_are_drawn_where_they_count(drawn):
+def test_error_curves_span_the_evaluated_recalls(drawn):
     errors = {name: [float(k)] * 101 for k, name in enumerate(evaluation_report.ERROR_NAMES)}
     evaluation_report._draw_errors("x.png", RECALL, errors, first=11, last=60)
     lines = drawn[0].axes[0].get_lines()
@@ -48,7 +48,7 @@ def test_errors_are_drawn_where_they_count(drawn):
     assert [line.get_label() for line in drawn[2].axes[0].get_lines()] == ["scale [1 - IoU]"]
 
 
-def test_range_image_with_truth_and_detections_below_each_other(drawn):
+def test_truth_and_detections_have_separate_panels(drawn):
     frame = make_frame(0, TINY)
     image = project_points(frame.points, np.ones(len(frame.points), bool), TINY, num_rounds=1)
     range_image.draw_range_image(image, "x.png", boxes=frame.boxes, detections=frame.boxes[:2])
@@ -59,7 +59,7 @@ def test_range_image_with_truth_and_detections_below_each_other(drawn):
     assert "intensity" in titles[2]
 
 
-def test_axes_do_not_say_which_of_them_is_ahead(drawn):
+def test_axis_labels_do_not_name_a_forward_direction(drawn):
     bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=10, classes=())
     axis = drawn[0].axes[0]
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("x [m]", "y [m]")

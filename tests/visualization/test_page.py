@@ -1,4 +1,4 @@
-"""The page: what it holds, and that it asks for nothing; what a browser makes of it is in test_page_browser.py."""
+"""Check the data in the HTML page, and that it is self-contained. See test_page_browser.py for its behaviour."""
 
 import base64
 import gzip
@@ -14,7 +14,7 @@ from fcos_lidar_jax.visualization.page import STEP_M, encode_points, page_frame,
 
 
 def decoded(num_points, max_lag_s, text):
-    """Points f64[n, 5], byte by byte as the page's own script reads them."""
+    """Decode points f64[n, 5] byte by byte, as the script of the page does."""
     data, step = gzip.decompress(base64.b64decode(text)), num_points
     assert len(data) == 8 * num_points
     points, x = [], 0
@@ -36,7 +36,7 @@ def found(seed, number=7):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """Two frames, whose classes' names try to end the script."""
+    """A page of two frames, with a class name that tries to end the script."""
     path = tmp_path_factory.mktemp("page") / "page.html"
     frames = []
     for index in range(2):
@@ -50,7 +50,7 @@ def page(tmp_path_factory):
     return path
 
 
-def test_boxes_come_back_as_they_were(page):
+def test_boxes_survive_a_round_trip(page):
     drive = page_content(page)
     assert drive["title"] == "<Drive> {{drive}}"
     assert drive["classes"] == ["car", "</script><b>"]
@@ -68,7 +68,7 @@ def test_boxes_come_back_as_they_were(page):
         assert np.array(frame["pose"]).reshape(4, 4)[0, 3] == 5 * index
 
 
-def test_points_come_back_within_half_a_step(page):
+def test_points_survive_a_round_trip_within_half_a_step(page):
     for index, frame in enumerate(page_content(page)["frames"]):
         points = make_frame(index, NUSCENES_HDL32E).points
         back = decoded(frame["num_points"], frame["max_lag_s"], frame["points"])
@@ -77,7 +77,7 @@ def test_points_come_back_within_half_a_step(page):
         assert np.abs(places * STEP_M - points[:, :3]).max() <= STEP_M / 2 + 1e-5
 
 
-def test_intensity_stays_with_its_point():
+def test_points_keep_their_intensity():
     rng = np.random.default_rng(0)
     points = rng.uniform(-600, 600, (500, 4)).astype(np.float32)
     points[:, 3] = rng.integers(0, 256, 500)
@@ -91,8 +91,8 @@ def test_intensity_stays_with_its_point():
         assert points[nearest, 3] == value
 
 
-def test_every_sweep_keeps_its_points_and_its_lag():
-    """Newest first; a place that two sweeps share is drawn for both."""
+def test_each_sweep_keeps_its_points_and_its_lag():
+    """Sweeps are sorted from the newest; a position in two sweeps is kept for both."""
     points = np.zeros((6, 5), np.float32)
     points[:, 0], points[:, 4] = (3, 3, -600, 600, 1, 1), (0.45, 0, 0.2, 0.2, np.nan, -5)
     back = decoded(*encode_points(points))
@@ -100,20 +100,20 @@ def test_every_sweep_keeps_its_points_and_its_lag():
     assert encode_points(points[:, :4])[1] == 0
 
 
-def test_what_cannot_be_drawn_is_left_out():
+def test_non_finite_and_distant_points_are_omitted():
     points = np.array([[np.nan, 0, 0, 1], [700, 0, 0, 1], [1, 2, 3, np.nan], [4, 5, 6, 1e9]], np.float32)
     np.testing.assert_allclose(decoded(*encode_points(points)), [[1, 2, 3, 0, 0], [4, 5, 6, 255, 0]], atol=1e-9)
     assert decoded(*encode_points(points[:0])).shape == (0, 5)
 
 
-def test_the_template_names_no_place_outside(page):
+def test_the_template_contains_no_external_links(page):
     text = re.sub(r'id="drive">.*?</script>', "", page.read_text(), flags=re.DOTALL)
-    text = text.replace("<meta http-equiv=", "")  # its own policy
+    text = text.replace("<meta http-equiv=", "")  # the page's content security policy
     for word in ("http", "src=", "fetch", "import", "@font-face", "url(", "XMLHttp", "WebSocket", "sendBeacon"):
         assert word not in text, word
     assert re.findall(r'href="([^"]*)"', text) == ["data:,"]
 
 
-def test_forty_sweeps_stay_below_eight_megabytes():
+def test_forty_sweeps_take_less_than_eight_megabytes():
     *_, text = encode_points(make_frame(3, NUSCENES_HDL32E).points)
     assert 40 * len(text) < 8e6

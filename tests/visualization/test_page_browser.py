@@ -1,15 +1,15 @@
-"""The page in a real browser: what it draws and where, its controls, and that it asks for nothing."""
+"""Check the HTML page in a real browser: its drawing, its controls, and that it makes no requests."""
 
 import numpy as np
 import pytest
+from browser import find_browser, open_tab, start_browser
 
-from experiments.browser import find_browser, open_tab, start_browser
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 
 CLASSES = ("car", "truck")
-BLUE, RED = (31, 119, 180), (214, 39, 40)  # of the first two classes
+BLUE, RED = (31, 119, 180), (214, 39, 40)  # colours of the first two classes
 LIGHT, DARK = (251, 251, 250), (16, 18, 20)  # backgrounds
 BOXES = np.array([[8, 5, 0, 6, 3, 2, 0.4, 0, 0], [-10, -6, -0.5, 8, 3, 3, 2, 0, 0]], np.float32)
 SCORES = np.array([0.9, 0.4], np.float32)
@@ -28,7 +28,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """Three frames of a drive, 4 m apart along x, each with two boxes and a true one."""
+    """A page of three frames of a drive, 4 m apart along x, each with two boxes and one true box."""
     path, frames = tmp_path_factory.mktemp("page") / "page.html", []
     for index in range(3):
         pose = np.eye(4)
@@ -42,7 +42,7 @@ def page(tmp_path_factory):
 
 @pytest.fixture
 def empty_page(tmp_path):
-    """One frame with boxes and a single point, far below, so that nothing hides them."""
+    """A page of one frame with boxes and a single point far below, so that nothing hides the boxes."""
     path, point = tmp_path / "page.html", np.array([[0, 0, -30, 0]], np.float32)
     write_page(
         path, [page_frame(point, (BOXES, [0, 1], SCORES), name="a", truth=(TRUTH, [0]))], classes=CLASSES, title=""
@@ -51,15 +51,17 @@ def empty_page(tmp_path):
 
 
 def state(tab):
-    """What the page says, once it has drawn."""
+    """Wait until the page has drawn and return its status text."""
     tab.run("(async () => { while (!$('state').textContent) await new Promise(r => setTimeout(r, 20)); })()")
     tab.settle()
     return tab.run("$('state').textContent")
 
 
 def from_above(points, distance=60.0, centre=(WIDTH / 2, HEIGHT / 2), shortest=HEIGHT):
-    """Where points are on the screen, f64[n, 2]: a camera ``distance`` above the origin that looks down, its field
-    of view 0.9 rad, +y up, as no drive gives another direction."""
+    """Screen positions of points, f64[n, 2], for a camera ``distance`` above the origin that looks down.
+
+    The field of view is 0.9 rad, with +y up, because there is no drive to define another direction.
+    """
     points = np.asarray(points, float)
     scale = shortest / 2 / np.tan(0.45) / (distance - points[:, 2])
     return np.stack([centre[0] + scale * points[:, 0], centre[1] - scale * points[:, 1]], axis=1)
@@ -77,14 +79,14 @@ def near(picture, color, tolerance=40):
 
 
 def canvas(tab):
-    """A screenshot of the canvas alone: texts and controls hidden."""
+    """Take a screenshot of the canvas only, with text and controls hidden."""
     tab.run("document.querySelectorAll('header, footer, #text').forEach(e => e.style.visibility = 'hidden')")
     return tab.picture()
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
-def test_it_draws_fits_and_asks_for_nothing(browser, page, width, dark):
+def test_the_page_draws_fits_and_makes_no_requests(browser, page, width, dark):
     with open_tab(browser, page.as_uri(), width=width, dark=dark) as tab:
         assert state(tab) == "frame 1 of 3, 0.00 s, 2 boxes, 1 in truth"
         parts = "[...document.querySelectorAll('header, footer, header *, footer *')].filter(e => e.offsetParent)"
@@ -96,7 +98,7 @@ def test_it_draws_fits_and_asks_for_nothing(browser, page, width, dark):
         assert left.min() >= 0 <= top.min()
         assert right.max() <= width
         assert bottom.max() <= 800
-        # Rows of controls leave most of the screen to the picture.
+        # The controls leave most of the screen to the picture.
         assert (
             tab.run("$('score').closest('footer').offsetHeight + document.querySelector('header').offsetHeight")
             < 260
@@ -106,12 +108,12 @@ def test_it_draws_fits_and_asks_for_nothing(browser, page, width, dark):
         asked = {event["request"]["url"] for event in tab.events("Network.requestWillBeSent")}
         assert {url for url in asked if not url.startswith("data:")} == {page.as_uri()}
         assert tab.events("Runtime.exceptionThrown") == tab.events("Log.entryAdded") == []
-        # And it could not: its own policy forbids it.
+        # The content security policy forbids requests.
         for place in ("'data:,x'", "location.href", "'http://127.0.0.1:9/'"):
             assert tab.run(f"fetch({place}).then(() => 'fetched', () => 'refused')") == "refused"
 
 
-def test_boxes_are_at_their_coordinates(browser, empty_page):
+def test_boxes_are_drawn_at_their_coordinates(browser, empty_page):
     with open_tab(browser, empty_page.as_uri()) as tab:
         state(tab)
         tab.press("b")
@@ -130,7 +132,7 @@ def test_boxes_are_at_their_coordinates(browser, empty_page):
                 assert np.linalg.norm(found - point, axis=1).min() < 2, (box, a, b, share)
 
 
-def test_truth_is_dashed_and_can_be_left_out(browser, empty_page):
+def test_truth_is_dashed_and_can_be_hidden(browser, empty_page):
     place = from_above(corners(TRUTH[0])[:4])
     with open_tab(browser, empty_page.as_uri()) as tab:
         state(tab)
@@ -144,7 +146,7 @@ def test_truth_is_dashed_and_can_be_left_out(browser, empty_page):
         assert near(tab.picture(), BLUE).any()
 
 
-def test_keys_and_sliders_step_and_filter(browser, page):
+def test_keys_and_sliders_change_frame_and_threshold(browser, page):
     with open_tab(browser, page.as_uri()) as tab:
         state(tab)
         first = canvas(tab)
@@ -153,7 +155,7 @@ def test_keys_and_sliders_step_and_filter(browser, page):
         assert state(tab) == "frame 2 of 3, 0.50 s, 2 boxes, 1 in truth"
         assert tab.run("$('name').textContent") == "frame b"
         assert (tab.picture() != first).any(axis=2).mean() > 0.01
-        for _ in range(3):  # from 0.3
+        for _ in range(3):  # starts at 0.3
             tab.press("ArrowUp")
         assert "1 boxes" in state(tab)
         assert not near(tab.picture(), RED, 20).any()
@@ -171,8 +173,8 @@ def test_keys_and_sliders_step_and_filter(browser, page):
         assert tab.run("$('play').textContent") == "Play"
 
 
-def test_points_are_at_their_places_and_earlier_ones_by_sweep(browser, tmp_path):
-    """A point of each of two frames of a drive, and two points of one cloud that are of different age."""
+def test_points_are_drawn_at_their_coordinates_with_earlier_sweeps(browser, tmp_path):
+    """Uses two frames of a drive with one point each, and one cloud of two points of different age."""
     nothing, points = (np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)), [[10, 4, 0, 200], [-8, 9, 1, 200]]
     frames = []
     for index, point in enumerate(points):
@@ -208,7 +210,7 @@ def test_points_are_at_their_places_and_earlier_ones_by_sweep(browser, tmp_path)
         assert np.abs(new.min(axis=0).astype(int) - old.min(axis=0)).max() > 40
 
 
-def test_fingers_turn_pinch_and_shift(browser, page):
+def test_touch_rotates_zooms_and_pans(browser, page):
     with open_tab(browser, page.as_uri(), width=390) as tab:
         state(tab)
 
@@ -231,7 +233,7 @@ def test_fingers_turn_pinch_and_shift(browser, page):
         assert (moved["x"], moved["y"]) != (near["x"], near["y"])
 
 
-def test_a_lost_context_is_drawn_anew(browser, page):
+def test_the_page_redraws_after_a_lost_context(browser, page):
     with open_tab(browser, page.as_uri()) as tab:
         state(tab)
         before = canvas(tab)

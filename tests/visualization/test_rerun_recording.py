@@ -1,4 +1,4 @@
-"""The recording for rerun, read back by rerun itself."""
+"""Check recordings by reading them with rerun."""
 
 import sys
 
@@ -13,7 +13,7 @@ BOXES = np.array([[8, 5, 0, 6, 3, 2, 0.4, 0, 0], [-10, -6, -1, 8, 3, 3, 2, 1, 0]
 FOUND = BOXES, np.array([1, 0]), np.array([0.5, 0.25], np.float32)
 
 
-def test_what_was_recorded_comes_back(tmp_path):
+def test_recordings_survive_a_round_trip(tmp_path):
     chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
     path, pose = tmp_path / "drive.rrd", np.eye(4)
     pose[:3, 3] = 1, 2, 3
@@ -44,14 +44,14 @@ def test_what_was_recorded_comes_back(tmp_path):
     assert [time.microsecond for time in columns["/sensor/boxes", "time"]] == [5, 10]
 
 
-def test_nothing_is_left_of_a_recording_that_fails(tmp_path):
+def test_a_failed_recording_leaves_no_file(tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     with pytest.raises(KeyboardInterrupt), rerun_recording(tmp_path / "drive.rrd", ("car",)):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_rerun_one_line_says_what_to_install(monkeypatch):
+def test_without_rerun_one_line_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ValueError, match=r"^--rrd: rerun is not installed.*pip install 'fcos-lidar-jax\[viz\]'$"):
         check_rerun()

@@ -1,4 +1,4 @@
-"""Pictures show what they should where they should; files are written whole or not at all."""
+"""Check the contents of pictures pixel by pixel, and reports."""
 
 import base64
 import re
@@ -41,17 +41,17 @@ def places(image, color):
 
 
 def frames(image):
-    """The panels' frames from top to bottom, as (top, bottom, left, right) in pixels."""
+    """Frames of the panels from top to bottom, as (top, bottom, left, right) in pixels."""
     black = (image < 60).all(-1)
     lines = np.flatnonzero(black.sum(1) > 0.6 * image.shape[1])
-    edges = lines[np.diff(lines, prepend=-9) > 2]  # a line is up to two pixels thick
+    edges = lines[np.diff(lines, prepend=-9) > 2]  # lines are up to two pixels thick
     sides = np.flatnonzero(black[edges[0] : edges[1]].mean(0) > 0.95)
-    sides = sides[sides < 0.95 * image.shape[1]] if len(sides) > 4 else sides  # colour bars have sides too
+    sides = sides[sides < 0.95 * image.shape[1]] if len(sides) > 4 else sides  # without colour bars
     return [(top, bottom, sides[0], sides[-1]) for top, bottom in edges.reshape(-1, 2)]
 
 
 class View:
-    """A bird's-eye view and where its frame is."""
+    """A bird's-eye view and the position of its frame."""
 
     def __init__(self, folder, points=((np.nan,) * 3,), classes=NUSCENES_CLASSES, **options):
         draw_bev(np.array(points), folder / "a.png", limit_m=LIMIT_M, classes=classes, **options)
@@ -60,7 +60,7 @@ class View:
         self.legend = self.image[self.frame[1] + 10 :]
 
     def at(self, x, y, reach=2):
-        """The pixels around a place in metres."""
+        """Pixels around a position in metres."""
         top, bottom, left, right = self.frame
         row = round((LIMIT_M - y) / (2 * LIMIT_M) * (bottom - top) + top)
         column = round((x + LIMIT_M) / (2 * LIMIT_M) * (right - left) + left)
@@ -72,7 +72,7 @@ def bicycle(*box):
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, np.pi / 2, np.pi, -2.0])
-def test_a_box_is_drawn_in_its_colour_at_its_place_with_its_heading(tmp_path, yaw):
+def test_a_box_is_drawn_with_its_colour_position_and_heading(tmp_path, yaw):
     view = View(tmp_path, detections=(*bicycle(-8, 12, 0, 10, 4, 1, yaw), np.array([0.5])))
     cos, sin = np.cos(yaw), np.sin(yaw)
     drawn = [(5, 0), (-5, 0), (0, 2), (0, -2), (5, 2), (2.5, 0)]  # front, back, sides, a corner, the heading
@@ -81,7 +81,7 @@ def test_a_box_is_drawn_in_its_colour_at_its_place_with_its_heading(tmp_path, ya
         assert bool(len(places(place, class_color(BICYCLE)))) == ((along, across) in drawn), (along, across)
 
 
-def test_truth_is_dashed_black_and_filled_in_its_colour(tmp_path):
+def test_truth_has_dashed_black_outlines_and_coloured_area(tmp_path):
     view = View(tmp_path, truth=bicycle(8, -12, 0, 10, 4, 1, 0))
     assert np.abs(view.at(5, -12) - fill(BICYCLE)).max() <= 3
     dark = (view.at(8, -10, reach=60) < 90).all(-1).any(0)
@@ -89,7 +89,7 @@ def test_truth_is_dashed_black_and_filled_in_its_colour(tmp_path):
     assert np.count_nonzero(np.diff(dark.astype(int)) == 1) > 8  # dashes
 
 
-def test_the_legend_has_the_classes_in_view_only(tmp_path):
+def test_the_legend_contains_only_visible_classes(tmp_path):
     boxes = np.array([[90, 0, 0, 4, 2, 1, 0, 0, 0], [5, 5, 0, 4, 2, 1, 0, 0, 0]], float)
     view = View(tmp_path, detections=(boxes, np.array([CAR, BICYCLE]), np.ones(2)))
     assert len(places(view.legend, class_color(BICYCLE))) > 50
@@ -97,7 +97,7 @@ def test_the_legend_has_the_classes_in_view_only(tmp_path):
 
 
 def test_any_number_of_classes_has_colours_and_a_legend(tmp_path):
-    """More classes than the legend has room for, with names that Matplotlib would take for formulas."""
+    """Uses more classes than fit in the legend, with names that Matplotlib could parse as math."""
     colors = [class_color(label) for label in range(200)]
     assert len(set(colors)) == 200
     assert all(np.abs(rgb(a) - rgb(b)).sum() > 30 for i, a in enumerate(colors[:30]) for b in colors[:i])
@@ -110,7 +110,7 @@ def test_any_number_of_classes_has_colours_and_a_legend(tmp_path):
     assert not len(places(view.legend, class_color(30)))
 
 
-def test_scores_stay_apart_and_within_the_picture(tmp_path):
+def test_scores_stay_within_the_frame(tmp_path):
     boxes = np.tile([[24.0, 24, 0, 0.6, 0.6, 1, 0, 0, 0]], (30, 1))
     view = View(tmp_path, detections=(boxes, np.full(30, BICYCLE), np.linspace(0.1, 0.9, 30)))
     top, _, _, right = view.frame
@@ -118,7 +118,7 @@ def test_scores_stay_apart_and_within_the_picture(tmp_path):
     assert (view.image[:, right + 4 :] == 255).all()
 
 
-def test_higher_points_are_darker_and_no_points_are_drawn_too(tmp_path):
+def test_higher_points_are_darker_and_empty_clouds_are_accepted(tmp_path):
     ground = np.stack([np.linspace(-20, 20, 400), np.full(400, -10), np.full(400, -1.8)], 1)
     view = View(tmp_path, np.concatenate([ground, ground + np.array([0, 20, 3])]))
     assert view.at(7, 10).mean() < view.at(7, -10).mean() - 20
@@ -126,7 +126,7 @@ def test_higher_points_are_darker_and_no_points_are_drawn_too(tmp_path):
 
 
 def small_image(cells, *, lag=0.0, rounds=1):
-    """A range image with one point in each of the cells, 10 m away along +x."""
+    """A range image with one point at x = 10 m in each given cell."""
     features = np.zeros((8, 16, 9, rounds), np.float32)
     for row, column in cells:
         values = {"x": 10, "range": 10, "intensity": 99, "existence": 1, "time_lag": lag, "inclination": -row / 10}
@@ -135,13 +135,13 @@ def small_image(cells, *, lag=0.0, rounds=1):
 
 
 def draw(folder, image, **options):
-    """The picture of a range image, and the frames of its panels."""
+    """Draw a range image; returns the picture and the frames of its panels."""
     draw_range_image(image, folder / "a.png", **options)
     picture = pixels(folder / "a.png")
     return picture, frames(picture)
 
 
-def test_a_filled_cell_shows_at_its_place_and_empty_ones_are_grey(tmp_path):
+def test_filled_cells_are_coloured_and_empty_cells_are_grey(tmp_path):
     image, panels = draw(tmp_path, small_image([(2, 4), (7, 15)]))
     assert len(panels) == 2  # range and intensity
     for top, bottom, left, right in panels:
@@ -152,7 +152,7 @@ def test_a_filled_cell_shows_at_its_place_and_empty_ones_are_grey(tmp_path):
 
 
 @pytest.mark.parametrize(("rounds", "lag", "expected"), [(1, 0.0, 2), (3, 0.0, 4), (1, 0.1, 3)])
-def test_every_round_has_a_panel_and_the_lag_where_there_is_one(tmp_path, rounds, lag, expected):
+def test_panels_show_all_rounds_and_nonzero_time_lags(tmp_path, rounds, lag, expected):
     _, panels = draw(tmp_path, small_image([(2, 4)], lag=lag, rounds=rounds), title="t")
     assert len(panels) == expected
 
@@ -168,7 +168,7 @@ def test_boxes_are_outlined_around_their_cells(tmp_path):
     np.testing.assert_allclose([cells.min(0), cells.max(0)], [[2, 4], [4, 6]], atol=0.15)
 
 
-def test_a_box_across_the_seam_is_outlined_at_both_ends(tmp_path):
+def test_a_box_across_azimuth_pi_is_outlined_at_both_ends(tmp_path):
     box = np.array([[10, 0, 0, 1, 1, 1, 0]], np.float32)
     picture, [(_, _, left, right), _] = draw(tmp_path, small_image([(2, 0), (2, 15)]), boxes=box)
     columns = (places(picture, RED)[:, 1] - left) / (right - left) * 16
@@ -177,8 +177,8 @@ def test_a_box_across_the_seam_is_outlined_at_both_ends(tmp_path):
     assert not ((columns > 1.2) & (columns < 14.8)).any()
 
 
-def test_in_a_sector_nothing_lies_across_a_seam(tmp_path):
-    """One outline from the first column to the last."""
+def test_boxes_in_a_sector_have_a_single_outline(tmp_path):
+    """The outline spans the picture from the first to the last column."""
     box = np.array([[10, 0, 0, 1, 1, 1, 0]], np.float32)
     image = small_image([(2, 0), (2, 15)])
     picture, [(_, _, left, right), _] = draw(tmp_path, image, boxes=box, azimuth_limits_rad=(3.0, 4.5))
@@ -186,14 +186,14 @@ def test_in_a_sector_nothing_lies_across_a_seam(tmp_path):
     assert reddish[left + 2 : right - 2].all()
 
 
-def test_rows_are_labelled_by_their_points_inclination():
+def test_rows_are_labelled_with_the_inclination_of_their_points():
     table = _row_inclinations(small_image([(2, 0), (2, 9), (6, 1)]).features)
-    np.testing.assert_allclose(table, -np.arange(8) / 10, atol=1e-6)  # between and beyond rows with points, too
+    np.testing.assert_allclose(table, -np.arange(8) / 10, atol=1e-6)  # includes interpolated and extrapolated rows
     np.testing.assert_allclose(_row_inclinations(small_image([(3, 0)]).features), -0.3)
     assert not _row_inclinations(small_image([]).features).any()
 
 
-def test_an_empty_and_a_whole_range_image_are_drawn(tmp_path):
+def test_empty_and_full_range_images_are_drawn(tmp_path):
     empty, _ = draw(tmp_path, small_image([]))
     frame = make_frame(0, TINY)
     image = project_points(frame.points, np.ones(len(frame.points), bool), TINY, num_rounds=2)
@@ -205,7 +205,7 @@ def test_curves_rise_with_their_values(tmp_path):
     series = {"a": [(x, 10**x) for x in np.linspace(0, 2, 100)]}
     draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=True)
     found = places(pixels(tmp_path / "c.png"), "#0072b2")
-    found = found[np.bincount(found[:, 0])[found[:, 0]] < 15]  # without the level line in the legend
+    found = found[np.bincount(found[:, 0])[found[:, 0]] < 15]  # without the horizontal line of the legend
     (bottom, left), (top, right) = found[found[:, 1].argmin()], found[found[:, 1].argmax()]
     middle = found[np.abs(found[:, 1] - (left + right) / 2) < 3, 0]
     assert top < bottom - 200
@@ -218,7 +218,7 @@ def test_curves_rise_with_their_values(tmp_path):
     [{}, {"a": []}, {"a": [(1, 2)]}, {"a": [(1, float("nan")), (2, 0), (3, -1)], "b": [(1, 1)] * 99}],
     ids=["none", "empty", "one", "gaps"],
 )
-def test_odd_curves_are_drawn_too(tmp_path, series, log_y):
+def test_empty_and_incomplete_curves_are_drawn(tmp_path, series, log_y):
     draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=log_y)
     assert (tmp_path / "c.png").stat().st_size > 5000
 
@@ -237,7 +237,7 @@ def test_report_is_self_contained_and_escaped(tmp_path):
         wide_pictures=[("wide one", picture)],
     )
     text = page.read_text(encoding="utf-8")
-    # Parsed as XML, which refuses elements that are not closed in order.
+    # Parse as XML, which rejects elements that are not closed in order.
     root = ElementTree.fromstring(re.sub("(<(meta|img)[^>]*)>", r"\1/>", text.removeprefix("<!doctype html>")))
     texts = list(root.itertext())
     assert "script" not in {element.tag for element in root.iter()}

@@ -1,6 +1,6 @@
 """The figures of ``docs/paper.md``, from one simulated frame of nuScenes' sensor: ten sweeps, traffic in motion.
 
-``python -m experiments.figures --out docs/figures``, half a minute on a CPU.
+``python -m docs.draw_figures --out docs/figures``, half a minute on a CPU.
 """
 
 import dataclasses

@@ -1,0 +1,117 @@
+"""Result cells: ``cells.csv`` of a scale has a row per training, ``scale.json`` what all of them share.
+
+A cell is a seed and what its configuration changes in the scale's base, in words such as
+``num_sweeps=1, projection.num_rounds=3``. So a new field of the configuration renames no cell. Cells whose data or
+base differ from those of today are refused.
+"""
+
+import csv
+import hashlib
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from experiments.paper_tables.scales import Scale
+from experiments.script import compact_json
+from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.files import atomic_write, file_lock, read_json
+from fcos_lidar_jax.training.checkpoint import LATER_FIELDS
+
+Cell = dict[str, Any]  # ``changes``, ``seed``, ``scores`` or ``diverged``, and who trained it.
+_CELLS, _SCALE, _LOCK = "cells.csv", "scale.json", "cells.lock"
+_TEXT = {"changes", "diverged", "git", "device", "processor", "jax", "python", "fcos_lidar_jax"}
+_LONGEST = 80  # Characters of a folder's name.
+
+
+def changes_of(config: Config, base: Config) -> str:
+    """What a configuration changes in another one, its name aside.
+
+    >>> from experiments.changes import change
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> changes_of(change(projection__num_rounds=3, num_sweeps=2, name="other")(QUICKSTART), QUICKSTART)
+    'num_sweeps=2, projection.num_rounds=3'
+    >>> changes_of(QUICKSTART, QUICKSTART)
+    'base'
+    """
+    own, before = (_flat(config_to_json(c)) for c in (config, base))
+    differing = [field for field in sorted(own.keys() - {"name"}) if before.get(field, ...) != own[field]]
+    return ", ".join(f"{field}={json.dumps(own[field])}" for field in differing) or "base"
+
+
+def run_name(changes: str, seed: int) -> str:
+    """The folder's name of a cell's training.
+
+    >>> run_name("num_sweeps=1, projection.num_rounds=3", 0)
+    'num_sweeps=1_projection.num_rounds=3_seed=0'
+    """
+    name = re.sub(r"[^\w.=-]+", "_", changes)
+    if len(name) > _LONGEST:
+        name = f"{name[:_LONGEST]}_{hashlib.blake2b(changes.encode(), digest_size=4).hexdigest()}"
+    return f"{name}_seed={seed}"
+
+
+def read_cells(folder: Path, scale: Scale) -> dict[tuple[str, int], Cell]:
+    """The finished cells of a scale, by their changes and seeds.
+
+    Raises:
+        ValueError: they are of other data or of another base; the message names the first field that differs.
+    """
+    if not (folder / _CELLS).is_file():
+        return {}
+    _check(folder / _SCALE, _shared(scale))
+    with (folder / _CELLS).open(encoding="utf-8", newline="") as file:
+        cells = [_cell(row) for row in csv.DictReader(file)]
+    return {(cell["changes"], cell["seed"]): cell for cell in cells}
+
+
+def add_cell(folder: Path, scale: Scale, cell: Cell, *, locks: Path) -> Cell:
+    """Write a finished cell beside the others of its scale, and read it."""
+    with file_lock(locks / _LOCK, wait=True):
+        cells = read_cells(folder, scale) | {(cell["changes"], cell["seed"]): cell}
+        rows = [_row(cells[key]) for key in sorted(cells)]
+        text = io.StringIO()
+        writer = csv.DictWriter(
+            text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n"
+        )
+        writer.writeheader()
+        writer.writerows(rows)
+        if not (folder / _SCALE).is_file():
+            _write(folder / _SCALE, compact_json(_shared(scale)) + "\n")
+        _write(folder / _CELLS, text.getvalue())
+    return read_cells(folder, scale)[cell["changes"], cell["seed"]]
+
+
+def _write(file: Path, text: str) -> None:
+    atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _row(cell: Cell) -> dict[str, str]:
+    flat: dict[str, Any] = flatten_dict(cell, sep=".", is_leaf=lambda _, value: not value)
+    return {name: value if name in _TEXT else json.dumps(value) for name, value in flat.items()}
+
+
+def _cell(row: dict[str, str]) -> Cell:
+    flat = {name: text if name in _TEXT else json.loads(text) for name, text in row.items() if text}
+    return unflatten_dict(flat, sep=".")
+
+
+def _shared(scale: Scale) -> dict[str, Any]:
+    return {"data": scale.describe(), "base": config_to_json(scale.base)}
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    """Values by dotted names, as JSON gives them back."""
+    return flatten_dict(json.loads(json.dumps(record)), sep=".")
+
+
+def _check(file: Path, shared: dict[str, Any]) -> None:
+    """Compare what the cells of a file share with today's; later fields had the values that checkpoints say."""
+    found = _flat({"base": LATER_FIELDS}) | _flat(read_json(file, dict[str, Any]))
+    for field, value in _flat(shared).items():
+        if field in found and field != "base.name" and found[field] != value:
+            line = f"{file}: {field}: got {found[field]!r}, expected {value!r}"
+            raise ValueError(f"{line}: its cells are of another scale, choose another --out and --runs")

@@ -1,0 +1,89 @@
+"""Cells of the paper's tables: told apart by what they change, found again, refused where their scale changed."""
+
+import dataclasses
+import json
+
+import pytest
+from pretended import Pretended
+from study_tables import study_tables
+
+from experiments.changes import change
+from experiments.ledger import RESULTS
+from experiments.paper_tables.__main__ import TABLES
+from experiments.paper_tables.cells import add_cell, changes_of, read_cells, run_name
+from experiments.paper_tables.scales import quarter
+from experiments.paper_tables.tables import as_markdown, make_record
+from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, QUICKSTART
+from fcos_lidar_jax.training.checkpoint import LATER_FIELDS
+
+SECTOR = RESULTS / "tables" / "sector"
+CELL = {"changes": "base", "seed": 0, "scores": {"mAP": 0.1, "AP": {}, "curve": [[1, 0.1]]}, "git": "1234567"}
+
+
+def test_the_tables_of_today_find_every_committed_cell(tmp_path):
+    scale = quarter(tmp_path)
+    rows = [row for table in (*TABLES, *study_tables()) for row in table.rows]
+    known = {changes_of(row.change(scale.base), scale.base) for row in rows}
+    cells = read_cells(SECTOR, scale)
+    assert len(cells) == 20
+    assert {changes for changes, _ in cells} <= known
+
+
+@pytest.mark.parametrize("file", sorted(SECTOR.glob("*.md")), ids=lambda file: file.stem)
+def test_a_committed_table_is_that_of_its_cells(tmp_path, file):
+    scale, record = quarter(tmp_path), json.loads(file.with_suffix(".json").read_text())
+    (table,) = [t for t in (*TABLES, *study_tables()) if t.name == record["table"]]
+    table, cells = table.only(tuple(row["label"] for row in record["rows"])), read_cells(SECTOR, scale)
+    configs = {row.label: changes_of(row.change(scale.base), scale.base) for row in table.rows}
+    by_row = {label: [cells[own, seed] for seed in record["seeds"]] for label, own in configs.items()}
+    again = make_record(table, record["scale"], scale, by_row, record["figures"])
+    assert as_markdown(table, again) == file.read_text()
+
+
+def test_cells_are_told_apart_by_what_decides_them():
+    changes = {"model__tied_heads": True, "projection__prioritize_current": False, "copy_paste": None}
+    changes |= {"class_ranges_m": (30.0,) * 10, "classes": tuple("abcdefghij")}
+    changes |= {"copy_paste__min_points": 6, "augment__scale_range": (0.9, 1.1)}
+    configs = [QUICKSTART, CENTERPOINT_COMPACT, change(pillars__min_radius=3)(CENTERPOINT_COMPACT)]
+    configs += [change(**{field: value})(QUICKSTART) for field, value in changes.items()]
+    names = {run_name(changes_of(config, QUICKSTART), seed) for config in configs for seed in (0, 1)}
+    assert len(names) == 2 * len(configs) == 20
+    assert max(map(len, names)) < 110
+    assert changes_of(change(name="other")(QUICKSTART), QUICKSTART) == "base"
+
+
+def test_a_cell_comes_back_as_it_was_and_others_stay(tmp_path):
+    scale, other = Pretended(), {**CELL, "seed": 1, "diverged": "step 7, loss: not finite"}
+    del other["scores"]
+    assert read_cells(tmp_path, scale) == {}
+    for cell in (other, CELL):
+        assert add_cell(tmp_path, scale, cell, locks=tmp_path) == cell
+    assert list(read_cells(tmp_path, scale).values()) == [CELL, other]
+    assert (tmp_path / "cells.csv").read_text().count("\n") == 3
+
+
+def test_cells_of_another_scale_are_refused_and_the_field_is_named(tmp_path):
+    scale = Pretended()
+    add_cell(tmp_path, scale, CELL, locks=tmp_path)
+    rounds = dataclasses.replace(scale, base=change(projection__num_rounds=3)(QUICKSTART))
+    with pytest.raises(ValueError, match=r"scale\.json: base\.projection\.num_rounds: got 1, expected 3: "):
+        read_cells(tmp_path, rounds)
+    with pytest.raises(ValueError, match=r"data\.scale: got 'pretended', expected 'elsewhere'"):
+        read_cells(tmp_path, dataclasses.replace(scale, name="elsewhere"))
+    assert read_cells(tmp_path, dataclasses.replace(scale, base=change(name="other")(QUICKSTART)))
+
+
+def test_a_later_field_of_the_configuration_refuses_only_what_it_changes(tmp_path):
+    scale = Pretended()
+    add_cell(tmp_path, scale, CELL, locks=tmp_path)
+    file = tmp_path / "scale.json"
+    record = json.loads(file.read_text())
+    for section, fields in LATER_FIELDS.items():
+        for field in fields:
+            record["base"][section].pop(field, None)
+    file.write_text(json.dumps(record))
+    earlier = {f"{section}__{field}": v for section, fields in LATER_FIELDS.items() for field, v in fields.items()}
+    assert read_cells(tmp_path, dataclasses.replace(scale, base=change(**earlier)(QUICKSTART)))
+    flipped = dataclasses.replace(scale, base=change(**earlier | {"inference__flips": "y"})(QUICKSTART))
+    with pytest.raises(ValueError, match=r"base\.inference\.flips: got 'none', expected 'y'"):
+        read_cells(tmp_path, flipped)
