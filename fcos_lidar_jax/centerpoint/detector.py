@@ -26,7 +26,7 @@ def build(config: CenterPointConfig, sensor: Sensor) -> Detector:
     cells = pillar_grid(config.pillars, sensor, stride=config.pillars.output_stride)
     network = CenterPoint(config.pillars, config.class_groups, grid.side)
 
-    def prepare(points: Array, valid: Array) -> Pillars:
+    def prepare(points: Array | np.ndarray, valid: Array | np.ndarray) -> Pillars:
         return make_pillars(points, valid, grid=grid, sensor=sensor)
 
     def init(key: Any) -> Variables:

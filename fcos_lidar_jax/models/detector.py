@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import Config, ModelConfig
@@ -128,7 +129,7 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     num_rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
     image_of = image_sensor(sensor, config.model)
 
-    def prepare(points: Array, valid: Array) -> RangeImage:
+    def prepare(points: Array | np.ndarray, valid: Array | np.ndarray) -> RangeImage:
         with jax.named_scope("mrv"):
             return project_points(points, valid, image_of, num_rounds=num_rounds, prioritize_current=current_first)
 

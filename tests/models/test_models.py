@@ -292,6 +292,8 @@ def parameters_by_hand(config):
         channels.append(last)
     total += sum((i + 1) * f for i in channels) + 6 * (9 * f + 1) * f
     tower = 9 * f * h + 2 * h + (model.head_convs - 1) * (9 * h + 2) * h
+    if model.local_geometry:
+        total += (85 + 2) * 32 + (32 + 2) * f + 6 * 2 * f * h
     return total + 6 * (2 * tower + (9 * h + 1) * (k + 1 + (3 + 3 + 2 + 2 + 1) * k))
 
 
