@@ -7,15 +7,10 @@ Variants are made with :func:`dataclasses.replace`; every configuration is hasha
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Self, get_args, get_origin, get_type_hints
 
 from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
-
-_RANGE_VIEW_LOSSES = (
-    *("top_q", "regress_on", "iou_loss", "iou_weight", "iou_prediction_weight"),
-    *("quality", "centreness_m"),
-)
-"""Fields of :class:`LossConfig` that CenterPoint has no use for."""
+from fcos_lidar_jax.sensors import Sensor
 
 
 def _check(condition: bool, field: str, got: object, expected: str) -> None:
@@ -127,9 +122,6 @@ class ModelConfig:
     regression_axes: Literal["lidar", "ray"] = "lidar"
     """Axes of the predicted centre offset and velocity: those of the LiDAR frame, as in equation 2, or, not in the
     paper, the direction of the point's azimuth and the one to its left, see :mod:`fcos_lidar_jax.coding`."""
-    meta_kernel: bool = False
-    """Not in the paper: the 3x3 of the backbone's first block weighs its neighbours by their offsets in space, as
-    in RangeDet, see ``fcos_lidar_jax.models.meta_kernel``."""
     local_geometry: bool = False
     """Not in the paper: each location's offsets to the points of the neighbouring pixels as further input of its
     head, see ``fcos_lidar_jax.models.local_geometry``."""
@@ -152,47 +144,6 @@ class ModelConfig:
         _check(nine, "channel_mean", self.channel_mean, "nine finite numbers")
         nine = len(self.channel_scale) == 9 and all(0 < scale < math.inf for scale in self.channel_scale)
         _check(nine, "channel_scale", self.channel_scale, "nine positive numbers")
-        _check_choices(self)
-
-
-@dataclasses.dataclass(frozen=True)
-class PillarConfig:
-    """CenterPoint on pillars (Yin et al., CVPR 2021), with the numbers that its authors publish for nuScenes.
-
-    >>> PillarConfig(range_m=50.0)
-    Traceback (most recent call last):
-    ValueError: pillar_m: got 0.2, expected a part of 100 m by a multiple of 8
-    """
-
-    range_m: float = 51.2  # Half the side of the square around the sensor that is divided into pillars, metres.
-    pillar_m: float = 0.2  # Side of a pillar, metres.
-    point_channels: tuple[int, ...] = (64, 64)  # Of the layers that points pass before they meet in their pillar.
-    backbone_blocks: tuple[int, int, int] = (3, 5, 5)
-    """3x3 convolutions a stage, beside the first one of each, which halves the size."""
-    backbone_widths: tuple[int, int, int] = (64, 128, 256)  # Channels a stage.
-    neck_channels: int = 128  # Channels that each stage gives to the heads.
-    output_stride: Literal[2, 4, 8] = 4  # Pillars a side of a cell of the heat map.
-    head_channels: int = 64  # Channels of the convolution that all heads share, and of those of each head.
-    groups: tuple[int, ...] = ()
-    """The group of each class, counted from 0: each has heads of its own; () for one of all classes."""
-    min_overlap: float = 0.1  # Decides the radius of a Gaussian, see fcos_lidar_jax.centres.gaussian_radius.
-    min_radius: int = 2  # Least radius of a Gaussian, cells of the heat map.
-    centre_prior: float = 0.1  # Probability of a centre at the start, everywhere.
-
-    def __post_init__(self) -> None:
-        _check(0 < self.range_m < math.inf, "range_m", self.range_m, "a positive number of metres")
-        _check(0 < self.pillar_m < self.range_m, "pillar_m", self.pillar_m, f"between 0 and {self.range_m} m")
-        side = 2 * self.range_m / self.pillar_m
-        whole = abs(side - round(side)) < 1e-3 and round(side) % 8 == 0
-        _check(whole, "pillar_m", self.pillar_m, f"a part of {2 * self.range_m:g} m by a multiple of 8")
-        layers = len(self.point_channels) >= 1 and min(self.point_channels) >= 2
-        _check(layers, "point_channels", self.point_channels, "one or more integers of at least 2")
-        _check_least(self, 1, "neck_channels", "head_channels", "min_radius")
-        _check(min(self.backbone_widths) >= 1, "backbone_widths", self.backbone_widths, "counts of at least 1")
-        numbered = set(self.groups) == set(range(max(self.groups, default=-1) + 1))
-        _check(numbered, "groups", self.groups, "the numbers from 0 up to the last group")
-        for name in ("min_overlap", "centre_prior"):
-            _check(0 < getattr(self, name) < 1, name, getattr(self, name), "between 0 and 1")
         _check_choices(self)
 
 
@@ -347,6 +298,9 @@ class OptimizerConfig:
 class Config:
     """All that defines a detector and its training, but for the data.
 
+    It describes FCOS-LiDAR. A subclass with fields of its own describes another detector and builds it, see
+    ``fcos_lidar_jax.centerpoint``.
+
     >>> from dataclasses import replace
     >>> paper = Config()
     >>> variant = replace(paper, projection=replace(paper.projection, num_rounds=3))
@@ -372,8 +326,6 @@ class Config:
     inference: InferenceConfig = InferenceConfig()  # Predictions to detections.
     augment: AugmentConfig | None = AugmentConfig()  # Augmentation of a training step; None for none.
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
-    pillars: PillarConfig | None = None
-    """Where given, the detector is CenterPoint, and ``model`` and the rounds of ``projection`` are ignored."""
 
     def __post_init__(self) -> None:
         _check_hashable(self)
@@ -393,16 +345,15 @@ class Config:
         for axis in self.inference.flips if self.inference.flips != "none" else "":
             seen = self.augment is not None and getattr(self.augment, f"flip_{axis}_probability") > 0
             _check(seen, "inference.flips", self.inference.flips, f"augment.flip_{axis}_probability above 0")
-        if self.pillars is not None:
-            groups = self.pillars.groups
-            one_each = len(groups) in (0, len(names))
-            _check(one_each, "pillars.groups", groups, f"{len(names)} values, one a class, or none")
-            _check(self.model == ModelConfig(), "model", "choices", "none: pillars takes its place")
-            for name in _RANGE_VIEW_LOSSES:
-                own, default = getattr(self.loss, name), getattr(LossConfig(), name)
-                _check(own == default, f"loss.{name}", own, f"{default!r} with pillars, which do not use it")
-            exponent = self.inference.iou_exponent
-            _check(exponent == 1, "inference.iou_exponent", exponent, "1 with pillars, which predict no IoU")
+
+    @classmethod
+    def of(cls, other: "Config", **changes: Any) -> Self:
+        """The configuration of another detector as one of this, with the fields that both have, and changes."""
+        return cls(**{name: getattr(other, name) for name in _names(cls) & _names(other)} | changes)
+
+    def build(self, sensor: Sensor) -> Any:
+        """The :class:`fcos_lidar_jax.models.Detector` of a subclass; None for FCOS-LiDAR."""
+        return None
 
     @property
     def ranges_m(self) -> dict[str, float]:
@@ -418,11 +369,6 @@ class Config:
         by_name = tuple(PASTE_TARGETS.get(name, DEFAULT_PASTE_TARGET) for name in self.classes)
         return self.copy_paste.targets or by_name
 
-    @property
-    def class_groups(self) -> tuple[int, ...]:
-        """The group of heads of each class, for a configuration with ``pillars``."""
-        return (self.pillars and self.pillars.groups) or (0,) * len(self.classes)
-
 
 def config_to_json(config: Config) -> dict[str, Any]:
     """The configuration as a JSON object.
@@ -431,13 +377,33 @@ def config_to_json(config: Config) -> dict[str, Any]:
     True
     """
     record = dataclasses.asdict(config)
-    if config.pillars is None:  # as before there was another detector
-        del record["pillars"]
+    if (kind := _kind_of(record)) is not type(config):
+        raise ValueError(
+            f"config: got fields of {kind.__name__}, expected one that only {type(config).__name__} has"
+        )
     return record
+
+
+def _kind_of(record: Mapping[str, Any]) -> type[Config]:
+    """The class of a configuration: the last subclass that adds a field which the record has."""
+    kinds: list[type[Config]] = [Config]
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+    for kind in reversed(kinds[1:]):
+        if any(record.get(name) is not None for name in _names(kind) - _names(kind.__base__)):
+            return kind
+    return Config
+
+
+def _names(kind: Any) -> set[str]:
+    return {field.name for field in dataclasses.fields(kind)}
 
 
 def config_from_json(record: Any, where: str = "config") -> Config:
     """A configuration from the JSON object that :func:`config_to_json` wrote.
+
+    The fields say which detector it describes, among the classes that the program has defined; nothing is
+    imported. A section of another detector may be null.
 
     Args:
         record, where: the parsed JSON value, and what to call its source in messages.
@@ -449,7 +415,11 @@ def config_from_json(record: Any, where: str = "config") -> Config:
     Traceback (most recent call last):
     ValueError: mine.json.sensor: missing
     """
-    return _from_json(Config, {"pillars": None, **record} if isinstance(record, Mapping) else record, where)
+    if not isinstance(record, Mapping):
+        return _from_json(Config, record, where)
+    kind = _kind_of(record)
+    given = {name: value for name, value in record.items() if value is not None or name in _names(kind)}
+    return _from_json(kind, given, where)
 
 
 def _from_json(kind: Any, value: Any, where: str) -> Any:

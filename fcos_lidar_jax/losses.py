@@ -147,40 +147,12 @@ def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], m
     return _masked(jax.nn.softplus(logits) - iou * logits, mask)
 
 
-def loss_terms(config: LossConfig) -> dict[str, tuple[float, str]]:
-    """Weight of each loss and name of the count that divides its sum.
+def weighted(losses: Mapping[str, Array], config: LossConfig) -> Array:
+    """The weighted sum of losses, ``NAME_weight`` of the configuration times NAME; 1 for names without a weight.
 
-    The number of positives divides the cross-entropy. Each box loss is divided by its number of locations.
-
-    >>> loss_terms(LossConfig(regress_on="candidates"))["l1"]
-    (0.25, 'candidates')
+    >>> float(weighted({"l1": jnp.float32(4), "mine": jnp.float32(3)}, LossConfig()))
+    4.0
     """
-    return {
-        "classification": (config.classification_weight, "positives"),
-        "l1": (config.l1_weight, config.regress_on),
-        "iou": (config.iou_weight, config.regress_on),
-        "iou_prediction": (config.iou_prediction_weight, config.regress_on),
-    }
-
-
-def combine(
-    sums: Mapping[str, Float[Array, ""]], counts: Mapping[str, Array], config: LossConfig
-) -> dict[str, Array]:
-    """Weighted total loss and its terms, each sum divided once by its count over the global batch.
-
-    Args:
-        sums: ``classification``, ``l1``, ``iou`` and ``iou_prediction``, over the global batch.
-        counts: ``positives`` and ``candidates`` of the global batch; a count below 1 divides as 1.
-        config: weights and divisors, see :func:`loss_terms`.
-
-    Returns:
-        the terms, divided but unweighted, and the weighted ``total``.
-
-    >>> sums = {part: jnp.float32(3) for part in loss_terms(LossConfig())}
-    >>> float(combine(sums, {"positives": jnp.int32(3)}, LossConfig())["total"])
-    3.25
-    """
-    terms = loss_terms(config)
-    divided = {name: sums[name] / jnp.maximum(counts[divisor], 1) for name, (_, divisor) in terms.items()}
-    weighted = [weight * divided[name] for name, (weight, _) in terms.items()]
-    return {**divided, "total": sum(weighted[1:], weighted[0])}
+    weights = {n.removesuffix("_weight"): w for n, w in vars(config).items() if n.endswith("_weight")}
+    names = [*(name for name in weights if name in losses), *(name for name in losses if name not in weights)]
+    return sum(weights.get(name, 1.0) * losses[name] for name in names)  # type: ignore[return-value]

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+from fcos_lidar_jax.centerpoint import CenterPointConfig, PillarConfig
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES
 from fcos_lidar_jax.config import (
     AugmentConfig,
@@ -11,7 +12,6 @@ from fcos_lidar_jax.config import (
     InferenceConfig,
     LossConfig,
     OptimizerConfig,
-    PillarConfig,
     ProjectionConfig,
     StemConfig,
 )
@@ -126,7 +126,7 @@ behind the vehicle. NMS at 0.1, weighted NMS and the IoU's exponent are not in t
 ``experiments/LOG.md`` compares them with the paper's.
 """
 
-CENTERPOINT_PILLARS = dataclasses.replace(
+CENTERPOINT_PILLARS = CenterPointConfig.of(
     NUSCENES,
     name="centerpoint_pillars",
     copy_paste=None,
@@ -138,7 +138,7 @@ CENTERPOINT_PILLARS = dataclasses.replace(
 )
 """CenterPoint on pillars with the numbers of its authors for nuScenes: ten sweeps, pillars of 0.2 m."""
 
-CENTERPOINT_COMPACT = dataclasses.replace(
+CENTERPOINT_COMPACT = CenterPointConfig.of(
     COMPACT,
     name="centerpoint_compact",
     model=NUSCENES.model,

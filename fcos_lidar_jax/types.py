@@ -9,7 +9,7 @@ A box is ``x, y, z, l, w, h, yaw, vx, vy``: centre of gravity, length along the 
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jaxtyping import Array, Bool, Float32, Int32, UInt8, UInt16
@@ -135,39 +135,6 @@ class Outputs:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Pillars:
-    """A point cloud divided into pillars, the input of CenterPoint.
-
-    >>> import jax.numpy as jnp
-    >>> Pillars(jnp.zeros((5, 10)), jnp.full(5, 64), jnp.int32(0)).features.shape  # nothing in 8 x 8 pillars
-    (5, 10)
-    """
-
-    features: Float32[Array, "*b n 10"]
-    """x, y, z, intensity, time lag, offset from the mean of the pillar's points 3, offset from the pillar's axis
-    2; zero for excluded points."""
-    cell: Int32[Array, "*b n"]  # Row-major pillar of each point; the number of pillars for excluded points.
-    num_dropped: Int32[Array, "*b"]  # Valid input rows that were non-finite or beyond the sensor's limits.
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class CentreOutputs:
-    """Raw predictions of CenterPoint on the bird's-eye-view map: rows along y, columns along x.
-
-    >>> import jax.numpy as jnp
-    >>> CentreOutputs(jnp.zeros((8, 8, 3)), jnp.zeros((8, 8, 1, 10))).heat.shape
-    (8, 8, 3)
-    """
-
-    heat: Float32[Array, "*b h w k"]  # Logit of an object centre, per class.
-    regression: Float32[Array, "*b h w g 10"]
-    """Per group of classes: centre offset 3 (x and y in cells, z in metres), log size 3, sin and cos of the yaw,
-    velocity 2."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
 class Targets:
     """Result of the assignment of one sample.
 
@@ -181,6 +148,21 @@ class Targets:
     owner: Int32[Array, "*b l"]  # Box that contains the location's point, -1 where no box does.
     positive: Bool[Array, "*b l"]  # True for the K cheapest locations of each owner.
     num_positive: Int32[Array, "*b m"]  # K of each box (0 for a box without candidates).
+
+
+class Sums(NamedTuple):
+    """The losses of a batch before the division; all of it adds up over micro-batches and devices.
+
+    >>> import jax.numpy as jnp
+    >>> Sums(losses={"boxes": {"l1": jnp.float32(3)}}, counts={"boxes": jnp.int32(2)}).means
+    {}
+    """
+
+    losses: dict[str, dict[str, Array]]
+    """Name of the count that divides them -> loss -> its sum, unweighted; ``LossConfig`` has the weights."""
+    counts: dict[str, Array]  # Integers, metrics by their names.
+    means: dict[str, dict[str, Array]] = {}  # noqa: RUF012
+    """Further metrics: name of the count that divides them -> metric -> its sum."""
 
 
 @jax.tree_util.register_dataclass

@@ -14,7 +14,8 @@ from quick import compile_quickly
 _UNCHECKED = ("types", "sensors", "config", "cli")
 _PACKAGE = Path(__file__).parents[1] / "fcos_lidar_jax"
 _MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", "__main__", *_UNCHECKED)]
-_ROOMS = ["models", "training", "inference", "evaluation"]
+_SECOND = [f"centerpoint.{name}" for name in ("pillars", "centres", "network", "objective", "detector")]
+_ROOMS = ["models", "training", "inference", "evaluation", *_SECOND]
 install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "typecheck.check")
 
 # A shell's background job ignores Ctrl-C, what nohup starts a hang-up, and so would the processes that the tests

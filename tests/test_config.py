@@ -14,14 +14,12 @@ from fcos_lidar_jax.config import (
     LossConfig,
     ModelConfig,
     OptimizerConfig,
-    PillarConfig,
     ProjectionConfig,
     StemConfig,
     config_from_json,
     config_to_json,
 )
 from fcos_lidar_jax.presets import (
-    CENTERPOINT_PILLARS,
     COMPACT,
     NUSCENES,
     NUSCENES_SINGLE,
@@ -100,7 +98,6 @@ def test_json_gives_back_the_configuration(name):
         (("num_sweeps",), True, "run.num_sweeps: got True, expected int"),
         (("augment", "scale_range"), [1.05, 0.95], "run.augment.scale_range"),
         (("loss",), MISSING, r"run\.loss: missing"),
-        (("pillars",), {"pillar_m": 0.2}, r"run\.pillars\.range_m: missing"),
     ],
 )
 def test_bad_json_gets_one_line_with_the_field(path, value, message):
@@ -147,16 +144,6 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: OptimizerConfig(weight_decay=-1.0),
         lambda: OptimizerConfig(b1_range=(0.0, 0.9)),
         lambda: OptimizerConfig(b2=1.0),
-        lambda: PillarConfig(pillar_m=0.3),
-        lambda: PillarConfig(pillar_m=0.0),
-        lambda: PillarConfig(output_stride=3),  # type: ignore[arg-type]
-        lambda: PillarConfig(point_channels=()),
-        lambda: PillarConfig(groups=(0, 2)),
-        lambda: PillarConfig(min_overlap=1.0),
-        lambda: Config(pillars=PillarConfig(groups=(0, 1))),
-        lambda: Config(pillars=PillarConfig(), model=ModelConfig(tied_heads=True)),
-        lambda: Config(pillars=PillarConfig(), inference=InferenceConfig(iou_exponent=0.5)),
-        lambda: Config(pillars=PillarConfig(), loss=LossConfig(top_q=10)),
         lambda: Config(max_points=0),
         lambda: Config(classes=()),
         lambda: Config(classes=("crate", "crate")),
@@ -189,12 +176,3 @@ def test_the_papers_presets_keep_close_points_of_the_current_sweep():
     assert modes == dict.fromkeys(PRESETS, "sweeps") | dict.fromkeys(
         ("compact", "centerpoint_compact", "quickstart"), "all"
     )
-
-
-def test_a_configuration_without_pillars_is_written_as_before_there_were_any():
-    assert "pillars" not in config_to_json(NUSCENES)
-    record = json.loads(json.dumps(config_to_json(CENTERPOINT_PILLARS)))
-    assert record["pillars"]["pillar_m"] == 0.2
-    assert config_from_json({**config_to_json(NUSCENES), "pillars": None}) == NUSCENES
-    assert CENTERPOINT_PILLARS.class_groups[CENTERPOINT_PILLARS.classes.index("barrier")] == 3
-    assert Config(classes=("a", "b"), pillars=PillarConfig()).class_groups == (0, 0)

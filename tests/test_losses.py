@@ -1,6 +1,5 @@
 """Compare each loss with NumPy, and check that losses and gradients are finite."""
 
-import dataclasses
 import functools
 import math
 
@@ -12,7 +11,7 @@ import pytest
 
 from fcos_lidar_jax.config import LossConfig
 from fcos_lidar_jax.iou import oriented
-from fcos_lidar_jax.losses import centreness, classification_loss, combine, iou_loss, iou_prediction_loss, l1_loss
+from fcos_lidar_jax.losses import centreness, classification_loss, iou_loss, iou_prediction_loss, l1_loss, weighted
 
 NUMBER = 50
 KINDS = ("iou", "log_iou", "giou", "diou")
@@ -131,19 +130,13 @@ def test_iou_prediction_loss_is_binary_cross_entropy_without_gradient_for_the_io
     assert float(huge) == 0
 
 
-def test_parts_are_divided_once_and_weighed():
+def test_losses_are_weighed_by_name():
     config = LossConfig(
         classification_weight=1, l1_weight=0.25, iou_weight=2, iou_prediction_weight=0.5, velocity_weight=0.2
     )
-    names = ("classification", "l1", "iou", "iou_prediction")
-    parts = {n: f32(v) for n, v in zip(names, (8.0, 4.0, 2.0, 6.0), strict=True)}
-    counts = {"positives": jnp.int32(4), "candidates": jnp.int32(8)}
-    assert float(combine(parts, counts, config)["total"]) == (8 + 1 + 4 + 3) / 4
-    assert float(combine(parts, counts, config)["l1"]) == 1.0
-    assert float(combine(parts, {"positives": jnp.int32(0)}, config)["total"]) == 16
-    wider = dataclasses.replace(config, regress_on="candidates")
-    assert float(combine(parts, counts, wider)["total"]) == 8 / 4 + (1 + 4 + 3) / 8
-    assert [float(combine(parts, counts, wider)[name]) for name in names] == [2.0, 0.5, 0.25, 0.75]
+    losses = {"mine": f32(1.0), "classification": f32(8.0), "l1": f32(4.0), "iou": f32(2.0)}
+    assert float(weighted(losses | {"iou_prediction": f32(6.0)}, config)) == 1 + 8 + 1 + 4 + 3
+    assert float(weighted({"top_q": f32(3.0)}, config)) == 3
 
 
 def test_an_unknown_kind_is_rejected():

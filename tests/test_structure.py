@@ -1,5 +1,6 @@
 """The structure of the project: layers, light imports, one test file a module."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -36,3 +37,11 @@ def test_every_core_module_has_its_test_file():
     )  # of tests/test_config.py
     tested = {p.stem.removeprefix("test_") for p in (ROOT / "tests").glob("test_*.py")}
     assert core - tested == set()
+
+
+def test_only_the_second_detector_and_the_presets_know_pillars():
+    package = ROOT / "fcos_lidar_jax"
+    knowing = [
+        f for f in package.rglob("*.py") if re.search(r"\b[Pp]illar(s|Config)?\b", f.read_text(encoding="utf-8"))
+    ]
+    assert {f.relative_to(package).parts[0] for f in knowing} == {"centerpoint", "presets.py"}

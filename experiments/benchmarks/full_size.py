@@ -24,17 +24,18 @@ from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
-from fcos_lidar_jax.inference import make_detect
-from fcos_lidar_jax.inference.stages import Stages
+from fcos_lidar_jax.inference import make_detect, make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters
+from fcos_lidar_jax.models.detector import network_parts
+from fcos_lidar_jax.models.objective import sample_losses
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
-from fcos_lidar_jax.training.objective import make_sums, sample_losses
+from fcos_lidar_jax.training.objective import make_objective
 from fcos_lidar_jax.types import Batch
 
 
@@ -62,11 +63,11 @@ def training_memory(config: Config) -> dict[str, dict[str, float]]:
     for remat in (False, True):
         model = dataclasses.replace(config.model, remat=remat)
         detector = build_detector(dataclasses.replace(config, model=model), sensor)
-        optimizer, sums = make_optimizer(config.optimizer, 100), make_sums(detector)
+        optimizer, objective = make_optimizer(config.optimizer, 100), make_objective(detector)
         state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
 
-        def pull_back(params: Any, statistics: Any, batch: Batch, sums: Any = sums) -> Any:
-            return jax.vjp(lambda params: sums(params, statistics, batch), params, has_aux=True)[1]
+        def pull_back(params: Any, statistics: Any, batch: Batch, objective: Any = objective) -> Any:
+            return jax.vjp(lambda params: objective(params, statistics, batch), params, has_aux=True)[1]
 
         kept = jax.tree.leaves(jax.eval_shape(pull_back, state.params, state.batch_stats, batch))
         step = jax.jit(make_train_step(detector, optimizer), donate_argnums=0)
@@ -94,13 +95,14 @@ def measure(args: Args) -> dict[str, Any]:
     record["boxes"] = len(frame.boxes)
     print(json.dumps(record), flush=True)
 
-    stages = Stages(config, sensor)
-    image = stages.project(batch.points[0], batch.valid[0])
-    seen = stages.preprocess(image.features[None])
-    after_stem = stages.stem(variables, seen)
-    levels = stages.backbone(variables, after_stem)
-    pyramid = stages.fpn(variables, levels)
-    outputs = stages.outputs(variables, image)
+    parts = network_parts(config, sensor)
+    prepare, network, _, postprocess = map(jax.jit, make_stages(detector))
+    image = prepare(batch.points[0], batch.valid[0])
+    seen = parts.preprocess(image.features[None])
+    after_stem = parts.stem(variables, seen)
+    levels = parts.backbone(variables, after_stem)
+    pyramid = parts.fpn(variables, levels)
+    outputs = network(variables, image)
     truth = batch.boxes[0], batch.labels[0], batch.box_valid[0]
     axes = config.model.regression_axes
     objective = functools.partial(sample_losses, config=config.loss, layout=layout, axes=axes)
@@ -108,17 +110,17 @@ def measure(args: Args) -> dict[str, Any]:
     # A trained detector is sure of little: as many candidates as the threshold lets through is the worst case.
     eager = dataclasses.replace(outputs, logits=outputs.logits.at[:, -1].add(-4.0))
     detect = jax.jit(make_detect(detector))
-    forward = jax.jit(lambda v, f: detector.apply(v, f, train=False)[0])
+    forward, images = jax.jit(lambda v, i: detector.apply(v, i)[0]), jax.tree.map(lambda leaf: leaf[None], image)
     calls: dict[str, Call] = {
-        "mrv": lambda: stages.project(batch.points[0], batch.valid[0]),
-        "stem": lambda: stages.stem(variables, seen),
-        "backbone": lambda: stages.backbone(variables, after_stem),
-        "fpn": lambda: stages.fpn(variables, levels),
-        "heads": lambda: stages.heads(variables, pyramid),
+        "mrv": lambda: prepare(batch.points[0], batch.valid[0]),
+        "stem": lambda: parts.stem(variables, seen),
+        "backbone": lambda: parts.backbone(variables, after_stem),
+        "fpn": lambda: parts.fpn(variables, levels),
+        "heads": lambda: parts.heads(variables, pyramid),
         "assignment": lambda: assignment(outputs, image),
         "assignment and losses": lambda: losses(outputs, image),
-        "candidates and nms": lambda: stages.postprocess(eager, image),
-        "forward": lambda: forward(variables, image.features[None]),
+        "candidates and nms": lambda: postprocess(eager, image),
+        "forward": lambda: forward(variables, images),
         "points to boxes": lambda: detect(variables, batch.points[0], batch.valid[0]),
     }
     times = interleaved(calls, args.repeats)

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments.script import Options, run_script, save
+from fcos_lidar_jax.config import Config
 
 Card = Literal["h100", "a100"]
 _CARDS = {  # major, cores, shared memory per core and per block, bandwidth, L2, clock, memory, name
@@ -84,7 +85,6 @@ class Program:
     precision: str = "float32"
     batch: int = 1
     remat: bool = False
-    additions: tuple[str, ...] = ()  # Fields of the model that are switched on.
     card: Card = "h100"
     devices: int = 1
 
@@ -113,12 +113,10 @@ def all_programs() -> dict[str, Program]:
 
     programs = dict(PROGRAMS)
     for name, config in PRESETS.items():
-        for precision in ("float32", "bfloat16") if config.pillars is None else ("float32",):
+        for precision in ("float32", "bfloat16") if type(config) is Config else ("float32",):
             label = name + ("" if precision == "float32" else f"-{precision}") + "-1"
             programs[f"train-{label}"] = Program("train", name, precision)
             programs[f"detect-{label}"] = Program("detect", name, precision)
-    for addition in ("meta_kernel",):
-        programs[f"train-compact-{addition}"] = Program("train", "compact", batch=2, additions=(addition,))
     return programs
 
 
@@ -264,9 +262,8 @@ def _configured(program: Program) -> Any:
 
     config = PRESETS[program.preset]
     model = config.model
-    if config.pillars is None:
-        switches = dict.fromkeys(program.additions, True)
-        model = dataclasses.replace(model, precision=program.precision, remat=program.remat, **switches)
+    if type(config) is Config:
+        model = dataclasses.replace(model, precision=program.precision, remat=program.remat)
     optimizer = dataclasses.replace(config.optimizer, batch_size=program.batch)
     return dataclasses.replace(config, model=model, optimizer=optimizer)
 
@@ -314,15 +311,15 @@ def _stage_gflop(program: Program, sharding: Any) -> dict[str, float]:
     """GFLOP of each stage of the range view's network, forward, for one frame."""
     import jax
 
-    from fcos_lidar_jax.inference.stages import Stages
     from fcos_lidar_jax.models import build_detector
+    from fcos_lidar_jax.models.detector import network_parts
     from fcos_lidar_jax.sensors import load_sensor
 
     config = _configured(program)
-    if config.pillars is not None:
+    if type(config) is not Config:
         return {}
     sensor = load_sensor(config.sensor)
-    stages, found = Stages(config, sensor), {}
+    parts, found = network_parts(config, sensor), {}
     variables = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
     shape = jax.ShapeDtypeStruct(
         (1, sensor.num_rows, sensor.num_columns, 9, config.projection.num_rounds), "float32"
@@ -332,9 +329,9 @@ def _stage_gflop(program: Program, sharding: Any) -> dict[str, float]:
 
         columns = image_sensor(sensor, config.model).num_columns
         shape = jax.ShapeDtypeStruct((*shape.shape[:2], columns, *shape.shape[3:]), "float32")
-    x = jax.eval_shape(stages.preprocess, shape)
+    x = jax.eval_shape(parts.preprocess, shape)
     for name in ("stem", "backbone", "fpn", "heads"):
-        stage = getattr(stages, name)
+        stage = getattr(parts, name)
         lowered = jax.jit(stage, in_shardings=sharding, out_shardings=sharding).lower(variables, x)
         found[name] = round(gflop(lowered), 1)
         x = jax.eval_shape(stage, variables, x)

@@ -31,13 +31,11 @@ from experiments.paper import PAPER
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.inference import make_detect
+from fcos_lidar_jax.inference import make_detect, make_stages
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
-from fcos_lidar_jax.inference.detect import select_candidates
-from fcos_lidar_jax.inference.stages import Stages
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved
-from fcos_lidar_jax.locations import image_layout, locate
 from fcos_lidar_jax.models import Variables, build_detector
+from fcos_lidar_jax.models.detector import network_parts
 from fcos_lidar_jax.models.modality import Form, Stem
 from fcos_lidar_jax.nms import rotated_nms
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, PRESETS
@@ -98,22 +96,23 @@ def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
 
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:
     """The stages of one cloud, each with its input at hand."""
-    stages = Stages(config, sensor)
-    detect = jax.jit(make_detect(build_detector(config, sensor)))
-    body = jax.jit(lambda v, f: stages.backbone(v, stages.stem(v, stages.preprocess(f))))
-    front = jax.jit(lambda v, levels: stages.heads(v, stages.fpn(v, levels)))
+    parts, detector = network_parts(config, sensor), build_detector(config, sensor)
+    prepare, network, _, postprocess = map(jax.jit, make_stages(detector))
+    detect = jax.jit(make_detect(detector))
+    body = jax.jit(lambda v, f: parts.backbone(v, parts.stem(v, parts.preprocess(f))))
+    front = jax.jit(lambda v, levels: parts.heads(v, parts.fpn(v, levels)))
     points, valid = jax.device_put((cloud.points, cloud.valid))
-    image = stages.project(points, valid)
+    image = prepare(points, valid)
     levels = body(variables, image.features[None])
-    pyramid, outputs = stages.fpn(variables, levels), stages.outputs(variables, image)
+    pyramid, outputs = parts.fpn(variables, levels), network(variables, image)
     return {
         "transfer": lambda: jax.device_put((cloud.points, cloud.valid)),
-        "MRV": lambda: stages.project(points, valid),
+        "MRV": lambda: prepare(points, valid),
         "Backbone (stem and backbone)": lambda: body(variables, image.features[None]),
         "Heads (pyramid and heads)": lambda: front(variables, levels),
-        "pyramid alone": lambda: stages.fpn(variables, levels),
-        "heads alone": lambda: stages.heads(variables, pyramid),
-        "post-processing": lambda: stages.postprocess(outputs, image),
+        "pyramid alone": lambda: parts.fpn(variables, levels),
+        "heads alone": lambda: parts.heads(variables, pyramid),
+        "post-processing": lambda: postprocess(outputs, image),
         _WHOLE: lambda: detect(variables, points, valid),
     }
 
@@ -128,12 +127,11 @@ def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: s
 
 def form_times(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, dict[str, Times]]:
     """The times of all forms of stem and NMS; the stages take the one that suits the platform."""
-    model, choices, layout = config.model, config.inference, image_layout(sensor, config.model)
-    stages = Stages(config, sensor)
-    image = stages.project(*jax.device_put((cloud.points, cloud.valid)))
-    seen, outputs = stages.preprocess(image.features[None]), stages.outputs(variables, image)
-    select = functools.partial(select_candidates, config=choices, layout=layout, axes=model.regression_axes)
-    boxes, scores, labels, valid = jax.jit(lambda o, i: select(o, locate(i, layout)))(outputs, image)
+    model, choices = config.model, config.inference
+    prepare, network, candidates, _ = map(jax.jit, make_stages(build_detector(config, sensor)))
+    image = prepare(*jax.device_put((cloud.points, cloud.valid)))
+    seen = network_parts(config, sensor).preprocess(image.features[None])
+    boxes, scores, labels, valid = candidates(network(variables, image), image)
     own = {kind: tree["stem"] for kind, tree in variables.items()}
 
     def stem(form: Form) -> Call:

@@ -25,6 +25,7 @@ from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
 from experiments.script import run_script
+from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_stages
@@ -36,18 +37,20 @@ _AS_LONG = 1.5  # Times the epochs of the scale, in which CenterPoint takes abou
 _CANDIDATES = (
     4450  # As many as the range view has on all of its levels, of which the coarsest hold less than 1000.
 )
-_OF_THE_PEER = {part: getattr(CENTERPOINT_COMPACT, part) for part in ("model", "loss", "pillars")}
 
 
 def _as_long(config: Config) -> Config:
     return change(optimizer__epochs=round(_AS_LONG * config.optimizer.epochs))(config)
 
 
+def _peer(config: Config) -> Config:
+    own = {part: getattr(CENTERPOINT_COMPACT, part) for part in ("model", "loss", "pillars")}
+    change_shared = change(inference__iou_exponent=1.0, inference__candidates_per_level=_CANDIDATES)
+    return CenterPointConfig.of(change_shared(config), **own)
+
+
 OURS = Row("FCOS-LiDAR", change())
-PEER = Row(
-    "CenterPoint",
-    change(inference__iou_exponent=1.0, inference__candidates_per_level=_CANDIDATES, **_OF_THE_PEER),
-)
+PEER = Row("CenterPoint", _peer)
 ROWS = (PEER, OURS, Row(f"FCOS-LiDAR, {_AS_LONG} x epochs", _as_long))
 
 

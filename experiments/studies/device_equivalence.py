@@ -31,12 +31,11 @@ from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import Detector, build_detector
+from fcos_lidar_jax.models.objective import sample_losses
 from fcos_lidar_jax.presets import QUICKSTART
-from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
-from fcos_lidar_jax.training.objective import sample_losses
 from fcos_lidar_jax.training.sharding import jit_step, make_mesh, replicate, shard_batch
 from fcos_lidar_jax.training.step import make_gradient
 from fcos_lidar_jax.types import Batch, TrainState
@@ -73,9 +72,9 @@ def batch_of(step: int) -> Batch:
 
 
 def _targets_of(detector: Detector, state: TrainState, batch: Batch) -> tuple[jax.Array, ...]:
-    image = jax.vmap(lambda p, v: project_points(p, v, SENSOR, num_rounds=1))(batch.points, batch.valid)
+    image = jax.vmap(detector.prepare)(batch.points, batch.valid)
     variables = {"params": state.params, "batch_stats": state.batch_stats}
-    outputs, _ = detector.apply(variables, image.features, train=True)
+    outputs, _ = detector.apply(variables, image, train=True)
     model = CONFIG.model
     options: dict[str, Any] = {"layout": image_layout(SENSOR, model), "axes": model.regression_axes}
     assign = functools.partial(sample_losses, config=CONFIG.loss, **options)

@@ -27,6 +27,7 @@ from experiments.changes import change
 from experiments.runs import detections, trained
 from experiments.script import Options, real_data, run_measurement
 from fcos_lidar_jax.assignment import owners
+from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import Frame, GivenFrames, without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
@@ -64,7 +65,7 @@ CONFIG = change(
 """The paper's depth at the quickstart's widths, on the full-size image of one sweep, rows not doubled."""
 CONFIGS = {
     "fcos": CONFIG,
-    "centerpoint": dataclasses.replace(
+    "centerpoint": CenterPointConfig.of(
         CONFIG, name="overfit_centerpoint", **{part: getattr(CENTERPOINT_COMPACT, part) for part in _OF_THE_PEER}
     ),
 }

@@ -164,7 +164,7 @@ def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
     images = [prepare(*cloud) for cloud in on_device]
     outputs = [network(image) for image in images]
     return {
-        "projection": _in_turn(lambda cloud: prepare(*cloud), on_device),
+        "prepare": _in_turn(lambda cloud: prepare(*cloud), on_device),
         "network": _in_turn(network, images),
         "postprocess": _in_turn(lambda pair: postprocess(*pair), list(zip(outputs, images, strict=True))),
     }

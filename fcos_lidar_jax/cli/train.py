@@ -38,12 +38,14 @@ _ABOUT = {
     "centerpoint_compact": "CenterPoint on one sweep, of about the cost of compact",
 }
 _PRESETS: Any = (
-    tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT[name])
+    Annotated[
+        type(preset), tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT[name])
+    ]
     for name, preset in PRESETS.items()
 )
 _OBJECTS = "objects"  # Folder in the run's, where objects of single frames are cut.
 _MADE_BEFORE = 2000  # Simulated frames that may be made before the first step: minutes.
-_Preset: Any = reduce(or_, (Annotated[Config, preset] for preset in _PRESETS))
+_Preset: Any = reduce(or_, _PRESETS)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ from jax.sharding import Mesh, PartitionSpec
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
-from fcos_lidar_jax.inference.detect import make_detect
+from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
@@ -139,16 +139,7 @@ class TrainedDetector(CloudDetector):
 
 @functools.lru_cache(maxsize=8)
 def _split_detect(detector: Detector, mesh: Mesh, batch_size: int) -> Callable[..., Any]:
-    detect = make_detect(detector)
-    if batch_size > 1:
-        detect = jax.vmap(detect, (None, 0, 0))
-
-    def on_one_device(variables: Variables, points: jax.Array, valid: jax.Array) -> Any:
-        if batch_size > 1:
-            return detect(variables, points, valid)
-        return jax.tree.map(lambda leaf: leaf[None], detect(variables, points[0], valid[0]))
-
-    return jit_split(on_one_device, mesh, shared=1)
+    return jit_split(over_clouds(make_detect(detector), batch_size), mesh, shared=1)
 
 
 def jit_split(on_one_device: Callable[..., Any], mesh: Mesh, *, shared: int = 0) -> Callable[..., Any]:

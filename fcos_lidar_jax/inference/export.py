@@ -23,7 +23,7 @@ from fcos_lidar_jax import __version__
 from fcos_lidar_jax.config import config_from_json, config_to_json
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.inference.cloud import usable_rows
-from fcos_lidar_jax.inference.detect import make_detect
+from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, jit_split
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.projection import remove_close as without_close
@@ -158,10 +158,7 @@ def _whole_path(detector: TrainedDetector, batch: Size) -> Callable[..., dict[st
     def whole(points: jax.Array, valid: jax.Array, remove_close: jax.Array) -> dict[str, jax.Array]:
         # As constants that are not folded, so that they are computed with as if they were arguments.
         variables = lax.optimization_barrier(jax.tree.map(jnp.asarray, weights))
-        if batch == 1:
-            found = jax.tree.map(lambda leaf: leaf[None], one(variables, points[0], valid[0], remove_close))
-        else:
-            found = jax.vmap(one, (None, 0, 0, None))(variables, points, valid, remove_close)
+        found = over_clouds(one, batch)(variables, points, valid, remove_close)
         return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
 
     return whole

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from fcos_lidar_jax import __version__
-from fcos_lidar_jax.config import ModelConfig, StemConfig, config_to_json
+from fcos_lidar_jax.config import Config, ModelConfig, StemConfig, config_to_json
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout
 from fcos_lidar_jax.models.layers import EPSILON, norm_groups, pieces
@@ -59,19 +59,18 @@ def network_graph(detector: TrainedDetector) -> bytes:
     float32, whatever ``config.model.precision`` is. The metadata hold classes, configuration and sensor as JSON.
 
     Raises:
-        ValueError: the detector is CenterPoint, onnx is not installed, or the network has parameters that the
-            graph does not know.
+        ValueError: the detector is another one than FCOS-LiDAR, onnx is not installed, or the network has
+            parameters that the graph does not know.
     """
     config, model = detector.config, detector.config.model
-    if config.pillars is not None:
-        raise ValueError(f"ONNX: got the detector {config.name!r} on pillars, expected one on range images")
+    if type(config) is not Config:
+        raise ValueError(f"ONNX: got the detector {config.name!r}, expected one on range images")
     onnx = cpu_package("onnx")
     layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
     network = _Network(onnx, detector.variables, circular=model.circular_width)
     image = _preprocessing(network, "features", model, layout)
-    geometry = _geometry(network, image, rounds, model.channel_scale) if model.meta_kernel else None
     stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
-    levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks, geometry))
+    levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks))
     k = len(config.classes)
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
     local = _local_geometry(network, image, rounds, model) if model.local_geometry else None
@@ -184,14 +183,14 @@ class _Network:
             )
         return x
 
-    def padded(self, x: str, high: int = 1, wide: int = 1) -> str:
+    def padded(self, x: str, high: int, wide: int) -> str:
         """With more pixels on every side: zeros, or wrapped around the width."""
         if self.circular:
             last, first = self("Slice", x, [-wide], [_END], [3]), self("Slice", x, [0], [wide], [3])
             x, wide = self("Concat", last, x, first, axis=3), 0
         return self("Pad", x, [0, 0, high, wide, 0, 0, high, wide])
 
-    def cut(self, x: str, row: int, column: int, high: int = 1, wide: int = 1) -> str:
+    def cut(self, x: str, row: int, column: int, high: int, wide: int) -> str:
         """A window of a padded image; its end is counted from the image's, whose size the graph need not know."""
         ends = [_END if place == 2 * pad else place - 2 * pad for place, pad in ((row, high), (column, wide))]
         return self("Slice", x, [row, column], ends, [2, 3])
@@ -251,17 +250,12 @@ def _block_diagonal(kernels: Sequence[np.ndarray]) -> np.ndarray:
     return whole
 
 
-def _geometry(network: _Network, image: str, rounds: int, scale: Sequence[float]) -> tuple[str, str]:
-    """As :func:`fcos_lidar_jax.models.meta_kernel.geometry_of`: points and where they exist."""
-    points = network("Gather", image, [0, rounds, 2 * rounds], axis=1)
-    metres = network("Mul", points, np.array(scale[:3])[:, None, None])
-    filled = network("Greater", network("Gather", image, [7 * rounds], axis=1), 0.0)
-    return metres, network("Where", filled, 1.0, 0.0)
-
-
 def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConfig) -> str:
     """As :class:`fcos_lidar_jax.models.local_geometry.LocalGeometry`."""
-    points, exists = _geometry(network, image, rounds, model.channel_scale)
+    points = network("Gather", image, [0, rounds, 2 * rounds], axis=1)
+    points = network("Mul", points, np.array(model.channel_scale[:3])[:, None, None])
+    filled = network("Greater", network("Gather", image, [7 * rounds], axis=1), 0.0)
+    exists = network("Where", filled, 1.0, 0.0)
     azimuth = network("Mul", network("Gather", image, [4 * rounds], axis=1), model.channel_scale[4])
     azimuth = network("Add", azimuth, model.channel_mean[4])
     cos, sin = network("Cos", azimuth), network("Sin", azimuth)
@@ -284,33 +278,13 @@ def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConf
     return x
 
 
-def _meta_kernel(network: _Network, x: str, geometry: tuple[str, str], path: str) -> str:
-    """As :class:`fcos_lidar_jax.models.meta_kernel.MetaKernel`."""
-    points, exists = geometry
-    kernel, (gain, shift) = network.parameter(f"{path}/kernel"), network.batch_norm(f"{path}/norm")
-    hidden, weigh = (network.parameter(f"{path}/{name}")[None, None] for name in ("hidden", "weigh"))
-    placed = network.conv(points, hidden)
-    here = network("Sub", placed, network.parameter(f"{path}/hidden_bias")[:, None, None])
-    around, total = [network.padded(image) for image in (network("Mul", x, exists), placed)], ""
-    for row, column in np.ndindex(3, 3):
-        f, there = (network.cut(image, row, column) for image in around)
-        bias = network.parameter(f"{path}/weigh_bias")
-        weight = network.conv(network("Relu", network("Sub", there, here)), weigh, bias)
-        tap = network.conv(network("Mul", weight, f), kernel[row, column][None, None] * gain)
-        total = network("Add", total, tap) if total else tap
-    return network("Relu", network("Add", network("Mul", total, exists), shift[:, None, None]))
-
-
-def _backbone(network: _Network, x: str, blocks: Sequence[int], geometry: tuple[str, str] | None) -> list[str]:
+def _backbone(network: _Network, x: str, blocks: Sequence[int]) -> list[str]:
     x, levels = network.conv_norm(x, "backbone/first"), []
     for stage, (count, stride) in enumerate(zip(blocks, STAGE_STRIDES, strict=True)):
         for block in range(count):
             path, step = f"backbone/stage{stage}_block{block}", stride if block == 0 else 1
             y = network.conv_norm(x, f"{path}/reduce")
-            if geometry is None or stage or block:
-                y = network.conv_norm(y, f"{path}/spatial", stride=step)
-            else:
-                y = _meta_kernel(network, y, geometry, f"{path}/meta_kernel")
+            y = network.conv_norm(y, f"{path}/spatial", stride=step)
             y = network.conv_norm(y, f"{path}/expand", relu=False)
             if block == 0:
                 x = network.conv_norm(x, f"{path}/shortcut", stride=step, relu=False)

@@ -1,6 +1,6 @@
 """A detector whose network runs in OpenVINO: the fast path on CPUs.
 
-Three programs a cloud: projection, compiled by XLA; the network, by OpenVINO; decoding and NMS, by XLA again.
+Three programs per cloud: projection, compiled by XLA; the network, by OpenVINO; decoding and NMS, by XLA again.
 """
 
 import dataclasses
@@ -14,10 +14,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.inference.onnx_graph import cpu_package, network_graph
-from fcos_lidar_jax.inference.stages import Stages
-from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.types import Detections, Outputs, RangeImage
 
 Precision = Literal["float32", "bfloat16"]
@@ -43,11 +43,11 @@ class OpenVinoDetector(TrainedDetector):
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         """As of any detector, but one cloud after the other: a batch changes nothing."""
-        stages = stages_of(self.config, self.sensor)
+        prepare, postprocess = _ends(self.model)
 
         def one(points: np.ndarray, valid: np.ndarray) -> Detections:
-            image = stages.project(points, valid)
-            boxes, scores, labels, used = stages.postprocess(self.network(image), image)
+            image = prepare(points, valid)
+            boxes, scores, labels, used = postprocess(self.network(image), image)
             return Detections(boxes, scores, labels, used, image.num_dropped)
 
         def several(points: Any, valid: Any) -> Detections:
@@ -58,9 +58,10 @@ class OpenVinoDetector(TrainedDetector):
 
 
 @functools.lru_cache(maxsize=8)
-def stages_of(config: Config, sensor: Sensor) -> Stages:
-    """The stages, of which the first and the last are run; compiled once."""
-    return Stages(config, sensor)
+def _ends(detector: Detector) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The stages before and behind the network, compiled once."""
+    stages = make_stages(detector)
+    return jax.jit(stages.prepare), jax.jit(stages.postprocess)
 
 
 def _check_flips(config: Config) -> None:

@@ -1,4 +1,4 @@
-"""The network: the only package that knows Flax."""
+"""Detectors as pure functions, and FCOS-LiDAR: network, losses and candidates."""
 
 from fcos_lidar_jax.models.detector import Detector, Variables, build_detector, count_parameters
 

@@ -1,4 +1,4 @@
-"""The network as a pair of pure functions."""
+"""Detectors as pure functions, and FCOS-LiDAR's network."""
 
 import functools
 from collections.abc import Callable
@@ -7,47 +7,59 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import Config, ModelConfig
-from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout, pad_image
-from fcos_lidar_jax.models.centerpoint import build_centerpoint
+from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout, image_sensor, locate, pad_image
+from fcos_lidar_jax.models.candidates import select_candidates
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
 from fcos_lidar_jax.models.layers import Image, recomputed
 from fcos_lidar_jax.models.lidar_net import Backbone
 from fcos_lidar_jax.models.local_geometry import LocalGeometry
-from fcos_lidar_jax.models.meta_kernel import geometry_of
 from fcos_lidar_jax.models.modality import Stem
+from fcos_lidar_jax.models.objective import make_sums
+from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import Outputs
+from fcos_lidar_jax.types import Batch, Outputs, RangeImage, Sums
 
 Variables = dict[str, Any]  # ``params`` and ``batch_stats``, plain dicts of arrays.
 
 
 class Detector(NamedTuple):
-    """The network's two pure functions, with the configuration and the sensor that they were built for.
+    """A detector as pure functions, with the configuration and the sensor that they were made for.
 
     Attributes:
+        prepare: ``(points f32[n, c], valid bool[n]) -> input`` of one cloud, without parameters: a pytree with
+            ``num_dropped`` i32[], valid points that it leaves out. FCOS-LiDAR's is a
+            :class:`~fcos_lidar_jax.types.RangeImage`.
         init: ``key -> variables``.
-        apply: ``(variables, features f32[b, h, w, 9, r], train=False) -> (Outputs, batch_stats)``. The
-            features are a range image's, in raw units; the batch statistics are the given ones unless training.
-            With ``config.pillars``: ``(variables, Pillars, train=False) -> (CentreOutputs, batch_stats)``.
+        apply: ``(variables, inputs, train=False) -> (outputs, batch_stats)`` of a batch of inputs. The batch
+            statistics are the given ones unless training. FCOS-LiDAR's outputs are
+            :class:`~fcos_lidar_jax.types.Outputs`.
+        sums: ``(outputs, inputs, batch) -> Sums``, the losses of a batch, see :class:`~fcos_lidar_jax.types.Sums`.
+        candidates: ``(outputs, input) -> (boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c])`` of one
+            cloud, before NMS.
         config: all choices.
-        sensor: the image's geometry.
+        sensor: what the clouds are of.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
     >>> detector = build_detector(QUICKSTART, SHORT_RANGE)
     >>> variables = jax.eval_shape(detector.init, jax.random.key(0))
-    >>> image = jax.ShapeDtypeStruct((1, 32, 128, 9, 1), jnp.float32)
-    >>> outputs, _ = jax.eval_shape(detector.apply, variables, image)
+    >>> clouds = jax.ShapeDtypeStruct((2, 4096, 5), jnp.float32), jax.ShapeDtypeStruct((2, 4096), bool)
+    >>> images = jax.eval_shape(jax.vmap(detector.prepare), *clouds)
+    >>> outputs, _ = jax.eval_shape(detector.apply, variables, images)
     >>> outputs.logits.shape  # all levels' locations; ten classes and the background
-    (1, 5460, 11)
+    (2, 5460, 11)
     """
 
+    prepare: Callable[..., Any]
     init: Callable[[Any], Variables]
     apply: Callable[..., tuple[Any, Any]]
+    sums: Callable[[Any, Any, Batch], Sums]
+    candidates: Callable[[Any, Any], tuple[Array, Array, Array, Array]]
     config: Config
     sensor: Sensor
 
@@ -73,8 +85,7 @@ class Network(nn.Module):
         with jax.named_scope("stem"):
             x = (recomputed(self.stem) if self.config.remat else self.stem)(image, train=train)
         with jax.named_scope("backbone"):
-            geometry = geometry_of(image, self.config.channel_scale) if self.config.meta_kernel else None
-            levels = self.backbone(x, geometry, train=train)
+            levels = self.backbone(x, train=train)
         with jax.named_scope("fpn"):
             levels = self.fpn(levels)
         local = None
@@ -104,7 +115,7 @@ def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, la
 
 @functools.cache
 def build_detector(config: Config, sensor: Sensor) -> Detector:
-    """The network of a configuration for a sensor's clouds; equal arguments share one object and its programs.
+    """The detector of a configuration for a sensor's clouds; equal arguments share one object and its programs.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import TINY
@@ -112,27 +123,64 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     >>> sorted(jax.eval_shape(detector.init, jax.random.key(0)))
     ['batch_stats', 'params']
     """
-    if config.pillars is not None:
-        return Detector(*build_centerpoint(config, sensor), config, sensor)
-    network = Network(config.model, len(config.classes))
-    layout = image_layout(sensor, config.model)
-    channels = 9 * config.projection.num_rounds
+    if (other := config.build(sensor)) is not None:
+        return other
+    network, layout = Network(config.model, len(config.classes)), image_layout(sensor, config.model)
+    num_rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
+    image_of = image_sensor(sensor, config.model)
+
+    def prepare(points: Array | np.ndarray, valid: Array | np.ndarray) -> RangeImage:
+        with jax.named_scope("mrv"):
+            return project_points(points, valid, image_of, num_rounds=num_rounds, prioritize_current=current_first)
 
     def init(key: Any) -> Variables:
         # Parameters do not depend on the image's size, and nothing of the forward pass is computed.
-        image = jax.ShapeDtypeStruct((1, 32, 32, channels), jnp.float32)
+        image = jax.ShapeDtypeStruct((1, 32, 32, 9 * num_rounds), jnp.float32)
         return network.lazy_init(key, image, train=False)  # type: ignore[return-value]
 
-    def apply(
-        variables: Variables, features: Float32[Array, "b h w 9 r"], *, train: bool = False
-    ) -> tuple[Outputs, Any]:
+    def apply(variables: Variables, images: RangeImage, *, train: bool = False) -> tuple[Outputs, Any]:
         # The image takes the parameters' type: float64 ones make everything behind it float64.
-        image = network_input(features, config.model, layout)
+        image = network_input(images.features, config.model, layout)
         image = image.astype(jax.tree.leaves(variables["params"])[0].dtype)
         outputs, updates = network.apply(variables, image, train=train, mutable=["batch_stats"] if train else [])
         return outputs, updates["batch_stats"] if train else variables["batch_stats"]
 
-    return Detector(init, apply, config, sensor)
+    def candidates(outputs: Outputs, image: RangeImage) -> tuple[Array, Array, Array, Array]:
+        choices: dict[str, Any] = {"config": config.inference, "axes": config.model.regression_axes}
+        return select_candidates(outputs, locate(image, layout), layout=layout, **choices)
+
+    return Detector(prepare, init, apply, make_sums(config, sensor), candidates, config, sensor)
+
+
+class Parts(NamedTuple):
+    """FCOS-LiDAR's network in compiled parts. All but the first take all variables and the previous output."""
+
+    preprocess: Callable[[Any], Image]
+    stem: Callable[[Variables, Any], Any]
+    backbone: Callable[[Variables, Any], Any]
+    fpn: Callable[[Variables, Any], Any]
+    heads: Callable[[Variables, Any], Any]
+
+
+def network_parts(config: Config, sensor: Sensor) -> Parts:
+    """The network of a configuration without ``local_geometry`` in parts, to be timed one by one.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> network_parts(QUICKSTART, SHORT_RANGE).preprocess(jnp.zeros((1, 32, 128, 9, 1))).shape
+    (1, 32, 128, 9)
+    """
+    layout, network = image_layout(sensor, config.model), Network(config.model, len(config.classes))
+
+    def part(name: str, **options: Any) -> Callable[[Variables, Any], Any]:
+        def apply(variables: Variables, x: Any) -> Any:
+            return network.apply(variables, x, method=lambda whole, x: getattr(whole, name)(x, **options))
+
+        return jax.jit(apply)
+
+    preprocess = jax.jit(lambda features: network_input(features, config.model, layout))
+    front = part("stem", train=False), part("backbone", train=False)
+    return Parts(preprocess, *front, part("fpn"), part("heads"))
 
 
 def count_parameters(params: Any) -> dict[str, int]:

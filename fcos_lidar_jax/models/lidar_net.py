@@ -4,7 +4,6 @@ import flax.linen as nn
 import jax
 
 from fcos_lidar_jax.models.layers import ConvNorm, Image, recomputed
-from fcos_lidar_jax.models.meta_kernel import Geometry, MetaKernel
 
 STAGE_STRIDES = (1, 2, 2, 2)
 _EXPANSION = 4
@@ -19,14 +18,10 @@ class Bottleneck(nn.Module):
     circular: bool = False
 
     @nn.compact
-    def __call__(self, x: Image, geometry: Geometry | None = None, *, train: bool) -> Image:
-        """The image; with a geometry the 3x3 is a Meta-Kernel, at stride 1."""
+    def __call__(self, x: Image, *, train: bool) -> Image:
         wide = self.width * _EXPANSION
         y = ConvNorm(self.width, 1, name="reduce")(x, train=train)
-        if geometry is None:
-            y = ConvNorm(self.width, 3, self.stride, circular=self.circular, name="spatial")(y, train=train)
-        else:
-            y = MetaKernel(self.width, self.circular, name="meta_kernel")(y, geometry, train=train)
+        y = ConvNorm(self.width, 3, self.stride, circular=self.circular, name="spatial")(y, train=train)
         y = ConvNorm(wide, 1, relu=False, name="expand")(y, train=train)
         if self.project:
             x = ConvNorm(wide, 1, self.stride, relu=False, name="shortcut")(x, train=train)
@@ -42,8 +37,8 @@ class Backbone(nn.Module):
     remat: bool = False  # Of the first convolution and stage, whose activations are the largest.
 
     @nn.compact
-    def __call__(self, x: Image, geometry: Geometry | None = None, *, train: bool) -> list[Image]:
-        """C2, C3, C4, C5 at 1/1, 1/2, 1/4, 1/8 of the image; the first block is given the geometry."""
+    def __call__(self, x: Image, *, train: bool) -> list[Image]:
+        """C2, C3, C4, C5 at 1/1, 1/2, 1/4, 1/8 of the image."""
         module = ConvNorm(x.shape[-1], 7, circular=self.circular, name="first")
         x = (recomputed(module) if self.remat else module)(x, train=train)
         levels = []
@@ -51,7 +46,6 @@ class Backbone(nn.Module):
             for block in range(count):
                 first, name = block == 0, f"stage{stage}_block{block}"
                 module = Bottleneck(width, stride if first else 1, first, self.circular, name=name)
-                places = geometry if (stage, block) == (0, 0) else None
-                x = (recomputed(module) if self.remat and stage == 0 else module)(x, places, train=train)
+                x = (recomputed(module) if self.remat and stage == 0 else module)(x, train=train)
             levels.append(x)
         return levels

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import fcos_lidar_jax.presets  # noqa: F401  (a checkpoint may hold the configuration of any of them)
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
@@ -29,11 +30,13 @@ from fcos_lidar_jax.types import TrainState
 _FORMAT = 3
 _OLD_FORMAT = 2
 LATER_FIELDS = {
-    "model": {"remat": False, "regression_axes": "lidar", "meta_kernel": False, "local_geometry": False},
+    "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False},
     "loss": {"quality": "iou", "centreness_m": 0.75},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
 }
 """Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
+GONE_FIELDS = {"model": {"meta_kernel": False}}
+"""Configuration fields that are gone, and the only values with which a configuration is still read."""
 _DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
 _CARD = "README.md"
 _ROOM_FOR_NAMES = 2**20  # Bytes on disk for what describes the arrays.
@@ -319,15 +322,17 @@ def _converted(config: dict[str, Any], written: int) -> dict[str, Any]:
 
 
 def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
-    """A configuration's JSON object with the fields that older ones do not have.
+    """A configuration's JSON object with the fields that older ones do not have, without those that are gone.
 
-    >>> with_later_fields({"model": {"remat": True}})["model"]
-    {'remat': True, 'regression_axes': 'lidar', 'meta_kernel': False, 'local_geometry': False}
+    >>> with_later_fields({"model": {"remat": True, "meta_kernel": False}})["model"]
+    {'remat': True, 'regression_axes': 'lidar', 'local_geometry': False}
     """
     later = dict[str, Any]()
     for section, fields in LATER_FIELDS.items():
         if isinstance(found := config.get(section, {}), dict):
-            later[section] = {**fields, **found}
+            gone = GONE_FIELDS.get(section, {})
+            kept = {name: value for name, value in found.items() if name not in gone or value != gone[name]}
+            later[section] = {**fields, **kept}
     return {**config, **later}
 
 

@@ -82,8 +82,8 @@ def fit(
         record |= {"seconds": now - before, "waiting_seconds": waited, **host.counts}
         before = now
         _check_finite(number, record, host.names)
-        total, iou = record["loss/total"], record["positive_iou"]
-        progress.show(number, f"loss {total:.3f}  IoU {iou:.2f}")
+        iou = f"  IoU {record['positive_iou']:.2f}" if "positive_iou" in record else ""
+        progress.show(number, f"loss {record['loss/total']:.3f}{iou}")
         if report is not None:
             report(number, record)
 

@@ -1,145 +1,49 @@
-"""The objective of a batch: predictions, targets and the losses between them, as sums."""
+"""The objective of any detector: weighted losses of a batch, and its metrics."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import lax
 from jaxtyping import Array
 
-from fcos_lidar_jax import losses
-from fcos_lidar_jax.assignment import assign, owners
-from fcos_lidar_jax.coding import Axes, decode_oriented, encode
-from fcos_lidar_jax.config import Config, LossConfig
-from fcos_lidar_jax.iou import oriented, oriented_iou_3d
-from fcos_lidar_jax.locations import ImageLayout, image_layout, image_sensor, locate
+from fcos_lidar_jax.config import LossConfig
+from fcos_lidar_jax.losses import weighted
 from fcos_lidar_jax.models import Detector
-from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.types import Batch, Locations, Outputs, RangeImage, Targets
+from fcos_lidar_jax.types import Batch, Sums
 
 Metrics = dict[str, Array]
 
 
-def location_owners(image: RangeImage, locations: Locations, boxes: Array, box_valid: Array) -> Array:
-    """The box of every location of one sample, -1 for none.
-
-    Tested once for each cell of the sensor's image: repeated rows and coarser levels see the same points.
-    """
-    first = image.features[..., 0].reshape(-1, 9)
-    cell_owner = owners(first[:, :3], first[:, 7] > 0, boxes, box_valid)
-    owner = cell_owner[jnp.maximum(locations.cell, 0)]
-    return jnp.where(locations.occupied, owner, -1)
-
-
-def sample_losses(
-    outputs: Outputs,
-    image: RangeImage,
-    boxes: Array,
-    labels: Array,
-    box_valid: Array,
-    *,
-    config: LossConfig,
-    layout: ImageLayout,
-    axes: Axes,
-) -> tuple[dict[str, tuple[Array, Array]], Targets, Metrics]:
-    """Assignment and losses of one sample (paper, section 3.4).
-
-    Args:
-        outputs, image: of one sample, as are the other arrays.
-        boxes: f32[m, 9]; NaN velocities are unknown.
-        labels, box_valid: i32[m] and bool[m].
-        config, layout: weights and choices, and sizes (static).
-        axes: of the regression, see :mod:`fcos_lidar_jax.coding` (static).
-
-    Returns:
-        the four losses as (sum, count), the targets, and counts to be summed over the batch.
-    """
-    background = outputs.logits.shape[-1] - 1
-    locations = locate(image, layout)
-    owner = location_owners(image, locations, boxes, box_valid)
-    owned = jnp.maximum(owner, 0)
-    box, label = boxes[owned], labels[owned]
-
-    regression = jnp.take_along_axis(outputs.regression, label[:, None, None], axis=2)[..., 0]
-    iou_logit = jnp.take_along_axis(outputs.iou_logits, label[:, None], axis=1)[:, 0]
-    # What has no owner gets a harmless box, so that nothing overflows on the way to being masked.
-    box = jnp.where((owner >= 0)[:, None], box, jnp.array([0, 0, 0, 1, 1, 1, 0, 0, 0], jnp.float32))
-    predicted = decode_oriented(regression, locations.points, locations.azimuth_rad, axes=axes)
-    truth = oriented(box)
-    iou = oriented_iou_3d(lax.stop_gradient(predicted), truth)
-    cost = losses.cross_entropy(lax.stop_gradient(outputs.logits), label)
-    targets = assign(owner, cost, iou, num_boxes=boxes.shape[0], top_q=config.top_q)
-    positive = targets.positive
-    regressed = positive if config.regress_on == "positives" else owner >= 0
-    quality = iou if config.quality == "iou" else losses.centreness(predicted, truth, config.centreness_m)
-    with jax.named_scope("losses"):
-        label, target = (
-            jnp.where(positive, label, background),
-            encode(box, locations.points, locations.azimuth_rad, axes=axes),
-        )
-        parts = {
-            "classification": losses.classification_loss(outputs.logits, label, locations.occupied),
-            "l1": losses.l1_loss(regression, target, regressed, velocity_weight=config.velocity_weight),
-            "iou": losses.iou_loss(predicted, truth, regressed, kind=config.iou_loss),
-            "iou_prediction": losses.iou_prediction_loss(iou_logit, quality, regressed),
-        }
-    levels = jnp.split(positive, np.cumsum(layout.level_sizes)[:-1])
-    cells = jnp.zeros(layout.rows * layout.columns + 1, bool)
-    cells = cells.at[jnp.where(positive, locations.cell, -1)].set(True)
-    counts = {
-        "positives": positive.sum(dtype=jnp.int32),
-        "unique_positives": cells[:-1].sum(dtype=jnp.int32),
-        "candidates": (owner >= 0).sum(dtype=jnp.int32),
-        "owned_boxes": (targets.num_positive > 0).sum(dtype=jnp.int32),
-        "iou_sum": jnp.where(positive, iou, 0.0).sum(),
-        "positives_per_level": jnp.stack([level.sum(dtype=jnp.int32) for level in levels]),
-    }
-    return parts, targets, counts
-
-
-def make_sums(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Metrics, tuple[Any, Metrics, Metrics]]]:
+def make_objective(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Metrics, tuple[Any, Sums]]]:
     """The weighted losses of a batch of raw points before the division, summed by the count that divides them.
 
     Sums and counts add up over micro-batches and devices; :func:`batch_metrics` divides them once.
 
     Returns:
-        pure ``(params, batch_stats, batch) -> ({count: sum}, (batch_stats, parts, counts))``.
+        pure ``(params, batch_stats, batch) -> ({count: sum}, (batch_stats, sums))``.
     """
-    config, sensor = detector.config, detector.sensor
-    project = functools.partial(
-        project_points,
-        sensor=image_sensor(sensor, config.model),
-        num_rounds=config.projection.num_rounds,
-        prioritize_current=config.projection.prioritize_current,
-    )
-    layout = image_layout(sensor, config.model)
-    options: dict[str, Any] = {"config": config.loss, "layout": layout, "axes": config.model.regression_axes}
-    losses_of = functools.partial(sample_losses, **options)
+    prepare, config = jax.vmap(detector.prepare), detector.config.loss
 
-    def sums(params: Any, batch_stats: Any, batch: Batch) -> tuple[Metrics, tuple[Any, Metrics, Metrics]]:
-        with jax.named_scope("mrv"):
-            image = jax.vmap(project)(batch.points, batch.valid)
+    def objective(params: Any, batch_stats: Any, batch: Batch) -> tuple[Metrics, tuple[Any, Sums]]:
+        inputs = prepare(batch.points, batch.valid)
         variables = {"params": params, "batch_stats": batch_stats}
-        outputs, batch_stats = detector.apply(variables, image.features, train=True)
-        parts, _, counts = jax.vmap(losses_of)(outputs, image, batch.boxes, batch.labels, batch.box_valid)
-        counts["dropped_points"] = image.num_dropped
-        sums_of = {name: part[0] for name, part in parts.items()}
-        parts, counts = jax.tree.map(lambda leaf: leaf.sum(axis=0), (sums_of, counts))
-        totals: dict[str, Array] = {}
-        for name, (weight, divisor) in losses.loss_terms(config.loss).items():
-            totals[divisor] = totals.get(divisor, 0) + weight * parts[name]
-        return totals, (batch_stats, parts, counts)
+        outputs, batch_stats = detector.apply(variables, inputs, train=True)
+        sums = detector.sums(outputs, inputs, batch)
+        totals = {count: weighted(losses, config) for count, losses in sums.losses.items()}
+        counts = sums.counts | {"dropped_points": inputs.num_dropped.sum()}
+        return totals, (batch_stats, sums._replace(counts=counts))
 
-    return sums
+    return objective
 
 
-def batch_metrics(parts: Metrics, counts: Metrics, config: Config) -> Metrics:
-    """The metrics of a whole batch from the sums of :func:`make_sums`: each loss divided once by its count."""
-    metrics = {f"loss/{name}": value for name, value in losses.combine(parts, counts, config.loss).items()}
-    metrics |= {name: value for name, value in counts.items() if name != "iou_sum"}
-    metrics["positive_iou"] = counts["iou_sum"] / jnp.maximum(counts["positives"], 1)
-    metrics["mean_k"] = counts["positives"] / jnp.maximum(counts["owned_boxes"], 1)
-    return metrics
+def batch_metrics(sums: Sums, config: LossConfig) -> Metrics:
+    """The metrics of a whole batch: its counts, and each loss and mean divided once by its count, at least 1."""
+
+    def divided(parts: dict[str, Metrics]) -> Metrics:
+        by = {count: jnp.maximum(sums.counts[count], 1) for count in parts}
+        return {name: value / by[count] for count, part in parts.items() for name, value in part.items()}
+
+    losses = divided(sums.losses)
+    losses["total"] = weighted(losses, config)
+    return {f"loss/{name}": value for name, value in losses.items()} | sums.counts | divided(sums.means)

@@ -13,10 +13,9 @@ from jax import lax
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.packing import unpack
-from fcos_lidar_jax.training import centre_objective, objective
-from fcos_lidar_jax.training.objective import Metrics
+from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
-from fcos_lidar_jax.types import Batch, PackedBatch, TrainState
+from fcos_lidar_jax.types import Batch, PackedBatch, Sums, TrainState
 
 TrainStep = Callable[[TrainState, Batch | PackedBatch], tuple[TrainState, Metrics]]
 
@@ -67,22 +66,20 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
     Returns:
         pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``.
     """
-    config = detector.config
-    chosen = objective if config.pillars is None else centre_objective
-    sums = chosen.make_sums(detector)
+    config, objective = detector.config, make_objective(detector)
     pieces = config.optimizer.accumulate
 
     def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
-        def visit(batch_stats: Any, micro: Batch) -> tuple[Any, tuple[Any, Metrics, Metrics]]:
-            totals, pull_back, (batch_stats, parts, counts) = jax.vjp(
-                lambda params: sums(params, batch_stats, micro), params, has_aux=True
+        def visit(batch_stats: Any, micro: Batch) -> tuple[Any, tuple[Any, Sums]]:
+            totals, pull_back, (batch_stats, sums) = jax.vjp(
+                lambda params: objective(params, batch_stats, micro), params, has_aux=True
             )
             zero = jax.tree.map(jnp.zeros_like, totals)
             grads = {name: pull_back(zero | {name: jnp.ones_like(t)})[0] for name, t in totals.items()}
-            return batch_stats, (grads, parts, counts)
+            return batch_stats, (grads, sums)
 
         if pieces == 1:
-            batch_stats, (grads, parts, counts) = visit(batch_stats, batch)
+            batch_stats, (grads, sums) = visit(batch_stats, batch)
         else:
 
             def add(carry: Any, micro: Batch) -> tuple[Any, None]:
@@ -94,20 +91,20 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
             micros = jax.tree.map(lambda leaf: leaf.reshape(-1, pieces, *leaf.shape[1:]).swapaxes(0, 1), batch)
             shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
             nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-            (batch_stats, (grads, parts, counts)), _ = lax.scan(add, (batch_stats, nothing), micros)
+            (batch_stats, (grads, sums)), _ = lax.scan(add, (batch_stats, nothing), micros)
 
         def divided(name: str) -> Any:
-            scale = 1 / jnp.maximum(counts[name], 1)
+            scale = 1 / jnp.maximum(sums.counts[name], 1)
             return jax.tree.map(lambda leaf: leaf * scale.astype(leaf.dtype), grads[name])
 
         grads = functools.reduce(optax.tree.add, [divided(name) for name in grads])
-        return grads, batch_stats, chosen.batch_metrics(parts, counts, config)
+        return grads, batch_stats, batch_metrics(sums, config.loss)
 
     return gradient
 
 
 def make_train_step(detector: Detector, optimizer: optax.GradientTransformation) -> TrainStep:
-    """A training step: augment unless ``config.augment`` is None, project, predict, assign, differentiate, update.
+    """A training step: augment unless ``config.augment`` is None, prepare, predict, differentiate, update.
 
     Returns:
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. A packed batch is unpacked first.

@@ -51,7 +51,7 @@ def test_benchmark_times_the_same_stages(home, tmp_path):
         tmp_path / "a",
     )
     record = json.loads((tmp_path / "a").read_text())
-    assert list(record["stages"]) == ["clean", "projection", "network", "postprocess", "detect", "whole"]
+    assert list(record["stages"]) == ["clean", "prepare", "network", "postprocess", "detect", "whole"]
     assert record["backend"] in ("openvino float32", "openvino bfloat16")
 
 

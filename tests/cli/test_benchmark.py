@@ -28,7 +28,7 @@ def home(tmp_path_factory):
     return folder
 
 
-PARTS = ["projection", "network", "postprocess"]
+PARTS = ["prepare", "network", "postprocess"]
 
 
 @pytest.mark.parametrize(("name", "parts"), [("checkpoint", PARTS), ("detector.fcos", [])])

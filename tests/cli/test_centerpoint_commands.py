@@ -11,6 +11,7 @@ from tiny_peer import NETWORK_OPTIONS
 from tiny_run import bits
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.checkpoint import load_checkpoint
@@ -55,7 +56,7 @@ def test_a_checkpoint_and_an_exported_file_give_back_the_detector(home):
     trained = load_trained(home / "run")
     again = load_checkpoint(find_checkpoint(home / "run"))
     assert again.config == trained.config
-    assert again.config.pillars is not None
+    assert type(again.config) is CenterPointConfig
     assert bits(again.variables) == bits(trained.variables)
     command("export --checkpoint", home / "run", "--out", home / "detector.fcos")
     exported = fcos.load_detector(home / "detector.fcos")
@@ -67,7 +68,7 @@ def test_a_checkpoint_and_an_exported_file_give_back_the_detector(home):
 def test_benchmark_times_the_same_stages(home, tmp_path):
     command("benchmark --repeats 1 --batch 2 --checkpoint", home / "run", "--out", tmp_path / "times.json")
     stages = json.loads((tmp_path / "times.json").read_text())["stages"]
-    assert list(stages) == ["clean", "projection", "network", "postprocess"]
+    assert list(stages) == ["clean", "prepare", "network", "postprocess"]
 
 
 def test_what_runs_range_images_alone_refuses_it_in_one_line(home, tmp_path, capsys):
@@ -75,5 +76,7 @@ def test_what_runs_range_images_alone_refuses_it_in_one_line(home, tmp_path, cap
     export = ["export", "--checkpoint", run, "--network-only", "--format", "onnx", "--out", out]
     detect = ["detect", cloud, "--checkpoint", run, "--backend", "openvino", "--out", out]
     for args in (export, detect):
-        assert_one_line_error(capsys, args, "ONNX: got the detector 'centerpoint_compact' on pillars")
+        assert_one_line_error(
+            capsys, args, "ONNX: got the detector 'centerpoint_compact', expected one on range images"
+        )
     assert not (tmp_path / "out").exists()

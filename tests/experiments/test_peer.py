@@ -11,6 +11,7 @@ from experiments.paper_tables import scales
 from experiments.paper_tables.scales import quarter, smoke
 from experiments.paper_tables.tables import Args
 from experiments.studies import centerpoint
+from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.locations import image_layout
@@ -30,7 +31,7 @@ def test_both_detectors_share_all_but_themselves(tmp_path):
     sizes = image_layout(scale.sensor, base.model).level_sizes  # (location, class) pairs of the range view
     assert sum(min(base.inference.candidates_per_level, len(base.classes) * size) for size in sizes) == 4450
     shared = {"model": base.model, "loss": base.loss, "inference": base.inference}
-    assert dataclasses.replace(peer, pillars=None, **shared) == base
+    assert Config.of(peer, **shared) == base
     assert (base.optimizer.epochs, longer.optimizer.epochs) == (2, 3)
     assert dataclasses.replace(longer, optimizer=base.optimizer) == base
 

@@ -11,10 +11,12 @@ from tiny_run import CONFIG, SENSOR, TINY_CONFIG, bits, untrained, weights
 
 from fcos_lidar_jax.coding import decode
 from fcos_lidar_jax.config import AugmentConfig, InferenceConfig
-from fcos_lidar_jax.inference import TrainedDetector, make_detect, postprocess, select_candidates
+from fcos_lidar_jax.inference import TrainedDetector, make_detect
 from fcos_lidar_jax.inference import detector as detectors
+from fcos_lidar_jax.inference.detect import suppress
 from fcos_lidar_jax.locations import ImageLayout, image_layout, locate
-from fcos_lidar_jax.models import Detector, build_detector
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.models.candidates import select_candidates
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -77,13 +79,10 @@ def test_candidates_are_the_best_pairs_of_each_level(scene, iou_exponent, axes):
 def test_postprocessing_is_class_wise_greedy_nms_of_the_candidates(scene):
     outputs, locations = scene
     config = InferenceConfig(min_probability=0.2, candidates_per_level=60, max_detections=40)
-    boxes, scores, labels, valid = map(
-        np.asarray, select_candidates(outputs, locations, config=config, layout=LAYOUT, axes="lidar")
-    )
+    candidates = select_candidates(outputs, locations, config=config, layout=LAYOUT, axes="lidar")
+    boxes, scores, labels, valid = map(np.asarray, candidates)
     expected = oracles.nms(boxes, scores, valid, labels, 0.2, 40)
-    found, found_scores, found_labels, used = map(
-        np.asarray, postprocess(outputs, locations, config=config, layout=LAYOUT, axes="lidar")
-    )
+    found, found_scores, found_labels, used = map(np.asarray, suppress(*candidates, config))
     assert used.sum() == len(expected)
     np.testing.assert_array_equal(found[used], boxes[expected])
     np.testing.assert_array_equal(found_scores[used], scores[expected])
@@ -128,13 +127,13 @@ def test_the_centre_is_offset_along_the_axes_of_the_configuration(axes):
     config = dataclasses.replace(TINY_CONFIG, model=model, inference=inference)
     number, kinds = image_layout(TINY, model).num_locations, len(config.classes)
 
-    def apply(_variables, _features, train):
+    def apply(_variables, _images):
         logits = jnp.where(jnp.arange(kinds + 1) == 2, 5.0, -5.0)
         one = jnp.zeros((1, number, 10, kinds)).at[..., 0, :].set(1.0)
         return Outputs(jnp.tile(logits, (1, number, 1)), one, jnp.zeros((1, number, kinds))), {}
 
     points = make_frame(0, TINY).points
-    found = make_detect(Detector(lambda _key: {}, apply, config, TINY))({}, points, np.ones(len(points), bool))
+    found = make_detect(build_detector(config, TINY)._replace(apply=apply))({}, points, np.ones(len(points), bool))
     boxes = np.asarray(found.boxes, np.float64)
     assert found.valid.all()
     distance = np.hypot(*boxes[:, :2].T)[:, None]

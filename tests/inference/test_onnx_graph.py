@@ -7,7 +7,7 @@ import json
 import jax
 import numpy as np
 import pytest
-from tiny_run import CONFIG, SENSOR
+from tiny_run import CONFIG, SENSOR, images_of
 
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.inference import TrainedDetector
@@ -49,20 +49,17 @@ CASES = {
     ),
     "a sector, padded with empty columns": (CONFIG, sector(SENSOR, np.pi / 2, 40)),
     "a turn that pads itself twice": (CONFIG, dataclasses.replace(SENSOR, num_columns=12)),
-    "Meta-Kernel, two rounds, padded columns": (
-        with_model(with_stem(), meta_kernel=True, channel_scale=(12.0, 11.5, 0.9, 8.0, 0.3, 0.2, 20.0, 2.0, 0.16)),
-        ODD,
-    ),
     "local geometry, two rounds, padded columns": (
-        with_model(with_stem(), local_geometry=True, channel_mean=(1, 2, -1, 12, 0.3, -0.2, 20, 0, 0.1)),
+        with_model(
+            with_stem(),
+            local_geometry=True,
+            channel_mean=(1, 2, -1, 12, 0.3, -0.2, 20, 0, 0.1),
+            channel_scale=(12.0, 11.5, 0.9, 8.0, 0.3, 0.2, 20.0, 2.0, 0.16),
+        ),
         ODD,
     ),
     "local geometry, circular, doubled rows": (
         with_model(CONFIG, local_geometry=True, circular_width=True, row_upscale=2),
-        SENSOR,
-    ),
-    "Meta-Kernel, circular, doubled rows": (
-        with_model(CONFIG, meta_kernel=True, circular_width=True, row_upscale=2),
         SENSOR,
     ),
 }
@@ -95,7 +92,9 @@ def made_features(detector):
 
 def by_flax(detector, features):
     apply = jax.jit(functools.partial(detector.model.apply, train=False))
-    return {name: np.asarray(value) for name, value in vars(apply(detector.variables, features)[0]).items()}
+    return {
+        name: np.asarray(value) for name, value in vars(apply(detector.variables, images_of(features))[0]).items()
+    }
 
 
 def by_openvino(content, features):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_run import CONFIG, SENSOR
+from tiny_run import CONFIG, SENSOR, images_of
 
 from fcos_lidar_jax.locations import STRIDES, image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters
@@ -142,7 +142,7 @@ def test_it_joins_the_heads_of_every_level_and_nothing_else_changes(tied):
 
     rng = np.random.default_rng(0)
     features = rng.uniform(1, 5, (1, SENSOR.num_rows, SENSOR.num_columns, 9, CONFIG.projection.num_rounds))
-    features = jnp.asarray(features, jnp.float32)
+    features = images_of(jnp.asarray(features, jnp.float32))
     apply = jax.jit(local.apply)
     found, _ = apply(variables, features)
     silent = jax.tree.map(lambda leaf: leaf, variables)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from tiny_run import CONFIG, SENSOR
+from tiny_run import CONFIG, SENSOR, images_of
 
 from fcos_lidar_jax.config import ModelConfig, StemConfig
 from fcos_lidar_jax.locations import STRIDES, image_layout
@@ -292,6 +292,8 @@ def parameters_by_hand(config):
         channels.append(last)
     total += sum((i + 1) * f for i in channels) + 6 * (9 * f + 1) * f
     tower = 9 * f * h + 2 * h + (model.head_convs - 1) * (9 * h + 2) * h
+    if model.local_geometry:
+        total += (85 + 2) * 32 + (32 + 2) * f + 6 * 2 * f * h
     return total + 6 * (2 * tower + (9 * h + 1) * (k + 1 + (3 + 3 + 2 + 2 + 1) * k))
 
 
@@ -308,7 +310,7 @@ def test_tied_heads_share_everything_between_levels():
 def test_background_starts_at_its_prior_and_shapes_are_the_contracts():
     detector = build_detector(CONFIG, SENSOR)
     features = normal(0, 1, 16, 64, 9, 1).at[..., 7, :].set(1.0)
-    outputs, _ = jax.jit(detector.apply)(detector.init(jax.random.key(0)), features)
+    outputs, _ = jax.jit(detector.apply)(detector.init(jax.random.key(0)), images_of(features))
     layout = image_layout(SENSOR, CONFIG.model)
     assert outputs.logits.shape == (1, layout.num_locations, 11)
     assert outputs.regression.shape == (1, layout.num_locations, 10, 10)

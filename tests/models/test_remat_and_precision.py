@@ -10,20 +10,18 @@ import numpy as np
 import tiny_run
 
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.projection import project_points
 
 
 @functools.cache
 def forward_and_backward(**model):
     """Outputs, statistics and gradient of a variant of the tiny network, and the bytes kept for the gradient."""
     config = dataclasses.replace(tiny_run.CONFIG, model=dataclasses.replace(tiny_run.CONFIG.model, **model))
-    apply, variables = build_detector(config, tiny_run.SENSOR).apply, tiny_run.weights()
+    detector, variables = build_detector(config, tiny_run.SENSOR), tiny_run.weights()
     batch = tiny_run.host_batch()
-    project = jax.vmap(lambda points, valid: project_points(points, valid, tiny_run.SENSOR, num_rounds=1).features)
-    features = jax.jit(project)(batch.points, batch.valid)
+    images = jax.jit(jax.vmap(detector.prepare))(batch.points, batch.valid)
 
     def loss(params):
-        outputs, statistics = apply({**variables, "params": params}, features, train=True)
+        outputs, statistics = detector.apply({**variables, "params": params}, images, train=True)
         return jnp.square(outputs.logits).mean() + jnp.square(outputs.regression).mean(), (outputs, statistics)
 
     gradient, (outputs, statistics) = jax.jit(jax.grad(loss, has_aux=True))(variables["params"])
@@ -74,6 +72,7 @@ def test_positions_are_taken_in_full_float32_precision_on_every_platform():
     detector = build_detector(tiny_run.CONFIG, tiny_run.SENSOR)
     variables = jax.eval_shape(detector.init, jax.random.key(0))
     image = jax.ShapeDtypeStruct((1, tiny_run.SENSOR.num_rows, tiny_run.SENSOR.num_columns, 9, 1), np.float32)
+    image = jax.eval_shape(tiny_run.images_of, image)
     program = jax.jit(lambda v, x: detector.apply(v, x, train=False)).lower(variables, image).as_text()
     lines = [line for line in program.splitlines() if "stablehlo.convolution" in line]
     kernels = [(re.findall(r"3x3x\d+x(\d+)xf32>\)", line), "HIGHEST" in line) for line in lines]

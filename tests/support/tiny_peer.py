@@ -1,15 +1,14 @@
 """CenterPoint so small that its step compiles in seconds."""
 
-import dataclasses
-
 from tiny_run import CONFIG as OURS
 from tiny_run import FRAMES
 
-from fcos_lidar_jax.config import ModelConfig, PillarConfig
+from fcos_lidar_jax.centerpoint import CenterPointConfig, PillarConfig
+from fcos_lidar_jax.config import ModelConfig
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.types import Batch
 
-CONFIG = dataclasses.replace(
+CONFIG = CenterPointConfig.of(
     OURS,
     model=ModelConfig(),
     pillars=PillarConfig(

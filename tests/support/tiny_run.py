@@ -5,6 +5,7 @@ import functools
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
@@ -14,7 +15,7 @@ from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.trainer import Schedule, train
-from fcos_lidar_jax.types import Batch, TrainState
+from fcos_lidar_jax.types import Batch, RangeImage, TrainState
 
 STEPS = 4
 SENSOR = dataclasses.replace(TINY, num_columns=64)
@@ -49,6 +50,13 @@ FRAMES = SimulatedFrames(SENSOR, 12)
 TESTS = SimulatedFrames(SENSOR, 2, 1000)
 TINY_CONFIG = dataclasses.replace(CONFIG, max_points=4096)
 """For whole clouds of the sensor TINY."""
+
+
+def images_of(features: jax.Array) -> RangeImage:
+    """Range images of which nothing but the features is known, which is what the network sees."""
+    batch, rows, columns, _, rounds = features.shape
+    index = jnp.zeros((batch, rows, columns, rounds), jnp.int32)
+    return RangeImage(jnp.asarray(features), index, jnp.zeros(batch, jnp.int32))
 
 
 @functools.cache

@@ -92,7 +92,7 @@ def test_a_checkpoint_of_older_fields_is_converted(copy, written, version):
     old = json.loads(file.read_text())
     config = old["config"]
     later = {
-        "model": {"remat": False, "regression_axes": "lidar", "meta_kernel": False, "local_geometry": False},
+        "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False},
         "loss": {"quality": "iou", "centreness_m": 0.75},
         "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
     }
@@ -100,6 +100,7 @@ def test_a_checkpoint_of_older_fields_is_converted(copy, written, version):
         for name, value in fields.items():
             assert config[section].pop(name) == value
     del old["hash"]
+    config["model"]["meta_kernel"] = False
     if version == 2:
         del config["classes"], config["class_ranges_m"]
         config["model"]["num_classes"] = 10
@@ -109,6 +110,16 @@ def test_a_checkpoint_of_older_fields_is_converted(copy, written, version):
     found, expected = load_checkpoint(copy), load_checkpoint(written)
     assert (found.config, found.sensor, found.step) == (expected.config, expected.sensor, expected.step)
     assert bits(found.variables) == bits(expected.variables)
+
+
+def test_a_checkpoint_with_a_part_that_is_gone_is_refused_in_one_line(copy):
+    file = copy / "checkpoint.json"
+    old = json.loads(file.read_text())
+    old["config"]["model"]["meta_kernel"] = True
+    del old["hash"]
+    file.write_text(json.dumps({**old, "hash": checksum(json.dumps(old, sort_keys=True).encode())}))
+    with pytest.raises(ValueError, match=r"^.*checkpoint\.json: config\.model\.meta_kernel: unknown field.*$"):
+        load_checkpoint(copy)
 
 
 def test_nothing_else_is_written_and_others_may_read_it(written):

@@ -14,18 +14,17 @@ from fcos_lidar_jax.evaluation.matching import match_frame
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout, locate, location_cells
-from fcos_lidar_jax.losses import loss_terms
 from fcos_lidar_jax.models import Detector, build_detector
+from fcos_lidar_jax.models.objective import location_owners, sample_losses
 from fcos_lidar_jax.packing import Packing, pack
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import NonFiniteLossError, fit, make_optimizer, make_state, make_train_step
-from fcos_lidar_jax.training.objective import location_owners, sample_losses
 from fcos_lidar_jax.training.optimizer import learning_rate_schedule, momentum_schedule
 from fcos_lidar_jax.training.step import detection_variables, make_gradient
-from fcos_lidar_jax.types import Batch, HostBatch, Outputs
+from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums
 
 STEPS = 60
 CONFIG = dataclasses.replace(
@@ -260,12 +259,12 @@ def toy_detector(config=CONFIG) -> Detector:
         params = {name: 0.1 * jax.random.normal(key, shape) for key, (name, shape) in named}
         return {"params": params, "batch_stats": {}}
 
-    def apply(variables, features, train):
-        size = 1 + 0.01 * features.mean(axis=tuple(range(1, features.ndim)))
+    def apply(variables, images, train):
+        size = 1 + 0.01 * images.features.mean(axis=(1, 2, 3, 4))
         outputs = {n: jnp.einsum("b,...->b...", size, leaf) for n, leaf in variables["params"].items()}
         return Outputs(**outputs), {}
 
-    return Detector(init, apply, config, TINY)
+    return build_detector(config, TINY)._replace(init=init, apply=apply)
 
 
 def with_optimizer(**changes):
@@ -284,7 +283,7 @@ def test_neither_micro_batches_nor_empty_samples_change_the_gradient_or_the_box_
     detector, batch = toy_detector(), four_frames()
     params = detector.init(jax.random.key(0))["params"]
     configs = [with_optimizer(batch_size=4, accumulate=accumulate) for accumulate in (1, 2)]
-    whole, in_parts = (jax.jit(make_gradient(detector._replace(config=config))) for config in configs)
+    whole, in_parts = (jax.jit(make_gradient(toy_detector(config))) for config in configs)
     (expected, _, metrics), (found, _, again) = whole(params, {}, batch), in_parts(params, {}, batch)
     assert int(metrics["positives"]) > 10
     for name, leaf in expected.items():
@@ -316,7 +315,7 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
     targets_of = jax.jit(lambda *sample: sample_losses(*sample, config=choices, layout=layout, axes=axes)[1])
     for points, valid, boxes, labels, box_valid in zip(*jax.tree.leaves(batch), strict=True):
         image = project_points(points, valid, TINY, num_rounds=CONFIG.projection.num_rounds)
-        outputs, _ = detector.apply({"params": params}, image.features[None], train=True)
+        outputs, _ = detector.apply({"params": params}, jax.tree.map(lambda leaf: leaf[None], image), train=True)
         outputs = jax.tree.map(lambda leaf: leaf[0], outputs)
         targets = targets_of(outputs, image, boxes, labels, box_valid)
         locations = locate(image, layout)
@@ -345,7 +344,7 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
         config = dataclasses.replace(
             with_optimizer(batch_size=4, accumulate=accumulate), loss=choices, model=model
         )
-        gradient, _, metrics = jax.jit(make_gradient(detector._replace(config=config)))(params, {}, batch)
+        gradient, _, metrics = jax.jit(make_gradient(toy_detector(config)))(params, {}, batch)
         assert (int(metrics["positives"]), int(metrics["candidates"])) == (positives, candidates)
         np.testing.assert_allclose(metrics["loss/classification"], losses["classification"] / positives, rtol=1e-4)
         np.testing.assert_allclose(metrics["loss/l1"], losses["l1"] / candidates, rtol=1e-4)
@@ -361,7 +360,7 @@ def test_the_scores_factor_is_trained_to_be_the_iou_or_the_centreness():
     detector, batch = toy_detector(), jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], four_frames())
     params, layout = detector.init(jax.random.key(0))["params"], image_layout(TINY, CONFIG.model)
     image = project_points(batch.points, batch.valid, TINY, num_rounds=CONFIG.projection.num_rounds)
-    outputs, _ = detector.apply({"params": params}, image.features[None], train=True)
+    outputs, _ = detector.apply({"params": params}, jax.tree.map(lambda leaf: leaf[None], image), train=True)
     outputs, locations = jax.tree.map(lambda leaf: leaf[0], outputs), locate(image, layout)
     owner = location_owners(image, locations, batch.boxes, batch.box_valid)
     box = np.asarray(batch.boxes)[np.asarray(owner)]
@@ -387,45 +386,48 @@ ZERO = {"params": {"w": jnp.float32(0)}, "batch_stats": {}}
 
 
 @pytest.fixture
-def squares(monkeypatch):
-    """In place of the objective: the squared distances of the weights from the samples' boxes. A note is taken of
-    the rows that are seen together."""
+def squares():
+    """Of a detector: the squared distances of its weight from the samples' boxes. A note is taken of the rows that
+    are seen together."""
     seen = []
 
-    def sums(params, batch_stats, batch):
+    def apply(variables, images, train):
+        return jnp.broadcast_to(variables["params"]["w"], images.num_dropped.shape), {}
+
+    def sums(outputs, _, batch):
         jax.debug.callback(lambda rows: seen.append(rows.tolist()), batch.boxes[:, 0, 0], ordered=True)
         count = batch.box_valid.sum(dtype=jnp.int32)
-        total = jnp.where(batch.box_valid, jnp.square(params["w"] - batch.boxes[..., 0]), 0.0).sum()
-        parts = {name: total for name in loss_terms(CONFIG.loss)}
-        counts = {"positives": count, "owned_boxes": count, "iou_sum": total}
-        return {"positives": total}, (batch_stats, parts, counts)
+        total = jnp.where(batch.box_valid, jnp.square(outputs[:, None] - batch.boxes[..., 0]), 0.0).sum()
+        return Sums({"positives": {"classification": total}}, {"positives": count}, {"positives": {"mean": total}})
 
-    monkeypatch.setattr("fcos_lidar_jax.training.objective.make_sums", lambda *_: sums)
+    def detector(config=CONFIG):
+        return build_detector(config, TINY)._replace(apply=apply, sums=sums)
+
     batch = empty_batch(0)
     batch = jax.tree.map(lambda leaf: np.repeat(leaf, 8, axis=0), batch)
     batch.boxes[:, :, 0] = np.arange(8)[:, None]
     batch.box_valid[...] = np.arange(CONFIG.max_boxes) < np.array([1, 0, 5, 2, 0, 0, 9, 3])[:, None]
-    return batch, seen
+    return detector, batch, seen
 
 
 @pytest.mark.parametrize("pieces", [1, 2, 4, 8])
 def test_one_division_by_all_positives_and_every_row_in_one_micro_batch(squares, pieces):
     """By hand: the mean of 2 (w - x) over all boxes. Rows are dealt out like cards: every device has its share."""
-    batch, seen = squares
+    detector, batch, seen = squares
     config = with_optimizer(batch_size=8, accumulate=pieces)
-    gradient, _, metrics = jax.jit(make_gradient(toy_detector(config)))({"w": jnp.float32(3.5)}, {}, batch)
+    gradient, _, metrics = jax.jit(make_gradient(detector(config)))({"w": jnp.float32(3.5)}, {}, batch)
     jax.effects_barrier()
     x = batch.boxes[..., 0][batch.box_valid]
     np.testing.assert_allclose(gradient["w"], np.mean(2 * (3.5 - x)), rtol=1e-6)
     assert int(metrics["positives"]) == len(x) == 20
-    np.testing.assert_allclose(metrics["positive_iou"], np.mean((3.5 - x) ** 2), rtol=1e-6)
+    np.testing.assert_allclose(metrics["mean"], np.mean((3.5 - x) ** 2), rtol=1e-6)
     assert [rows for rows in seen if rows] == [list(range(first, 8, pieces)) for first in range(pieces)]
 
 
 def test_the_running_mean_of_the_weights_is_that_of_a_loop_in_numpy(squares):
-    decay, batch = 0.2, squares[0]
+    decay, (make, batch, _) = 0.2, squares
     config = with_optimizer(ema_decay=decay, batch_size=8)
-    detector, optimizer = toy_detector(config), make_optimizer(CONFIG.optimizer, STEPS)
+    detector, optimizer = make(config), make_optimizer(CONFIG.optimizer, STEPS)
     state = make_state(detector, optimizer, jax.random.key(0), variables=ZERO)
     step = jax.jit(make_train_step(detector, optimizer))
     mean, kept = 0.0, []
@@ -437,7 +439,7 @@ def test_the_running_mean_of_the_weights_is_that_of_a_loop_in_numpy(squares):
     np.testing.assert_allclose(state.ema["w"], mean, rtol=1e-6)
     assert abs(mean - float(state.params["w"])) > 1e-5
     assert detection_variables(state) == {"params": state.ema, "batch_stats": {}}
-    plain = make_state(toy_detector(), optimizer, jax.random.key(0), variables=ZERO)
+    plain = make_state(make(), optimizer, jax.random.key(0), variables=ZERO)
     assert plain.ema is None
     assert detection_variables(plain) == {"params": plain.params, "batch_stats": {}}
 
@@ -445,10 +447,10 @@ def test_the_running_mean_of_the_weights_is_that_of_a_loop_in_numpy(squares):
 def test_a_learning_rate_beyond_reason_stops_the_run_before_its_numbers_are_kept(squares):
     """The weight explodes in the first update; the loss of the second step tells, and no pause comes after it."""
     config = with_optimizer(peak_learning_rate=1e30, batch_size=8)
-    detector, optimizer = toy_detector(config), make_optimizer(config.optimizer, STEPS)
+    detector, optimizer = squares[0](config), make_optimizer(config.optimizer, STEPS)
     state = make_state(detector, optimizer, jax.random.key(0), variables=ZERO)
     step, paused = jax.jit(make_train_step(detector, optimizer)), []
     options = {"pause_at": lambda number: True, "pause": lambda number, _: paused.append(number)}
     with pytest.raises(NonFiniteLossError, match=r"^step 2: not finite: .*total inf.*; samples: a, b$"):
-        fit(step, state, fed(squares[0]), num_steps=STEPS, **options)
+        fit(step, state, fed(squares[1]), num_steps=STEPS, **options)
     assert paused == [1]

@@ -10,17 +10,18 @@ import pytest
 from tiny_peer import CONFIG
 from tiny_run import SENSOR
 
-from fcos_lidar_jax.centres import decode_centres
-from fcos_lidar_jax.config import Config, InferenceConfig, PillarConfig
+from fcos_lidar_jax.centerpoint import CenterPointConfig, PillarConfig
+from fcos_lidar_jax.centerpoint.centres import CentreOutputs, decode_centres
+from fcos_lidar_jax.centerpoint.detector import centre_candidates
+from fcos_lidar_jax.centerpoint.pillars import Grid
+from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.inference import make_detect
-from fcos_lidar_jax.inference.detect import centre_candidates, suppress
+from fcos_lidar_jax.inference.detect import suppress
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.pillars import Grid
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.types import CentreOutputs
 
 GRID = Grid(12, 1.0, (-6.0, -6.0))
-SMALL = Config(
+SMALL = CenterPointConfig(
     classes=("a", "b", "c"),
     pillars=PillarConfig(range_m=6.0, pillar_m=0.5, output_stride=2, groups=(0, 1, 0)),
     inference=InferenceConfig(min_probability=0.3, candidates_per_level=90, max_detections=20),

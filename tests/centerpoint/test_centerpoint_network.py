@@ -1,7 +1,6 @@
 """CenterPoint's network: published sizes, any order of the points, batches, empty clouds."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +9,10 @@ import pytest
 from tiny_peer import CONFIG
 from tiny_run import SENSOR
 
+from fcos_lidar_jax.centerpoint.network import Neck, from_channels
+from fcos_lidar_jax.centerpoint.pillars import make_pillars, pillar_grid
 from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.models import build_detector, count_parameters
-from fcos_lidar_jax.models.centerpoint import Neck, from_channels
-from fcos_lidar_jax.pillars import make_pillars, pillar_grid
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, CENTERPOINT_PILLARS, COMPACT
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -22,11 +21,10 @@ from fcos_lidar_jax.simulation.frames import make_frame
 @pytest.fixture(scope="module")
 def scene():
     detector = build_detector(CONFIG, SENSOR)
-    grid = pillar_grid(CONFIG.pillars, SENSOR)  # type: ignore[arg-type]
     clouds = [make_cloud(make_frame(seed, SENSOR).points, CONFIG, sensor=SENSOR) for seed in (0, 1)]
     points, valid = (np.stack([getattr(cloud, name) for cloud in clouds]) for name in ("points", "valid"))
     valid[1, 500:] = False
-    make = jax.jit(jax.vmap(functools.partial(make_pillars, grid=grid, sensor=SENSOR)))
+    make = jax.jit(jax.vmap(detector.prepare))
     apply = jax.jit(detector.apply, static_argnames="train")
     return apply, jax.jit(detector.init)(jax.random.key(0)), make, points, valid
 

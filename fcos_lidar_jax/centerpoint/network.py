@@ -1,21 +1,18 @@
 """CenterPoint on pillars: point layers, a backbone that sees the scene from above, heads of centres and boxes."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from fcos_lidar_jax.config import Config, PillarConfig
+from fcos_lidar_jax.centerpoint.config import PillarConfig
+from fcos_lidar_jax.centerpoint.pillars import cell_maxima
+from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
 from fcos_lidar_jax.models.convolution import FULL
 from fcos_lidar_jax.models.heads import Predictions
 from fcos_lidar_jax.models.layers import BatchNorm, Conv, ConvNorm, Image, pieces
-from fcos_lidar_jax.pillars import cell_maxima, pillar_grid
-from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import CentreOutputs, Pillars
 
 _NUMBERS = {"offset": 2, "height": 1, "size": 3, "heading": 2, "velocity": 2}  # In the order of ``coding.encode``.
 
@@ -159,22 +156,3 @@ class CenterPoint(nn.Module):
             x = self.neck(levels, train=train)
         with jax.named_scope("heads"):
             return self.heads(x, train=train)
-
-
-def build_centerpoint(config: Config, sensor: Sensor) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """``init`` and ``apply`` of :class:`fcos_lidar_jax.models.Detector` for a configuration with ``pillars``."""
-    assert config.pillars is not None
-    side = pillar_grid(config.pillars, sensor).side
-    network = CenterPoint(config.pillars, config.class_groups, side)
-
-    def init(key: Any) -> dict[str, Any]:
-        # Parameters do not depend on the number of points, and nothing of the forward pass is computed.
-        features, cell = jax.ShapeDtypeStruct((1, 8, 10), jnp.float32), jax.ShapeDtypeStruct((1, 8), jnp.int32)
-        pillars = Pillars(features, cell, jax.ShapeDtypeStruct((1,), jnp.int32))  # type: ignore[arg-type]
-        return network.lazy_init(key, pillars, train=False)  # type: ignore[return-value]
-
-    def apply(variables: dict[str, Any], pillars: Pillars, *, train: bool = False) -> tuple[CentreOutputs, Any]:
-        outputs, updates = network.apply(variables, pillars, train=train, mutable=["batch_stats"] if train else [])
-        return outputs, updates["batch_stats"] if train else variables["batch_stats"]
-
-    return init, apply

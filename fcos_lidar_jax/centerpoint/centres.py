@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
+from fcos_lidar_jax.centerpoint.pillars import Grid, cell_positions, cells_below
 from fcos_lidar_jax.coding import decode, decode_oriented, encode
-from fcos_lidar_jax.pillars import Grid, cell_positions, cells_below
 
 _HARMLESS = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 

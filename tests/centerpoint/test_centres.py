@@ -5,15 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.centres import (
+from fcos_lidar_jax.centerpoint.centres import (
     centre_targets,
     decode_centres,
     encode_centres,
     focal_loss,
     gaussian_radius,
 )
+from fcos_lidar_jax.centerpoint.pillars import Grid
 from fcos_lidar_jax.iou import oriented
-from fcos_lidar_jax.pillars import Grid
 
 GRID = Grid(24, 0.8, (-9.6, -9.6))
 OPTIONS = {"grid": GRID, "num_classes": 3, "min_overlap": 0.1, "min_radius": 2}

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.config import PillarConfig
-from fcos_lidar_jax.pillars import (
+from fcos_lidar_jax.centerpoint import PillarConfig
+from fcos_lidar_jax.centerpoint.pillars import (
     Grid,
     cell_maxima,
     cell_positions,

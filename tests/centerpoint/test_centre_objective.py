@@ -10,15 +10,20 @@ import pytest
 from tiny_peer import CONFIG, host_batch
 from tiny_run import SENSOR
 
-from fcos_lidar_jax.centres import centre_targets, decode_centres, encode_centres, focal_loss
+from fcos_lidar_jax.centerpoint.centres import (
+    CentreOutputs,
+    centre_targets,
+    decode_centres,
+    encode_centres,
+    focal_loss,
+)
+from fcos_lidar_jax.centerpoint.objective import sample_losses
+from fcos_lidar_jax.centerpoint.pillars import pillar_grid
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.pillars import make_pillars, pillar_grid
-from fcos_lidar_jax.training.centre_objective import batch_metrics, make_sums, sample_losses
+from fcos_lidar_jax.training.objective import batch_metrics, make_objective
 from fcos_lidar_jax.training.step import make_gradient
-from fcos_lidar_jax.types import CentreOutputs
 
 PILLARS = CONFIG.pillars
-assert PILLARS is not None
 GROUPED = dataclasses.replace(CONFIG, pillars=dataclasses.replace(PILLARS, groups=(0, 1, 2, 2, 1, 5, 4, 4, 5, 3)))
 GRID = pillar_grid(PILLARS, SENSOR, stride=PILLARS.output_stride)
 
@@ -69,10 +74,10 @@ def test_sums_are_those_of_a_loop_over_boxes(config):
 
 def test_every_group_is_divided_by_its_own_boxes():
     detector, variables = prepared(GROUPED)
-    batch, grid = host_batch(), pillar_grid(PILLARS, SENSOR)
-    totals, (_, parts, counts) = jax.jit(make_sums(detector))(variables["params"], variables["batch_stats"], batch)
-    metrics = batch_metrics(parts, counts, GROUPED)
-    pillars = jax.vmap(lambda p, v: make_pillars(p, v, grid=grid, sensor=SENSOR))(batch.points, batch.valid)
+    batch, objective = host_batch(), jax.jit(make_objective(detector))
+    totals, (_, of_batch) = objective(variables["params"], variables["batch_stats"], batch)
+    metrics = batch_metrics(of_batch, GROUPED.loss)
+    pillars = jax.vmap(detector.prepare)(batch.points, batch.valid)
     found, _ = detector.apply(variables, pillars, train=True)
     sums, boxes = {"classification": np.zeros(6), "l1": np.zeros(6)}, np.zeros(6)
     for i in range(2):
@@ -86,7 +91,7 @@ def test_every_group_is_divided_by_its_own_boxes():
         assert float(metrics[f"loss/{name}"]) == pytest.approx(value, rel=1e-4)
     total = expected["classification"] + 0.25 * expected["l1"]
     assert float(metrics["loss/total"]) == pytest.approx(total, rel=1e-4)
-    assert float(totals["positives"] / counts["positives"]) == pytest.approx(total, rel=1e-4)
+    assert float(totals["positives"] / of_batch.counts["positives"]) == pytest.approx(total, rel=1e-4)
 
 
 def test_a_batch_without_points_or_boxes_has_finite_losses_and_gradients():

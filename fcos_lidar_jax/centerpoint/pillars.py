@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from fcos_lidar_jax.config import PillarConfig
+from fcos_lidar_jax.centerpoint.config import PillarConfig
+from fcos_lidar_jax.centerpoint.types import Pillars
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import Pillars
 
 _STEPS_PER_M = 2.0**16  # Of the integers that means are computed with: far below what a LiDAR can tell.
 

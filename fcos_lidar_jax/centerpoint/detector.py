@@ -1,0 +1,72 @@
+"""CenterPoint as a :class:`fcos_lidar_jax.models.Detector`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from fcos_lidar_jax.centerpoint.centres import decode_centres
+from fcos_lidar_jax.centerpoint.config import CenterPointConfig
+from fcos_lidar_jax.centerpoint.network import CenterPoint
+from fcos_lidar_jax.centerpoint.objective import make_sums
+from fcos_lidar_jax.centerpoint.pillars import Grid, make_pillars, pillar_grid
+from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
+from fcos_lidar_jax.models import Detector, Variables
+from fcos_lidar_jax.sensors import Sensor
+
+_BEYOND_M = 10.0  # How far outside the map, and above or below the sensor, a box may lie.
+
+
+def build(config: CenterPointConfig, sensor: Sensor) -> Detector:
+    """CenterPoint for the clouds of a sensor."""
+    grid = pillar_grid(config.pillars, sensor)
+    cells = pillar_grid(config.pillars, sensor, stride=config.pillars.output_stride)
+    network = CenterPoint(config.pillars, config.class_groups, grid.side)
+
+    def prepare(points: Array | np.ndarray, valid: Array | np.ndarray) -> Pillars:
+        return make_pillars(points, valid, grid=grid, sensor=sensor)
+
+    def init(key: Any) -> Variables:
+        # Parameters do not depend on the number of points, and nothing of the forward pass is computed.
+        features, cell = jax.ShapeDtypeStruct((1, 8, 10), jnp.float32), jax.ShapeDtypeStruct((1, 8), jnp.int32)
+        pillars = Pillars(features, cell, jax.ShapeDtypeStruct((1,), jnp.int32))  # type: ignore[arg-type]
+        return network.lazy_init(key, pillars, train=False)  # type: ignore[return-value]
+
+    def apply(variables: Variables, pillars: Pillars, *, train: bool = False) -> tuple[CentreOutputs, Any]:
+        outputs, updates = network.apply(variables, pillars, train=train, mutable=["batch_stats"] if train else [])
+        return outputs, updates["batch_stats"] if train else variables["batch_stats"]
+
+    def candidates(outputs: CentreOutputs, _: Pillars) -> tuple[Array, Array, Array, Array]:
+        return centre_candidates(outputs, config=config, grid=cells)
+
+    return Detector(prepare, init, apply, make_sums(config, cells), candidates, config, sensor)
+
+
+def centre_candidates(
+    outputs: CentreOutputs, *, config: CenterPointConfig, grid: Grid
+) -> tuple[Array, Array, Array, Array]:
+    """The best (cell, class) pairs of CenterPoint's heat map, decoded; boxes far outside the map are discarded.
+
+    Args:
+        outputs: of one sample.
+        config, grid: thresholds and counts, and the cells of the heat map (static).
+
+    Returns:
+        boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c].
+    """
+    probability = jax.nn.sigmoid(outputs.heat)
+    scores = jnp.where(probability > config.inference.min_probability, probability, -1.0).reshape(-1)
+    score, pair = lax.top_k(scores, min(config.inference.candidates_per_level, scores.shape[0]))
+    cell, label = pair // len(config.classes), (pair % len(config.classes)).astype(jnp.int32)
+    group = jnp.array(config.class_groups)[label]
+    regression = outputs.regression.reshape(-1, *outputs.regression.shape[-2:])[cell, group]
+    boxes = decode_centres(regression, cell, grid)
+    reach, centre = config.pillars.range_m + _BEYOND_M, np.asarray(grid.low_m) + config.pillars.range_m
+    near = (jnp.abs(boxes[:, :2] - centre.astype(np.float32)) <= reach).all(axis=1) & (
+        jnp.abs(boxes[:, 2]) <= _BEYOND_M
+    )
+    valid = (score >= 0) & near
+    return boxes, jnp.where(valid, score, 0.0), label, valid

@@ -1,0 +1,88 @@
+"""Losses of CenterPoint, as sums."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from fcos_lidar_jax.centerpoint.centres import (
+    centre_targets,
+    decode_centres,
+    encode_centres,
+    focal_loss,
+)
+from fcos_lidar_jax.centerpoint.config import CenterPointConfig
+from fcos_lidar_jax.centerpoint.pillars import Grid
+from fcos_lidar_jax.centerpoint.types import CentreOutputs
+from fcos_lidar_jax.iou import oriented, oriented_iou_3d
+from fcos_lidar_jax.losses import l1_loss
+from fcos_lidar_jax.types import Batch, Sums
+
+Parts = dict[str, Array]
+
+
+def sample_losses(
+    outputs: CentreOutputs, boxes: Array, labels: Array, box_valid: Array, *, config: CenterPointConfig, grid: Grid
+) -> tuple[Parts, Parts]:
+    """Targets and losses of one sample.
+
+    Args:
+        outputs: of one sample, as are the other arrays.
+        boxes: f32[m, 9]; NaN velocities are unknown.
+        labels, box_valid: i32[m] and bool[m].
+        config, grid: choices, and the cells of the heat map (static).
+
+    Returns:
+        sums of the two losses and counts of the boxes, each f32[g] or i32[g] by group of classes, and counts to be
+        summed over the batch.
+    """
+    pillars, groups = config.pillars, jnp.array(config.class_groups)
+    targets = centre_targets(
+        boxes,
+        labels,
+        box_valid,
+        grid=grid,
+        num_classes=len(config.classes),
+        min_overlap=pillars.min_overlap,
+        min_radius=pillars.min_radius,
+    )
+    with jax.named_scope("losses"):
+        group = groups[jnp.where(targets.valid, labels, 0)]
+        own = targets.valid & (group == jnp.arange(outputs.regression.shape[-2])[:, None])
+        away, at_boxes = focal_loss(outputs.heat, targets.heat, targets.cell, labels, targets.valid)
+        regression = outputs.regression.reshape(-1, *outputs.regression.shape[-2:])[targets.cell, group]
+        numbers = encode_centres(targets.boxes, targets.cell, grid)
+        weight = config.loss.velocity_weight
+        l1 = [l1_loss(regression, numbers, mask, velocity_weight=weight)[0] for mask in own]
+        parts = {
+            "classification": jnp.zeros(own.shape[0]).at[groups].add(away) + (own * at_boxes).sum(axis=1),
+            "l1": jnp.stack(l1),
+        }
+    predicted = decode_centres(regression, targets.cell, grid, oriented=True)
+    iou = oriented_iou_3d(predicted, oriented(targets.boxes))
+    counts = {"positives": own.sum(axis=1, dtype=jnp.int32), "iou_sum": jnp.where(targets.valid, iou, 0.0).sum()}
+    return parts, counts
+
+
+def make_sums(config: CenterPointConfig, grid: Grid) -> Callable[[CentreOutputs, Any, Batch], Sums]:
+    """The losses of a batch; ``grid`` holds the cells of the heat map.
+
+    The losses of every group of classes are divided by its own boxes: its sums are weighed so that the one
+    division by all boxes does it. Over micro-batches this is exact with one group; with more, each has its shares.
+    """
+
+    def sums(outputs: CentreOutputs, _: Any, batch: Batch) -> Sums:
+        parts, counts = jax.vmap(lambda *sample: sample_losses(*sample, config=config, grid=grid))(
+            outputs, batch.boxes, batch.labels, batch.box_valid
+        )
+        parts, counts = jax.tree.map(lambda leaf: leaf.sum(axis=0), (parts, counts))
+        by_group = counts["positives"]
+        positives = by_group.sum()
+        share = jnp.maximum(positives, 1) / jnp.maximum(by_group, 1)
+        losses = {name: (part * share).sum() for name, part in parts.items()}
+        means = {"positives": {"positive_iou": counts["iou_sum"]}}
+        return Sums({"positives": losses}, {"positives": positives}, means)
+
+    return sums
