@@ -11,9 +11,10 @@ from tiny_peer import CONFIG
 from tiny_run import SENSOR
 
 from fcos_lidar_jax.centerpoint import CenterPointConfig, PillarConfig
-from fcos_lidar_jax.centerpoint.centres import CentreOutputs, decode_centres
+from fcos_lidar_jax.centerpoint.centres import decode_centres
 from fcos_lidar_jax.centerpoint.detector import centre_candidates
 from fcos_lidar_jax.centerpoint.pillars import Grid
+from fcos_lidar_jax.centerpoint.types import CentreOutputs
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.inference.detect import suppress

@@ -11,7 +11,6 @@ from tiny_peer import CONFIG, host_batch
 from tiny_run import SENSOR
 
 from fcos_lidar_jax.centerpoint.centres import (
-    CentreOutputs,
     centre_targets,
     decode_centres,
     encode_centres,
@@ -19,6 +18,7 @@ from fcos_lidar_jax.centerpoint.centres import (
 )
 from fcos_lidar_jax.centerpoint.objective import sample_losses
 from fcos_lidar_jax.centerpoint.pillars import pillar_grid
+from fcos_lidar_jax.centerpoint.types import CentreOutputs
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.training.objective import batch_metrics, make_objective
 from fcos_lidar_jax.training.step import make_gradient
