@@ -27,11 +27,11 @@ from experiments.real_frames import real_frames
 from experiments.runs import detections
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax import open_frames
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.onnx_graph import cpu_package
 from fcos_lidar_jax.inference.openvino import Precision, processor_precision, with_openvino

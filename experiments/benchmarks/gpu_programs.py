@@ -171,8 +171,8 @@ def suppression_iterations(number: int) -> Iterator[int]:
     import jax
     import numpy as np
 
+    from fcos_lidar_jax.data.cloud_policy import make_cloud
     from fcos_lidar_jax.inference import load_trained
-    from fcos_lidar_jax.inference.cloud import make_cloud
     from fcos_lidar_jax.inference.detect import make_stages
     from fcos_lidar_jax.iou import oriented, oriented_overlap
     from fcos_lidar_jax.simulation.frame_set import unseen_frames

@@ -30,9 +30,9 @@ from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.inference import make_detect
-from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
 from fcos_lidar_jax.inference.detect import select_candidates
 from fcos_lidar_jax.inference.stages import Stages
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved

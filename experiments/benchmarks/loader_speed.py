@@ -40,6 +40,8 @@ from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
+from fcos_lidar_jax.devices.transfer import feed
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
@@ -48,8 +50,6 @@ from fcos_lidar_jax.input_pipeline.loader import make_batches, packing_for
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training.feed import feed
-from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
 from fcos_lidar_jax.types import HostBatch
 
 EPOCHS, EPOCH_SAMPLES, HOURS = 40, 123_580, 26

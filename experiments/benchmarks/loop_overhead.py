@@ -22,9 +22,9 @@ from fcos_lidar_jax.data.frame import GivenFrames
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.trainer import Schedule, train
 from fcos_lidar_jax.training.loop import Record
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.training.run import Schedule, train
 
 CONFIG = dataclasses.replace(QUICKSTART, copy_paste=None, class_balanced=False)
 

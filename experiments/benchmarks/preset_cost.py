@@ -23,10 +23,10 @@ from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import Change, change
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.inference import make_detect
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.timing import Call
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.models.detector import count_parameters

@@ -19,10 +19,10 @@ from typing import Any
 
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.training.checkpoint import LATER_FIELDS
 
 _SECTIONS = {
     "": "sensor num_sweeps max_points max_boxes fade_epochs copy_paste class_balanced augment",

@@ -32,6 +32,7 @@ from fcos_lidar_jax.evaluation.results import read_results, result_entries, writ
 from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.files import checksum, file_lock
 from fcos_lidar_jax.inference import CloudDetector
+from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
@@ -40,9 +41,8 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, Sensor, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.lidar import SWEEP_S
 from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
-from fcos_lidar_jax.trainer import Schedule
-from fcos_lidar_jax.trainer.results import write_predictions
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.training.run import Schedule
 
 _CURVE_FRAMES = 100  # Test frames of the evaluations during a training.
 _BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, which would leave a trail when sweeps are fused.

@@ -19,6 +19,7 @@ from experiments.paper_tables.cell_names import cell_name
 from experiments.paper_tables.scales import NuScenesLayout, write_submission
 from experiments.paper_tables.tables import Args, Row, Table, make_scale, run_table
 from experiments.script import run_script
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -26,8 +27,7 @@ from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.trainer.run import RUN_SPEC
-from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints
+from fcos_lidar_jax.training.run import RUN_SPEC
 
 _PART_FADED = 8  # The paper's five epochs of forty.
 _SUBMITTED = "c128 and fade"  # Row whose detector writes the results file.

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 from experiments.script import Options, run_script, save
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY, Sensor
 from fcos_lidar_jax.types import RangeImage

@@ -26,7 +26,7 @@ from experiments.changes import change
 from experiments.paper_tables.tables import Args, Row, Table, run_table, simulated_scale
 from experiments.script import run_script
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector, count_parameters

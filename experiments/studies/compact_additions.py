@@ -28,12 +28,12 @@ from experiments.runs import detections, trained
 from experiments.script import Options, run_measurement
 from experiments.statistics import paired_difference
 from experiments.studies.shipped_weights import CONFIGS, streets
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.matching import DISTANCES_M
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.inference import TrainedDetector
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import count_parameters

@@ -24,13 +24,13 @@ import numpy as np
 
 from experiments.changes import change
 from experiments.script import Options, run_measurement
+from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, save_checkpoint
 from fcos_lidar_jax.inference import load_detector, load_trained
 from fcos_lidar_jax.inference.export import export_detector
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training import Checkpoint, CheckpointError, save_checkpoint
 
 PAPER = "nuscenes, random weights"
 _TRACES = (str(Path.cwd()), sys.prefix, str(Path.home()), "site-packages", ".py")

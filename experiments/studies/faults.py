@@ -42,14 +42,13 @@ import numpy as np
 from experiments.changes import change
 from experiments.script import Options, run_script, save
 from experiments.studies.device_equivalence import CONFIG, SENSOR, draw_variables
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS
 from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.cli import main as command
 from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.trainer import Schedule, train
-from fcos_lidar_jax.trainer.run import RUN_SPEC
-from fcos_lidar_jax.training.checkpoints import CHECKPOINTS
+from fcos_lidar_jax.training.run import RUN_SPEC, Schedule, train
 
 STEPS = 6
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)

@@ -29,8 +29,8 @@ from fcos_lidar_jax.presets import COMPACT, NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.streets import CITY
-from fcos_lidar_jax.trainer import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.training.run import Schedule
 
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000

@@ -18,10 +18,10 @@ from experiments.changes import change
 from experiments.runs import trained
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.inference.prediction import evaluate
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, fresh_streets
-from fcos_lidar_jax.trainer import evaluate
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 _LAST = 20  # Steps whose mean counts.

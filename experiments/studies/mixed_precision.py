@@ -19,9 +19,9 @@ from experiments.changes import change
 from experiments.runs import trained
 from experiments.script import Options, run_measurement
 from experiments.statistics import interval
+from fcos_lidar_jax.inference.prediction import evaluate
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.simulation.frame_set import fresh_streets, unseen_frames
-from fcos_lidar_jax.trainer import evaluate
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 PRECISIONS = ("float32", "bfloat16")

@@ -33,7 +33,7 @@ from fcos_lidar_jax.data.frame import Frame, GivenFrames, without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.matching import candidate_pairs, match_frame
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
-from fcos_lidar_jax.inference.records import confident
+from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
 from fcos_lidar_jax.projection import project_points

@@ -21,11 +21,11 @@ from experiments.script import Options, find_real_data, run_measurement
 from experiments.statistics import paired_difference
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.config import InferenceConfig
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.frame import ChosenFrames, Frame, FrameSet
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.presets import COMPACT

@@ -32,6 +32,9 @@ from experiments.runs import detections, trained
 from experiments.script import Options, run_script, save
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
+from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
@@ -43,11 +46,8 @@ from fcos_lidar_jax.presets import COMPACT, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, fresh_streets
 from fcos_lidar_jax.simulation.streets import CITY
-from fcos_lidar_jax.trainer import Schedule
-from fcos_lidar_jax.training import load_checkpoint, save_checkpoint
-from fcos_lidar_jax.training.checkpoint import Checkpoint, read_description
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.training.run import Schedule
 
 _FRESH = change(copy_paste=None, class_balanced=False)  # What makes more of few frames has no use here.
 CONFIGS = {

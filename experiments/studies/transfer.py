@@ -30,6 +30,8 @@ from experiments.runs import detections, trained
 from experiments.script import Options, real_data, run_script, save
 from experiments.studies.real_scene import TEST, TRAIN
 from fcos_lidar_jax import open_frames
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.benchmark import evaluate_keyframes
@@ -39,8 +41,6 @@ from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.training.checkpoint import read_description
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 FROM_SCRATCH = change(copy_paste=None, class_balanced=False)(COMPACT)
 FINE_TUNING = change(optimizer__peak_learning_rate=1e-3)(FROM_SCRATCH)

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from fcos_lidar_jax.cli.processes import tell
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.classes import ClassMap, MappedFrames
+from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.files import read_json

@@ -16,16 +16,16 @@ from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.benchmark import evaluate_keyframes
 from fcos_lidar_jax.evaluation.examples import choose_examples
+from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.evaluation.results import LIDAR_META
 from fcos_lidar_jax.evaluation.summary import describe, write_evaluation
 from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.records import confident
+from fcos_lidar_jax.inference.prediction import Prediction, predict
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.trainer import Prediction, predict
-from fcos_lidar_jax.trainer.run import NUM_SEEDS
+from fcos_lidar_jax.training.run import NUM_SEEDS
 from fcos_lidar_jax.visualization.drive import Scene, draw_drive
 from fcos_lidar_jax.visualization.evaluation_report import write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page

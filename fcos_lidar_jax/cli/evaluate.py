@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import tyro
 
+from fcos_lidar_jax.checkpoints.preemption import take_sigterm_back
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder, check_outside
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
@@ -19,23 +20,22 @@ from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_p
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
 from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
 from fcos_lidar_jax.evaluation.frames import frame_columns, read_detections, write_detections
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation, Metric, evaluate, metric_of
+from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
-from fcos_lidar_jax.inference.records import as_records
+from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor, load_sensor
-from fcos_lidar_jax.trainer.results import write_predictions
-from fcos_lidar_jax.training.agreement import agreed
-from fcos_lidar_jax.training.preemption import take_sigterm_back
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.evaluation_report import PAGE, Example, clear_report, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page

@@ -12,9 +12,9 @@ import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
+from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference.cloud import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import load_sensor
 

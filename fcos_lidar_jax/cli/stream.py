@@ -15,16 +15,16 @@ import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
 from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.drives import Drive, folder_drive
 from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
 from fcos_lidar_jax.data.nuscenes.reader import NuScenes
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
+from fcos_lidar_jax.evaluation.records import as_records, confident
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
-from fcos_lidar_jax.inference.cloud import sensor_mismatch
-from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open import find_layout

@@ -11,20 +11,20 @@ from typing import Annotated, Any
 import jax
 import tyro
 
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_of
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
+from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import Layout
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.trainer.run import NUM_SEEDS, Schedule, check_run, train
-from fcos_lidar_jax.training.agreement import agreed
-from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of
+from fcos_lidar_jax.training.run import NUM_SEEDS, Schedule, check_run, train
 
 _ABOUT = {
     "nuscenes": "the paper's detector on ten sweeps",

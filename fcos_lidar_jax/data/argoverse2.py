@@ -10,7 +10,7 @@ import numpy as np
 
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES
 from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
-from fcos_lidar_jax.data.classes import map_labels, unknown_name
+from fcos_lidar_jax.data.class_mapping import map_labels, unknown_name
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
 from fcos_lidar_jax.data.nuscenes.build import velocities

@@ -10,7 +10,7 @@ import numpy as np
 
 from fcos_lidar_jax.data import point_files
 from fcos_lidar_jax.data.box_geometry import LIMITS, count_inside, find_bad_box
-from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import (
     Frame,
     FrameSet,

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import count_inside, find_bad_box
-from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, distinct_names, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.sweeps import is_rotation

@@ -20,15 +20,15 @@ from jax import export, lax
 from jax.sharding import Mesh
 
 from fcos_lidar_jax import __version__
+from fcos_lidar_jax.checkpoints.storage import CheckpointError, with_later_fields
 from fcos_lidar_jax.config import config_from_json, config_to_json
+from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.files import checksum
-from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, jit_split
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.projection import remove_close as without_close
 from fcos_lidar_jax.sensors import sensor_from_json, sensor_to_json
-from fcos_lidar_jax.training.checkpoint import CheckpointError, with_later_fields
 from fcos_lidar_jax.types import Detections
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
+from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud
 from fcos_lidar_jax.data.sweeps import Sweep, about_z, before_turning, fuse_sweeps, turned
-from fcos_lidar_jax.inference.cloud import Cloud, expect_points, make_cloud
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.types import Detections

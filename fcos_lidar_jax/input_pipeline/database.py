@@ -22,10 +22,10 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
+from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, checksum
-from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
 from fcos_lidar_jax.workers import end_with_parent
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, assert_never
 
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
-from fcos_lidar_jax.data.classes import ClassMap, MappedFrames, mapped_classes, unknown_name
+from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes, unknown_name
 from fcos_lidar_jax.data.folder import SPLITS, FolderFrames, read_splits
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.kitti import KittiFrames
@@ -171,8 +171,8 @@ def open_frames(
         follow_links: of nuScenes and folders: read files to which links lead outside of the root.
 
     Returns:
-        frames whose labels count their own classes; :class:`~fcos_lidar_jax.data.classes.MappedFrames` brings them
-        to those of a detector.
+        frames with labels of their own classes; :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames` brings
+        them to those of a detector.
 
     Raises:
         ValueError: in one line, what was found and what was expected.

@@ -13,6 +13,7 @@ from commands import assert_one_line_error, in_use, page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import evaluate
 from fcos_lidar_jax.cli.data import DataOptions
@@ -21,10 +22,9 @@ from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation import evaluate_detections
 from fcos_lidar_jax.inference import load_detector
+from fcos_lidar_jax.inference.prediction_log import _fingerprint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.trainer.results import _fingerprint
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
 FILES = {"metrics_summary.json", "curves.json", "results_nusc.json", ".lock"}
 

@@ -17,9 +17,9 @@ from commands import assert_one_line_error, child_environment, command, in_use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax import cli
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 VERSION = "v1.0-synthetic"
@@ -118,7 +118,7 @@ def interrupted(root, tmp_path_factory, child):
 
 
 def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, interrupted, tmp_path, child):
-    """Where a stopped and resumed run ends, tests/trainer/test_run.py tells."""
+    """Where a stopped and resumed run ends, tests/training/test_run.py tells."""
     first, code, errors, stopped_at = interrupted
     out = shutil.copytree(first, tmp_path / "run")
     resumed = child(train(root, out, *long(root), "--resume"))

@@ -16,7 +16,7 @@ from toy_frames import toy_frame
 
 from fcos_lidar_jax.data import cached
 from fcos_lidar_jax.data.cached import CachedFrames
-from fcos_lidar_jax.data.classes import MappedFrames
+from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.clouds import CloudFiles
 from fcos_lidar_jax.data.frame import (
     ChosenFrames,

@@ -11,7 +11,7 @@ from experiments.paper_tables import scales
 from experiments.paper_tables.scales import quarter, smoke
 from experiments.paper_tables.tables import Args
 from experiments.studies import centerpoint
-from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector

@@ -15,12 +15,12 @@ from tiny_run import TINY_CONFIG, untrained
 from experiments.real_frames import SPANS_M, scores_by_range, within
 from experiments.studies import compact_additions, model_card, shipped_weights, transfer
 from experiments.studies.shipped_weights import earlier_trainings, half_precision
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import CheckpointError
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
-from fcos_lidar_jax.training.checkpoint import CheckpointError
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Detections
 

@@ -9,16 +9,16 @@ import pytest
 from refusal import refused
 from tiny_run import TINY_CONFIG, bits, untrained
 
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds
 from fcos_lidar_jax.data.sweeps import Sweep, before_turning, fuse_sweeps
+from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.inference import TrainedDetector
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detector import _split_detect
 from fcos_lidar_jax.inference.stream import detect_stream
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training.sharding import make_mesh
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from made_kitti import make_kitti
 from made_nuscenes import VERSION, make_tables, token, write
 
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
-from fcos_lidar_jax.data.classes import MappedFrames
+from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes

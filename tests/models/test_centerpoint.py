@@ -10,7 +10,7 @@ import pytest
 from tiny_peer import CONFIG
 from tiny_run import SENSOR
 
-from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.models.centerpoint import Neck, from_channels
 from fcos_lidar_jax.pillars import make_pillars, pillar_grid

@@ -6,14 +6,14 @@ import re
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.inference.cloud import (
+from fcos_lidar_jax.data.cloud_policy import (
     MAX_INTENSITY,
     MAX_TIME_LAG_S,
     expect_points,
     make_cloud,
     sensor_mismatch,
 )
+from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, PRESETS, TINY
 from fcos_lidar_jax.simulation.frames import make_frame

@@ -15,15 +15,16 @@ import pytest
 from commands import run_python
 from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 
+from fcos_lidar_jax.checkpoints import load_checkpoint
+from fcos_lidar_jax.checkpoints.storage import CheckpointError, load_state
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
 from fcos_lidar_jax.data.frame import GivenFrames
+from fcos_lidar_jax.devices.transfer import feed
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.input_pipeline.database import prepare_database
-from fcos_lidar_jax.trainer import run as runs
-from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
-from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
-from fcos_lidar_jax.training.feed import feed
+from fcos_lidar_jax.training import NonFiniteLossError
+from fcos_lidar_jax.training import run as runs
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Batch, PackedBatch
 

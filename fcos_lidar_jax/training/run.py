@@ -20,22 +20,9 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.augment import check_augmentation
-from fcos_lidar_jax.config import Config, config_to_json
-from fcos_lidar_jax.data.classes import MappedFrames
-from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.files import atomic_write, checksum, folder_lock, read_json
-from fcos_lidar_jax.inference.cloud import sensor_mismatch
-from fcos_lidar_jax.inference.detector import TrainedDetector
-from fcos_lidar_jax.input_pipeline.batching import check_counts
-from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
-from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import check_loader_options, make_batches, packing_for
-from fcos_lidar_jax.models import Detector, Variables, build_detector
-from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.trainer.pictures import draw_metrics, draw_predictions
-from fcos_lidar_jax.trainer.prediction import evaluate, predict
-from fcos_lidar_jax.training.agreement import agreed, check_same
-from fcos_lidar_jax.training.checkpoint import (
+from fcos_lidar_jax.checkpoints.preemption import stop_requests
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import (
     Checkpoint,
     CheckpointError,
     NonFiniteStateError,
@@ -43,13 +30,26 @@ from fcos_lidar_jax.training.checkpoint import (
     load_checkpoint,
     with_later_fields,
 )
-from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, find_checkpoint
-from fcos_lidar_jax.training.feed import feed
+from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.data.class_mapping import MappedFrames
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.devices.agreement import agreed, check_same
+from fcos_lidar_jax.devices.mesh import check_batch_size, jit_step, make_mesh, replicate
+from fcos_lidar_jax.devices.transfer import feed
+from fcos_lidar_jax.files import atomic_write, checksum, folder_lock, read_json
+from fcos_lidar_jax.inference.detector import TrainedDetector
+from fcos_lidar_jax.inference.prediction import evaluate, predict
+from fcos_lidar_jax.input_pipeline.batching import check_counts
+from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
+from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
+from fcos_lidar_jax.input_pipeline.loader import check_loader_options, make_batches, packing_for
+from fcos_lidar_jax.models import Detector, Variables, build_detector
+from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
 from fcos_lidar_jax.training.metrics_log import MetricsLog, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
-from fcos_lidar_jax.training.preemption import stop_requests
-from fcos_lidar_jax.training.sharding import check_batch_size, jit_step, make_mesh, replicate
+from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 from fcos_lidar_jax.types import TrainState
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from fcos_lidar_jax.data.classes import MappedFrames, map_labels, mapped_classes
+from fcos_lidar_jax.data.class_mapping import MappedFrames, map_labels, mapped_classes
 from fcos_lidar_jax.data.frame import ChosenFrames, Frame, GivenFrames
 from fcos_lidar_jax.sensors import TINY
 

@@ -8,10 +8,9 @@ import pytest
 from tiny_run import CONFIG, FRAMES, TESTS, weights
 
 from fcos_lidar_jax.data.frame import Frame, FramesOf
-from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.inference import TrainedDetector, prediction
+from fcos_lidar_jax.inference.prediction import evaluate, predict, predict_groups
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.trainer import evaluate, predict, prediction
-from fcos_lidar_jax.trainer.prediction import predict_groups
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +21,8 @@ def detector():
 @pytest.fixture
 def compared(monkeypatch) -> list[Frame]:
     """The truth that an evaluation compares with."""
-    kept: list[Frame] = []
-    monkeypatch.setattr(prediction, "evaluate_frames", lambda found, truths, metric: kept.extend(truths))
+    kept, compare = list[Frame](), prediction.evaluate_frames
+    monkeypatch.setattr(prediction, "evaluate_frames", lambda *of: kept.extend(of[1]) or compare(*of))
     return kept
 
 
