@@ -11,7 +11,8 @@ from fcos_lidar_jax.evaluation.frames import frame_columns
 from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.inference.prediction import predict
-from fcos_lidar_jax.training.run import RUN_SPEC, Schedule, train
+from fcos_lidar_jax.training import Schedule, train
+from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.types import Detections
 
 

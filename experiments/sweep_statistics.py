@@ -25,7 +25,7 @@ def sweep_statistics(frame: Frame, sensor: Sensor) -> Figures:
     "Above ground" is above the lowest point within a cell of a metre and its neighbours. Clusters are connected
     half-metre cells with points 0.3 to 3 m above ground, outside all boxes.
     """
-    points = frame.points[~close_to_sensor(frame.points, sensor)]
+    points = frame.points[~close_to_sensor(frame.points, sensor, 1.0)]
     away = np.hypot(points[:, 0], points[:, 1])
     points, away = points[away < sensor.limit_xy_m], away[away < sensor.limit_xy_m]
     inside = np.zeros(len(points), bool)

@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
@@ -23,13 +24,13 @@ from fcos_lidar_jax.types import RangeImage
 
 
 def close_to_sensor(
-    points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float = 1.0
+    points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float
 ) -> Bool[Array | np.ndarray, "n"]:
     """Points on the ego vehicle: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
 
     NumPy gives NumPy, so that clouds of any length can be filtered on the host without compiling.
 
-    >>> close_to_sensor(jnp.zeros((1, 5)), Sensor("two", (0.1, 0.0), 8)).tolist()
+    >>> close_to_sensor(jnp.zeros((1, 5)), Sensor("two", (0.1, 0.0), 8), 1.0).tolist()
     [True]
     """
     with np.errstate(invalid="ignore"):  # of a signalling NaN
@@ -41,30 +42,24 @@ def remove_close(
     points: Float32[Array | np.ndarray, "n c"],
     valid: Bool[Array | np.ndarray, "n"],
     sensor: Sensor,
-    *,
-    mode: str,
-    close_m: float = 1.0,
+    reading: CloudReading,
 ) -> Bool[Array | np.ndarray, "n"]:
     """``valid`` without the points on the ego vehicle, judged in the current frame.
 
     Args:
         points: x, y, z, intensity, time lag; NumPy or JAX, as is the answer.
         valid, sensor: rows that count, and the sensor, which gives the origin.
-        mode: ``"all"`` drops them from all sweeps, ``"sweeps"`` from the older ones, ``"none"`` not at all; else
-            there is a ValueError.
-        close_m: half the side of the square that is emptied.
+        reading: of which sweeps they are dropped, and the size of the square that is emptied.
 
     >>> me = jnp.zeros((1, 5))
-    >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), mode="all").tolist()
+    >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), CloudReading(1, "all")).tolist()
     [False]
     """
-    if mode == "none":
+    if reading.remove_close == "none":
         return valid
-    close = close_to_sensor(points, sensor, close_m)
-    if mode == "sweeps":
+    close = close_to_sensor(points, sensor, reading.close_m)
+    if reading.remove_close == "sweeps":
         close = close & (points[:, 4] != 0)
-    elif mode != "all":
-        raise ValueError(f"mode: got {mode!r}, expected 'all', 'sweeps' or 'none'")
     return valid & ~close
 
 

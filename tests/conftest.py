@@ -14,8 +14,12 @@ from quick import compile_quickly
 _UNCHECKED = ("types", "sensors", "config", "cli")
 _PACKAGE = Path(__file__).parents[1] / "fcos_lidar_jax"
 _MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", "__main__", *_UNCHECKED)]
-_ROOMS = ["models", "training", "inference", "evaluation", "checkpoints", "devices", "data.cloud_policy"]
-install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "typecheck.check")
+_ROOMS = ["models", "inference", "evaluation", "checkpoints", "devices", "data.cloud_policy"]
+# A run, like a command, checks its numbers in its own words.
+_STEP = [
+    f"training.{p.stem}" for p in (_PACKAGE / "training").glob("*.py") if p.stem not in ("__init__", "plan", "run")
+]
+install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS, *_STEP)], "typecheck.check")
 
 # A shell's background job ignores Ctrl-C, what nohup starts a hang-up, and so would the processes that the tests
 # start and interrupt.

@@ -28,7 +28,7 @@ from experiments.runs import detections
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.data.cloud_policy import make_cloud
-from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
@@ -103,13 +103,12 @@ def scores(args: Args) -> dict[str, Any]:
     """mAP with both backends."""
     trained = load_trained(args.weights)
     other = with_openvino(trained)
-    close: dict[str, Any] = {"remove_close": trained.config.projection.remove_close}
-    unseen = open_frames(format="simulated", split="val", sensor=trained.sensor, **close)
+    unseen = open_frames(format="simulated", split="val", sensor=trained.sensor, reading=trained.config.reading)
     sets: dict[str, Sequence[FrameSet]] = {
-        f"{args.frames} unseen simulated frames": [ChosenFrames(unseen, tuple(range(args.frames)))]
+        f"{args.frames} unseen simulated frames": [SelectedFrames(unseen, tuple(range(args.frames)))]
     }
     if find_real_data(args.data) is not None:
-        sets["real keyframes"] = list(real_frames(args.data, trained.config.projection).values())
+        sets["real keyframes"] = list(real_frames(args.data, trained.config.reading).values())
     record: dict[str, Any] = {"weights": str(args.weights), "precision": other.precision}
     for name, frames in sets.items():
         mean_aps = [mean_ap(detector, frames) for detector in (trained, other)]

@@ -25,6 +25,7 @@ from experiments.benchmarks.peers import turn_by_turn
 from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.data.frame import without_close
+from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.presets import COMPACT
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -43,7 +44,7 @@ class Args(Options):
 
 @functools.cache
 def _step() -> Callable[[], Any]:
-    frames = [without_close(make_frame(0, NUSCENES_HDL32E, num_objects=30), NUSCENES_HDL32E)]
+    frames = [without_close(make_frame(0, NUSCENES_HDL32E, num_objects=30), NUSCENES_HDL32E, cut_reading(1))]
     return training_steps(COMPACT, NUSCENES_HDL32E, frames)
 
 

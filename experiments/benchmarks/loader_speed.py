@@ -40,12 +40,12 @@ from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
-from fcos_lidar_jax.devices.transfer import feed
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
-from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase, prepare_database
+from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase, cut_reading, prepare_database
 from fcos_lidar_jax.input_pipeline.loader import make_batches, packing_for
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
@@ -221,7 +221,7 @@ def measure(args: Args) -> dict[str, Any]:
         raise ValueError("--data-root: missing, expected a data set in nuScenes' layout")
     config = change(optimizer__batch_size=args.batch_size)(NUSCENES)
     nuscenes = NuScenes(root, args.version)
-    frames = NuScenesFrames(nuscenes, tuple(nuscenes.split(args.split)), config.num_sweeps)
+    frames = NuScenesFrames(nuscenes, tuple(nuscenes.split(args.split)), cut_reading(config.num_sweeps))
     record: dict[str, Any] = {"data": args.version, "load_before": round(os.getloadavg()[0], 1)}
     with tempfile.TemporaryDirectory() as folder:
         began = time.process_time()

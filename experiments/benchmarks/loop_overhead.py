@@ -18,13 +18,13 @@ import jax
 
 from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, run_measurement
-from fcos_lidar_jax.data.frame import GivenFrames
+from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.loop import Record
 from fcos_lidar_jax.training.metrics_log import read_metrics
-from fcos_lidar_jax.training.run import Schedule, train
 
 CONFIG = dataclasses.replace(QUICKSTART, copy_paste=None, class_balanced=False)
 
@@ -60,7 +60,7 @@ def measure(args: Args) -> dict[str, Any]:
         began = time.perf_counter()
 
     with tempfile.TemporaryDirectory() as temporary:
-        given, never = GivenFrames(frames, TINY, simulated.classes), Schedule(total + 1, total + 1)
+        given, never = InMemoryFrames(frames, TINY, simulated.classes), Schedule(total + 1, total + 1)
         device = jax.devices()[:1]
         train(CONFIG, given, temporary, steps=total, hooks=(take_turns,), schedule=never, devices=device)
         records = read_metrics(Path(temporary))

@@ -26,6 +26,7 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.visualization.page import page_frame, write_page
@@ -59,7 +60,7 @@ def measure(args: Args) -> dict[str, Any]:
     frames: FrameSet = SimulatedFrames(NUSCENES_HDL32E, args.frames)
     if root is not None:
         data = NuScenes(root, "v1.0-scene0523")
-        frames = NuScenesFrames(data, tuple(data.sample_tokens), 1)
+        frames = NuScenesFrames(data, tuple(data.sample_tokens), cut_reading(1))
     read = [frames.frame(index % len(frames)) for index in range(args.frames)]
     with tempfile.TemporaryDirectory() as folder:
         path = args.page or Path(folder, "page.html")

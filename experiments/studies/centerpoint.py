@@ -55,7 +55,7 @@ def stage_calls(config: Config, points: Any, sensor: Any) -> tuple[dict[str, Cal
     """The stages of a detector with random weights on one cloud, each to be timed alone, and its parameters."""
     detector = build_detector(config, sensor)
     stages, variables = make_stages(detector), detector.init(jax.random.key(0))
-    cloud = make_cloud(points, config, sensor=sensor, remove_close="none")
+    cloud = make_cloud(points, config, sensor=sensor, num_close=0)
     prepare, network, boxes = (jax.jit(part) for part in (stages.prepare, stages.network, stages.postprocess))
     image = prepare(cloud.points, cloud.valid)
     outputs = network(variables, image)

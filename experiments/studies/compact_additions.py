@@ -106,7 +106,7 @@ def network_times(detectors: dict[str, TrainedDetector], frame: Frame, repeats: 
     calls: dict[str, Call] = {}
     for name, detector in detectors.items():
         stages = make_stages(detector.model)
-        cloud = make_cloud(frame.points, detector.config, sensor=detector.sensor, remove_close="none")
+        cloud = make_cloud(frame.points, detector.config, sensor=detector.sensor, num_close=0)
         image, network = jax.jit(stages.prepare)(cloud.points, cloud.valid), jax.jit(stages.network)
         variables = jax.device_put(detector.variables)
         calls[name] = lambda network=network, given=(variables, image): jax.block_until_ready(network(*given))

@@ -48,7 +48,8 @@ from fcos_lidar_jax.cli import main as command
 from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.training.run import RUN_SPEC, Schedule, train
+from fcos_lidar_jax.training import Schedule, train
+from fcos_lidar_jax.training.plan import RUN_SPEC
 
 STEPS = 6
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)

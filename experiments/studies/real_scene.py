@@ -26,7 +26,7 @@ from experiments.script import real_data, run_script, save
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import AugmentConfig, Config
-from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
@@ -85,13 +85,12 @@ def _scores(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
 def main(args: Args) -> None:
     """Train, evaluate, print, write: one run after the other."""
     root = real_data(args.data, "nuscenes_scene0523")
-    close = CONFIG.projection
-    frames = open_frames(root, split="scene0523", remove_close=close.remove_close, close_m=close.close_m)
-    test, every = (ChosenFrames(frames, tuple(chosen)) for chosen in (TEST, TRAIN))
+    frames = open_frames(root, split="scene0523", num_sweeps=1, reading=CONFIG.reading)
+    test, every = (SelectedFrames(frames, tuple(chosen)) for chosen in (TEST, TRAIN))
     augmented = change(augment=AugmentConfig())(CONFIG)
     runs: dict[str, tuple[Config, FrameSet, int]] = {
-        "1 frame": (CONFIG, ChosenFrames(frames, (20,)), args.steps[0]),
-        "4 frames": (CONFIG, ChosenFrames(frames, (0, 13, 26, 39)), args.steps[1]),
+        "1 frame": (CONFIG, SelectedFrames(frames, (20,)), args.steps[0]),
+        "4 frames": (CONFIG, SelectedFrames(frames, (0, 13, 26, 39)), args.steps[1]),
         "32 frames": (CONFIG, every, args.steps[2]),
         "32 frames, augmented": (augmented, every, args.steps[3]),
     }

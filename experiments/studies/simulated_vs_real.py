@@ -29,6 +29,7 @@ from experiments.benchmarks.mrv_figures import ROUNDS, kept_by_rounds
 from experiments.script import Options, real_data, run_script, save
 from experiments.sweep_statistics import Figures, sweep_statistics
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import WHOLE_SWEEP
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -71,7 +72,7 @@ def _keyframes(data: NuScenes) -> list[Keyframe]:
     in_full_view = {row["token"] for row in rows if row["visibility_token"] in full}
     found = []
     for token in data.sample_tokens:
-        truth, points = data.boxes(token), data.sweeps(token, 1, remove_close="none")
+        truth, points = data.boxes(token), data.fuse_sweeps(token, WHOLE_SWEEP)[0]
         visible = np.array([token in in_full_view for token in truth.tokens], bool)
         found.append(Keyframe(points, truth.boxes, truth.labels, truth.num_lidar_pts, visible=visible))
     return found
@@ -101,7 +102,7 @@ def points_by_range(frames: list[Keyframe]) -> dict[str, dict[str, dict[str, Any
 
 
 def _sweep_figures(frame: Keyframe) -> Figures:
-    close = close_to_sensor(frame.points, SENSOR)
+    close = close_to_sensor(frame.points, SENSOR, 1.0)
     far = frame.points[~close]
     distance = np.hypot(far[:, 0], far[:, 1])
     image = project_points(_padded(far, 40_960), np.arange(40_960) < len(far), SENSOR, num_rounds=1)

@@ -117,7 +117,7 @@ def main(args: Args) -> None:
         raise ValueError(f"--only: got {sorted(unknown)[0]!r}, expected some of {', '.join(map(repr, CELLS))}")
     config = change(augment=AugmentConfig())(CONFIG)
     tests = {"unseen streets": city_frames(NUSCENES_HDL32E, args.test_frames, UNSEEN_SEED)}
-    tests |= real_frames(args.data, config.projection)
+    tests |= real_frames(args.data, config.reading)
     record: dict[str, Any] = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
     for seed in args.seeds:
         for name in args.only or CELLS:

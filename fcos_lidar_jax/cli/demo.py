@@ -11,8 +11,6 @@ import tyro
 
 from fcos_lidar_jax.cli import demo_training
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
-from fcos_lidar_jax.cli.evaluate import examples
-from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.benchmark import evaluate_keyframes
 from fcos_lidar_jax.evaluation.examples import choose_examples
@@ -21,13 +19,14 @@ from fcos_lidar_jax.evaluation.results import LIDAR_META
 from fcos_lidar_jax.evaluation.summary import describe, write_evaluation
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.prediction import Prediction, predict
+from fcos_lidar_jax.input_pipeline import open_frames
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.training.run import NUM_SEEDS
+from fcos_lidar_jax.training.plan import NUM_SEEDS
 from fcos_lidar_jax.visualization.drive import Scene, draw_drive
-from fcos_lidar_jax.visualization.evaluation_report import write_evaluation_report
+from fcos_lidar_jax.visualization.evaluation_report import make_examples, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 
 WEIGHTS = "hdl32e"  # That are shown.
@@ -90,12 +89,14 @@ def run(args: Demo) -> None:
 
 def _simulate(args: Demo, detector: CloudDetector) -> NuScenesFrames:
     """The keyframes of a drive, which is written as a data set."""
-    version, close = "v1.0-drive", detector.config.projection
+    version = "v1.0-drive"
     spec = DatasetSpec(1, args.drive, args.keyframes, detector.sensor, True, version)
     write_dataset(spec, args.out / "drive", workers=1, report=Progress("sweeps", spec.sweeps).show)
-    data = NuScenes(args.out / "drive", version)
-    options = detector.config.num_sweeps, close.remove_close, close.close_m, detector.sensor
-    return NuScenesFrames(data, tuple(data.sample_tokens), *options)
+    frames = open_frames(
+        args.out / "drive", version=version, reading=detector.config.reading, sensor=detector.sensor
+    )
+    assert isinstance(frames, NuScenesFrames)
+    return frames
 
 
 def _report(args: Demo, detector: CloudDetector, frames: NuScenesFrames, predictions: list[Prediction]) -> str:
@@ -120,7 +121,7 @@ def _report(args: Demo, detector: CloudDetector, frames: NuScenesFrames, predict
         args.out,
         title=f"{WEIGHTS} on an unseen simulated drive",
         num_samples=len(scenes),
-        examples=examples(evaluation, frames, np.zeros((len(scenes), 3)), chosen.rows, min_score=least),
+        examples=make_examples(evaluation, frames, np.zeros((len(scenes), 3)), chosen.rows, min_score=least),
         sensor=sensor,
         pictures=[(_CAPTION, args.out / "drive.gif")],
         links=[("Look at the drive: play, turn, zoom", _PAGE)],

@@ -22,9 +22,10 @@ from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.simulation.frame_set import fresh_streets, unseen_frames
+from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.training.pictures import SHOWN_SCORE, draw_frame
-from fcos_lidar_jax.training.run import RUN_SPEC, Schedule, train
+from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.range_image import draw_range_image
 from fcos_lidar_jax.visualization.report import write_report

@@ -114,9 +114,7 @@ def predict_groups(
                 frame = frames.frame(group[row])
                 if group is groups[0] and slot == 0 and (line := sensor_mismatch(frame.points, sensor)):
                     print(f"warning: {line}", file=sys.stderr, flush=True)
-                cloud = make_cloud(
-                    frame.points, config, sensor=sensor, num_close=frame.num_close, remove_close="none"
-                )
+                cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close)
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud
         return loaded, (points, valid)

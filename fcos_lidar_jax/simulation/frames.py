@@ -1,8 +1,11 @@
 """Simulated frames: a sweep, or several fused, with the boxes of the current moment."""
 
+import dataclasses
+
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
@@ -20,9 +23,8 @@ def make_frame(
     num_objects: int = 12,
     reach_m: float | None = None,
     min_points: int = 1,
-    num_sweeps: int = 1,
+    reading: CloudReading = WHOLE_SWEEP,
     fast_traffic: bool = False,
-    close_m: float = 0.0,
     streets: Streets = PLAIN,
 ) -> Frame:
     """A simulated frame of a street; the same seed gives the same bytes, in whatever order frames are made.
@@ -34,21 +36,15 @@ def make_frame(
         num_objects: to place, on average where the streets are crowded or empty; fewer where there is no room.
         reach_m: greatest distance along the street at which they are placed; default: four fifths of the sensor's.
         min_points: objects that fewer points of the current sweep show are not annotated.
-        num_sweeps: fused, the current one included; with more than one the world moves.
+        reading: sweeps to fuse, see :func:`scan_sweeps`; with more than one the world moves.
         fast_traffic: as of :func:`~.world.sample_world`.
-        close_m: as of :func:`scan_sweeps`.
         streets: how varied they are.
-
-    Raises:
-        ValueError: fewer than one sweep.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> a, b = make_frame(3, TINY), make_frame(3, TINY)
     >>> bool((a.points == b.points).all()), bool((a.num_points >= 1).all())
     (True, True)
     """
-    if num_sweeps < 1:
-        raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
     rng = np.random.default_rng([seed, 0xF0C5])
     mixed = rng.spawn(1)[0]
     if streets.setting:
@@ -59,11 +55,11 @@ def make_frame(
     else:
         labels = rng.permutation(np.resize(rng.permutation(len(NUSCENES_CLASSES)), num_objects))
     reach = 0.8 * sensor.limit_xy_m if reach_m is None else reach_m
-    now_s = (num_sweeps - 1 + streets.rolling_shutter) * SWEEP_S
+    now_s = (reading.num_sweeps - 1 + streets.rolling_shutter) * SWEEP_S
     options = {"level": not streets.slopes, "fused": True, "fast_traffic": fast_traffic, "streets": streets}
     world = sample_world(rng, reach_m=reach, beyond_m=2 * reach, duration_s=now_s, labels=labels, **options)
     mount = sample_mount(rng, sensor, level=not streets.slopes, streets=streets)
-    points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, num_sweeps=num_sweeps, close_m=close_m)
+    points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, reading)
     boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, now_s), now_s).astype(np.float32)
     counts = count_inside(points[points[:, 4] == 0], boxes)
     shown = counts >= max(min_points, 1)
@@ -76,9 +72,7 @@ def scan_sweeps(
     mount: np.ndarray,
     time_s: float,
     rng: np.random.Generator,
-    *,
-    num_sweeps: int,
-    close_m: float = 0.0,
+    reading: CloudReading,
 ) -> tuple[np.ndarray, int]:
     """The sweeps up to a moment in the sensor's frame of that moment, the current one first, then by age.
 
@@ -86,8 +80,8 @@ def scan_sweeps(
         mount: f64[4, 4], as of :func:`~.lidar.sample_mount`.
         time_s: of the current sweep; the others are ``SWEEP_S`` apart.
         rng: noise and dropout.
-        num_sweeps: how many, the current one included.
-        close_m: points with ``|x|, |y|`` below it around the sensor, in their own sweep's frame, are left out.
+        reading: how many sweeps. Close points are left out of all sweeps or none: the simulated ego vehicle has no
+            body that the sensor could see, so what is close is the road.
 
     Returns:
         f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, the lag exactly 0 for the current sweep; and how
@@ -104,7 +98,9 @@ def scan_sweeps(
         pose = sensor_pose(world, mount, then_s)
         return Sweep(np.concatenate(columns, axis=1), pose, -age * round(SWEEP_S * 1e6))
 
-    return fuse_sweeps(map(take_sweep, range(num_sweeps)), sensor, remove_close="all", close_m=close_m)
+    removed = "none" if reading.remove_close == "none" else "all"
+    reading = dataclasses.replace(reading, remove_close=removed)
+    return fuse_sweeps(map(take_sweep, range(reading.num_sweeps)), sensor, reading)
 
 
 def boxes_in_sensor_frame(world: World, pose: np.ndarray, time_s: float) -> np.ndarray:

@@ -19,94 +19,30 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.checkpoints.preemption import stop_requests
-from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
-from fcos_lidar_jax.checkpoints.storage import (
-    Checkpoint,
-    CheckpointError,
-    NonFiniteStateError,
-    check_arrays,
-    load_checkpoint,
-    with_later_fields,
-)
-from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.checkpoints.storage import Checkpoint, NonFiniteStateError
+from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.class_mapping import MappedFrames
-from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.agreement import agreed, check_same
-from fcos_lidar_jax.devices.mesh import check_batch_size, jit_step, make_mesh, replicate
-from fcos_lidar_jax.devices.transfer import feed
-from fcos_lidar_jax.files import atomic_write, checksum, folder_lock, read_json
+from fcos_lidar_jax.devices.feeding import feed
+from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, replicate
+from fcos_lidar_jax.files import atomic_write, checksum, folder_lock
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.inference.prediction import evaluate, predict
-from fcos_lidar_jax.input_pipeline.batching import check_counts
-from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import check_loader_options, make_batches, packing_for
-from fcos_lidar_jax.models import Detector, Variables, build_detector
-from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.models import Variables
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
-from fcos_lidar_jax.training.metrics_log import MetricsLog, evaluated_steps
-from fcos_lidar_jax.training.optimizer import make_optimizer
+from fcos_lidar_jax.training.metrics_log import MetricsLog
 from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
+from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, plan_run
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 from fcos_lidar_jax.types import TrainState
 
 _NUM_PICTURES = 2  # Test frames that are drawn at an evaluation.
-_LATER_FIELDS = ("ground_truth_database", "tests")  # that the specification did not have at first
-NUM_SEEDS = 2**32  # JAX keeps 32 bits of a seed: larger ones would be others' again.
-RUN_SPEC = "run.json"  # Name of the file in a run's folder that says what the run is.
 
 Hook = Callable[[int, Record], None]  # Called with (steps done, metrics of the last of them) after every step.
-
-
-@dataclasses.dataclass(frozen=True)
-class Schedule:
-    """When a run saves and evaluates.
-
-    >>> Schedule(save_every=100).keep
-    2
-    """
-
-    save_every: int | None = None  # Steps between two checkpoints; default: a fiftieth of the run.
-    evaluate_every: int | None = None
-    """Steps between two evaluations; each saves a checkpoint, too; default: a tenth of the run."""
-    keep: int = 2  # Newest checkpoints that are kept, beside the best.
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if value is not None and (type(value) is not int or value < 1):
-                raise ValueError(f"schedule.{field.name}: got {value!r}, expected an integer of at least 1")
-
-
-@dataclasses.dataclass(frozen=True)
-class _Run:
-    """What stays the same through a run."""
-
-    folder: Path
-    detector: Detector
-    schedule: Schedule
-    num_steps: int
-    tests: FrameSet | None
-    devices: Sequence[Any] | None
-    spec: dict[str, Any]
-
-    def evaluation_pending(self, step: int) -> bool:
-        """Whether a run was stopped during the evaluation after a step, whose record is written last."""
-        return step > 0 and self.evaluates_at(step) and step not in evaluated_steps(self.folder)
-
-    @property
-    def checkpoints(self) -> Checkpoints:
-        return Checkpoints(self.folder / CHECKPOINTS, keep=self.schedule.keep)
-
-    def evaluates_at(self, step: int) -> bool:
-        every = self.schedule.evaluate_every or -(-self.num_steps // 10)
-        return self.tests is not None and (step % every == 0 or step == self.num_steps)
-
-    def saves_at(self, step: int) -> bool:
-        return step % (self.schedule.save_every or -(-self.num_steps // 50)) == 0 or self.evaluates_at(step)
 
 
 def train(
@@ -167,68 +103,41 @@ def train(
     Traceback (most recent call last):
     ValueError: ...
     """
-    frames = MappedFrames(frames, config.classes)
-    tests = None if tests is None else MappedFrames(tests, config.classes)
     mesh = make_mesh(devices)
     is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
-    with agreed("cannot train"):  # What can be refused is refused before the folder becomes a run's.
-        if type(steps) is not int or steps < 1:
-            raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
-        if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
-            raise ValueError(f"seed: got {seed!r}, expected an integer from 0 to {NUM_SEEDS - 1}")
-        if not len(frames):
-            raise ValueError("training frames: got none, expected at least one")
-        check_counts(frames)
-        check_batch_size(config.optimizer.batch_size, mesh)
-        check_loader_options(config, objects, threads=threads, workers=workers, num_processes=jax.process_count())
-        if config.augment is not None:
-            check_augmentation(config.augment, frames.sensor)
-        # What the run follows from: only the same can be resumed. Weights given as arrays are not recorded.
-        spec = {
-            "config": config_to_json(config),
-            "sensor": sensor_to_json(frames.sensor),
-            "steps": steps,
-            "seed": seed,
-            "frames": len(frames),
-            "data": frames.fingerprint(),
-            "tests": None if tests is None else tests.fingerprint(),
-            "objects": None if objects is None else objects.manifest.source,
-            "ground_truth_database": None if objects is None else objects.fingerprint(),
-            "weights": str(weights) if isinstance(weights, str | Path) else None,
-        }
-        spec, detector = json.loads(json.dumps(spec)), build_detector(config, frames.sensor)
-        run = _Run(Path(out), detector, schedule, steps, tests, devices, spec)
-        check_run(run.folder, run.spec, resume=resume)
-        given = weights if resume else _given_weights(run.detector, weights)  # needed where no checkpoint is yet
-        optimizer = make_optimizer(config.optimizer, steps)
-        jax.eval_shape(lambda key: make_state(run.detector, optimizer, key), jax.random.key(seed))
-        if config.copy_paste is not None and objects is not None:
-            make_paste(objects, config)
-        mismatch = sensor_mismatch(frames.frame(0).points, frames.sensor)
-        single = config.num_sweeps > 1 and _of_one_sweep(frames)
-        on_cpus = mesh.devices.flat[0].platform == "cpu"
-        packed = packing_for(frames, config) if packing or (packing is None and not on_cpus) else None
-    program = json.dumps([spec, None if packed is None else dataclasses.asdict(packed)], sort_keys=True)
+    with agreed("cannot train"):
+        run = plan_run(
+            config,
+            MappedFrames(frames, config.classes),
+            Path(out),
+            mesh,
+            steps=steps,
+            seed=seed,
+            tests=None if tests is None else MappedFrames(tests, config.classes),
+            objects=objects,
+            resume=resume,
+            weights=weights,
+            devices=devices,
+            schedule=schedule,
+            threads=threads,
+            workers=workers,
+            packing=packing,
+        )
+    packed = None if run.packing is None else dataclasses.asdict(run.packing)
+    program = json.dumps([run.spec, packed], sort_keys=True)
     check_same(checksum(program.encode()), "configuration, data or packing")
-    with _claimed(run, resume=resume):
-        start = _start(run, optimizer, seed, resume, given)
+    with _own_folder(run, resume=resume):
+        start = _start(run, resume=resume)
         first = int(start.step)
         pending = run.evaluation_pending(first)
         if first == steps and not pending:
             print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
             return start
-        step = jit_step(make_train_step(run.detector, optimizer), mesh)
+        step = jit_step(make_train_step(run.detector, run.optimizer), mesh)
         metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
         if is_main_process:
-            if mismatch:
-                print(f"warning: {frames.name(0)}: {mismatch}", file=sys.stderr, flush=True)
-            if single:
-                print(
-                    f"warning: num_sweeps: got {config.num_sweeps}, but the frames hold one sweep each: expected "
-                    "1, for `stream` will fuse as many, which the detector has not seen",
-                    file=sys.stderr,
-                    flush=True,
-                )
+            for line in run.warnings:
+                print(f"warning: {line}", file=sys.stderr, flush=True)
             print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
 
         def report(number: int, record: Record) -> None:
@@ -245,10 +154,20 @@ def train(
             if run.evaluates_at(number):
                 _evaluate(run, number, state, metrics)
 
-        processes = {"process_index": jax.process_index(), "num_processes": jax.process_count()}
-        helpers: dict[str, Any] = {"threads": threads, "workers": workers, "packing": packed, **processes}
         batches = make_batches(
-            frames, config, seed=seed, num_steps=steps, first_step=first, objects=objects, lend=True, **helpers
+            run.frames,
+            config,
+            seed=seed,
+            num_steps=steps,
+            first_step=first,
+            objects=objects,
+            process_index=jax.process_index(),
+            num_processes=jax.process_count(),
+            threads=threads,
+            workers=workers,
+            packing=run.packing,
+            lend=True,
+            order=run.order,
         )
         with stop_requests(active=not several) as request, batches as prepared, feed(prepared, mesh) as stream:
 
@@ -292,51 +211,8 @@ def train(
     return state
 
 
-def _of_one_sweep(frames: FrameSet) -> bool:
-    """Whether none of some frames, spread over the set, has points of an older sweep."""
-    looked_at = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
-    return all(len(np.unique(frames.frame(int(i)).points[:, 4])) <= 1 for i in looked_at)
-
-
-def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
-    """Refuse a folder that cannot take a run.
-
-    Args:
-        folder: of the run.
-        spec: what ``run.json`` must hold; None to check only whether there is a run.
-        resume: the run is to be resumed.
-
-    Returns:
-        fields of the specification that an older run does not have, and that were not compared.
-
-    Raises:
-        ValueError: there is a run and it is not to be resumed, or none to resume, or another one, with the first
-            field that differs.
-    """
-    folder = Path(folder)
-    file = folder / RUN_SPEC
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder}: found a file, expected a folder")
-    if not file.is_file():
-        if resume:
-            raise ValueError(f"{file}: found nothing, expected the run to resume")
-        return []
-    if not resume:
-        raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
-    found = read_json(file, dict[str, Any], what="the specification of a run")
-    if spec is None:
-        return []
-    missing = [name for name in _LATER_FIELDS if name in spec and name not in found]
-    found |= {name: spec[name] for name in missing}
-    if isinstance(config := found.get("config"), dict):
-        found["config"] = with_later_fields(config)
-    for name, (was, wanted) in _differences(found, spec):
-        raise ValueError(f"{file}: {name}: was {was!r}, got {wanted!r}: only the same run can be resumed")
-    return missing
-
-
 @contextlib.contextmanager
-def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
+def _own_folder(run: Run, *, resume: bool) -> Iterator[None]:
     """Hold the run's folder in the main process; the others continue only when it does."""
     with contextlib.ExitStack() as held:
         error: Exception | None = None
@@ -358,40 +234,18 @@ def _claimed(run: _Run, *, resume: bool) -> Iterator[None]:
         yield
 
 
-def _given_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
-    if not isinstance(weights, str | Path):
-        return weights
-    folder = find_checkpoint(Path(weights))
-    checkpoint = load_checkpoint(folder)
-    theirs, ours = checkpoint.config.classes, detector.config.classes
-    if theirs != ours:
-        raise CheckpointError(f"{folder}: classes: got {theirs}, expected {ours}, which are to be trained")
-    expected = jax.eval_shape(detector.init, jax.random.key(0))
-    check_arrays(folder, expected, checkpoint.variables, whose="the network that is to be trained")
-    # Arrays of the same shapes may still mean something else.
-    given, wanted = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
-    if jax.process_index() == 0:
-        for name, (theirs, ours) in _differences(given, wanted, "model"):
-            print(
-                f"{folder}: weights of {name} {theirs!r}, to be trained with {ours!r}", file=sys.stderr, flush=True
-            )
-    return checkpoint.variables
-
-
-def _start(
-    run: _Run, optimizer: Any, seed: int, resume: bool, weights: str | Path | Variables | None
-) -> TrainState:
+def _start(run: Run, *, resume: bool) -> TrainState:
     """The state of the newest checkpoint, or one of given or random weights."""
-    key = jax.random.key(seed)
+    key = jax.random.key(run.seed)
     if resume:
-        like = jax.eval_shape(lambda k: make_state(run.detector, optimizer, k), key)
-        found = run.checkpoints.newest(like)
-        if found is not None:
-            return found[1]
-    return make_state(run.detector, optimizer, key, variables=_given_weights(run.detector, weights))
+        like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
+        newest = run.checkpoints.newest(like)
+        if newest is not None:
+            return newest[1]
+    return make_state(run.detector, run.optimizer, key, variables=run.weights)
 
 
-def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | None) -> None:
+def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | None) -> None:
     """Score on the test frames, which all processes share; the main process draws, saves and records."""
     assert run.tests is not None
     trained = TrainedDetector(run.detector, _local_variables(state))
@@ -408,7 +262,7 @@ def _evaluate(run: _Run, number: int, state: TrainState, metrics: MetricsLog | N
         metrics.write(number, {"test/mAP": score, **values})  # Last: what is recorded is not done again.
 
 
-def _save(run: _Run, state: TrainState) -> None:
+def _save(run: Run, state: TrainState) -> None:
     data = json.dumps({name: run.spec[name] for name in ("data", "frames", "weights")}, sort_keys=True)
     config, sensor = run.detector.config, run.detector.sensor
     checkpoint = Checkpoint(config, sensor, _local_variables(state), int(state.step), data)
@@ -417,12 +271,3 @@ def _save(run: _Run, state: TrainState) -> None:
 
 def _local_variables(state: TrainState) -> Variables:
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), detection_variables(state))
-
-
-def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
-    """Where two JSON values differ."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in sorted(found.keys() | wanted.keys()):
-            yield from _differences(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
-    elif found != wanted:
-        yield name, (found, wanted)

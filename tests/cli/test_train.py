@@ -160,13 +160,13 @@ def test_two_processes_are_one_run_and_stop_together(root, interrupted, tmp_path
 
 
 BAD = {
-    "no steps": ("--steps 0", "--steps: got 0, expected at least 1"),
-    "no saves": ("--save-every 0", "--save-every: got 0"),
-    "no evaluations": ("--evaluate-every -1", "--evaluate-every: got -1"),
-    "none kept": ("--keep 0", "--keep: got 0"),
-    "threads": ("--threads -1", "--threads: got -1, expected at least 0"),
-    "workers": ("--workers -1", "--workers: got -1"),
-    "seed": ("--seed -1", "--seed: got -1"),
+    "no steps": ("--steps 0", "steps: got 0, expected an integer of at least 1"),
+    "no saves": ("--save-every 0", "schedule.save_every: got 0"),
+    "no evaluations": ("--evaluate-every -1", "schedule.evaluate_every: got -1"),
+    "none kept": ("--keep 0", "schedule.keep: got 0"),
+    "threads": ("--threads -1", "threads: got -1, expected at least 0"),
+    "workers": ("--workers -1", "workers: got -1"),
+    "seed": ("--seed -1", "seed: got -1"),
     "all faded": (
         "--fade-epochs 4 --steps 4",
         "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: nothing would ever be pasted",

@@ -43,7 +43,7 @@ def test_the_stages_that_are_timed_are_the_detector(tmp_path):
     detector = build_detector(config, scale.sensor)
     variables = detector.init(jax.random.key(0))
     assert parameters == sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
-    cloud = make_cloud(points, config, sensor=scale.sensor, remove_close="none")
+    cloud = make_cloud(points, config, sensor=scale.sensor, num_close=0)
     whole = jax.jit(make_detect(detector))(variables, cloud.points, cloud.valid)
     assert whole.valid.any()
     expected = whole.boxes, whole.scores, whole.labels, whole.valid

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tiny_run import CONFIG, FRAMES, TESTS, weights
 
-from fcos_lidar_jax.data.frame import Frame, FramesOf
+from fcos_lidar_jax.data.frame import Frame, WrappedFrames
 from fcos_lidar_jax.inference import TrainedDetector, prediction
 from fcos_lidar_jax.inference.prediction import evaluate, predict, predict_groups
 from fcos_lidar_jax.models import build_detector
@@ -32,7 +32,7 @@ def test_an_evaluation_keeps_no_cloud(detector, compared):
     assert all(frame.points.base is None for frame in compared), "a view of the whole cloud"
 
 
-class TruthAlone(FramesOf):
+class TruthAlone(WrappedFrames):
     """Test frames whose clouds are on another machine."""
 
     def frame(self, index: int) -> Frame:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from toy_frames import ToyFrames
 
-from fcos_lidar_jax.devices import transfer as feeding
+from fcos_lidar_jax.devices import feeding
+from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import make_mesh
-from fcos_lidar_jax.devices.transfer import feed
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.types import HostBatch
