@@ -24,8 +24,8 @@ from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.training.plan import Schedule, check_run
-from fcos_lidar_jax.training.run import train
+from fcos_lidar_jax.training import Schedule, train
+from fcos_lidar_jax.training.plan import check_numbers, check_run
 
 _ABOUT = {
     "nuscenes": "the paper's detector on ten sweeps",
@@ -99,6 +99,7 @@ def run(args: Train) -> None:
         with contextlib.ExitStack() as held:
             with agreed("cannot train"):
                 if task.cuts_objects and is_main_process:  # one cuts, the others find it done
+                    check_numbers(task.steps, args.seed)
                     held.enter_context(folder_lock(args.out, "training"))
                     check_run(args.out, resume=args.resume)  # another process may have been faster
                     _cut_objects(args.out, task)

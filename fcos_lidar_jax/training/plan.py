@@ -113,10 +113,7 @@ def plan_run(
     Raises:
         ValueError: what cannot be trained.
     """
-    if type(steps) is not int or steps < 1:
-        raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
-    if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
-        raise ValueError(f"seed: got {seed!r}, expected an integer from 0 to {NUM_SEEDS - 1}")
+    check_numbers(steps, seed)
     order = SampleOrder(frames, config, seed=seed)
     an_epoch = -(-order.epoch_size // config.optimizer.batch_size)
     if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:
@@ -165,6 +162,14 @@ def plan_run(
         packing=packing_for(frames, config) if packing or (packing is None and not on_cpus) else None,
         warnings=tuple(_warnings(frames, config)),
     )
+
+
+def check_numbers(steps: int, seed: int) -> None:
+    """Refuse numbers of steps and seeds that no run can have: ValueError."""
+    if type(steps) is not int or steps < 1:
+        raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
+    if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
+        raise ValueError(f"seed: got {seed!r}, expected an integer from 0 to {NUM_SEEDS - 1}")
 
 
 def _any_checkpoint(out: Path) -> bool:
