@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 
 from experiments.script import run_script
 from fcos_lidar_jax.assignment import assign, owners
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.iou import rotated_iou_3d
 from fcos_lidar_jax.projection import project_points
@@ -69,8 +70,8 @@ def main(args: Figures) -> None:
 
 def _scene() -> Scene:
     """Around the fastest of the cars that many points show, away from the ends of the image."""
-    options: dict[str, Any] = {"num_objects": 60, "reach_m": 54.0, "streets": CITY, "close_m": 1.0}
-    frame = make_frame(_SEED, NUSCENES_HDL32E, num_sweeps=10, fast_traffic=True, **options)
+    options: dict[str, Any] = {"num_objects": 60, "reach_m": 54.0, "streets": CITY, "reading": CloudReading(10)}
+    frame = make_frame(_SEED, NUSCENES_HDL32E, fast_traffic=True, **options)
     column = (np.pi - np.arctan2(frame.boxes[:, 1], frame.boxes[:, 0])) / NUSCENES_HDL32E.column_rad
     inside = np.abs(column - NUSCENES_HDL32E.num_columns / 2) < NUSCENES_HDL32E.num_columns / 2 - _WIDTH
     shown = inside & (frame.labels == 0) & (frame.num_points >= 60)

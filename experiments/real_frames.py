@@ -10,8 +10,8 @@ import numpy as np
 from experiments.script import real_data
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.config import ProjectionConfig
-from fcos_lidar_jax.data.frame import ChosenFrames, Frame, FrameSet
+from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
@@ -49,21 +49,20 @@ class Keyframes(FrameSet):
         return f"{self.folder.name} {index}"
 
 
-def real_frames(data: Path | None, projection: ProjectionConfig) -> dict[str, FrameSet]:
+def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]:
     """Name -> keyframes: those of scene-0523 to choose by (even) and to report (odd), and two other scenes.
 
     Args:
         data: folder of the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
-        projection: says which points are too close.
+        reading: says which points are too close.
     """
-    close = {"remove_close": projection.remove_close, "close_m": projection.close_m}
-    scene = open_frames(real_data(data, "nuscenes_scene0523"), split="scene0523", **close)
+    scene = open_frames(real_data(data, "nuscenes_scene0523"), split="scene0523", reading=reading, num_sweeps=1)
     sets: dict[str, FrameSet] = {
-        "scene-0523, even": ChosenFrames(scene, tuple(range(0, len(scene), 2))),
-        "scene-0523, odd": ChosenFrames(scene, tuple(range(1, len(scene), 2))),
+        "scene-0523, even": SelectedFrames(scene, tuple(range(0, len(scene), 2))),
+        "scene-0523, odd": SelectedFrames(scene, tuple(range(1, len(scene), 2))),
     }
     for number, frames in (("0103", 2), ("0061", 1)):
-        sets[f"scene-{number}"] = Keyframes(real_data(data, f"nuscenes_scene{number}"), frames, projection.close_m)
+        sets[f"scene-{number}"] = Keyframes(real_data(data, f"nuscenes_scene{number}"), frames, reading.close_m)
     return sets
 
 

@@ -10,8 +10,9 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.evaluation.frames import frame_columns
 from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
-from fcos_lidar_jax.trainer import Schedule, predict, train
-from fcos_lidar_jax.trainer.run import RUN_SPEC
+from fcos_lidar_jax.inference.prediction import predict
+from fcos_lidar_jax.training import Schedule, train
+from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.types import Detections
 
 
@@ -20,7 +21,7 @@ def trained(
 ) -> TrainedDetector:
     """The detector at the end of a run in a folder, which is begun, resumed or found finished.
 
-    Options are those of :func:`fcos_lidar_jax.trainer.train`; by default one device, one thread that prepares
+    Options are those of :func:`fcos_lidar_jax.train`; by default one device, one thread that prepares
     batches, and five checkpoints.
     """
     defaults = {"threads": 1, "devices": jax.devices()[:1], "schedule": Schedule(-(-steps // 5), steps)}

@@ -6,26 +6,30 @@
 >>> detector(np.ones((100, 4), np.float32)).boxes.shape
 (500, 9)
 
-Training, prediction and evaluation in many frames are in :mod:`fcos_lidar_jax.trainer`.
+``open_frames`` opens a data set; ``train``, ``predict`` and ``evaluate`` work on its frames.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fcos_lidar_jax.inference import load_detector
+    from fcos_lidar_jax.inference import evaluate, load_detector, predict
     from fcos_lidar_jax.input_pipeline import open_frames
     from fcos_lidar_jax.presets import PRESETS
     from fcos_lidar_jax.sensors import load_sensor
+    from fcos_lidar_jax.training import train
 
 __version__ = "0.2.0"
-__all__ = ["PRESETS", "load_detector", "load_sensor", "open_frames"]
+__all__ = ["PRESETS", "evaluate", "load_detector", "load_sensor", "open_frames", "predict", "train"]
 
 _HOME = {
     "PRESETS": "presets",
+    "evaluate": "inference",
     "load_detector": "inference",
     "load_sensor": "sensors",
     "open_frames": "input_pipeline",
+    "predict": "inference",
+    "train": "training",
 }
 
 

@@ -46,6 +46,31 @@ def _check_choices(config: Any) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
+class CloudReading:
+    """How clouds are read, the same in training, evaluation and detection; see :attr:`Config.reading`.
+
+    >>> CloudReading(num_sweeps=0)
+    Traceback (most recent call last):
+    ValueError: num_sweeps: got 0, expected at least 1
+    """
+
+    num_sweeps: int = 1  # Sweeps fused at most, the current one included; fewer where the data have fewer.
+    remove_close: Literal["all", "sweeps", "none"] = "sweeps"
+    """Sweeps that lose the points on the ego vehicle, each judged in its own frame: all, only the older ones, or
+    none."""
+    close_m: float = 1.0  # Half the side of the square around the sensor that is emptied, metres.
+
+    def __post_init__(self) -> None:
+        _check_least(self, 1, "num_sweeps")
+        _check(0 < self.close_m < math.inf, "close_m", self.close_m, "a positive number of metres")
+        _check_choices(self)
+
+
+WHOLE_SWEEP = CloudReading(remove_close="none")
+"""The current sweep with every point."""
+
+
+@dataclasses.dataclass(frozen=True)
 class ProjectionConfig:
     """Points to range image (paper, sections 3.1 and 3.2).
 
@@ -55,10 +80,11 @@ class ProjectionConfig:
 
     num_rounds: int = 5  # Rounds of the multi-round projection.
     prioritize_current: bool = True  # Points of the current sweep win every collision with older ones (table 2).
-    remove_close: Literal["all", "sweeps", "none"] = "sweeps"
+    remove_close: Literal["all", "sweeps", "none"] = CloudReading.remove_close
     """Reading: drop the points on the ego vehicle, ``|x|, |y| < close_m``, of all sweeps, of the older sweeps only
     (which gives the paper's numbers of points), or not at all."""
-    close_m: float = 1.0  # Reading: half the side of the square that ``remove_close`` empties, metres.
+    close_m: float = CloudReading.close_m
+    """Reading: half the side of the square that ``remove_close`` empties, metres."""
 
     def __post_init__(self) -> None:
         _check(1 <= self.num_rounds <= MAX_ROUNDS, "num_rounds", self.num_rounds, f"1 to {MAX_ROUNDS}")
@@ -354,6 +380,11 @@ class Config:
     def build(self, sensor: Sensor) -> Any:
         """The :class:`fcos_lidar_jax.models.Detector` of a subclass; None for FCOS-LiDAR."""
         return None
+
+    @property
+    def reading(self) -> CloudReading:
+        """How the clouds of this configuration are read."""
+        return CloudReading(self.num_sweeps, self.projection.remove_close, self.projection.close_m)
 
     @property
     def ranges_m(self) -> dict[str, float]:

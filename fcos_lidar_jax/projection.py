@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
@@ -24,13 +25,13 @@ from fcos_lidar_jax.types import RangeImage
 
 
 def close_to_sensor(
-    points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float = 1.0
+    points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float
 ) -> Bool[Array | np.ndarray, "n"]:
     """Mask of the points on the ego vehicle: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
 
     NumPy input gives NumPy output, which filters clouds of any length on the host without compilation.
 
-    >>> close_to_sensor(jnp.zeros((1, 5)), Sensor("two", (0.1, 0.0), 8)).tolist()
+    >>> close_to_sensor(jnp.zeros((1, 5)), Sensor("two", (0.1, 0.0), 8), 1.0).tolist()
     [True]
     """
     with np.errstate(invalid="ignore"):  # signalling NaN
@@ -42,30 +43,24 @@ def remove_close(
     points: Float32[Array | np.ndarray, "n c"],
     valid: Bool[Array | np.ndarray, "n"],
     sensor: Sensor,
-    *,
-    mode: str,
-    close_m: float = 1.0,
+    reading: CloudReading,
 ) -> Bool[Array | np.ndarray, "n"]:
     """Remove the points on the ego vehicle from ``valid``, by their position in the current frame.
 
     Args:
         points: x, y, z, intensity, time lag. NumPy input gives NumPy output, JAX input gives JAX output.
         valid, sensor: False for padding; the sensor's position.
-        mode: ``"all"`` drops the points from all sweeps, ``"sweeps"`` from all but the current sweep, ``"none"``
-            keeps them. Other modes raise a ValueError.
-        close_m: half the side of the emptied square.
+        reading: which sweeps lose their close points, and the size of the emptied square.
 
     >>> me = jnp.zeros((1, 5))
-    >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), mode="all").tolist()
+    >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), CloudReading(1, "all")).tolist()
     [False]
     """
-    if mode == "none":
+    if reading.remove_close == "none":
         return valid
-    close = close_to_sensor(points, sensor, close_m)
-    if mode == "sweeps":
+    close = close_to_sensor(points, sensor, reading.close_m)
+    if reading.remove_close == "sweeps":
         close = close & (points[:, 4] != 0)
-    elif mode != "all":
-        raise ValueError(f"mode: got {mode!r}, expected 'all', 'sweeps' or 'none'")
     return valid & ~close
 
 

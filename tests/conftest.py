@@ -15,8 +15,12 @@ _UNCHECKED = ("types", "sensors", "config", "cli")
 _PACKAGE = Path(__file__).parents[1] / "fcos_lidar_jax"
 _MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", "__main__", *_UNCHECKED)]
 _SECOND = [f"centerpoint.{name}" for name in ("pillars", "centres", "network", "objective", "detector")]
-_ROOMS = ["models", "training", "inference", "evaluation", *_SECOND]
-install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS)], "typecheck.check")
+_ROOMS = ["models", "inference", "evaluation", "checkpoints", "devices", "data.cloud_policy", *_SECOND]
+# A run, like a command, checks its numbers in its own words.
+_STEP = [
+    f"training.{p.stem}" for p in (_PACKAGE / "training").glob("*.py") if p.stem not in ("__init__", "plan", "run")
+]
+install_import_hook([f"fcos_lidar_jax.{name}" for name in (*_MODULES, *_ROOMS, *_STEP)], "typecheck.check")
 
 # A shell's background job ignores Ctrl-C, what nohup starts a hang-up, and so would the processes that the tests
 # start and interrupt.
@@ -29,18 +33,31 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 # Most of the time goes to compilation. Where the question is what a command or a run does, not how it rounds, the
-# programs are compiled without optimisation, in these folders.
-_QUICK = ("cli", "experiments", "models", "trainer", "training")
+# programs are compiled without optimisation, in these folders and files.
+_QUICK = (
+    "cli",
+    "experiments",
+    "models",
+    "training",
+    "checkpoints",
+    "devices",
+    "test_prediction",
+    "test_prediction_log",
+)
+
+
+def _is_quick(path: Path) -> bool:
+    return path.parent.name in _QUICK or path.stem in _QUICK
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What is compiled without optimisation comes first, for a change of the mode forgets all programs."""
-    items.sort(key=lambda item: item.path.parent.name not in _QUICK)
+    items.sort(key=lambda item: not _is_quick(item.path))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _optimisation(request: pytest.FixtureRequest) -> None:
-    compile_quickly(request.path.parent.name in _QUICK)
+    compile_quickly(_is_quick(request.path))
 
 
 @pytest.fixture(scope="session")

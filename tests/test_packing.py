@@ -168,7 +168,7 @@ def test_the_given_clouds_determine_the_packing(clouds, num_sweeps, num_pasted, 
 
 def check_no_communication() -> None:
     """Each device unpacks its own samples."""
-    from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
+    from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 
     mesh = make_mesh()
     assert mesh.size == 2

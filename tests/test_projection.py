@@ -10,6 +10,7 @@ import oracles
 import pytest
 from jax import export
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.projection import image_cells, project_points, remove_close, winners
 from fcos_lidar_jax.sensors import (
     KITTI_HDL64E,
@@ -281,7 +282,7 @@ def test_remove_close_modes(mode, kept):
         [[0.5, -0.9, 0, 0, 0], [0.5, 0.5, 0, 0, 0.1], [0.5, 1, 0, 0, 0.1], [2, 0, 0, 0, 0]], np.float32
     )
     for kind in (np.asarray, jnp.asarray):
-        valid = remove_close(kind(points), kind(np.ones(4, bool)), SMALL, mode=mode)
+        valid = remove_close(kind(points), kind(np.ones(4, bool)), SMALL, CloudReading(remove_close=mode))
         assert np.asarray(valid).astype(int).tolist() == kept
 
 
@@ -301,7 +302,8 @@ def real_cloud(real_data):
 )
 def test_real_cloud_gives_the_expected_counts(real_cloud, close, expected):
     sensor = NUSCENES_HDL32E
-    valid = np.asarray(remove_close(real_cloud, np.ones(len(real_cloud), bool), sensor, mode=close))
+    reading = CloudReading(remove_close=close)
+    valid = np.asarray(remove_close(real_cloud, np.ones(len(real_cloud), bool), sensor, reading))
     xyz = np.abs(real_cloud[:, :3])
     limits = (xyz[:, 0] < 54) & (xyz[:, 1] < 54) & (real_cloud[:, 2] > -5) & (real_cloud[:, 2] < 3)
     in_range = int((limits & valid).sum())
@@ -325,7 +327,8 @@ def test_real_cloud_gives_the_expected_counts(real_cloud, close, expected):
 def test_real_cloud_changes_under_permutation_only_where_keys_tie(real_cloud, close):
     """In round 1 only no-returns within millimetres of the sensor tie; removing close points removes them all."""
     sensor = NUSCENES_HDL32E
-    valid = np.asarray(remove_close(real_cloud, np.ones(len(real_cloud), bool), sensor, mode=close))
+    reading = CloudReading(remove_close=close)
+    valid = np.asarray(remove_close(real_cloud, np.ones(len(real_cloud), bool), sensor, reading))
     straight = project_points(real_cloud, valid, sensor, num_rounds=7)
     cell, angles = jax.tree.map(np.asarray, image_cells(jnp.asarray(real_cloud), jnp.asarray(valid), sensor))
     keys = np.stack([cell, real_cloud[:, 4] != 0, np.asarray(angles[0]).view(np.uint32)], 1)

@@ -1,11 +1,68 @@
 """The structure of the project: layers, light imports, one test file a module."""
 
+import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
+
+from fcos_lidar_jax.cli.commands import _COMMANDS
+from fcos_lidar_jax.input_pipeline.open import READERS, Format
 
 ROOT = Path(__file__).parents[1]
+
+
+def nodes(*folders: str) -> Iterator[tuple[str, ast.AST]]:
+    """The syntax of all files below some folders, with the files' names."""
+    for folder in folders:
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            name = file.relative_to(ROOT).as_posix()
+            yield from ((name, node) for node in ast.walk(ast.parse(file.read_text())))
+
+
+def test_only_the_rows_of_the_readers_know_formats_by_name():
+    names = {reader.name for reader in READERS}
+    assert names == set(get_args(Format))
+    compared = {
+        file
+        for file, node in nodes("fcos_lidar_jax")
+        if isinstance(node, ast.Compare)
+        for part in ast.walk(node)
+        if isinstance(part, ast.Constant) and part.value in names
+    }
+    assert compared == set()
+
+
+def test_which_close_points_go_has_one_default_and_is_handed_on_whole():
+    defaults, taken = [], []
+    for file, node in nodes("fcos_lidar_jax", "experiments"):
+        if (
+            isinstance(node, ast.AnnAssign)
+            and isinstance(node.value, ast.Constant)
+            and node.value.value is not None
+        ):
+            defaults += [file for name in ast.walk(node.target) if getattr(name, "id", "") == "remove_close"]
+        if isinstance(node, ast.FunctionDef):
+            arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            taken += [node.name for argument in arguments if argument.arg in ("remove_close", "close_m")]
+    assert defaults == ["fcos_lidar_jax/config.py"]
+    assert taken == ["close_to_sensor"]
+
+
+def test_no_command_imports_another():
+    commands = {kind.__module__ for kind, _ in _COMMANDS.values()}
+    for file, node in nodes("fcos_lidar_jax/cli"):
+        own = file.removesuffix(".py").replace("/", ".")
+        if own in commands and isinstance(node, ast.ImportFrom):
+            found = {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)} & commands
+            assert found <= {own}, own
+
+
+def test_files_of_tests_have_different_names():
+    names = [file.name for file in (ROOT / "tests").rglob("test_*.py")]
+    assert len(names) == len(set(names))
 
 
 def test_arrows_point_inward_only():

@@ -27,6 +27,7 @@ from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.inference import make_detect, make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.input_pipeline.batching import make_batch
+from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.models.detector import network_parts
@@ -86,7 +87,8 @@ def measure(args: Args) -> dict[str, Any]:
     sensor = load_sensor(config.sensor)
     layout = image_layout(sensor, config.model)
     folder = find_real_data(args.data, "nuscenes_scene0061") if sensor == NUSCENES_HDL32E else None
-    frame = without_close(read_keyframe(folder, sensor) if folder else make_frame(0, sensor), sensor)
+    frame = read_keyframe(folder, sensor) if folder else make_frame(0, sensor)
+    frame = without_close(frame, sensor, cut_reading(1))
     batch = jax.device_put(make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes))
     detector = build_detector(config, sensor)
     variables = detector.init(jax.random.key(0))

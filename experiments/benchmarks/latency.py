@@ -29,10 +29,10 @@ from experiments.changes import change
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, find_real_data, run_measurement
-from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.config import CloudReading, Config
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.inference import make_detect, make_stages
-from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.models.detector import network_parts
@@ -84,14 +84,15 @@ def fused_cloud(data: Path | None, sensor: Sensor) -> tuple[np.ndarray, str]:
     if file is not None and sensor == NUSCENES_HDL32E:
         return np.fromfile(file, np.float16).reshape(-1, 5).astype(np.float32), "real ten-sweep cloud"
     with simulated_sweeps(sensor) as (drive, token):
-        return drive.sweeps(token, 10, remove_close="sweeps"), "simulated ten-sweep cloud"
+        return drive.fuse_sweeps(token, CloudReading(10))[0], "simulated ten-sweep cloud"
 
 
 def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
     """The fused cloud, or its current sweep alone, as the detector gets it."""
     points = cloud[cloud[:, 4] == 0] if setting == "single" else cloud
-    config = dataclasses.replace(NUSCENES, max_points=ROWS[setting])
-    return make_cloud(points, config, sensor=sensor, remove_close="all")
+    projection = dataclasses.replace(NUSCENES.projection, remove_close="all")
+    config = dataclasses.replace(NUSCENES, max_points=ROWS[setting], projection=projection)
+    return make_cloud(points, config, sensor=sensor)
 
 
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:
@@ -120,9 +121,9 @@ def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Clou
 def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: str) -> np.ndarray:
     """Host work: files to a padded cloud."""
     number = 1 if setting == "single" else 10
-    points = drive.sweeps(token, number, remove_close="all", close_m=config.projection.close_m)
+    points, num_close = drive.fuse_sweeps(token, CloudReading(number, "all", config.projection.close_m))
     config = dataclasses.replace(config, max_points=ROWS[setting])
-    return make_cloud(points, config, sensor=sensor, remove_close="none").points
+    return make_cloud(points, config, sensor=sensor, num_close=num_close).points
 
 
 def form_times(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, dict[str, Times]]:

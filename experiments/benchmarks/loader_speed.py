@@ -35,14 +35,14 @@ from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.devices.feeding import feed
+from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.inference.timing import interleaved
-from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase, prepare_database
+from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase, cut_reading, prepare_database
 from fcos_lidar_jax.input_pipeline.loader import make_batches, packing_for
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training.feed import feed
-from fcos_lidar_jax.training.sharding import make_mesh
 from fcos_lidar_jax.types import HostBatch
 
 EPOCHS, EPOCH_SAMPLES, HOURS = 40, 123_580, 26
@@ -122,7 +122,7 @@ def measure(args: Args) -> dict[str, Any]:
         raise ValueError("--data-root: missing, expected a data set in nuScenes' layout")
     config = change(optimizer__batch_size=args.batch_size)(NUSCENES)
     nuscenes = NuScenes(root, args.version)
-    frames = NuScenesFrames(nuscenes, tuple(nuscenes.split(args.split)), config.num_sweeps)
+    frames = NuScenesFrames(nuscenes, tuple(nuscenes.split(args.split)), cut_reading(config.num_sweeps))
     record: dict[str, Any] = {"data": args.version, "load_before": round(os.getloadavg()[0], 1)}
     with tempfile.TemporaryDirectory() as folder:
         began = time.process_time()

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -23,6 +23,7 @@ from experiments.benchmarks.latency import ROWS, fused_cloud, padded
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, run_measurement
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.projection import project_points, remove_close
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
@@ -39,8 +40,12 @@ class Args(Options):
     repeats: int = 100  # Turns of the times.
 
 
+Close = Literal["all", "none"]
+_CLOSE: dict[str, Close] = {"with": "none", "without": "all"}
+
+
 def kept_by_rounds(
-    points: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, close: str = "all"
+    points: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, close: Close = "all"
 ) -> dict[str, Any]:
     """Points of a fused cloud f32[n, c] that so many rounds keep, with and without priority of the current sweep.
 
@@ -58,7 +63,7 @@ def kept_by_rounds(
     >>> found["prioritized"]["kept"], found["prioritized"]["current"], found["not prioritized"]["current"]
     ({'1': 1, '2': 2}, {'1': 1, '2': 1}, {'1': 0, '2': 1})
     """
-    valid = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, mode=close))
+    valid = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, CloudReading(remove_close=close)))
     (low, high), z = sensor.limit_z_m, points[:, 2]
     inside = (np.abs(points[:, :2]) < sensor.limit_xy_m).all(axis=1) & (z > low) & (z < high)
     in_range = int((inside & valid).sum())
@@ -156,7 +161,7 @@ def measure(args: Args) -> dict[str, Any]:
         "kept": {
             f"{sweeps}, {which} close points": kept_by_rounds(points, sensor, close=close)
             for sweeps, points in (("ten sweeps", cloud), ("one sweep", cloud[cloud[:, 4] == 0]))
-            for which, close in (("with", "none"), ("without", "all"))
+            for which, close in _CLOSE.items()
         },
         "repeats": args.repeats,
         "times": mrv_times(cloud, sensor, repeats=args.repeats),

@@ -17,9 +17,9 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from experiments.paper_tables.scales import Scale
 from experiments.script import compact_json
+from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock, read_json
-from fcos_lidar_jax.training.checkpoint import LATER_FIELDS
 
 Cell = dict[str, Any]  # ``changes``, ``seed``, ``scores`` or ``diverged``, and who trained it.
 _CELLS, _SCALE, _LOCK = "cells.csv", "scale.json", "cells.lock"

@@ -14,10 +14,10 @@ from pathlib import Path
 from experiments.hardware import hardware
 from experiments.paper_tables.cells import Cell, add_cell, changes_of, read_cells, run_name
 from experiments.paper_tables.scales import Scale
+from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.files import atomic_write, file_lock
 from fcos_lidar_jax.training import NonFiniteLossError
-from fcos_lidar_jax.training.checkpoint import NonFiniteStateError
 
 _PATIENCE_S = 5.0  # Between looks at what other processes train.
 

@@ -20,9 +20,9 @@ import numpy as np
 from experiments.changes import change
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
-from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
+from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.data.cached import CachedFrames
-from fcos_lidar_jax.data.frame import ChosenFrames, Frame, FramesOf
+from fcos_lidar_jax.data.frame import Frame, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames, default_index
@@ -31,6 +31,7 @@ from fcos_lidar_jax.evaluation.results import read_results, result_entries, writ
 from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.files import checksum, file_lock
 from fcos_lidar_jax.inference import CloudDetector
+from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
@@ -39,8 +40,7 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, Sensor, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.lidar import SWEEP_S
 from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
-from fcos_lidar_jax.trainer import Schedule
-from fcos_lidar_jax.trainer.results import write_predictions
+from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 _CURVE_FRAMES = 100  # Test frames of the evaluations during a training.
@@ -48,7 +48,7 @@ _BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, which would le
 
 
 @dataclasses.dataclass(frozen=True)
-class NewestSweeps(FramesOf):
+class NewestSweeps(WrappedFrames):
     """Simulated frames of which only the newest sweeps are kept; what is annotated, the current sweep decides."""
 
     num_sweeps: int
@@ -114,8 +114,7 @@ class Simulated:
             self.num_objects,
             self.reach_m,
             self.min_points,
-            _BONNET_M,
-            sweeps,
+            CloudReading(sweeps, "all", _BONNET_M),
             streets=self.streets,
         )
         return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
@@ -143,7 +142,7 @@ class Simulated:
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
         steps, options = config.optimizer.epochs * steps_per_epoch(frames, config), dict[str, Any]()
         if self.looks:
-            along = ChosenFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
+            along = SelectedFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
             options = {"tests": along, "schedule": Schedule(-(-steps // 20), -(-steps // self.looks))}
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
         found, seen = detections(detector, tests)
@@ -234,8 +233,7 @@ class NuScenesLayout:
     def frames(self, split: str, config: Config, version: str | None = None) -> NuScenesFrames:
         """Keyframes of a split, of the layout's version or another, fused as a configuration wants it."""
         data = self._data(version or self.layout.version)
-        tokens, projection = data.split(split, file=self.layout.splits), config.projection
-        return NuScenesFrames(data, tuple(tokens), config.num_sweeps, projection.remove_close, projection.close_m)
+        return NuScenesFrames(data, tuple(data.split(split, file=self.layout.splits)), config.reading)
 
     @functools.cache  # noqa: B019
     def describe(self) -> dict[str, Any]:
@@ -258,9 +256,9 @@ class NuScenesLayout:
         folder = database.objects_folder(self.index, self.splits[0])
         if not folder.is_dir():
             raise ValueError(f"{folder}: no objects here, expected some: run fcos-lidar prepare")
-        objects, prepared = database.open_database(folder), NuScenesFrames(frames.nuscenes, frames.tokens)
-        sweeps = range(frames.num_sweeps, NUSCENES.num_sweeps + 1)
-        known = [dataclasses.replace(prepared, num_sweeps=n).fingerprint() for n in sweeps]
+        objects = database.open_database(folder)
+        sweeps = range(frames.reading.num_sweeps, NUSCENES.num_sweeps + 1)
+        known = [dataclasses.replace(frames, reading=database.cut_reading(n)).fingerprint() for n in sweeps]
         if objects.manifest.source not in known:
             origin = f"cut from other frames than {self.splits[0]}"
             raise ValueError(f"{folder}: {origin}: run fcos-lidar prepare again")

@@ -19,6 +19,7 @@ from experiments.paper_tables.cells import changes_of, read_cells, run_name
 from experiments.paper_tables.scales import NuScenesLayout, write_submission
 from experiments.paper_tables.tables import Args, Row, Table, make_scale, run_table
 from experiments.script import run_script
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -26,8 +27,7 @@ from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.trainer.run import RUN_SPEC
-from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints
+from fcos_lidar_jax.training.plan import RUN_SPEC
 
 _PART_FADED = 8  # The paper's five epochs of forty.
 _SUBMITTED = "c128 and fade"  # Row whose detector writes the results file.
@@ -75,8 +75,8 @@ def submission(args: Args) -> list[str]:
         root, version = args.runs / "frames" / f"{scale.sensor.name}_submission", "v1.0-synthetic"
         spec = DatasetSpec(2, 0, 3, scale.sensor, scale.streets.rolling_shutter, version, scale.streets)
         write_dataset(spec, root, workers=1, report=lambda _: None)
-        data, close = NuScenes(root, version), (config.projection.remove_close, config.projection.close_m)
-        frames = NuScenesFrames(data, tuple(data.split("val")), config.num_sweeps, *close, scale.sensor)
+        data = NuScenes(root, version)
+        frames = NuScenesFrames(data, tuple(data.split("val")), config.reading, scale.sensor)
     file = args.out / args.scale / "submission" / "results_nusc.json"
     write_submission(load_detector(run), frames, file)
     return [f"Results file for {len(frames)} keyframes: {file}, {file.stat().st_size} bytes."]

@@ -27,7 +27,7 @@ from experiments.paper_tables.tables import Args, Row, Table, run_table, simulat
 from experiments.script import run_script
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector, count_parameters
@@ -58,7 +58,7 @@ def stage_calls(config: Config, points: Any, sensor: Any) -> tuple[dict[str, Cal
     """The stages of a detector with random weights on one cloud, each to be timed alone, and its parameters."""
     detector = build_detector(config, sensor)
     stages, variables = make_stages(detector), detector.init(jax.random.key(0))
-    cloud = make_cloud(points, config, sensor=sensor, remove_close="none")
+    cloud = make_cloud(points, config, sensor=sensor, num_close=0)
     prepare, network, boxes = (jax.jit(part) for part in (stages.prepare, stages.network, stages.postprocess))
     image = prepare(cloud.points, cloud.valid)
     outputs = network(variables, image)

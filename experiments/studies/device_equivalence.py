@@ -28,6 +28,7 @@ from experiments.changes import change
 from experiments.paper_tables.scales import small_network
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import StemConfig
+from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, replicate, shard_batch
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import Detector, build_detector
@@ -36,7 +37,6 @@ from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
-from fcos_lidar_jax.training.sharding import jit_step, make_mesh, replicate, shard_batch
 from fcos_lidar_jax.training.step import make_gradient
 from fcos_lidar_jax.types import Batch, TrainState
 

@@ -21,15 +21,15 @@ from experiments.changes import Change, change
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_measurement
 from experiments.studies.centerpoint import PEER
-from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.cached import CachedFrames
-from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.streets import CITY
-from fcos_lidar_jax.trainer import Schedule
+from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
@@ -68,14 +68,15 @@ class Args(Options):
 def frames(work: Path, split: str) -> FrameSet:
     """Frames of a split, simulated once."""
     number, first = {"train": (TRAIN_FRAMES, 0), "test": (TEST_FRAMES, UNSEEN_SEED)}[split]
-    made = SimulatedFrames(SENSOR, number, first, 60, NUSCENES_HDL32E.limit_xy_m, 1, _BONNET_M, 1, streets=CITY)
+    reading, reach_m = CloudReading(1, "all", _BONNET_M), NUSCENES_HDL32E.limit_xy_m
+    made = SimulatedFrames(SENSOR, number, first, 60, reach_m, 1, reading, streets=CITY)
     return CachedFrames(made, work / f"frames_{split}_{number}")
 
 
 def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     """Scores of a training."""
     tests = frames(args.work, "test")
-    along = ChosenFrames(tests, tuple(range(CURVE_FRAMES)))
+    along = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
     folder = args.work / f"{name.replace(' ', '_').replace(',', '')}_{args.steps}_{seed}"
     schedule = Schedule(-(-args.steps // 10), -(-args.steps // 4), 1)
     detector = trained(

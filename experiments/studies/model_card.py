@@ -15,10 +15,10 @@ import numpy as np
 
 import fcos_lidar_jax
 from experiments.script import run_script
+from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.files import atomic_write, read_json
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models.detector import count_parameters
-from fcos_lidar_jax.training.checkpoint import read_description
 
 RESULTS = Path("experiments/results")
 SHIPPED = Path(fcos_lidar_jax.__file__).parent / "weights"

@@ -29,11 +29,12 @@ from experiments.script import Options, real_data, run_measurement
 from fcos_lidar_jax.assignment import owners
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.frame import Frame, GivenFrames, without_close
+from fcos_lidar_jax.data.frame import Frame, InMemoryFrames, without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.matching import candidate_pairs, match_frame
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
-from fcos_lidar_jax.inference.records import confident
+from fcos_lidar_jax.evaluation.records import confident
+from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, QUICKSTART
 from fcos_lidar_jax.projection import project_points
@@ -95,7 +96,7 @@ def owned_cells(frame: Frame) -> np.ndarray:
 def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:
     started = time.monotonic()
     peer = "" if args.detector == "fcos" else f"{args.detector}_"
-    folder, frames = args.runs / f"{peer}{args.source}_{seed}", GivenFrames((frame,), SENSOR, NUSCENES_CLASSES)
+    folder, frames = args.runs / f"{peer}{args.source}_{seed}", InMemoryFrames((frame,), SENSOR, NUSCENES_CLASSES)
     detector = trained(folder, CONFIGS[args.detector], frames, steps=args.steps, seed=seed)
     (found,), _ = detections(detector, frames)
     minutes = (time.monotonic() - started) / 60
@@ -138,7 +139,7 @@ def measure(args: Args) -> dict[str, Any]:
     """Run all seeds, a line each."""
     real = args.source == "real"
     frame = read_keyframe(real_data(args.data, "nuscenes_scene0061"), SENSOR) if real else make_frame(0, SENSOR)
-    frame = without_close(frame, SENSOR)
+    frame = without_close(frame, SENSOR, cut_reading(1))
     names = Counter(NUSCENES_CLASSES[i] for i in sorted(frame.labels[owned_cells(frame) >= MIN_CELLS]))
     print("boxes that count:", ", ".join(f"{number} {name}" for name, number in names.items()))
     shapes = jax.eval_shape(build_detector(CONFIGS[args.detector], SENSOR).init, jax.random.key(0))

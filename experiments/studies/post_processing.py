@@ -21,11 +21,11 @@ from experiments.script import Options, find_real_data, run_measurement
 from experiments.statistics import paired_difference
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.config import InferenceConfig
-from fcos_lidar_jax.data.frame import ChosenFrames, Frame, FrameSet
+from fcos_lidar_jax.data.cloud_policy import make_cloud
+from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.presets import COMPACT
@@ -73,7 +73,7 @@ def find(trained: TrainedDetector, sets: Sequence[FrameSet]) -> tuple[dict[str, 
     for frames in sets:
         for index in range(len(frames)):
             read.append(frames.frame(index))
-            cloud = make_cloud(read[-1].points, trained.config, sensor=trained.sensor, remove_close="none")
+            cloud = make_cloud(read[-1].points, trained.config, sensor=trained.sensor, num_close=0)
             for name, detections in jax.device_get(together(variables, cloud.points, cloud.valid)).items():
                 found[name].append(detections)
             progress.show(len(read))
@@ -109,11 +109,10 @@ def times(trained: TrainedDetector, repeats: int) -> dict[str, Any]:
 def measure(args: Args) -> dict[str, Any]:
     """Scores and times."""
     trained = load_trained(args.weights)
-    close: dict[str, Any] = {"remove_close": trained.config.projection.remove_close}
-    unseen = open_frames(format="simulated", split="val", sensor=trained.sensor, **close)
-    sets: dict[str, Sequence[FrameSet]] = {"unseen simulated": [ChosenFrames(unseen, tuple(range(args.frames)))]}
+    unseen = open_frames(format="simulated", split="val", sensor=trained.sensor, reading=trained.config.reading)
+    sets: dict[str, Sequence[FrameSet]] = {"unseen simulated": [SelectedFrames(unseen, tuple(range(args.frames)))]}
     if find_real_data(args.data) is not None:
-        sets["real keyframes"] = list(real_frames(args.data, trained.config.projection).values())
+        sets["real keyframes"] = list(real_frames(args.data, trained.config.reading).values())
     record: dict[str, Any] = {"weights": str(args.weights), "times": times(trained, args.repeats)}
     return record | {name: compare(*find(trained, frames), trained.classes) for name, frames in sets.items()}
 

@@ -32,8 +32,11 @@ from experiments.runs import detections, trained
 from experiments.script import Options, run_script, save
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
+from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
@@ -43,10 +46,7 @@ from fcos_lidar_jax.presets import COMPACT, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, fresh_streets
 from fcos_lidar_jax.simulation.streets import CITY
-from fcos_lidar_jax.trainer import Schedule
-from fcos_lidar_jax.training import load_checkpoint, save_checkpoint
-from fcos_lidar_jax.training.checkpoint import Checkpoint, read_description
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
+from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 _FRESH = change(copy_paste=None, class_balanced=False)  # What makes more of few frames has no use here.
@@ -86,7 +86,7 @@ _OF_TRAINING = ("steps", "seed", "warm_start", "save_every", "export")  # Option
 
 def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, FrameSet]:
     """Training frames of which none is shown twice, and unseen ones; in cities classes as frequent as there."""
-    unseen = open_frames(format="simulated", split="val", sensor=load_sensor(config.sensor), remove_close="all")
+    unseen = open_frames(format="simulated", split="val", sensor=load_sensor(config.sensor))
     assert isinstance(unseen, SimulatedFrames)
     fresh = fresh_streets(config, steps=steps, seed=seed)[1]
     shown = dataclasses.replace(unseen, number=fresh.number, first_seed=fresh.first_seed)
@@ -103,7 +103,7 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
     frames, unseen = streets(config, steps=args.steps, seed=args.seed)
     schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
-    tests = ChosenFrames(unseen, tuple(range(_TESTS_ALONG)))
+    tests = SelectedFrames(unseen, tuple(range(_TESTS_ALONG)))
     length = {"steps": args.steps, "seed": args.seed}
     trained(work, config, frames, **length, tests=tests, schedule=schedule, weights=args.warm_start)
     return training_record(work)
@@ -155,7 +155,7 @@ def scores(args: Args) -> dict[str, Any]:
     folder = SHIPPED / args.name
     detector = load_trained(folder)
     _, unseen = streets(detector.config, steps=args.steps, seed=args.seed)
-    found, frames = detections(detector, ChosenFrames(unseen, tuple(range(args.test_frames))))
+    found, frames = detections(detector, SelectedFrames(unseen, tuple(range(args.test_frames))))
     evaluation = evaluate_frames(found, frames, metric_of(detector.classes))
     return {
         "name": args.name,

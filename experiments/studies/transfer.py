@@ -29,17 +29,18 @@ from experiments.real_frames import interval_of, real_frames, scores_by_range
 from experiments.runs import detections, trained
 from experiments.script import Options, real_data, run_script, save
 from fcos_lidar_jax import open_frames
-from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import read_description
+from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.benchmark import evaluate_keyframes
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
+from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.presets import COMPACT
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.training.checkpoint import read_description
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 FROM_SCRATCH = change(copy_paste=None, class_balanced=False)(COMPACT)
 FINE_TUNING = change(optimizer__peak_learning_rate=1e-3)(FROM_SCRATCH)
@@ -70,7 +71,7 @@ def simulated_drives(args: Args, sensor: Sensor) -> NuScenesFrames:
     spec = DatasetSpec(args.scenes, args.seed, args.keyframes, sensor, True, "v1.0-synthetic")
     root = args.work / f"drives_{args.scenes}_{args.keyframes}_{args.seed}"
     write_dataset(spec, root, workers=1, report=Progress("sweeps", spec.scenes * spec.sweeps).show)
-    frames = open_frames(root, num_sweeps=1, remove_close="all", sensor=sensor)
+    frames = open_frames(root, reading=cut_reading(1), sensor=sensor)
     assert isinstance(frames, NuScenesFrames)
     return frames
 
@@ -80,7 +81,7 @@ def parts(args: Args, detector: TrainedDetector) -> Iterator[tuple[str, FrameSet
     if not args.only or "simulated" in args.only:
         yield "simulated", simulated_drives(args, detector.sensor)
     if not args.only or {*args.only} & {*REAL}:
-        real = real_frames(args.data, detector.config.projection)
+        real = real_frames(args.data, detector.config.reading)
         yield from ((name, real[name]) for name in args.only or REAL if name in real)
 
 
@@ -108,8 +109,8 @@ def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
 
 def fine_tuning(args: Args) -> dict[str, Any]:
     """Scores on unseen keyframes of scene-0523, after training on the others from two beginnings."""
-    street = open_frames(real_data(args.data, "nuscenes_scene0523"), split="scene0523", remove_close="all")
-    test, shown = (ChosenFrames(street, tuple(chosen)) for chosen in (TEST, TRAIN))
+    street = open_frames(real_data(args.data, "nuscenes_scene0523"), split="scene0523", reading=cut_reading(1))
+    test, shown = (SelectedFrames(street, tuple(chosen)) for chosen in (TEST, TRAIN))
     record: dict[str, Any] = {"steps": args.fine_tuning_steps, "keyframes": len(shown)}
     beginnings = {"from the checkpoint": (FINE_TUNING, args.checkpoint), "from scratch": (FROM_SCRATCH, None)}
     of = read_description(find_checkpoint(args.checkpoint))["hash"][:12]  # Others of the same name are others.

@@ -14,17 +14,17 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import Backend, CloudDetector, TrainedDetector, load_detector
-from fcos_lidar_jax.inference.cloud import Cloud, make_cloud
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.export import ExportedDetector
 from fcos_lidar_jax.inference.openvino import OpenVinoDetector
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
 
 _SIMULATED = 3  # Clouds, where no files are given.
 _SIDE = 2048  # Of the matrices whose product is timed.

@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.files import check_writable
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 
 def check_at_least(args: object, least: int, *options: str) -> None:

@@ -2,15 +2,15 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from fcos_lidar_jax.cli.processes import tell
-from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.classes import ClassMap, MappedFrames
-from fcos_lidar_jax.data.frame import ChosenFrames, FrameSet
+from fcos_lidar_jax.config import CloudReading, Config
+from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
+from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.files import read_json
-from fcos_lidar_jax.input_pipeline.open import Format, Layout, default_split, find_layout, open_frames
+from fcos_lidar_jax.input_pipeline.open import DataSet, Format, default_split, find_data_set, open_frames
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 
 
@@ -31,11 +31,11 @@ class DataOptions:
     follow_links: bool = False  # Read files to which links lead outside of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps where files of older sweeps are missing.
 
-    def layout(self) -> Layout:
-        return find_layout(self.data_root, self.format, self.version)
+    def find(self) -> DataSet:
+        return find_data_set(self.data_root, self.format, self.version)
 
     def split(self, purpose: Literal["train", "val"], *, required: bool = True) -> str | None:
-        return default_split(self.layout(), purpose, required=required, splits=self.splits)
+        return default_split(self.find(), purpose, required=required, splits=self.splits)
 
     def open(
         self,
@@ -56,15 +56,9 @@ class DataOptions:
             samples: ranges of the frames, see :func:`parse_ranges`, as given by ``option``; None for all.
             sensor: for layouts that do not define theirs; default: the configuration's.
         """
-        frames = self.open_whole(
-            split,
-            num_sweeps=config.num_sweeps,
-            remove_close=config.projection.remove_close,
-            close_m=config.projection.close_m,
-            sensor=sensor or load_sensor(config.sensor),
-        )
+        frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:
-            frames = ChosenFrames(frames, tuple(parse_ranges(samples, len(frames), option)))
+            frames = SelectedFrames(frames, tuple(parse_ranges(samples, len(frames), option)))
         mapped = MappedFrames(frames, config.classes)
         if lost := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
             counts = ", ".join(f"{count} {name}" for name, count in lost.items())
@@ -72,31 +66,30 @@ class DataOptions:
         return mapped
 
     def open_whole(
-        self, split: str | None, *, num_sweeps: int, sensor: Sensor | None = None, **options: Any
+        self, split: str | None, reading: CloudReading, sensor: Sensor | None = None, *, missing: bool = True
     ) -> FrameSet:
-        """Frames with all of their own classes; by default as the ground-truth database is made of them.
+        """Frames with all of their own classes; the sensor is for data that do not say theirs.
 
-        ``options`` are ``remove_close`` and ``close_m`` of :func:`open_frames`; by default all close points go.
+        With ``missing`` a line on standard error counts the sweeps whose file is missing.
         """
-        layout = self.layout()
+        data = self.find()
         frames = open_frames(
             self.data_root,
-            format=layout.format,
-            version=layout.version,
+            format=data.reader.name,
+            version=data.version or None,
             split=split,
-            sensor=None if layout.format == "folder" else sensor,
-            num_sweeps=num_sweeps,
+            sensor=data.reader.sensor and sensor,
+            reading=reading,
             class_map=read_class_map(self.class_map),
-            index=self.index if layout.format == "nuscenes" else None,
+            index=self.index if data.tables else None,
             splits=self.splits,
             allow_missing_sweeps=self.allow_missing_sweeps,
             follow_links=self.follow_links,
-            **{"remove_close": "all", **options},
         )
-        if isinstance(frames, NuScenesFrames):
-            missing = frames.nuscenes.missing_sweeps(list(frames.tokens), num_sweeps)
-            if missing:
-                tell(f"{missing} sweep files of split {split!r} are missing")
+        if missing and isinstance(frames, NuScenesFrames):
+            number = frames.nuscenes.missing_sweeps(list(frames.tokens), reading.num_sweeps)
+            if number:
+                tell(f"{number} sweep files of split {split!r} are missing")
         return frames
 
 

@@ -11,23 +11,22 @@ import tyro
 
 from fcos_lidar_jax.cli import demo_training
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
-from fcos_lidar_jax.cli.evaluate import examples
-from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.benchmark import evaluate_keyframes
 from fcos_lidar_jax.evaluation.examples import choose_examples
+from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.evaluation.results import LIDAR_META
 from fcos_lidar_jax.evaluation.summary import describe, write_evaluation
 from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.records import confident
+from fcos_lidar_jax.inference.prediction import Prediction, predict
+from fcos_lidar_jax.input_pipeline import open_frames
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.trainer import Prediction, predict
-from fcos_lidar_jax.trainer.run import NUM_SEEDS
+from fcos_lidar_jax.training.plan import check_numbers
 from fcos_lidar_jax.visualization.drive import Scene, draw_drive
-from fcos_lidar_jax.visualization.evaluation_report import write_evaluation_report
+from fcos_lidar_jax.visualization.evaluation_report import make_examples, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 
 WEIGHTS = "hdl32e"  # That are shown.
@@ -60,9 +59,8 @@ class Demo:
 def run(args: Demo) -> None:
     """Simulate, detect, evaluate, draw; train where it is asked for."""
     check_at_least(args, 1, "keyframes", "test_frames")
-    check_at_least(args, 0, "steps", "drive", "seed")
-    if args.seed >= NUM_SEEDS:
-        raise ValueError(f"--seed: got {args.seed}, expected less than 2**32")
+    check_at_least(args, 0, "steps", "drive")
+    check_numbers(1, args.seed)
     check_out_folder(args.out)
     for name in () if args.train else ("steps", "test_frames", "seed"):
         if getattr(args, name) != getattr(Demo, name):
@@ -90,12 +88,14 @@ def run(args: Demo) -> None:
 
 def _simulate(args: Demo, detector: CloudDetector) -> NuScenesFrames:
     """The keyframes of a drive, which is written as a data set."""
-    version, close = "v1.0-drive", detector.config.projection
+    version = "v1.0-drive"
     spec = DatasetSpec(1, args.drive, args.keyframes, detector.sensor, True, version)
     write_dataset(spec, args.out / "drive", workers=1, report=Progress("sweeps", spec.sweeps).show)
-    data = NuScenes(args.out / "drive", version)
-    options = detector.config.num_sweeps, close.remove_close, close.close_m, detector.sensor
-    return NuScenesFrames(data, tuple(data.sample_tokens), *options)
+    frames = open_frames(
+        args.out / "drive", version=version, reading=detector.config.reading, sensor=detector.sensor
+    )
+    assert isinstance(frames, NuScenesFrames)
+    return frames
 
 
 def _report(args: Demo, detector: CloudDetector, frames: NuScenesFrames, predictions: list[Prediction]) -> str:
@@ -120,7 +120,7 @@ def _report(args: Demo, detector: CloudDetector, frames: NuScenesFrames, predict
         args.out,
         title=f"{WEIGHTS} on an unseen simulated drive",
         num_samples=len(scenes),
-        examples=examples(evaluation, frames, np.zeros((len(scenes), 3)), chosen.rows, min_score=least),
+        examples=make_examples(evaluation, frames, np.zeros((len(scenes), 3)), chosen.rows, min_score=least),
         sensor=sensor,
         pictures=[(_CAPTION, args.out / "drive.gif")],
         links=[("Look at the drive: play, turn, zoom", _PAGE)],

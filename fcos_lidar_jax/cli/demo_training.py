@@ -10,21 +10,22 @@ from typing import Any
 import jax
 import numpy as np
 
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import DISTANCES_M, metric_of
+from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
-from fcos_lidar_jax.inference.records import as_records
+from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.simulation.frame_set import fresh_streets, unseen_frames
-from fcos_lidar_jax.trainer import Schedule, predict, train
-from fcos_lidar_jax.trainer.pictures import SHOWN_SCORE, draw_frame
-from fcos_lidar_jax.trainer.run import RUN_SPEC
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
+from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.training.pictures import SHOWN_SCORE, draw_frame
+from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.range_image import draw_range_image
 from fcos_lidar_jax.visualization.report import write_report

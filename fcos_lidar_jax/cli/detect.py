@@ -13,19 +13,19 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_out_folder, check_outside
+from fcos_lidar_jax.data.cloud_policy import expect_points
 from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import MAX_POINTS
-from fcos_lidar_jax.data.sweeps import about_z, before_turning, read_list, turned
+from fcos_lidar_jax.data.sweeps import about_z, read_list, sensor_before_rotation, turned
+from fcos_lidar_jax.evaluation.records import as_records, confident
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.files import atomic_write, file_lock
 from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
-from fcos_lidar_jax.inference.cloud import expect_points
-from fcos_lidar_jax.inference.records import as_records, confident
+from fcos_lidar_jax.inference.prediction import predict
+from fcos_lidar_jax.inference.prediction_log import detections_fingerprint
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import Progress
-from fcos_lidar_jax.trainer import predict
-from fcos_lidar_jax.trainer.results import detections_fingerprint
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
 
@@ -123,16 +123,14 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
 
 
 def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector) -> CloudFiles:
-    projection = detector.config.projection
+    reading = detector.config.reading
     return CloudFiles(
         tuple(files),
-        before_turning(detector.sensor, np.deg2rad(args.yaw_deg)),
-        args.remove_close or projection.remove_close,
-        projection.close_m,
+        sensor_before_rotation(detector.sensor, np.deg2rad(args.yaw_deg)),
+        dataclasses.replace(reading, remove_close=args.remove_close or reading.remove_close),
         columns=args.columns,
         dtype=args.dtype,
         max_points=args.max_file_points,
-        num_sweeps=detector.config.num_sweeps,
     )
 
 

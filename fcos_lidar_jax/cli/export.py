@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 import tyro
 
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.cli.checks import check_out_file, check_outside
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.export import PLATFORMS, Size, export_detector, load_exported
 from fcos_lidar_jax.inference.onnx_graph import network_graph
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,8 +17,8 @@ from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
 from fcos_lidar_jax.data.nuscenes.tables import TableError
 from fcos_lidar_jax.files import folder_lock
-from fcos_lidar_jax.input_pipeline.database import objects_folder, prepare_database
-from fcos_lidar_jax.input_pipeline.open import Layout
+from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
+from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.progress import Progress
 
@@ -45,27 +45,27 @@ class Prepare:
 def run(args: Prepare) -> None:
     """Make index and database, and print what there is now."""
     check_at_least(args, 1, "workers", "num_sweeps", "min_points")
-    layout, began = args.data.layout(), time.monotonic()
-    if layout.format == "simulated":
+    data, began = args.data.find(), time.monotonic()
+    if not data.on_disk:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
-    folder = args.data.index or layout.index
+    folder = args.data.index or data.index
     check_out_folder(folder, "--index")
     with folder_lock(folder, "preparing"):
-        record = _prepare(args, layout, folder)
+        record = _prepare(args, data, folder)
     record["seconds"] = round(time.monotonic() - began, 1)
     print(json.dumps(record))
 
 
-def _prepare(args: Prepare, layout: Layout, folder: Path) -> dict[str, Any]:
+def _prepare(args: Prepare, data: DataSet, folder: Path) -> dict[str, Any]:
     record: dict[str, Any] = {"folder": str(folder)}
-    if layout.format == "nuscenes":
-        index = _make_index(layout.root / str(layout.version), folder)
+    if data.tables is not None:
+        index = _make_index(data.tables, folder)
         record |= {"scenes": len(index.scene_name), "keyframes": len(index.sample_token)}
         record |= {"sweeps": len(index.sweep_file), "annotations": len(index.box_token)}
         if not record["annotations"]:
             return record
     split = args.train_split or args.data.split("train")
-    frames = args.data.open_whole(split, num_sweeps=args.num_sweeps)
+    frames = args.data.open_whole(split, cut_reading(args.num_sweeps))
     progress = Progress("frames", len(frames))
     objects = objects_folder(folder, split)
     options = {"min_points": args.min_points, "workers": args.workers}

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import jax
 
 from fcos_lidar_jax.cli.checks import check_at_least
-from fcos_lidar_jax.training.launcher import local_device_ids
+from fcos_lidar_jax.devices.launcher import local_device_ids
 
 
 @dataclasses.dataclass(frozen=True)

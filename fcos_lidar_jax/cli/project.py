@@ -12,9 +12,9 @@ import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
+from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference.cloud import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import load_sensor
 
@@ -34,8 +34,9 @@ class Project:
     sensor: str = "nuscenes_hdl32e"  # Sensor preset, or a sensor file.
     rounds: int = 5  # Rounds of the projection.
     prioritize_current: bool = True  # Points of the current sweep win every collision with older ones.
-    remove_close: Literal["all", "sweeps", "none"] = "all"
-    """Drop points within a metre of the sensor in x and y: of all sweeps, of the older ones, or none."""
+    remove_close: Literal["all", "sweeps", "none"] | None = None
+    """Drop points within a metre of the sensor in x and y: of all sweeps, of the older ones, or none. Default: of
+    all."""
     columns: int | None = None
     """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
     dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
@@ -54,7 +55,8 @@ def run(args: Project) -> None:
     points = read_points(
         args.file, sensor, columns=args.columns, dtype=args.dtype, max_points=args.max_file_points
     )
-    config = Config(max_points=max(len(points), 1), projection=ProjectionConfig(remove_close=args.remove_close))
+    projection = ProjectionConfig(remove_close=args.remove_close or "all")
+    config = Config(max_points=max(len(points), 1), projection=projection)
     cloud = make_cloud(points, config, sensor=sensor)
     rounds = {"num_rounds": args.rounds, "prioritize_current": args.prioritize_current}
     image = jax.device_get(project_points(cloud.points, cloud.valid, sensor, **rounds))

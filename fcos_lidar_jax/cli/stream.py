@@ -15,19 +15,19 @@ import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
 from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.drives import Drive, folder_drive
 from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
 from fcos_lidar_jax.data.nuscenes.reader import NuScenes
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
+from fcos_lidar_jax.evaluation.records import as_records, confident
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
-from fcos_lidar_jax.inference.cloud import sensor_mismatch
-from fcos_lidar_jax.inference.records import as_records, confident
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
-from fcos_lidar_jax.input_pipeline.open import find_layout
+from fcos_lidar_jax.input_pipeline.open import find_data_set
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
@@ -97,7 +97,7 @@ def run(args: Stream) -> None:
         sweeps = timing.read(_announcing(drive.sweeps))
         how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": at_us}
         if not drive.posed:
-            how["num_sweeps"] = 1
+            how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
         for found in timing.detect(detect_stream(sweeps, detector, **how)):
             points = found.cloud.points[found.cloud.valid]
             if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
@@ -254,8 +254,7 @@ def _open(args: Stream, detector: CloudDetector) -> tuple[Drive, Collection[int]
         return _open_source(args, args.source, detector.sensor), None
     assert args.data_root is not None
     assert args.scene is not None
-    version = find_layout(args.data_root, "nuscenes", args.version).version
-    assert version is not None
+    version = find_data_set(args.data_root, "nuscenes", args.version).version
     allowed = {"allow_missing_sweeps": args.allow_missing_sweeps, "follow_links": args.follow_links}
     data = NuScenes(args.data_root, version, index=args.index, **allowed)
     alone = args.keyframes and detector.config.num_sweeps == 1

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
-from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset

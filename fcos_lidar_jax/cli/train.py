@@ -11,20 +11,21 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_of
+from fcos_lidar_jax.cli.checks import check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
+from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
-from fcos_lidar_jax.input_pipeline.open import Layout
+from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.trainer.run import NUM_SEEDS, Schedule, check_run, train
-from fcos_lidar_jax.training.agreement import agreed
-from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of
+from fcos_lidar_jax.training import Schedule, train
+from fcos_lidar_jax.training.plan import check_numbers, check_run
 
 _ABOUT = {
     "nuscenes": "the paper's detector on ten sweeps",
@@ -44,7 +45,7 @@ _PRESETS: Any = (
     for name, preset in PRESETS.items()
 )
 _OBJECTS = "objects"  # Folder in the run's, where objects of single frames are cut.
-_MADE_BEFORE = 2000  # Simulated frames that may be made before the first step: minutes.
+_MAX_SIMULATED = 2000  # Simulated frames that may be made before the first step: minutes.
 _Preset: Any = reduce(or_, _PRESETS)
 
 
@@ -90,6 +91,7 @@ class Train:
 def run(args: Train) -> None:
     """Train, and print where the result is."""
     _check(args)
+    schedule = Schedule(args.save_every, args.evaluate_every, args.keep)
     join_processes(args.processes)
     is_main_process = jax.process_index() == 0
     with agreed("cannot train"):
@@ -99,6 +101,7 @@ def run(args: Train) -> None:
         with contextlib.ExitStack() as held:
             with agreed("cannot train"):
                 if task.cuts_objects and is_main_process:  # one cuts, the others find it done
+                    check_numbers(task.steps, args.seed)
                     held.enter_context(folder_lock(args.out, "training"))
                     check_run(args.out, resume=args.resume)  # another process may have been faster
                     _cut_objects(args.out, task)
@@ -111,7 +114,7 @@ def run(args: Train) -> None:
                 steps=task.steps,
                 tests=task.tests,
                 objects=objects,
-                schedule=Schedule(args.save_every, args.evaluate_every, args.keep),
+                schedule=schedule,
                 packing=False if args.no_packing else None,
                 **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
             )
@@ -131,7 +134,7 @@ class _Task:
     """What is trained, on what."""
 
     config: Config
-    layout: Layout
+    data: DataSet
     split: str | None
     frames: FrameSet
     tests: FrameSet | None
@@ -148,41 +151,35 @@ def _open(args: Train) -> _Task:
     )
     check_run(args.out, resume=args.resume)
     check_out_folder(args.out)
-    layout = args.data.layout()
-    index = args.data.index or layout.index
-    if layout.format == "nuscenes" and (layout.root / str(layout.version)).is_dir() and not has_index(index):
+    data = args.data.find()
+    index = args.data.index or data.index
+    if data.tables is not None and data.tables.is_dir() and not has_index(index):
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
-    _check_sensor(config, layout, frames)
-    tests = _open_tests(args, config, layout)
+    _check_sensor(config, data, frames)
+    tests = _open_tests(args, config, data)
     if split is None and args.samples is None and tests is None:
-        tell(f"{layout.root}: no splits: all {len(frames)} frames are trained on, none is left to evaluate on")
+        tell(f"{data.root}: no splits: all {len(frames)} frames are trained on, none is left to evaluate on")
     if tests is not None:
         _tell_of_overlap(frames, tests)
-    if layout.format == "simulated":
+    if not data.on_disk:
         _check_simulated(len(frames), config)
-    an_epoch = steps_per_epoch(frames, config)
-    steps = args.steps or config.optimizer.epochs * an_epoch
-    if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:
-        raise ValueError(
-            f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
-            f"{steps} steps: nothing would ever be pasted"
-        )
-    own = args.samples is not None or layout.format == "simulated"
-    return _Task(config, layout, split, frames, tests, steps, own and config.copy_paste is not None)
+    steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
+    own = args.samples is not None or not data.on_disk
+    return _Task(config, data, split, frames, tests, steps, own and config.copy_paste is not None)
 
 
-def _check_sensor(config: Config, layout: Layout, frames: FrameSet) -> None:
+def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
     # The default sensor is that of the preset, which --name may have renamed.
     presets = [preset for preset in PRESETS.values() if preset.name == config.name] or PRESETS.values()
-    if layout.format == "folder" and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
+    if data.reader.sensor is None and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
         raise ValueError(
-            f"--sensor: got {config.sensor!r}, expected none: {layout.root}/sensor.json has {frames.sensor.name!r}"
+            f"--sensor: got {config.sensor!r}, expected none: {data.root}/sensor.json has {frames.sensor.name!r}"
         )
 
 
-def _open_tests(args: Train, config: Config, layout: Layout) -> FrameSet | None:
+def _open_tests(args: Train, config: Config, data: DataSet) -> FrameSet | None:
     """The frames to evaluate on along the way, if there are any."""
     split, tests = args.val_split or args.data.split("val", required=False), None
     if split != "none" and (split or args.val_samples):
@@ -190,17 +187,13 @@ def _open_tests(args: Train, config: Config, layout: Layout) -> FrameSet | None:
     if tests is None and args.evaluate_every is not None:
         raise ValueError(
             f"--evaluate-every: got {args.evaluate_every}, expected --val-split or --val-samples too: "
-            f"{layout.root} has no split to evaluate on"
+            f"{data.root} has no split to evaluate on"
         )
     return tests
 
 
 def _check(args: Train) -> None:
-    check_at_least(args, 1, "steps", "evaluate_every", "save_every", "keep")
     check_processes(args.processes)
-    check_at_least(args, 0, "threads", "workers", "seed")
-    if args.seed >= NUM_SEEDS:
-        raise ValueError(f"--seed: got {args.seed}, expected less than 2**32")
     if args.val_split == "none":
         for name in ("val_samples", "evaluate_every"):
             if (given := getattr(args, name)) is not None:
@@ -211,11 +204,11 @@ def _check(args: Train) -> None:
 def _check_simulated(number: int, config: Config) -> None:
     """Simulated frames are made one by one, so nothing should need all of very many before the first step."""
     wanted = {"class_balanced": config.class_balanced, "copy_paste": config.copy_paste is not None}
-    if number > _MADE_BEFORE and any(wanted.values()):
+    if number > _MAX_SIMULATED and any(wanted.values()):
         options = " ".join(f"--no-{name.replace('_', '-')}" for name, on in wanted.items() if on)
         raise ValueError(
             f"--format simulated: all {number} frames would be made before the first step, expected {options}, or "
-            f"at most {_MADE_BEFORE} of them by --samples"
+            f"at most {_MAX_SIMULATED} of them by --samples"
         )
 
 
@@ -232,7 +225,7 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
         return None
     if task.cuts_objects:
         return database.open_database(args.out / _OBJECTS)
-    folder = database.objects_folder(args.data.index or task.layout.index, split)
+    folder = database.objects_folder(args.data.index or task.data.index, split)
     if not folder.is_dir():
         of = "" if split is None else f" --train-split {split}"
         raise ValueError(
@@ -247,7 +240,7 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
         )
     # Objects of more sweeps than are fused will do: those too many are left out.
     sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
-    if not any(source == args.data.open_whole(split, num_sweeps=n).fingerprint() for n in sweeps):
+    if not any(source == args.data.open_whole(split, database.cut_reading(n)).fingerprint() for n in sweeps):
         raise ValueError(
             f"{folder}: cut from other frames than those of split {split!r}, with another --class-map, or from "
             f"fewer sweeps than {config.num_sweeps}, expected these: run fcos-lidar prepare again, with the same "

@@ -4,13 +4,14 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
-from fcos_lidar_jax.data.classes import map_labels, unknown_name
+from fcos_lidar_jax.data.class_mapping import map_labels, unknown_name
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
 from fcos_lidar_jax.data.nuscenes.build import velocities
@@ -44,8 +45,7 @@ class Argoverse2Frames(FrameSet):
         root: the folder of the splits, of logs, or of one log.
         split: its logs alone; all of them without it.
         sensor: whose points they are; with rows by laser number.
-        num_sweeps: sweeps to fuse at most, the current one included; fewer at the beginning of a log.
-        remove_close, close_m: as in :func:`~fcos_lidar_jax.data.sweeps.fuse_sweeps`.
+        reading: sweeps to fuse at most, fewer at the beginning of a log, and which points are dropped.
 
     Raises:
         ValueError: here or on reading a frame, naming the file, the row, the field, found and expected.
@@ -59,12 +59,9 @@ class Argoverse2Frames(FrameSet):
         split: str | None = None,
         *,
         sensor: Sensor = ARGOVERSE2,
-        num_sweeps: int = 1,
-        remove_close: Literal["all", "sweeps", "none"] = "sweeps",
-        close_m: float = 1.0,
+        reading: CloudReading = CloudReading(),
     ) -> None:
-        self.root, self.sensor, self.num_sweeps = Path(root), sensor, num_sweeps
-        self.remove_close, self.close_m = remove_close, close_m
+        self.root, self.sensor, self.reading = Path(root), sensor, reading
         splits = find_splits(self.root)
         if split is not None and split not in splits:
             raise ValueError(f"{self.root}: split: {unknown_name(split, splits)}")
@@ -79,10 +76,10 @@ class Argoverse2Frames(FrameSet):
 
     def frame(self, index: int) -> Frame:
         """One sweep, read anew, fused with those before it."""
-        older = min(self._sweeps[index][2], self.num_sweeps - 1)
+        older = min(self._sweeps[index][2], self.reading.num_sweeps - 1)
         chain = range(index, index - older - 1, -1)
         sweeps = (Sweep(read_points(self._file(i), self.sensor), self.pose(i), self.time_us(i)) for i in chain)
-        points, num_close = fuse_sweeps(sweeps, self.sensor, remove_close=self.remove_close, close_m=self.close_m)
+        points, num_close = fuse_sweeps(sweeps, self.sensor, self.reading)
         return Frame(points, *self._boxes(index), num_close)
 
     def truth(self, index: int) -> Frame:
@@ -112,7 +109,7 @@ class Argoverse2Frames(FrameSet):
         files = [self._file(index) for index in range(len(self))]
         for log in dict.fromkeys(log for log, _, _ in self._sweeps):
             files += [file for name in (_POSES, _BOXES) if (file := log / name).exists()]
-        return files_fingerprint(files, self.root, (self.sensor, self.num_sweeps, self.remove_close, self.close_m))
+        return files_fingerprint(files, self.root, (self.sensor, *dataclasses.astuple(self.reading)))
 
     def _file(self, index: int) -> Path:
         log, stamp, _ = self._sweeps[index]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax import __version__
-from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, no_points, without_points
+from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames, no_points, without_points
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, read_json
 
@@ -19,7 +19,7 @@ _TRUTH = ("boxes", "labels", "num_points")
 
 
 @dataclasses.dataclass(frozen=True)
-class CachedFrames(FramesOf):
+class CachedFrames(WrappedFrames):
     """A frame set that makes every frame once.
 
     The folder holds ``frames.json``, which says whose frames they are, and an archive of NumPy arrays for every

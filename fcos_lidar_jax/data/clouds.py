@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, drop_close, files_fingerprint, no_points
+from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames, drop_close, files_fingerprint, no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import about_z, read_sweeps, turned
 from fcos_lidar_jax.files import checksum
@@ -19,26 +20,22 @@ class CloudFiles(FrameSet):
 
     files: tuple[Path, ...]  # one a frame: a point file for read_points, or a .json list for read_sweeps
     sensor: Sensor  # whose points they are
-    remove_close: str = "sweeps"  # as in projection.remove_close; of a list, in each sweep's own frame
-    close_m: float = 1.0  # half the side of the square that is emptied
+    reading: CloudReading = CloudReading()
     columns: int | None = None  # of a raw file of another layout
     dtype: str | None = None  # likewise
     max_points: int = MAX_POINTS  # of a file; a larger one is refused
-    num_sweeps: int | None = None  # of a list, at most so many are fused; None for all
     classes: tuple[str, ...] = ()  # none: there are no boxes
 
     def __len__(self) -> int:
         return len(self.files)
 
     def frame(self, index: int) -> Frame:
-        file, mode, close_m = self.files[index], self.remove_close, self.close_m
+        file = self.files[index]
         layout: dict[str, Any] = {"columns": self.columns, "dtype": self.dtype, "max_points": self.max_points}
         if file.suffix == ".json":
-            how: dict[str, Any] = {"remove_close": mode, "close_m": close_m, "num_sweeps": self.num_sweeps}
-            points, num_close = read_sweeps(file, self.sensor, **how, **layout)
+            points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
-            cloud = read_points(file, self.sensor, **layout)
-            points, num_close = drop_close(cloud, self.sensor, mode=mode, close_m=close_m)
+            points, num_close = drop_close(read_points(file, self.sensor, **layout), self.sensor, self.reading)
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 
     def truth(self, index: int) -> Frame:
@@ -53,12 +50,12 @@ class CloudFiles(FrameSet):
         return str(self.files[index])
 
     def fingerprint(self) -> str:
-        reading = self.remove_close, self.close_m, self.columns, self.dtype, self.num_sweeps
+        reading = self.reading, self.columns, self.dtype
         return files_fingerprint([file.absolute() for file in self.files], Path("/"), reading)
 
 
 @dataclasses.dataclass(frozen=True)
-class TurnedClouds(FramesOf):
+class TurnedClouds(WrappedFrames):
     """Clouds of a frame set, rotated about z after their close points were removed."""
 
     yaw_rad: float  # counter-clockwise seen from above

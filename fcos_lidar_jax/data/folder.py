@@ -1,16 +1,18 @@
 """The user's own annotated clouds: a folder of point files with boxes in JSON beside them."""
 
+import dataclasses
 import os
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import point_files
 from fcos_lidar_jax.data.box_geometry import LIMITS, count_inside, find_bad_box
-from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import (
     Frame,
     FrameSet,
@@ -24,7 +26,7 @@ from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.sensors import PRESETS, Sensor, sensor_from_json
 
-SPLITS = "splits.json"
+_SPLITS = "splits.json"
 _MAX_LAGS = 100  # Nobody fuses as many sweeps.
 _Speed = Annotated[float, msgspec.Meta(ge=-LIMITS["vx"], le=LIMITS["vx"])]  # no NaN: an unknown one is null
 
@@ -64,8 +66,7 @@ class FolderFrames(FrameSet):
         sensor: whose points they are; replaces ``sensor.json``.
         split: frames and order from the splits; all frames, sorted, without it.
         splits: JSON file with them; default: ``splits.json``.
-        num_sweeps: clouds to fuse at most, from the first of the list on.
-        remove_close, close_m: as in :func:`~fcos_lidar_jax.data.sweeps.fuse_sweeps`.
+        reading: clouds to fuse at most, from the first of the list on, and which points are dropped.
         follow_links: read files that lie outside the folder.
 
     Raises:
@@ -91,18 +92,12 @@ class FolderFrames(FrameSet):
         *,
         split: str | None = None,
         splits: str | Path | None = None,
-        num_sweeps: int = 10,
-        remove_close: Literal["all", "sweeps", "none"] = "all",
-        close_m: float = 1.0,
+        reading: CloudReading = CloudReading(),
         follow_links: bool = False,
     ) -> None:
-        root = Path(root)
+        self.root = root = Path(root)
         self._inside = None if follow_links else root
-        if num_sweeps < 1:
-            raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
-        if remove_close not in ("all", "sweeps", "none"):
-            raise ValueError(f"remove_close: got {remove_close!r}, expected 'all', 'sweeps' or 'none'")
-        self.root, self.num_sweeps, self.remove_close, self.close_m = root, num_sweeps, remove_close, close_m
+        self.reading = reading
         self._clouds = _list_files(root, "clouds", point_files.ENDINGS, self._inside)
         self._boxes = _list_files(root, "boxes", (".json",), self._inside)
         listed = (root / "sweeps").exists()
@@ -120,18 +115,18 @@ class FolderFrames(FrameSet):
         self.sensor = _read_sensor(root, self._inside) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
-            self.names = _read_split(root / SPLITS if splits is None else Path(splits), split, self._clouds)
+            self.names = _read_split(root / _SPLITS if splits is None else Path(splits), split, self._clouds)
 
     def __len__(self) -> int:
         return len(self.names)
 
     def frame(self, index: int) -> Frame:
         """One frame, read anew; the points in each box are counted."""
-        return self._frame(index, self.num_sweeps)
+        return self._frame(index, self.reading)
 
     def truth(self, index: int) -> Frame:
         """As of any frame set; of the sweeps the current one alone is read, for its points in each box count."""
-        return without_points(self._frame(index, 1))
+        return without_points(self._frame(index, dataclasses.replace(self.reading, num_sweeps=1)))
 
     def labels(self, index: int) -> np.ndarray:
         return self._annotation(index)[1]
@@ -154,32 +149,31 @@ class FolderFrames(FrameSet):
         older = {*map(_normalized, listed)} - {*map(_normalized, self._clouds.values())}
         files = [*self._clouds.values(), *self._boxes.values(), *self._sweeps.values(), *older]
         files += [file for name in ("sensor.json", "classes.json") if (file := self.root / name).exists()]
-        reading = self.names, self.sensor, self.num_sweeps, self.remove_close, self.close_m
+        reading = self.names, self.sensor, *dataclasses.astuple(self.reading)
         return files_fingerprint(files, self.root, reading)
 
     def _current_sweep(self, index: int) -> ListedSweep | None:
         listed = self._sweeps.get(self.names[index])
         return None if listed is None else read_list(listed)[0]
 
-    def _frame(self, index: int, num_sweeps: int) -> Frame:
+    def _frame(self, index: int, reading: CloudReading) -> Frame:
         boxes, labels = self._annotation(index)
-        points, num_close = self._points(index, num_sweeps)
+        points, num_close = self._points(index, reading)
         return Frame(points, boxes, labels, count_inside(points[points[:, 4] == 0], boxes), num_close)
 
-    def _points(self, index: int, num_sweeps: int) -> tuple[np.ndarray, int]:
-        name, mode, close_m = self.names[index], self.remove_close, self.close_m
-        cloud, listed = self._clouds[name], self._sweeps.get(name)
-        if listed is None or self.num_sweeps == 1:
+    def _points(self, index: int, reading: CloudReading) -> tuple[np.ndarray, int]:
+        cloud, listed = self._clouds[self.names[index]], self._sweeps.get(self.names[index])
+        if listed is None or self.reading.num_sweeps == 1:
             points = point_files.read_points(cloud, self.sensor)
             _expect_sweeps(points[:, 4], cloud)
-            return drop_close(points, self.sensor, mode=mode, close_m=close_m)
+            return drop_close(points, self.sensor, reading)
         files = [sweep.file for sweep in read_list(listed)]
         for i, file in enumerate(files):
             _expect_file(listed.parent / file, self._inside, f"{listed}: $[{i}].file")
         if (listed.parent / files[0]).resolve() != cloud.resolve():
             expected = f"the frame's own cloud, '../clouds/{cloud.name}'"
             raise ValueError(f"{listed}: $[0].file: got {files[0]!r}, expected {expected}")
-        return read_sweeps(listed, self.sensor, remove_close=mode, close_m=close_m, num_sweeps=num_sweeps)
+        return read_sweeps(listed, self.sensor, reading)
 
     def _annotation(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         file = self._boxes[self.names[index]]
@@ -266,13 +260,19 @@ def _read_sensor(root: Path, inside: Path | None) -> Sensor:
     return PRESETS[record]
 
 
-def read_splits(file: Path) -> dict[str, list[str]]:
-    """The splits of a ``splits.json``: name -> frames."""
+def find_folder_splits(root: Path, file: str | Path | None = None) -> list[str]:
+    """Names of the splits in a file, by default ``splits.json``; none where there is no such file."""
+    own = root / _SPLITS
+    return list(_read_splits(Path(file or own))) if file is not None or own.exists() else []
+
+
+def _read_splits(file: Path) -> dict[str, list[str]]:
+    """Name -> frames."""
     return read_json(file, dict[str, list[str]], what="splits")
 
 
 def _read_split(file: Path, split: str, clouds: Collection[str]) -> tuple[str, ...]:
-    splits = read_splits(file)
+    splits = _read_splits(file)
     if split not in splits:
         raise ValueError(f"{file}: split: {unknown_name(split, splits)}")
     where = f"{file}: {split}"

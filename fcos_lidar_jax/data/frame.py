@@ -4,10 +4,11 @@ import dataclasses
 import os
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.projection import remove_close
 from fcos_lidar_jax.sensors import Sensor
@@ -37,6 +38,7 @@ class Frame:
     num_close: int = 0
 
 
+@runtime_checkable
 class FrameSet(Protocol):
     """Frames in a fixed order: what every reader offers to the training pipeline and the commands.
 
@@ -107,12 +109,12 @@ class FrameSet(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class GivenFrames(FrameSet):
+class InMemoryFrames(FrameSet):
     """Frames in memory.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> nothing = Frame(np.zeros((0, 5)), np.zeros((0, 9)), np.zeros(0, int), np.zeros(0, int))
-    >>> len(GivenFrames((nothing,), TINY, ("car",)))
+    >>> len(InMemoryFrames((nothing,), TINY, ("car",)))
     1
     """
 
@@ -135,7 +137,7 @@ class GivenFrames(FrameSet):
 
 
 @dataclasses.dataclass(frozen=True)
-class FramesOf(FrameSet):
+class WrappedFrames(FrameSet):
     """A frame set made of another, from which it has whatever it does not define itself."""
 
     frames: FrameSet
@@ -182,12 +184,12 @@ class FramesOf(FrameSet):
 
 
 @dataclasses.dataclass(frozen=True)
-class ChosenFrames(FramesOf):
+class SelectedFrames(WrappedFrames):
     """Some of the frames, in any order.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> ChosenFrames(SimulatedFrames(TINY, 5), (4, 2)).name(1)
+    >>> SelectedFrames(SimulatedFrames(TINY, 5), (4, 2)).name(1)
     'seed 2'
     """
 
@@ -245,12 +247,9 @@ def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], wh
     return tuple(names)
 
 
-def drop_close(points: np.ndarray, sensor: Sensor, *, mode: str, close_m: float) -> tuple[np.ndarray, int]:
-    """A cloud f32[n, c] without the points on the ego vehicle, and how many they were.
-
-    Mode and metres are those of :func:`fcos_lidar_jax.projection.remove_close`.
-    """
-    kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, mode=mode, close_m=close_m))
+def drop_close(points: np.ndarray, sensor: Sensor, reading: CloudReading) -> tuple[np.ndarray, int]:
+    """A cloud f32[n, c] without the points on the ego vehicle, and how many they were."""
+    kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, reading))
     return points[kept], len(points) - int(kept.sum())
 
 
@@ -275,13 +274,13 @@ def without_points(frame: Frame) -> Frame:
     return dataclasses.replace(frame, points=frame.points[:0].copy(), num_close=0)  # a view would keep the cloud
 
 
-def without_close(frame: Frame, sensor: Sensor, *, mode: str = "all", close_m: float = 1.0) -> Frame:
-    """The frame without the points on the ego vehicle, as detectors are trained; as :func:`drop_close`.
+def without_close(frame: Frame, sensor: Sensor, reading: CloudReading) -> Frame:
+    """The frame without the points on the ego vehicle.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> frame = Frame(np.eye(5, dtype=np.float32) * 9, np.zeros((0, 9)), np.zeros(0), np.zeros(0))
-    >>> len(without_close(frame, TINY).points)
+    >>> len(without_close(frame, TINY, CloudReading(1, "all")).points)
     2
     """
-    points, number = drop_close(frame.points, sensor, mode=mode, close_m=close_m)
+    points, number = drop_close(frame.points, sensor, reading)
     return dataclasses.replace(frame, points=points, num_close=frame.num_close + number)

@@ -1,12 +1,12 @@
 """KITTI object detection: Velodyne clouds with labels in camera coordinates."""
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside, find_bad_box
-from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, distinct_names, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.sweeps import is_rotation
@@ -56,7 +56,7 @@ class KittiFrames(FrameSet):
         split: frames and order from ``ImageSets/SPLIT.txt``, a name a line; all frames, sorted, without it.
         sensor: beam table, limits and intensity scale.
         image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.
-        remove_close, close_m: as in :func:`~fcos_lidar_jax.data.sweeps.fuse_sweeps`; a frame is one sweep.
+        reading: which points on the ego vehicle are dropped; a frame is one sweep.
 
     Raises:
         ValueError: here or on reading a frame, naming the file, the line, the field, found and expected.
@@ -71,11 +71,9 @@ class KittiFrames(FrameSet):
         *,
         sensor: Sensor = KITTI_HDL64E,
         image_size: tuple[int, int] | None = IMAGE_SIZE,
-        remove_close: Literal["all", "sweeps", "none"] = "all",
-        close_m: float = 1.0,
+        reading: CloudReading = CloudReading(),
     ) -> None:
-        self.root, self.sensor, self.image_size = Path(root), sensor, image_size
-        self.remove_close, self.close_m = remove_close, close_m
+        self.root, self.sensor, self.image_size, self.reading = Path(root), sensor, image_size, reading
         clouds = _stems(self.root / "training" / "velodyne", ".bin")
         self.names = tuple(sorted(clouds)) if split is None else _read_split(self.root, split, clouds)
         """Names of the frames: of their files, without the extension."""
@@ -101,7 +99,7 @@ class KittiFrames(FrameSet):
         kept = np.ones(len(points), bool)
         if self.image_size is not None:
             kept = in_image(points, calibration["P2"] @ calibration["velo_to_rect"], self.image_size)
-        points, num_close = drop_close(points[kept], self.sensor, mode=self.remove_close, close_m=self.close_m)
+        points, num_close = drop_close(points[kept], self.sensor, self.reading)
         return Frame(points, boxes, labels, count_inside(points, boxes), num_close)
 
     def labels(self, index: int) -> np.ndarray:
@@ -112,7 +110,7 @@ class KittiFrames(FrameSet):
 
     def fingerprint(self) -> str:
         files = (self._file(kind, name) for kind in ("velodyne", "label_2", "calib") for name in self.names)
-        reading = self.names, self.sensor, self.image_size, self.remove_close, self.close_m
+        reading = self.names, self.sensor, self.image_size, self.reading.remove_close, self.reading.close_m
         return files_fingerprint(files, self.root, reading)
 
     def _file(self, kind: str, name: str) -> Path:

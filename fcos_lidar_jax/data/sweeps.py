@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.projection import close_to_sensor
@@ -38,9 +39,7 @@ class ListedSweep(msgspec.Struct):
     sensor_to_world: tuple[_Row, _Row, _Row, _Row]  # from its own frame
 
 
-def fuse_sweeps(
-    sweeps: Iterable[Sweep], sensor: Sensor, *, remove_close: str, close_m: float
-) -> tuple[np.ndarray, int]:
+def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) -> tuple[np.ndarray, int]:
     """Sweeps in the frame of the first, which is the current one (paper, section 4).
 
     Poses are composed in float64 and times subtracted as whole microseconds; only the result is float32. The
@@ -48,32 +47,25 @@ def fuse_sweeps(
 
     Args:
         sweeps: the current one, then the others by age.
-        remove_close: drop the points on the ego vehicle, judged in each sweep's own frame: of ``"all"`` sweeps, of
-            the older ``"sweeps"``, or ``"none"``.
-        close_m: half the side of the square that is emptied, metres.
+        reading: which points on the ego vehicle are dropped. All given sweeps are fused.
 
     Returns:
         f32[n, c] with the time lag in seconds as fifth column, exactly 0 for the current sweep; and how many
         points were dropped.
-
-    Raises:
-        ValueError: unknown ``remove_close``.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> there, before = np.eye(4), np.eye(4)
     >>> there[0, 3] = 2.0  # the ego vehicle went on by two metres
     >>> point = np.array([[9, 0, 0, 1, 0]], np.float32)
     >>> sweeps = Sweep(point, there, 500), Sweep(point, before, 0)
-    >>> fuse_sweeps(sweeps, TINY, remove_close="all", close_m=1.0)[0][:, 0].tolist()
+    >>> fuse_sweeps(sweeps, TINY, CloudReading(2))[0][:, 0].tolist()
     [9.0, 7.0]
     """
-    if remove_close not in ("all", "sweeps", "none"):
-        raise ValueError(f"remove_close: got {remove_close!r}, expected 'all', 'sweeps' or 'none'")
     parts, num_close, now_us, world_to_current = [], 0, 0, np.eye(4)
     for index, sweep in enumerate(sweeps):
         points = sweep.points.copy()
-        if remove_close == "all" or (remove_close == "sweeps" and index > 0):
-            close = np.asarray(close_to_sensor(points, sensor, close_m))
+        if reading.remove_close == "all" or (reading.remove_close == "sweeps" and index > 0):
+            close = np.asarray(close_to_sensor(points, sensor, reading.close_m))
             num_close += int(close.sum())
             points = points[~close]
         if index == 0:
@@ -91,10 +83,8 @@ def fuse_sweeps(
 def read_sweeps(
     path: Path,
     sensor: Sensor,
+    reading: CloudReading,
     *,
-    remove_close: str,
-    close_m: float,
-    num_sweeps: int | None = None,
     columns: int | None = None,
     dtype: str | None = None,
     max_points: int = MAX_POINTS,
@@ -103,7 +93,7 @@ def read_sweeps(
 
     Args:
         path: the JSON file, see :func:`read_list`.
-        num_sweeps: how many of the list to read at most, from the current one on; None for all.
+        reading: how many of the list to read at most, from the current one on, and without which points.
         columns, dtype, max_points: of the files, as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
 
     Raises:
@@ -119,8 +109,8 @@ def read_sweeps(
             raise ValueError(f"{path}: $[{index}].file: {error}") from None
         return Sweep(points, np.array(each.sensor_to_world), each.timestamp_us)
 
-    sweeps = (read(index, each) for index, each in enumerate(read_list(path)[:num_sweeps]))
-    return fuse_sweeps(sweeps, sensor, remove_close=remove_close, close_m=close_m)
+    sweeps = (read(index, each) for index, each in enumerate(read_list(path)[: reading.num_sweeps]))
+    return fuse_sweeps(sweeps, sensor, reading)
 
 
 def read_list(path: Path) -> list[ListedSweep]:
@@ -197,12 +187,12 @@ def about_z(yaw_rad: float) -> np.ndarray:
     return pose
 
 
-def before_turning(sensor: Sensor, yaw_rad: float) -> Sensor:
+def sensor_before_rotation(sensor: Sensor, yaw_rad: float) -> Sensor:
     """The sensor in the frame that becomes its own by a rotation about z.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> ahead = dataclasses.replace(TINY, origin_m=(0.0, 1.0, 2.0))
-    >>> np.round(before_turning(ahead, np.pi / 2).origin_m, 3).tolist()
+    >>> np.round(sensor_before_rotation(ahead, np.pi / 2).origin_m, 3).tolist()
     [1.0, 0.0, 2.0]
     """
     if yaw_rad == 0:

@@ -1,16 +1,20 @@
-"""From points to boxes."""
+"""From points to boxes: one cloud, many frames, drives."""
 
 from fcos_lidar_jax.inference.detect import Stages, make_detect, make_stages
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
 from fcos_lidar_jax.inference.load import Backend, load_detector, load_trained
+from fcos_lidar_jax.inference.prediction import Prediction, evaluate, predict
 
 __all__ = [
     "Backend",
     "CloudDetector",
+    "Prediction",
     "Stages",
     "TrainedDetector",
+    "evaluate",
     "load_detector",
     "load_trained",
     "make_detect",
     "make_stages",
+    "predict",
 ]

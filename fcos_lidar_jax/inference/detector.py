@@ -14,12 +14,12 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
-from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
+from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.types import Detections
 
 
@@ -88,7 +88,7 @@ class CloudDetector(abc.ABC):
         return self.detect(make_cloud(cloud, self.config, sensor=sensor))
 
     def detect(self, cloud: Cloud) -> Detections:
-        """Boxes in one cloud of :func:`~fcos_lidar_jax.inference.cloud.make_cloud`, as NumPy arrays."""
+        """Boxes in one cloud of :func:`~fcos_lidar_jax.data.cloud_policy.make_cloud`, as NumPy arrays."""
         mesh = make_mesh(jax.local_devices()[:1])
         found = self.program(mesh)(*shard_batch((cloud.points[None], cloud.valid[None]), mesh))
         return jax.tree.map(lambda leaf: leaf[0], jax.device_get(found))

@@ -20,15 +20,15 @@ from jax import export, lax
 from jax.sharding import Mesh
 
 from fcos_lidar_jax import __version__
+from fcos_lidar_jax.checkpoints.storage import CheckpointError, with_later_fields
 from fcos_lidar_jax.config import config_from_json, config_to_json
+from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.files import checksum
-from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, jit_split
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.projection import remove_close as without_close
+from fcos_lidar_jax.projection import remove_close
 from fcos_lidar_jax.sensors import sensor_from_json, sensor_to_json
-from fcos_lidar_jax.training.checkpoint import CheckpointError, with_later_fields
 from fcos_lidar_jax.types import Detections
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -147,18 +147,18 @@ def export_detector(detector: TrainedDetector, *, num_points: Size | None = None
 
 
 def _whole_path(detector: TrainedDetector, batch: Size) -> Callable[..., dict[str, jax.Array]]:
-    detect, config, sensor = make_detect(detector.model), detector.config.projection, detector.sensor
+    detect, reading, sensor = make_detect(detector.model), detector.config.reading, detector.sensor
     weights = jax.tree.map(np.asarray, detector.variables)
 
-    def one(variables: Any, points: jax.Array, valid: jax.Array, remove_close: jax.Array) -> Detections:
+    def one(variables: Any, points: jax.Array, valid: jax.Array, removes_close: jax.Array) -> Detections:
         usable = valid & usable_rows(points)
-        far = without_close(points, usable, sensor, mode=config.remove_close, close_m=config.close_m)
-        return detect(variables, points, jnp.where(remove_close, far, usable))
+        far = remove_close(points, usable, sensor, reading)
+        return detect(variables, points, jnp.where(removes_close, far, usable))
 
-    def whole(points: jax.Array, valid: jax.Array, remove_close: jax.Array) -> dict[str, jax.Array]:
+    def whole(points: jax.Array, valid: jax.Array, removes_close: jax.Array) -> dict[str, jax.Array]:
         # As constants that are not folded, so that they are computed with as if they were arguments.
         variables = lax.optimization_barrier(jax.tree.map(jnp.asarray, weights))
-        found = over_clouds(one, batch)(variables, points, valid, remove_close)
+        found = over_clouds(one, batch)(variables, points, valid, removes_close)
         return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
 
     return whole

@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import Literal, get_args
 
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import load_checkpoint
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
 from fcos_lidar_jax.inference.export import load_exported
 from fcos_lidar_jax.inference.openvino import with_openvino
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.training.checkpoint import load_checkpoint
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 
 Backend = Literal["xla", "openvino"]
 

@@ -6,8 +6,9 @@ from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
-from fcos_lidar_jax.data.sweeps import Sweep, about_z, before_turning, fuse_sweeps, turned
-from fcos_lidar_jax.inference.cloud import Cloud, expect_points, make_cloud
+from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud
+from fcos_lidar_jax.data.sweeps import Sweep, about_z, fuse_sweeps, sensor_before_rotation, turned
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.types import Detections
@@ -26,7 +27,7 @@ def detect_stream(
     sweeps: Iterable[Sweep],
     detector: CloudDetector,
     *,
-    num_sweeps: int | None = None,
+    reading: CloudReading | None = None,
     at_us: Collection[int] | None = None,
     yaw_rad: float = 0.0,
 ) -> Iterator[Found]:
@@ -37,8 +38,8 @@ def detect_stream(
     Args:
         sweeps: in the order of time; an iterator that waits for the next sweep will do.
         detector: compiled once, for the first sweep.
-        num_sweeps: of the window, the current one included; default: as the detector was trained. 1 where poses
-            are not known.
+        reading: sweeps to fuse and points to drop; default: as the detector was trained. One sweep where poses are
+            not known.
         at_us: times of the sweeps to detect in; the others are only fused into later ones. Default: all.
         yaw_rad: by which sweeps are turned about z for the detector, and boxes back: pi / 2 for a sensor whose x
             axis points ahead and a detector of one whose y axis does. A detector finds less in clouds that are
@@ -55,10 +56,10 @@ def detect_stream(
     >>> [found.sweep.time_us for found in detect_stream(sweeps, load_detector("quickstart"))]
     [0, 1]
     """
-    window: deque[Sweep] = deque(maxlen=detector.config.num_sweeps if num_sweeps is None else num_sweeps)
-    projection, sensor = detector.config.projection, detector.sensor
+    reading, sensor = reading or detector.config.reading, detector.sensor
+    window: deque[Sweep] = deque(maxlen=reading.num_sweeps)
     before: Sweep | None = None
-    turn, unturned = about_z(yaw_rad), before_turning(sensor, yaw_rad)
+    turn, unturned = about_z(yaw_rad), sensor_before_rotation(sensor, yaw_rad)
     for sweep in sweeps:
         if before is not None and sweep.time_us <= before.time_us:
             raise ValueError(
@@ -69,12 +70,10 @@ def detect_stream(
         before = sweep
         if at_us is not None and sweep.time_us not in at_us:
             continue
-        points, num_close = fuse_sweeps(
-            window, unturned, remove_close=projection.remove_close, close_m=projection.close_m
-        )
+        points, num_close = fuse_sweeps(window, unturned, reading)
         if yaw_rad:
             points = turned(points, turn)
-        cloud = make_cloud(points, detector.config, sensor=sensor, num_close=num_close, remove_close="none")
+        cloud = make_cloud(points, detector.config, sensor=sensor, num_close=num_close)
         found = detector.detect(cloud)
         expect_points(sweep.name, cloud, int(found.num_dropped), sensor)
         if yaw_rad:

@@ -6,8 +6,8 @@ from typing import Any, cast
 import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import find_bad_box
+from fcos_lidar_jax.data.cloud_policy import usable_rows, write_points
 from fcos_lidar_jax.data.frame import Frame, FrameSet
-from fcos_lidar_jax.inference.cloud import usable_rows, write_points
 from fcos_lidar_jax.types import Batch
 
 _INSPECTED = 20  # Frames whose counts of points are looked at.
@@ -34,7 +34,7 @@ def fill_row(
 ) -> dict[str, int]:
     """Write one sample into a row of a batch of NumPy arrays.
 
-    Points follow the one policy of :mod:`fcos_lidar_jax.inference.cloud`. Where there are too many boxes, those
+    Points follow the one policy of :mod:`fcos_lidar_jax.data.cloud_policy`. Where there are too many boxes, those
     with the fewest points go, among equals the last; the others keep their order.
 
     Args:

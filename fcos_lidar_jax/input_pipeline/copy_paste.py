@@ -6,7 +6,7 @@ import numpy as np
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.box_geometry import footprints_overlap, points_in_boxes
-from fcos_lidar_jax.data.classes import map_labels
+from fcos_lidar_jax.data.class_mapping import map_labels
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 

@@ -21,11 +21,12 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
+from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, checksum
-from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
 from fcos_lidar_jax.workers import end_with_parent
 
@@ -158,6 +159,11 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
         )
     shard = np.repeat(np.arange(len(tables), dtype=np.int32), [len(table) for table in tables])
     return GroundTruthDatabase(folder, manifest, rows, shard)
+
+
+def cut_reading(num_sweeps: int) -> CloudReading:
+    """How the frames are read that objects are cut from."""
+    return CloudReading(num_sweeps, "all")
 
 
 def objects_folder(index: Path, split: str | None) -> Path:

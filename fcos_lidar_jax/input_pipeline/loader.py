@@ -21,8 +21,8 @@ import jax
 import numpy as np
 
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.inference.cloud import usable_rows
 from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
@@ -181,6 +181,7 @@ def make_batches(
     workers: int = 0,
     packing: Packing | None = None,
     lend: bool = False,
+    order: SampleOrder | None = None,
 ) -> Iterator[Iterator[HostBatch]]:
     """The batches of a run from some step on, prepared ahead; leaving the context stops all that prepares them.
 
@@ -203,12 +204,13 @@ def make_batches(
             fit comes plain, and a line on standard error says why, once.
         lend: leave batches of workers in the memory through which they came, and save a copy. Keep none of their
             arrays then: they fill memory that the workers need, and must be gone before the process ends.
+        order: of the samples, where it is known already.
 
     Yields:
         an iterator over :class:`fcos_lidar_jax.types.HostBatch`, of this process's rows.
 
     Raises:
-        ValueError: sizes that do not divide, no frames, or no objects where some are to be pasted. From the
+        ValueError: sizes that do not divide, or no frames; :func:`check_loader_options` refuses the rest. From the
             iterator: a frame that cannot be read, or one that does not fit the packing where there are several
             processes, for all of them must run the same program.
     """
@@ -218,13 +220,12 @@ def make_batches(
     if not 0 <= first_step <= num_steps:
         raise ValueError(f"first_step: got {first_step}, expected 0 to {num_steps}")
     threads = default_threads(workers) if threads is None else threads
-    check_loader_options(config, objects, threads=threads, workers=workers, num_processes=num_processes)
     size = config.optimizer.batch_size
     if not 0 <= process_index < num_processes or size % num_processes:
         raise ValueError(
             f"process {process_index} of {num_processes}: expected a number that divides the batch of {size}"
         )
-    order = SampleOrder(frames, config, seed=seed)
+    order = order or SampleOrder(frames, config, seed=seed)
     batch_of = _BatchOf(
         frames=frames,
         config=config,

@@ -1,48 +1,113 @@
-"""One way to open any data set: its layout is recognised, its reader chosen, its classes translated."""
+"""One way to open any data set: one row per format says how it is recognised and read."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, assert_never
+from typing import Any, Literal
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
-from fcos_lidar_jax.data.classes import ClassMap, MappedFrames, mapped_classes, unknown_name
-from fcos_lidar_jax.data.folder import SPLITS, FolderFrames, read_splits
+from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes, unknown_name
+from fcos_lidar_jax.data.folder import FolderFrames, find_folder_splits
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.kitti import KittiFrames
-from fcos_lidar_jax.data.nuscenes.reader import NuScenes, NuScenesFrames
-from fcos_lidar_jax.data.nuscenes.splits import own_splits
+from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
+from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL, own_splits
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
-from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames, city_frames
+from fcos_lidar_jax.simulation.frame_set import SIMULATED_SPLITS, simulated_split
 
 Format = Literal["nuscenes", "kitti", "argoverse2", "folder", "simulated"]
 
-_MARKS: dict[Format, tuple[str, ...]] = {  # by what a layout is recognised: one of these is there
-    "nuscenes": ("*/sample.json",),
-    "kitti": ("training/velodyne",),
-    "argoverse2": ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar"),
-    "folder": ("clouds",),
-}
 
-_FULL_REACH_M = 45.0
-_SIMULATED = {"train": (100_000, 0), "val": (400, UNSEEN_SEED)}  # number of frames, the first one's seed
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """A format of data sets.
+
+    Attributes:
+        name: one of :data:`Format`.
+        marks: patterns; a folder where one of them matches is of this format. ``()``: the frames are not on disk.
+        sensor: whose points the frames hold unless told otherwise; None where the data say it.
+        splits: ``(data set, file of own splits) -> names of the splits``.
+        open: ``(data set, split, sensor, reading, **options) -> frames``.
+        options: further options of :func:`open_frames` that this format takes.
+    """
+
+    name: Format
+    marks: tuple[str, ...]
+    sensor: Sensor | None
+    splits: Callable[["DataSet", str | Path | None], list[str]]
+    open: Callable[..., FrameSet]
+    options: tuple[str, ...] = ()
+
+
+READERS = (
+    Reader(
+        "nuscenes",
+        ("*/sample.json",),
+        NUSCENES_HDL32E,
+        lambda data, file: list(own_splits(data.root / data.version, file) or OFFICIAL),
+        lambda data, *how, **options: open_keyframes(data.root, data.version, *how, **options),
+        ("version", "index", "splits", "allow_missing_sweeps", "follow_links"),
+    ),
+    Reader(
+        "kitti",
+        ("training/velodyne",),
+        KITTI_HDL64E,
+        lambda data, _: sorted(file.stem for file in (data.root / "ImageSets").glob("*.txt")),
+        lambda data, split, sensor, reading: KittiFrames(data.root, split, sensor=sensor, reading=reading),
+    ),
+    Reader(
+        "argoverse2",
+        ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar"),
+        ARGOVERSE2,
+        lambda data, _: find_splits(data.root),
+        lambda data, split, sensor, reading: Argoverse2Frames(data.root, split, sensor=sensor, reading=reading),
+    ),
+    Reader(
+        "folder",
+        ("clouds",),
+        None,
+        lambda data, file: find_folder_splits(data.root, file),
+        lambda data, split, sensor, reading, **options: FolderFrames(
+            data.root, sensor, split=split, reading=reading, **options
+        ),
+        ("splits", "follow_links"),
+    ),
+    Reader(
+        "simulated",
+        (),
+        NUSCENES_HDL32E,
+        lambda data, _: list(SIMULATED_SPLITS),
+        lambda data, split, sensor, reading: simulated_split(split or "train", sensor, reading),
+    ),
+)
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
-    """What kind of data set a folder holds."""
+class DataSet:
+    """A folder and its format."""
 
     root: Path
-    format: Format
-    version: str | None  # Folder of the tables, for nuScenes alone.
+    reader: Reader
+    version: str = ""  # Folder of the tables, for nuScenes only.
+
+    @property
+    def on_disk(self) -> bool:
+        return bool(self.reader.marks)
+
+    @property
+    def tables(self) -> Path | None:
+        """The folder of nuScenes' tables; None for other formats."""
+        return self.root / self.version if self.version else None
 
     @property
     def index(self) -> Path:
         """Where ``prepare`` writes by default, and where its index is looked for."""
-        return self.root / ".fcos_lidar" / (self.version or "")
+        return self.root / ".fcos_lidar" / self.version
 
 
-def find_layout(root: str | Path | None, format: Format | None = None, version: str | None = None) -> Layout:
-    """What kind of data set a folder holds.
+def find_data_set(root: str | Path | None, format: str | None = None, version: str | None = None) -> DataSet:
+    """The format of the data set that a folder holds.
 
     Args:
         root: the folder; None for simulated frames.
@@ -52,53 +117,57 @@ def find_layout(root: str | Path | None, format: Format | None = None, version: 
     Raises:
         ValueError: not one format's or version's, naming the folder and what was looked for.
     """
-    if format == "simulated":
+    if format is not None and format not in (names := [reader.name for reader in READERS]):
+        raise ValueError(f"format: {unknown_name(format, names)}")
+    readers = [reader for reader in READERS if reader.name == format]
+    if readers and not readers[0].marks:
         if root is not None:
-            raise ValueError(f"data root: got {root}, expected none for simulated frames")
-        if version is not None:
-            raise ValueError(f"version: got {version!r}, expected none for simulated frames")
-        return Layout(Path("simulated"), format, None)
-    if root is None:
-        raise ValueError("data root: missing, expected the folder of a data set")
-    root = Path(root)
-    if not root.is_dir():
-        raise ValueError(f"{root}: no such folder, expected a data set")
-    known = _recognise(root) if format is None else format
-    if known not in _MARKS:
-        raise ValueError(f"format: {unknown_name(known, _MARKS)}")
-    if known == "nuscenes":
-        there = sorted(file.parent.name for file in root.glob("*/sample.json")) if version is None else [version]
-        if len(there) != 1:
-            raise ValueError(f"{root}: got versions {', '.join(there) or '(none)'}, expected one: name it")
-        version = there[0]
-    elif version is not None:
-        raise ValueError(f"version: got {version!r}, expected none: {root} is of format {known}")
-    return Layout(root, known, version)
+            raise ValueError(f"data root: got {root}, expected none for {format} frames")
+        data = DataSet(Path(readers[0].name), readers[0])
+    else:
+        if root is None:
+            raise ValueError("data root: missing, expected the folder of a data set")
+        root = Path(root)
+        if not root.is_dir():
+            raise ValueError(f"{root}: no such folder, expected a data set")
+        data = DataSet(root, readers[0] if readers else _recognise(root))
+    if "version" not in data.reader.options:
+        _refuse(data, version=version)
+        return data
+    there = [version] if version else sorted(file.parent.name for file in data.root.glob("*/sample.json"))
+    if len(there) != 1:
+        raise ValueError(f"{root}: got versions {', '.join(there) or '(none)'}, expected one: name it")
+    return dataclasses.replace(data, version=there[0])
 
 
-def _recognise(root: Path) -> Format:
-    found: list[Format] = [
-        name for name, marks in _MARKS.items() if any(next(root.glob(mark), None) for mark in marks)
-    ]
-    if len(found) > 1:
-        raise ValueError(f"{root}: looks like {' and '.join(found)}, expected one format: name it")
-    if not found:
-        marks = ", ".join(f"{' or '.join(marks)} ({name})" for name, marks in _MARKS.items())
+def _recognise(root: Path) -> Reader:
+    matching = [reader for reader in READERS if any(next(root.glob(mark), None) for mark in reader.marks)]
+    if len(matching) > 1:
+        names = " and ".join(reader.name for reader in matching)
+        raise ValueError(f"{root}: looks like {names}, expected one format: name it")
+    if not matching:
+        marks = ", ".join(f"{' or '.join(reader.marks)} ({reader.name})" for reader in READERS if reader.marks)
         raise ValueError(f"{root}: no known data set, expected one of {marks}")
-    return found[0]
+    return matching[0]
+
+
+def _refuse(data: DataSet, **options: object) -> None:
+    for name, value in options.items():
+        if value and name not in data.reader.options:
+            raise ValueError(f"{name}: got {value}, expected none: {data.root} is of format {data.reader.name}")
 
 
 def default_split(
-    layout: Layout, purpose: Literal["train", "val"], *, required: bool, splits: str | Path | None = None
+    data: DataSet, purpose: Literal["train", "val"], *, required: bool, splits: str | Path | None = None
 ) -> str | None:
     """The split that is meant unless another is named: ``train`` or ``val``.
 
     For nuScenes versions that end in mini: ``mini_train`` or ``mini_val``.
 
     Args:
-        layout: of the data set.
+        data: the data set.
         purpose: what it is for.
-        required: where the data have one other split alone, take that, unless it is for the other purpose by its
+        required: where the data have only one other split, take that, unless it is for the other purpose by its
             name; where they have several, refuse to choose.
         splits: JSON file of own splits.
 
@@ -108,31 +177,15 @@ def default_split(
     Raises:
         ValueError: one is required, and the splits are several or for the other purpose.
     """
-    name = f"mini_{purpose}" if (layout.version or "").endswith("mini") else purpose
-    names = _split_names(layout, splits)
-    if name in names or (layout.format == "nuscenes" and not names):
+    name = f"mini_{purpose}" if data.version.endswith("mini") else purpose
+    names = data.reader.splits(data, splits)
+    if name in names:
         return name
     if not required or not names:
         return None
     if len(names) > 1 or names[0] in ("train", "val", "mini_train", "mini_val"):
-        raise ValueError(f"{layout.root}: split: got splits {', '.join(names)}, none is {name}: name one")
+        raise ValueError(f"{data.root}: split: got splits {', '.join(names)}, none is {name}: name one")
     return names[0]
-
-
-def _split_names(layout: Layout, splits: str | Path | None) -> list[str]:
-    """Splits that the data set defines itself; nuScenes' official ones are in its devkit."""
-    if layout.format == "nuscenes":
-        return list(own_splits(layout.root / (layout.version or ""), splits))
-    if layout.format == "simulated":
-        return list(_SIMULATED)
-    if layout.format == "kitti":
-        return sorted(file.stem for file in (layout.root / "ImageSets").glob("*.txt"))
-    if layout.format == "argoverse2":
-        return find_splits(layout.root)
-    if layout.format == "folder":
-        file = layout.root / SPLITS if splits is None else Path(splits)
-        return list(read_splits(file)) if splits is not None or file.exists() else []
-    assert_never(layout.format)
 
 
 def open_frames(
@@ -142,16 +195,15 @@ def open_frames(
     version: str | None = None,
     split: str | None = None,
     sensor: Sensor | None = None,
-    num_sweeps: int = 1,
-    remove_close: Literal["all", "sweeps", "none"] = "sweeps",
-    close_m: float = 1.0,
+    num_sweeps: int | None = None,
+    reading: CloudReading | None = None,
     class_map: ClassMap | None = None,
     index: str | Path | None = None,
     splits: str | Path | None = None,
     allow_missing_sweeps: bool = False,
     follow_links: bool = False,
 ) -> FrameSet:
-    """The frames of a data set in any layout that there is a reader for.
+    """The frames of a data set in any format that there is a reader for.
 
     Args:
         root: the folder; None for simulated frames.
@@ -160,10 +212,8 @@ def open_frames(
         version: of nuScenes; may be left out where there is one.
         split: name of the part that is wanted; all frames by default, see also :func:`default_split`.
         sensor: whose points they are; by default the format's own.
-        num_sweeps: sweeps fused at most, the current one included; fewer where the data have fewer.
-        remove_close: drop the points on the ego vehicle, judged in each sweep's own frame: of ``"all"`` sweeps, of
-            the older ``"sweeps"``, or ``"none"``.
-        close_m: half the side of the square that is emptied, metres.
+        num_sweeps: sweeps fused at most, the current one included; default: as in ``reading``.
+        reading: which points are read, such as ``config.reading``; default: ``CloudReading()``.
         class_map: the data's name -> another, None for objects to leave out; other names stay.
         index: of nuScenes, where ``prepare`` has put it.
         splits: JSON file of own splits, ``{"name": [scene, ...]}`` for nuScenes, of frames for a folder.
@@ -171,8 +221,8 @@ def open_frames(
         follow_links: of nuScenes and folders: read files to which links lead outside of the root.
 
     Returns:
-        frames whose labels count their own classes; :class:`~fcos_lidar_jax.data.classes.MappedFrames` brings them
-        to those of a detector.
+        frames with labels of their own classes; :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames` brings
+        them to those of a detector.
 
     Raises:
         ValueError: in one line, what was found and what was expected.
@@ -182,47 +232,19 @@ def open_frames(
     Traceback (most recent call last):
     ValueError: ...: no known data set, expected one of ...
     """
-    layout = find_layout(root, format, version)
-    refused = {"index": index, "allow_missing_sweeps": allow_missing_sweeps or None}
-    if layout.format != "folder":
-        refused |= {"splits": splits, "follow_links": follow_links or None}
-    for name, value in refused.items():
-        if value is not None and layout.format != "nuscenes":
-            raise ValueError(f"{name}: got {value}, expected none: {layout.root} is of format {layout.format}")
-    if num_sweeps < 1:
-        raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
-    close: Any = {"remove_close": remove_close, "close_m": close_m}
-    if layout.format == "simulated":
-        frames = _simulated_frames(split, sensor or NUSCENES_HDL32E, num_sweeps, remove_close, close_m)
-    elif layout.format == "nuscenes":
-        allowed = {"allow_missing_sweeps": allow_missing_sweeps, "follow_links": follow_links}
-        data = NuScenes(layout.root, str(layout.version), index=index, **allowed)
-        tokens = data.sample_tokens if split is None else data.split(split, file=splits)
-        frames = NuScenesFrames(data, tuple(tokens), num_sweeps, sensor=sensor or NUSCENES_HDL32E, **close)
-    elif layout.format == "kitti":
-        frames = KittiFrames(layout.root, split, sensor=sensor or KITTI_HDL64E, **close)
-    elif layout.format == "argoverse2":
-        frames = Argoverse2Frames(layout.root, split, sensor=sensor or ARGOVERSE2, num_sweeps=num_sweeps, **close)
-    elif layout.format == "folder":
-        close["follow_links"] = follow_links
-        frames = FolderFrames(layout.root, sensor, split=split, splits=splits, num_sweeps=num_sweeps, **close)
-    else:
-        assert_never(layout.format)
+    data = find_data_set(root, format, version)
+    given: dict[str, Any] = {
+        "index": index,
+        "splits": splits,
+        "allow_missing_sweeps": allow_missing_sweeps,
+        "follow_links": follow_links,
+    }
+    _refuse(data, **given)
+    reading = reading or CloudReading()
+    if num_sweeps is not None:
+        reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
+    options = {name: value for name, value in given.items() if name in data.reader.options}
+    frames = data.reader.open(data, split, sensor or data.reader.sensor, reading, **options)
     if class_map is None:
         return frames
     return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
-
-
-def _simulated_frames(
-    split: str | None, sensor: Sensor, num_sweeps: int, remove_close: str, close_m: float
-) -> FrameSet:
-    """Streets that fit the sensor: what is near in plain ones for one of a short reach, else varied ones."""
-    split = split or "train"
-    if split not in _SIMULATED:
-        raise ValueError(f"split: {unknown_name(split, _SIMULATED)}")
-    number, first = _SIMULATED[split]
-    # The simulated ego vehicle has no body that the sensor could see: what is close is the road.
-    close_m = 0.0 if remove_close == "none" else close_m
-    if sensor.limit_xy_m < _FULL_REACH_M:
-        return SimulatedFrames(sensor, number, first, num_sweeps=num_sweeps, close_m=close_m)
-    return dataclasses.replace(city_frames(sensor, number, first), num_sweeps=num_sweeps, close_m=close_m)

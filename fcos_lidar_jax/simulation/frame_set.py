@@ -4,7 +4,8 @@ import dataclasses
 
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.config import CloudReading, Config
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.sensors import Sensor, load_sensor
@@ -33,8 +34,7 @@ class SimulatedFrames(FrameSet):
     num_objects: int = 14  # for this and the following fields see make_frame
     reach_m: float = 10.0
     min_points: int = 5
-    close_m: float = 1.0
-    num_sweeps: int = 1
+    reading: CloudReading = CloudReading()
     fast_traffic: bool = False
     streets: Streets = PLAIN
     classes = NUSCENES_CLASSES
@@ -49,8 +49,7 @@ class SimulatedFrames(FrameSet):
             num_objects=self.num_objects,
             reach_m=self.reach_m,
             min_points=self.min_points,
-            close_m=self.close_m,
-            num_sweeps=self.num_sweeps,
+            reading=self.reading,
             fast_traffic=self.fast_traffic,
             streets=self.streets,
         )
@@ -75,6 +74,24 @@ def city_frames(sensor: Sensor, number: int, first_seed: int = 0, *, streets: St
 
 
 UNSEEN_SEED = 1_000_000  # first seed of test frames; seeds of training frames are smaller
+SIMULATED_SPLITS = {"train": (100_000, 0), "val": (400, UNSEEN_SEED)}  # number of frames, first seed
+_FULL_REACH_M = 45.0
+
+
+def simulated_split(split: str, sensor: Sensor, reading: CloudReading) -> SimulatedFrames:
+    """Streets that fit the sensor: plain streets for a short range, varied streets otherwise.
+
+    Raises:
+        ValueError: unknown split.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> len(simulated_split("val", TINY, CloudReading()))
+    400
+    """
+    if split not in SIMULATED_SPLITS:
+        raise ValueError(f"split: {unknown_name(split, SIMULATED_SPLITS)}")
+    make = SimulatedFrames if sensor.limit_xy_m < _FULL_REACH_M else city_frames
+    return dataclasses.replace(make(sensor, *SIMULATED_SPLITS[split]), reading=reading)
 
 
 def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config, SimulatedFrames]:

@@ -1,8 +1,11 @@
 """Simulated frames: one sweep or several fused sweeps, with the boxes at the time of the current sweep."""
 
+import dataclasses
+
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
@@ -20,9 +23,8 @@ def make_frame(
     num_objects: int = 12,
     reach_m: float | None = None,
     min_points: int = 1,
-    num_sweeps: int = 1,
+    reading: CloudReading = WHOLE_SWEEP,
     fast_traffic: bool = False,
-    close_m: float = 0.0,
     streets: Streets = PLAIN,
 ) -> Frame:
     """Simulate a frame of a street. The bytes depend only on the arguments, not on the order of calls.
@@ -34,20 +36,15 @@ def make_frame(
         num_objects: number of objects, or their mean with ``streets.setting``; objects without room are omitted.
         reach_m: maximum distance of the objects along the street; by default 80 % of the sensor's range limit.
         min_points: objects with fewer points in the current sweep are not annotated.
-        num_sweeps: number of fused sweeps, including the current one; the world moves between sweeps.
+        reading: the sweeps to fuse, see :func:`scan_sweeps`; the world moves between sweeps.
         fast_traffic: see :func:`~.world.sample_world`.
-        close_m: see :func:`scan_sweeps`.
-
-    Raises:
-        ValueError: fewer than one sweep.
+        streets: how varied they are.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> a, b = make_frame(3, TINY), make_frame(3, TINY)
     >>> bool((a.points == b.points).all()), bool((a.num_points >= 1).all())
     (True, True)
     """
-    if num_sweeps < 1:
-        raise ValueError(f"num_sweeps: got {num_sweeps}, expected at least 1")
     rng = np.random.default_rng([seed, 0xF0C5])
     mix = rng.spawn(1)[0]
     if streets.setting:
@@ -58,11 +55,11 @@ def make_frame(
     else:
         labels = rng.permutation(np.resize(rng.permutation(len(NUSCENES_CLASSES)), num_objects))
     reach = 0.8 * sensor.limit_xy_m if reach_m is None else reach_m
-    now_s = (num_sweeps - 1 + streets.rolling_shutter) * SWEEP_S
+    now_s = (reading.num_sweeps - 1 + streets.rolling_shutter) * SWEEP_S
     options = {"level": not streets.slopes, "fused": True, "fast_traffic": fast_traffic, "streets": streets}
     world = sample_world(rng, reach_m=reach, beyond_m=2 * reach, duration_s=now_s, labels=labels, **options)
     mount = sample_mount(rng, sensor, level=not streets.slopes, streets=streets)
-    points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, num_sweeps=num_sweeps, close_m=close_m)
+    points, num_close = scan_sweeps(world, sensor, mount, now_s, rng, reading)
     boxes = boxes_in_sensor_frame(world, sensor_pose(world, mount, now_s), now_s).astype(np.float32)
     counts = count_inside(points[points[:, 4] == 0], boxes)
     visible = counts >= max(min_points, 1)
@@ -75,9 +72,7 @@ def scan_sweeps(
     mount: np.ndarray,
     time_s: float,
     rng: np.random.Generator,
-    *,
-    num_sweeps: int,
-    close_m: float = 0.0,
+    reading: CloudReading,
 ) -> tuple[np.ndarray, int]:
     """Fuse the sweeps up to a moment in the sensor's frame at that moment, current sweep first, then by age.
 
@@ -85,9 +80,8 @@ def scan_sweeps(
         mount: f64[4, 4], from :func:`~.lidar.sample_mount`.
         time_s: time of the current sweep; sweeps are ``SWEEP_S`` apart.
         rng: source of noise and dropout.
-        num_sweeps: number of sweeps, including the current one.
-        close_m: points with ``|x|`` and ``|y|`` below this value around the sensor, in the frame of their own
-            sweep, are removed.
+        reading: the number of sweeps. Close points are removed from all sweeps or from no sweep: the simulated ego
+            vehicle has no body that the sensor could see, so close points lie on the road.
 
     Returns:
         points f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, with lag exactly 0 for the current sweep,
@@ -104,7 +98,9 @@ def scan_sweeps(
         pose = sensor_pose(world, mount, then_s)
         return Sweep(np.concatenate(columns, axis=1), pose, -age * round(SWEEP_S * 1e6))
 
-    return fuse_sweeps(map(take_sweep, range(num_sweeps)), sensor, remove_close="all", close_m=close_m)
+    removed = "none" if reading.remove_close == "none" else "all"
+    reading = dataclasses.replace(reading, remove_close=removed)
+    return fuse_sweeps(map(take_sweep, range(reading.num_sweeps)), sensor, reading)
 
 
 def boxes_in_sensor_frame(world: World, pose: np.ndarray, time_s: float) -> np.ndarray:

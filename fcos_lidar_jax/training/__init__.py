@@ -1,19 +1,18 @@
-"""Optimizer, step, loop and checkpoints."""
+"""Objective, optimizer, step, loop, and the run in a folder."""
 
-from fcos_lidar_jax.training.checkpoint import Checkpoint, CheckpointError, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.loop import NonFiniteLossError, fit
 from fcos_lidar_jax.training.optimizer import make_optimizer
+from fcos_lidar_jax.training.plan import Schedule
+from fcos_lidar_jax.training.run import train
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 
 __all__ = [
-    "Checkpoint",
-    "CheckpointError",
     "NonFiniteLossError",
+    "Schedule",
     "detection_variables",
     "fit",
-    "load_checkpoint",
     "make_optimizer",
     "make_state",
     "make_train_step",
-    "save_checkpoint",
+    "train",
 ]

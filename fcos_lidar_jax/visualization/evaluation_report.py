@@ -3,12 +3,15 @@
 import dataclasses
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.evaluation.examples import sensor_boxes
+from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.bev import draw_bev
@@ -37,6 +40,31 @@ class Example:
     points: np.ndarray  # f32[n, >= 5]: the cloud; if it is empty, there is no range image
     detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f64[d, 9], labels and scores
     truth: tuple[np.ndarray, np.ndarray]  # boxes f64[m, 9] and labels
+
+
+def make_examples(
+    evaluation: Evaluation,
+    frames: FrameSet | None,
+    centres: np.ndarray,
+    rows: Mapping[str, int],
+    *,
+    min_score: float,
+    all_sweeps: bool = False,
+) -> Iterator[Example]:
+    """Samples by what they are called, with the boxes that reach a score, and the current sweep or all of them.
+
+    Without frames they are in the global frame, around their ``centres`` f64[samples, 3], and without points.
+    """
+    for kind, row in rows.items():
+        pose, points = np.eye(4), np.zeros((0, 5), np.float32)
+        pose[:3, 3] = centres[row]
+        if frames is not None:
+            points = frames.frame(row).points
+            points = points if all_sweeps else points[points[:, 4] == 0]
+            own_pose = frames.pose(row) if evaluation.metric is NUSCENES_METRIC else None
+            pose = np.eye(4) if own_pose is None else own_pose
+        found, truth = sensor_boxes(evaluation, row, pose, min_score=min_score)
+        yield Example(kind, evaluation.tokens[row], points, found, truth)
 
 
 def write_evaluation_report(

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.data.cloud_policy import MAX_TIME_LAG_S
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference.cloud import MAX_TIME_LAG_S
 from fcos_lidar_jax.visualization.figure import class_color
 
 STEP_M = 0.02  # resolution of the points

@@ -11,7 +11,7 @@ from tiny_run import SENSOR
 
 from fcos_lidar_jax.centerpoint.network import Neck, from_channels
 from fcos_lidar_jax.centerpoint.pillars import make_pillars, pillar_grid
-from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, CENTERPOINT_PILLARS, COMPACT
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E

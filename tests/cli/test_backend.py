@@ -10,9 +10,9 @@ import pytest
 from commands import assert_one_line_error, command, run_python
 from tiny_run import TINY_CONFIG, untrained
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
 onnx = pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
 pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")

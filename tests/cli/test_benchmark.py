@@ -8,6 +8,7 @@ import pytest
 from commands import assert_one_line_error, command
 from tiny_run import TINY_CONFIG, untrained
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli import benchmark
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.locations import image_layout
@@ -15,7 +16,6 @@ from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
 
 @pytest.fixture(scope="module")

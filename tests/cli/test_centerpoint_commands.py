@@ -12,10 +12,10 @@ from tiny_run import bits
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.centerpoint import CenterPointConfig
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import load_checkpoint
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training.checkpoint import load_checkpoint
-from fcos_lidar_jax.training.checkpoints import find_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 STEPS = 20

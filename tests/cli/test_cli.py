@@ -14,6 +14,7 @@ from commands import assert_one_line_error, command, page_content
 from PIL import Image
 from tiny_run import TINY_CONFIG, bits, untrained
 
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import demo, main
 from fcos_lidar_jax.cli import detect as detect_command
@@ -21,7 +22,6 @@ from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 
 
 @pytest.fixture(scope="module")

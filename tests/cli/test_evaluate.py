@@ -13,18 +13,17 @@ from commands import assert_one_line_error, in_use, page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli import evaluate
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.evaluate import Evaluate, run
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.evaluation import evaluate_detections
+from fcos_lidar_jax.evaluation import comparison, evaluate_detections
 from fcos_lidar_jax.inference import load_detector
+from fcos_lidar_jax.inference.prediction_log import _fingerprint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.trainer.results import _fingerprint
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
 FILES = {"metrics_summary.json", "curves.json", "results_nusc.json", ".lock"}
 
@@ -152,8 +151,8 @@ def test_a_checkpoint_is_run_restarted_and_evaluated(home, tmp_path, monkeypatch
             raise KeyboardInterrupt
         return entries(found, token, pose, classes)
 
-    entries = evaluate.result_entries
-    monkeypatch.setattr(evaluate, "result_entries", interrupted)
+    entries = comparison.result_entries
+    monkeypatch.setattr(comparison, "result_entries", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(args)
     assert {path.name for path in cut.iterdir()} == {"results_nusc.resume_log", ".lock"}
@@ -174,7 +173,7 @@ def test_a_checkpoint_is_run_restarted_and_evaluated(home, tmp_path, monkeypatch
 def test_a_resume_log_of_another_detector_is_not_used(home):
     detector, data = load_detector(home / "checkpoint"), NuScenes(home, VERSION)
     tokens = tuple(data.split(SPLIT))
-    frames, fewer = (NuScenesFrames(data, chosen, 1, sensor=TINY) for chosen in (tokens, tokens[1:]))
+    frames, fewer = (NuScenesFrames(data, chosen, sensor=TINY) for chosen in (tokens, tokens[1:]))
     other = dataclasses.replace(detector, variables=jax.tree.map(lambda leaf: leaf + 1, detector.variables))
     runs = ((detector, frames, 1), (other, frames, 1), (detector, fewer, 1), (detector, frames, 2))
     found = {_fingerprint(*run) for run in runs}
@@ -293,7 +292,7 @@ MISTAKES = {
     ),
     "version of simulated frames": (
         "--format simulated --checkpoint HOME/checkpoint --version v1",
-        "version: got 'v1', expected none for simulated frames",
+        "version: got v1, expected none: simulated is of format simulated",
     ),
     "file for a folder": (f"--results x {TRUTH} --out HOME/truth.json", "--out: .*found a file"),
 }

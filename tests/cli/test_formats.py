@@ -22,13 +22,14 @@ from tiny_run import NETWORK_OPTIONS, SENSOR
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES
-from fcos_lidar_jax.data.frame import GivenFrames
+from fcos_lidar_jax.data.frame import InMemoryFrames
+from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.input_pipeline.open import Format
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, sensor_to_json
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.trainer import predict, train
+from fcos_lidar_jax.training.run import train
 
 STEPS = 20
 Made = tuple[str, str, Path, tuple[str, ...]]
@@ -213,8 +214,8 @@ def test_own_data_may_be_prepared_elsewhere_and_detections_are_those_evaluated(t
 
 def test_training_on_another_sensors_clouds_is_told_before_the_step_is_compiled(tmp_path, capsys, monkeypatch):
     frames = SimulatedFrames(fcos.load_sensor("nuscenes_hdl32e"), 2)
-    wrong = GivenFrames((frames.frame(0), frames.frame(1)), fcos.load_sensor("short_range"), frames.classes)
-    monkeypatch.setattr("fcos_lidar_jax.trainer.run.jit_step", lambda step, mesh: None)
+    wrong = InMemoryFrames((frames.frame(0), frames.frame(1)), fcos.load_sensor("short_range"), frames.classes)
+    monkeypatch.setattr("fcos_lidar_jax.training.run.jit_step", lambda step, mesh: None)
     with pytest.raises(TypeError):  # there is no step
         train(dataclasses.replace(QUICKSTART, copy_paste=None), wrong, tmp_path / "run", steps=1)
     told, compiling = capsys.readouterr().err.splitlines()[:2]

@@ -16,10 +16,10 @@ import pytest
 from commands import assert_one_line_error, child_environment, command, in_use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 SRUN = {

@@ -9,12 +9,12 @@ from commands import assert_one_line_error, command, page_content
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.cli import stream as cli_stream
 from fcos_lidar_jax.inference.stream import detect_stream
 from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
 SWEEPS, WINDOW, STEP_US = 5, 3, 100_000
 

@@ -12,12 +12,12 @@ from made_bags import FORMS, structured, write_recording
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
 SWEEPS, WINDOW, START_NS, STEP = 5, 3, 1_700_000_000_000_000_000, 100_000_000
 

@@ -17,9 +17,9 @@ from commands import assert_one_line_error, child_environment, command, in_use
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax import cli
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 VERSION = "v1.0-synthetic"
@@ -118,7 +118,7 @@ def interrupted(root, tmp_path_factory, child):
 
 
 def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, interrupted, tmp_path, child):
-    """Where a stopped and resumed run ends, tests/trainer/test_run.py tells."""
+    """Where a stopped and resumed run ends, tests/training/test_run.py tells."""
     first, code, errors, stopped_at = interrupted
     out = shutil.copytree(first, tmp_path / "run")
     resumed = child(train(root, out, *long(root), "--resume"))
@@ -160,13 +160,13 @@ def test_two_processes_are_one_run_and_stop_together(root, interrupted, tmp_path
 
 
 BAD = {
-    "no steps": ("--steps 0", "--steps: got 0, expected at least 1"),
-    "no saves": ("--save-every 0", "--save-every: got 0"),
-    "no evaluations": ("--evaluate-every -1", "--evaluate-every: got -1"),
-    "none kept": ("--keep 0", "--keep: got 0"),
-    "threads": ("--threads -1", "--threads: got -1, expected at least 0"),
-    "workers": ("--workers -1", "--workers: got -1"),
-    "seed": ("--seed -1", "--seed: got -1"),
+    "no steps": ("--steps 0", "steps: got 0, expected an integer of at least 1"),
+    "no saves": ("--save-every 0", "schedule.save_every: got 0"),
+    "no evaluations": ("--evaluate-every -1", "schedule.evaluate_every: got -1"),
+    "none kept": ("--keep 0", "schedule.keep: got 0"),
+    "threads": ("--threads -1", "threads: got -1, expected at least 0"),
+    "workers": ("--workers -1", "workers: got -1"),
+    "seed": ("--seed -1", "seed: got -1"),
     "all faded": (
         "--fade-epochs 4 --steps 4",
         "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: nothing would ever be pasted",

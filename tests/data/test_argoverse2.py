@@ -12,6 +12,7 @@ from made_argoverse2 import START_NS, make_argoverse2, make_log, write_boxes, wr
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.point_files import read_points
@@ -64,7 +65,7 @@ def root(tmp_path):
 
 
 def test_sweeps_see_a_fixed_world(root):
-    frames = pickle.loads(pickle.dumps(Argoverse2Frames(root, num_sweeps=3, remove_close="none")))
+    frames = pickle.loads(pickle.dumps(Argoverse2Frames(root, reading=CloudReading(3, "none"))))
     assert len(frames) == 4  # also in worker processes
     for i in range(4):
         points = frames.frame(i).points
@@ -82,7 +83,7 @@ def test_close_points_lie_around_the_sensor_in_their_own_sweep(root):
         points = np.array([[origin[0] + 0.9, -0.9, 0, 9, 0], [origin[0] + 1.1, 0, 0, 9, 0]])
         write_sweep(root / "train" / "log-a", START_NS + i * STEP_NS, points)
     for mode, expected in {"all": (1, 1, 2), "sweeps": (2, 1, 1), "none": (2, 2, 0)}.items():
-        frame = Argoverse2Frames(root, num_sweeps=2, remove_close=mode).frame(1)
+        frame = Argoverse2Frames(root, reading=CloudReading(2, mode)).frame(1)
         older = frame.points[:, 4] > 0
         assert ((~older).sum(), older.sum(), frame.num_close) == expected
 

@@ -14,12 +14,13 @@ from refusal import refused
 from toy_frames import ToyFrames, toy_frame
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import SHORT_RANGE, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
-FRAMES = SimulatedFrames(TINY, 6, num_sweeps=2, fast_traffic=True)
+FRAMES = SimulatedFrames(TINY, 6, reading=CloudReading(2), fast_traffic=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +97,7 @@ def test_another_sets_folder_is_refused(tmp_path, toy):
     CachedFrames(FRAMES, folder).frame(0)
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
     others = {
-        "num_sweeps: found 2, expected 3": dataclasses.replace(FRAMES, num_sweeps=3),
+        "reading: found": dataclasses.replace(FRAMES, reading=CloudReading(3)),
         "fast_traffic: found True, expected False": dataclasses.replace(FRAMES, fast_traffic=False),
         "number: found 6, expected 7": dataclasses.replace(FRAMES, number=7),
         "sensor: found tiny, expected short_range": dataclasses.replace(FRAMES, sensor=SHORT_RANGE),

@@ -8,6 +8,7 @@ from made_nuscenes import BETWEEN, KEYFRAMES, VERSION, make_tables, write
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.drives import folder_drive, read_tum
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
@@ -91,11 +92,11 @@ def test_a_scene_is_all_its_sweeps_or_its_keyframes(tmp_path):
     assert len(sweeps) == KEYFRAMES * BETWEEN
     assert len(keyframes) == KEYFRAMES
     assert np.diff([sweep.time_us for sweep in sweeps]).min() > 0
-    how = {"remove_close": "all", "close_m": 1.0}
+    reading = CloudReading(10, "all")
     for number, token in enumerate(data.split("scene-1")):
         assert keyframes[number].name == sweeps[number * BETWEEN].name
         window = sweeps[max(0, number * BETWEEN - 2) : number * BETWEEN + 1][::-1]
-        fused, _ = fuse_sweeps(window, NUSCENES_HDL32E, **how)
+        fused, _ = fuse_sweeps(window, NUSCENES_HDL32E, reading)
         np.testing.assert_array_equal(fused, data.sweeps(token, 3))
     with refused("scene: got 'scene-7', expected"):
         data.drive("scene-7")
@@ -136,7 +137,7 @@ def test_rows_beyond_all_numbers_become_infinite_without_a_warning():
     points = np.full((2, 5), 3e38, np.float32)
     points[1] = np.array([0x7F800001], np.uint32).view(np.float32)  # a signalling NaN
     sweeps = [Sweep(points, np.eye(4), 50_000), Sweep(points, turned, 0)]
-    fused, _ = fuse_sweeps(sweeps, TINY, remove_close="all", close_m=1.0)
+    fused, _ = fuse_sweeps(sweeps, TINY, CloudReading(10, "all"))
     assert fused.shape == (4, 5)
     assert np.isinf(fused[2, 1])
     assert np.isnan(fused[[1, 3], :3]).all()

@@ -11,11 +11,13 @@ from refusal import refused
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.detect import as_records
+from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.sensors import KITTI_HDL64E, TINY, sensor_to_json
 from fcos_lidar_jax.types import Detections
 
+ALL = CloudReading(10, "all")
 CAR = {"label": "car", "box": [8, 1, -1, 4, 2, 1.5, 0.25, 1.5, -0.5]}
 
 
@@ -41,7 +43,7 @@ def root(tmp_path):
 
 
 def test_frames_come_by_name_with_points_boxes_labels_and_counts(root):
-    frames = pickle.loads(pickle.dumps(FolderFrames(root)))  # as worker processes have them
+    frames = pickle.loads(pickle.dumps(FolderFrames(root, reading=ALL)))  # as worker processes have them
     assert (len(frames), frames.names, frames.sensor) == (2, ("a", "b"), TINY)
     empty, full = frames.frame(0), frames.frame(1)
     assert (empty.boxes.shape, empty.labels.tolist(), empty.num_points.tolist()) == ((0, 9), [], [])
@@ -54,15 +56,15 @@ def test_frames_come_by_name_with_points_boxes_labels_and_counts(root):
 
 
 def test_close_points_stay_on_demand(root):
-    all_options = {}, {"remove_close": "none"}, {"remove_close": "sweeps"}, {"close_m": 9}
-    read = [FolderFrames(root, **options).frame(1) for options in all_options]
+    readings = (CloudReading(10, "all"), CloudReading(10, "none"), CloudReading(10), CloudReading(10, "all", 9.0))
+    read = [FolderFrames(root, reading=reading).frame(1) for reading in readings]
     assert [(len(frame.points), frame.num_close) for frame in read] == [(3, 1), (4, 0), (4, 0), (0, 4)]
 
 
 def test_the_sensor_may_be_a_preset_or_an_argument(root):
     write(root / "sensor.json", '"kitti_hdl64e"')
-    assert FolderFrames(root).sensor is KITTI_HDL64E
-    assert FolderFrames(root).frame(1).points[0, 3] == 30 * 255
+    assert FolderFrames(root, reading=ALL).sensor is KITTI_HDL64E
+    assert FolderFrames(root, reading=ALL).frame(1).points[0, 3] == 30 * 255
     (root / "sensor.json").unlink()
     assert FolderFrames(root, TINY).frame(1).points[0, 3] == 30
 
@@ -71,18 +73,18 @@ def test_own_labels_are_translated_or_left_out(root):
     write(root / "classes.json", {"lorry": "truck", "sign": None, "car": "bus"})
     records = [{**CAR, "label": label} for label in ("sign", "lorry", "car", "barrier")]
     write(root / "boxes" / "b.json", {"boxes": records})
-    frames = FolderFrames(root)
+    frames = FolderFrames(root, reading=ALL)
     assert frames.classes == ("barrier", "bus", "truck")
     assert [frames.classes[i] for i in frames.frame(1).labels] == ["truck", "bus", "barrier"]
 
 
 def test_classes_are_the_labels_of_all_frames_or_a_list(root):
     write(root / "boxes" / "a.json", {"boxes": [{**CAR, "label": label} for label in ("zebra", "ant", "zebra")]})
-    frames = FolderFrames(root)
+    frames = FolderFrames(root, reading=ALL)
     assert frames.classes == ("ant", "car", "zebra")
     assert (frames.labels(0).tolist(), frames.labels(1).tolist()) == ([2, 0, 2], [1])
     write(root / "classes.json", ["zebra", "yak", "car", "ant"])
-    frames = FolderFrames(root)
+    frames = FolderFrames(root, reading=ALL)
     assert frames.classes == ("zebra", "yak", "car", "ant")
     assert (frames.labels(0).tolist(), frames.labels(1).tolist()) == ([0, 3, 0], [2])
 
@@ -110,7 +112,7 @@ def test_splits_give_frames_and_order_but_not_classes(root):
 def test_unknown_velocity_is_nan_and_yaw_may_turn_over(root):
     box = [*CAR["box"][:6], 0.25 + 4 * np.pi, None, None]
     write(root / "boxes" / "b.json", {"boxes": [{**CAR, "box": box}]})
-    boxes = FolderFrames(root).frame(1).boxes
+    boxes = FolderFrames(root, reading=ALL).frame(1).boxes
     assert np.isnan(boxes[0, 7:]).all()
     assert boxes[0, 6] == pytest.approx(0.25, abs=1e-6)
 
@@ -123,7 +125,7 @@ def test_predictions_are_labels(root):
     one = np.ones(1, np.float32)
     found = Detections(*map(jnp.asarray, (boxes, one, np.array([6], np.int32), np.ones(1, bool), np.int32(0))))
     write(root / "boxes" / "b.json", {"boxes": as_records(found, NUSCENES_CLASSES)})
-    frames = FolderFrames(root)
+    frames = FolderFrames(root, reading=ALL)
     frame = frames.frame(1)
     np.testing.assert_array_equal(frame.boxes, boxes)
     assert [frames.classes[i] for i in frame.labels] == ["motorcycle"]
@@ -149,7 +151,7 @@ def sweeps(root):
 
 @pytest.mark.parametrize(("num_sweeps", "lags"), [(1, [0, 0, 0]), (2, [0, 0, 0, 0.1]), (9, [0, 0, 0, 0.1, 0.2])])
 def test_sweeps_are_fused_up_to_a_number(root, sweeps, num_sweeps, lags):
-    frame = FolderFrames(root, num_sweeps=num_sweeps).frame(1)
+    frame = FolderFrames(root, reading=CloudReading(num_sweeps, "all")).frame(1)
     np.testing.assert_array_equal(frame.points[:, 4], np.array(lags, np.float32))
     # The older points lie where the first of the car's does; only the current sweep counts.
     np.testing.assert_allclose(frame.points[3:, :3], np.tile([8.0, 1, -1], (len(lags) - 3, 1)), atol=1e-6)
@@ -157,14 +159,14 @@ def test_sweeps_are_fused_up_to_a_number(root, sweeps, num_sweeps, lags):
 
 
 def test_the_fingerprint_is_of_older_sweeps_too(root, sweeps):
-    before = FolderFrames(root).fingerprint()
+    before = FolderFrames(root, reading=ALL).fingerprint()
     np.save(root / "older" / "1.npy", np.array([[8, 1, -1, 30], [9, 1, -1, 30]]))
-    assert FolderFrames(root).fingerprint() != before
+    assert FolderFrames(root, reading=ALL).fingerprint() != before
 
 
 def test_a_list_of_sweeps_gives_pose_and_time_and_one_sweep_needs_no_other(root, sweeps):
     (root / "older" / "1.npy").unlink()
-    frames = FolderFrames(root, num_sweeps=1)
+    frames = FolderFrames(root, reading=CloudReading(1, "all"))
     np.testing.assert_array_equal(frames.pose(1), np.array(sweeps[0]["sensor_to_world"]))
     assert (frames.time_us(1), frames.pose(0), frames.time_us(0)) == (900_000, None, None)
     assert len(frames.frame(1).points) == 3
@@ -202,7 +204,7 @@ BAD_BOXES = {
 
 
 def read_all(root: Path) -> None:
-    frames = FolderFrames(root)
+    frames = FolderFrames(root, reading=ALL)
     for index in range(len(frames)):
         frames.frame(index)
 
@@ -263,19 +265,15 @@ def test_offsets_within_a_turn_are_no_time_lags(root):
     points = np.tile(np.load(root / "clouds" / "b.npy"), (40, 1))
     np.save(root / "clouds" / "b.npy", np.column_stack([points, np.linspace(0, 0.1, 160)]))
     with refused("fifth column: got 160 different time lags, which look like", root / "clouds/b.npy"):
-        FolderFrames(root).frame(1)
+        FolderFrames(root, reading=ALL).frame(1)
     np.save(root / "clouds" / "b.npy", np.column_stack([points, np.repeat([0, 0.05, 0.1, np.nan], 40)]))
-    assert len(FolderFrames(root, remove_close="none").frame(1).points) == 160
+    assert len(FolderFrames(root, reading=WHOLE_SWEEP).frame(1).points) == 160
 
 
 def test_bad_arguments_and_sensor_files_are_named(root):
-    with refused("num_sweeps: got 0"):
-        FolderFrames(root, num_sweeps=0)
-    with refused("remove_close: got 'some'"):
-        FolderFrames(root, remove_close="some")  # pyright: ignore[reportArgumentType]
     write(root / "sensor.json", {"name": "mine", "num_columns": 8})
     with refused(f"{root}/sensor.json: inclinations_rad: missing"):
-        FolderFrames(root)
+        FolderFrames(root, reading=ALL)
 
 
 @pytest.mark.real_data
@@ -289,7 +287,7 @@ def test_points_counted_in_real_boxes_are_those_annotated(real_data, tmp_path):
     write(tmp_path / "boxes" / "0.json", {"boxes": records})
     write(tmp_path / "classes.json", {"None": "barrier"})  # keep the one of an ignored category, to count it too
     write(tmp_path / "sensor.json", '"nuscenes_hdl32e"')
-    frame = FolderFrames(tmp_path, remove_close="none").frame(0)
+    frame = FolderFrames(tmp_path, reading=WHOLE_SWEEP).frame(0)
     annotated = [b["num_lidar_pts"] for b in keyframe["boxes"]]
     assert len(annotated) == 69
     assert int((frame.num_points == annotated).sum()) == 61

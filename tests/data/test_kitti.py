@@ -8,6 +8,7 @@ from made_kitti import AXES, MOUNTED, P2, RECTIFIED, SHIFT, calibration_text, la
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
+from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import inside_box
 from fcos_lidar_jax.data.kitti import CLASSES, TO_NUSCENES, KittiFrames, read_calibration, read_labels, to_lidar
 from fcos_lidar_jax.input_pipeline.open import open_frames
@@ -52,9 +53,10 @@ def test_points_are_those_that_the_camera_sees(root):
     seen = np.array([[15, 2, -1, 51, 0], [14, 1.6, -0.8, 255, 0], [9, -1, -0.5, 0, 0]], np.float32)
     np.testing.assert_allclose(KittiFrames(root).frame(1).points, seen)
     # The pedestrian lies to the right of the car, and a narrower image has only the car.
-    options = {"image_size": None}, {"image_size": None, "remove_close": "none"}, {"image_size": (600, 375)}
+    whole = {"image_size": None, "reading": CloudReading(1, "all")}
+    options = whole, {"image_size": None, "reading": WHOLE_SWEEP}, {"image_size": (600, 375)}
     assert [len(KittiFrames(root, **o).frame(1).points) for o in options] == [5, 6, 2]
-    assert KittiFrames(root, image_size=None).frame(1).num_close == 1
+    assert KittiFrames(root, **whole).frame(1).num_close == 1
 
 
 def test_the_image_ends_where_the_projection_says(root):
@@ -64,7 +66,7 @@ def test_the_image_ends_where_the_projection_says(root):
     seen = np.hstack([np.tile(pixels, (3, 1)) * depths, depths]) - P2[:, 3]
     velo = (seen @ np.linalg.inv(P2[:, :3]).T @ RECTIFIED - SHIFT) @ MOUNTED  # transposed rotations
     np.column_stack([velo, np.zeros(len(velo))]).astype(np.float32).tofile(root / "training/velodyne/000003.bin")
-    points = KittiFrames(root, remove_close="none").frame(0).points
+    points = KittiFrames(root, reading=WHOLE_SWEEP).frame(0).points
     kept = [0, 1, 2, 7, 8, 9]
     np.testing.assert_allclose(points[:, :3], velo[kept].astype(np.float32))
 
@@ -200,7 +202,7 @@ def test_missing_folders_and_splits_are_named(root):
 
 def test_simulated_objects_are_where_kittis_files_say(tmp_path):
     """Boxes hold the points of their objects, but for what the tilt moves out."""
-    frames = open_frames(make_kitti(tmp_path, train=2, val=1), split="train", remove_close="all")
+    frames = open_frames(make_kitti(tmp_path, train=2, val=1), split="train", reading=CloudReading(1, "all"))
     assert (len(frames), frames.name(1)) == (2, "000001")
     counts = np.concatenate([frames.frame(i).num_points for i in range(2)])
     assert len(counts) >= 6

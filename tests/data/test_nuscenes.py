@@ -17,6 +17,7 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.build import build_index, velocities
 from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
@@ -33,14 +34,14 @@ def made(tmp_path_factory) -> Path:
 
 def test_what_stands_still_in_the_world_is_at_one_place_from_every_sweep(made):
     data = NuScenes(made, VERSION)
-    cloud = data.sweeps(token("sample", 1, 3), 8, remove_close="none").reshape(8, 50, 5)
+    cloud = data.fuse_sweeps(token("sample", 1, 3), CloudReading(8, "none"))[0].reshape(8, 50, 5)
     _, clouds = make_tables()
     np.testing.assert_array_equal(cloud[0, :, :3], clouds[f"samples/LIDAR_TOP/1-{3 * BETWEEN}.pcd.bin"][:, :3])
     assert np.abs(cloud[..., :3] - cloud[:1, :, :3]).max() < 1e-5
     np.testing.assert_allclose(cloud[..., 4], (np.arange(8) * STEP_US / 1e6)[:, None] * np.ones(50), rtol=1e-6)
     assert (cloud[0, :, 4] == 0).all()
     # Chains end at the start of the scene.
-    sizes = [len(data.sweeps(token("sample", 1, k), 10, remove_close="none")) for k in range(KEYFRAMES)]
+    sizes = [len(data.fuse_sweeps(token("sample", 1, k), CloudReading(10, "none"))[0]) for k in range(KEYFRAMES)]
     assert sizes == [50 * min(1 + k * BETWEEN, 10) for k in range(KEYFRAMES)]
 
 
@@ -51,11 +52,11 @@ def test_close_points_are_judged_in_their_own_sweep(tmp_path):
         points[5:8, :2] = 1.0, 0.5
     data = NuScenes(write(tmp_path, tables, clouds), VERSION)
     sample = token("sample", 0, 2)
-    sizes = {mode: len(data.sweeps(sample, 3, remove_close=mode)) for mode in ("none", "sweeps", "all")}
+    sizes = {mode: len(data.fuse_sweeps(sample, CloudReading(3, mode))[0]) for mode in ("none", "sweeps", "all")}
     assert sizes == {"none": 150, "sweeps": 140, "all": 135}
-    assert len(data.sweeps(sample, 3, close_m=1.01)) == 126
+    assert len(data.fuse_sweeps(sample, CloudReading(3, "all", 1.01))[0]) == 126
     with refused("remove_close: got 'some'"):
-        data.sweeps(sample, 3, remove_close="some")
+        CloudReading(3, "some")  # pyright: ignore[reportArgumentType]
 
 
 def test_boxes_in_the_lidar_frame_by_explicit_matrices(made):
@@ -136,7 +137,7 @@ def test_index_opens_to_what_was_saved_and_frames_are_the_same(made, tmp_path):
         np.testing.assert_array_equal(getattr(index, name), getattr(opened, name))
     plain, indexed = NuScenes(made, VERSION), NuScenes(made, VERSION, index=tmp_path / "a")
     for data in (plain, indexed, pickle.loads(pickle.dumps(indexed))):
-        frames = NuScenesFrames(data, tuple(data.split("scene-0")), num_sweeps=4)
+        frames = NuScenesFrames(data, tuple(data.split("scene-0")), CloudReading(4, "all"))
         frame = frames.frame(2)
         assert (len(frames), frame.points.shape[1], len(frame.boxes)) == (KEYFRAMES, 5, 2)
         np.testing.assert_array_equal(frame.points, plain.sweeps(token("sample", 0, 2), 4))
@@ -146,11 +147,11 @@ def test_index_opens_to_what_was_saved_and_frames_are_the_same(made, tmp_path):
 def test_close_points_are_those_near_the_sensor_wherever_its_frame_begins(made):
     data = NuScenes(made, VERSION)
     tokens = tuple(data.split("scene-0"))
-    x, y, _ = data.sweeps(tokens[0], 1, remove_close="none")[0, :3].tolist()
+    x, y, _ = data.fuse_sweeps(tokens[0], WHOLE_SWEEP)[0][0, :3].tolist()
     for origin in ((0.0, 0.0, 0.0), (x, y, 0.0)):
         sensor = dataclasses.replace(NUSCENES_HDL32E, origin_m=origin)
-        frame = NuScenesFrames(data, tokens, 1, "all", 1.0, sensor).frame(0)
-        points = data.sweeps(tokens[0], 1, remove_close="none")
+        frame = NuScenesFrames(data, tokens, CloudReading(1, "all"), sensor).frame(0)
+        points = data.fuse_sweeps(tokens[0], WHOLE_SWEEP)[0]
         close = (np.abs(points[:, :2] - np.float32(origin[:2])) < 1).all(axis=1)
         assert frame.num_close == close.sum()
         assert close.any() or origin == (0.0, 0.0, 0.0)
@@ -165,7 +166,7 @@ def test_an_older_sweep_may_be_missing_when_allowed(tmp_path):
     with pytest.raises(ValueError, match=r"0-5\.pcd\.bin: no such file.*--allow-missing-sweeps"):
         NuScenes(root, VERSION).sweeps(sample, 4)
     data = NuScenes(root, VERSION, allow_missing_sweeps=True)
-    cloud = data.sweeps(sample, 4, remove_close="none")
+    cloud = data.fuse_sweeps(sample, CloudReading(4, "none"))[0]
     np.testing.assert_allclose(np.unique(cloud[:, 4]), [0, 0.1, 0.15], rtol=1e-6)
     assert data.missing_sweeps(data.sample_tokens, 4) == 1
     (root / "samples/LIDAR_TOP/0-6.pcd.bin").unlink()
@@ -286,10 +287,8 @@ def test_a_link_out_of_the_root_may_be_followed(tmp_path):
     (root / "samples").symlink_to(tmp_path / "disk")
     with refused("resolves to", "--follow-links allows"):
         NuScenes(root, VERSION).sweeps(token("sample", 0, 1), 2)
-    assert (
-        len(NuScenes(root, VERSION, follow_links=True).sweeps(token("sample", 0, 1), 2, remove_close="none"))
-        == 100
-    )
+    data = NuScenes(root, VERSION, follow_links=True)
+    assert len(data.fuse_sweeps(token("sample", 0, 1), CloudReading(2, "none"))[0]) == 100
 
 
 def test_bad_roots_and_indexes_get_one_line(made, tmp_path):
@@ -345,7 +344,7 @@ def test_real_scene_counts_exactly(real_data):
     assert int(np.isnan(index.box_velocity[:, 0]).sum()) == 9
     wrong = 0
     for i, sample in enumerate(data.sample_tokens):
-        cloud = data.sweeps(sample, 1, remove_close="none")
+        cloud = data.fuse_sweeps(sample, WHOLE_SWEEP)[0]
         matrix = data.sensor_to_global(sample)
         world = cloud[:, :3].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         for row in range(index.sample_first[i], index.sample_first[i + 1]):

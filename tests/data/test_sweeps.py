@@ -8,6 +8,7 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 
@@ -21,7 +22,7 @@ def entry(file="a.npy", timestamp_us=1, sensor_to_world=EYE):
 def fuse(folder, entries, sensor=TINY, remove_close="all"):
     path = folder / "sweeps.json"
     path.write_text(entries if isinstance(entries, str) else json.dumps(entries))
-    return read_sweeps(path, sensor, remove_close=remove_close, close_m=1.0)
+    return read_sweeps(path, sensor, CloudReading(20, remove_close))
 
 
 def test_sweeps_see_a_fixed_world(tmp_path):
@@ -47,8 +48,8 @@ def test_raw_sweeps_of_another_layout_are_read_as_it_is_said(tmp_path):
     rows = np.random.default_rng(0).uniform(3, 9, (40, 6))
     rows.tofile(tmp_path / "a.bin")
     (tmp_path / "sweeps.json").write_text(json.dumps([entry("a.bin")]))
-    options = {"remove_close": "all", "close_m": 1.0, "columns": 6, "dtype": "float64"}
-    fused, _ = read_sweeps(tmp_path / "sweeps.json", TINY, **options)
+    options = {"columns": 6, "dtype": "float64"}
+    fused, _ = read_sweeps(tmp_path / "sweeps.json", TINY, CloudReading(1, "all"), **options)
     np.testing.assert_array_equal(fused[:, :4], rows[:, :4].astype(np.float32))
 
 

@@ -14,15 +14,16 @@ from made_kitti import make_kitti
 from made_nuscenes import make_tables, write
 from toy_frames import toy_frame
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import cached
 from fcos_lidar_jax.data.cached import CachedFrames
-from fcos_lidar_jax.data.classes import MappedFrames
+from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.clouds import CloudFiles
 from fcos_lidar_jax.data.frame import (
-    ChosenFrames,
     Frame,
     FrameSet,
-    GivenFrames,
+    InMemoryFrames,
+    SelectedFrames,
     no_points,
     without_points,
 )
@@ -60,11 +61,11 @@ def folder(root: Path) -> FrameSet:
 
 
 def simulated(root: Path) -> FrameSet:
-    return SimulatedFrames(TINY, 2, num_sweeps=2)
+    return SimulatedFrames(TINY, 2, reading=CloudReading(2))
 
 
 def given(root: Path) -> FrameSet:
-    return GivenFrames((toy_frame(0), toy_frame(1)), TINY, ("car",) * 10)
+    return InMemoryFrames((toy_frame(0), toy_frame(1)), TINY, ("car",) * 10)
 
 
 def mapped(root: Path) -> FrameSet:
@@ -72,18 +73,18 @@ def mapped(root: Path) -> FrameSet:
 
 
 def chosen(root: Path) -> FrameSet:
-    return ChosenFrames(kitti(root), (2, 0))
+    return SelectedFrames(kitti(root), (2, 0))
 
 
 def kept(root: Path) -> FrameSet:
-    frames = CachedFrames(SimulatedFrames(TINY, 2, num_sweeps=2), root)
+    frames = CachedFrames(SimulatedFrames(TINY, 2, reading=CloudReading(2)), root)
     frames.frame(0)  # The other one is made when its boxes are asked for.
     return frames
 
 
 def clouds(root: Path) -> FrameSet:
     folder(root)
-    return CloudFiles((root / "clouds" / "000.npy", root / "sweeps" / "001.json"), TINY)
+    return CloudFiles((root / "clouds" / "000.npy", root / "sweeps" / "001.json"), TINY, CloudReading(2))
 
 
 MAKERS = (nuscenes, argoverse2, kitti, folder, simulated, given, mapped, chosen, kept, clouds)

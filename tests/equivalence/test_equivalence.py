@@ -9,7 +9,7 @@ import jax, numpy as np
 from tiny_run import CONFIG, SENSOR, FRAMES, weights
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.trainer import predict
+from fcos_lidar_jax.inference.prediction import predict
 detector = TrainedDetector(build_detector(CONFIG, SENSOR), weights())
 runs = []
 for n in (1, 2, 8):
@@ -27,7 +27,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from tiny_run import CONFIG, SENSOR, FRAMES, weights
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.models import build_detector, convolution
-from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
+from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.training.step import make_gradient
 convolution.LARGE = 0  # the weight gradients of large images
 frames = [FRAMES.frame(i) for i in range(8)]

@@ -16,10 +16,10 @@ from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
 from fcos_lidar_jax.evaluation.frames import evaluate_frames, frame_columns, read_detections, write_detections
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, evaluate, metric_of
+from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.evaluation.results import read_results
 from fcos_lidar_jax.evaluation.summary import describe, full_summary, warnings, write_evaluation
 from fcos_lidar_jax.evaluation.truth import read_truth
-from fcos_lidar_jax.inference.records import as_records
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.evaluation_report import Example, write_evaluation_report

@@ -13,8 +13,8 @@ from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cells import add_cell, changes_of, read_cells, run_name
 from experiments.paper_tables.scales import quarter
 from experiments.paper_tables.tables import as_markdown, make_record
+from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT, QUICKSTART
-from fcos_lidar_jax.training.checkpoint import LATER_FIELDS
 
 SECTOR = RESULTS / "tables" / "sector"
 CELL = {"changes": "base", "seed": 0, "scores": {"mAP": 0.1, "AP": {}, "curve": [[1, 0.1]]}, "git": "1234567"}

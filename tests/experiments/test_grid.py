@@ -10,9 +10,9 @@ from experiments.changes import change
 from experiments.paper_tables import grid
 from experiments.paper_tables.cells import run_name
 from experiments.paper_tables.grid import run_cell, run_cells
+from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import QUICKSTART
-from fcos_lidar_jax.training.checkpoint import NonFiniteStateError
 
 
 def test_a_finished_cell_is_never_run_again(tmp_path):

@@ -12,7 +12,7 @@ from experiments.paper_tables.scales import quarter, smoke
 from experiments.paper_tables.tables import Args
 from experiments.studies import centerpoint
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.inference.cloud import make_cloud
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector
@@ -44,7 +44,7 @@ def test_the_stages_that_are_timed_are_the_detector(tmp_path):
     detector = build_detector(config, scale.sensor)
     variables = detector.init(jax.random.key(0))
     assert parameters == sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
-    cloud = make_cloud(points, config, sensor=scale.sensor, remove_close="none")
+    cloud = make_cloud(points, config, sensor=scale.sensor, num_close=0)
     whole = jax.jit(make_detect(detector))(variables, cloud.points, cloud.valid)
     assert whole.valid.any()
     expected = whole.boxes, whole.scores, whole.labels, whole.valid

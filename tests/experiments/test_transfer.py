@@ -15,11 +15,11 @@ from tiny_run import TINY_CONFIG, untrained
 from experiments.real_frames import SPANS_M, scores_by_range, within
 from experiments.studies import model_card, shipped_weights, transfer
 from experiments.studies.shipped_weights import earlier_trainings, half_precision
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints.storage import CheckpointError
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.training import Checkpoint, load_checkpoint, save_checkpoint
-from fcos_lidar_jax.training.checkpoint import CheckpointError
 from fcos_lidar_jax.types import Detections
 
 CONFIG = dataclasses.replace(TINY_CONFIG, sensor="tiny")

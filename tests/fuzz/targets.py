@@ -20,12 +20,14 @@ from made_kitti import calibration_text, label_text
 from made_nuscenes import VERSION, make_tables
 from made_nuscenes import write as write_nuscenes
 
+from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import read_class_map
-from fcos_lidar_jax.config import config_from_json, config_to_json
+from fcos_lidar_jax.config import CloudReading, config_from_json, config_to_json
 from fcos_lidar_jax.data import argoverse2
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.cached import CachedFrames
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.drives import read_tum
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import Frame, FrameSet
@@ -43,7 +45,6 @@ from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.export import load_exported
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
 from fcos_lidar_jax.input_pipeline.database import open_database, prepare_database
@@ -60,9 +61,8 @@ from fcos_lidar_jax.sensors import (
 )
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.trainer.run import check_run
-from fcos_lidar_jax.training.checkpoint import read_description
 from fcos_lidar_jax.training.metrics_log import read_metrics
+from fcos_lidar_jax.training.plan import check_run
 
 from .mutators import mutate, mutate_bytes, mutate_json
 
@@ -189,7 +189,7 @@ def _argoverse2_files(folder: Path) -> None:
 
 def _read_argoverse2(folder: Path, name: str) -> None:
     argoverse2._cached_log.cache_clear()  # files change faster than their times
-    frames = Argoverse2Frames(folder, num_sweeps=2)
+    frames = Argoverse2Frames(folder, reading=CloudReading(2))
     check_frame(frames.frame(len(frames) - 1), frames)
 
 
@@ -227,7 +227,7 @@ def _folder_files() -> dict[str, bytes]:
 
 
 def _read_folder(folder: Path, name: str) -> None:
-    frames = FolderFrames(folder, split="train", num_sweeps=2)
+    frames = FolderFrames(folder, split="train", reading=CloudReading(2))
     check_frame(frames.frame(0), frames)
     frames.fingerprint()
 
@@ -261,7 +261,7 @@ def _read_recording(folder: Path, name: str) -> None:
 def _read_nuscenes(folder: Path, name: str) -> None:
     data = NuScenes(folder, VERSION)
     tokens = data.split("all")
-    check_points(data.sweeps(tokens[0], 2, remove_close="none"), NUSCENES_HDL32E)
+    check_points(data.fuse_sweeps(tokens[0], CloudReading(2, "none"))[0], NUSCENES_HDL32E)
     boxes = data.boxes(tokens[0])
     check_boxes(boxes.boxes, str(folder / name))
     truth = split_truth(data, tokens)
@@ -319,7 +319,7 @@ def _read_keyframe(folder: Path, name: str) -> None:
 
 
 def _read_sweeps(folder: Path, name: str) -> None:
-    points, _ = read_sweeps(folder / name, TINY, remove_close="all", close_m=1.0)
+    points, _ = read_sweeps(folder / name, TINY, CloudReading(99, "all"))
     if len(points):
         check_points(points, TINY)
 

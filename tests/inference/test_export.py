@@ -13,10 +13,10 @@ from commands import assert_one_line_error, command, run_python
 from tiny_run import TINY_CONFIG, bits, untrained
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.inference.export import PLATFORMS, export_detector, load_exported, read_record
 from fcos_lidar_jax.sensors import TINY, sensor_from_json
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training import Checkpoint, save_checkpoint
 
 ROOT = Path(__file__).parents[2]
 VARIABLES = untrained(TINY_CONFIG, TINY)

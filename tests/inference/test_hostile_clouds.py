@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tiny_run import bits
 
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference import load_trained
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 

@@ -13,13 +13,13 @@ from commands import run_python
 from tiny_run import TINY_CONFIG, bits, untrained
 
 from fcos_lidar_jax.config import AugmentConfig
+from fcos_lidar_jax.data.cloud_policy import make_cloud
+from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.inference import TrainedDetector, load_detector
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.openvino import processor_precision, with_openvino
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training.sharding import make_mesh
 
 pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
 pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")

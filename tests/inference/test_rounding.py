@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference import load_trained
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.models import heads
 from fcos_lidar_jax.simulation.frame_set import unseen_frames

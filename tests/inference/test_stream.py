@@ -9,16 +9,16 @@ import pytest
 from refusal import refused
 from tiny_run import TINY_CONFIG, bits, untrained
 
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds
-from fcos_lidar_jax.data.sweeps import Sweep, before_turning, fuse_sweeps
+from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps, sensor_before_rotation
+from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.inference import TrainedDetector
-from fcos_lidar_jax.inference.cloud import make_cloud
 from fcos_lidar_jax.inference.detector import _split_detect
 from fcos_lidar_jax.inference.stream import detect_stream
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.training.sharding import make_mesh
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +41,16 @@ def test_a_window_of_sweeps_moves_along_and_is_compiled_once(detector):
     assert [each.sweep.name for each in found] == [sweep.name for sweep in sweeps]
     for index, each in enumerate(found):
         window = sweeps[max(0, index - 1) : index + 1][::-1]
-        mode = config.projection.remove_close
-        points, _ = fuse_sweeps(window, TINY, remove_close=mode, close_m=config.projection.close_m)
-        cloud = make_cloud(points, config, sensor=TINY, remove_close="none")
+        points, num_close = fuse_sweeps(window, TINY, config.reading)
+        cloud = make_cloud(points, config, sensor=TINY, num_close=num_close)
         assert bits((each.cloud.points, each.cloud.valid)) == bits((cloud.points, cloud.valid))
         assert bits(each.detections) == bits(detector.detect(cloud))
     assert _split_detect(detector.model, make_mesh(jax.local_devices()[:1]), 1)._cache_size() == 1
 
 
 def test_a_window_of_one_sweep_forgets_the_others(detector):
-    several = list(detect_stream(drive(3), detector, num_sweeps=1))
+    reading = dataclasses.replace(detector.config.reading, num_sweeps=1)
+    several = list(detect_stream(drive(3), detector, reading=reading))
     for each, sweep in zip(several, drive(3), strict=True):
         [alone] = detect_stream([sweep], detector)
         assert bits(each.detections) == bits(alone.detections)
@@ -93,7 +93,7 @@ def test_turned_sweeps_lose_the_same_points_as_a_list_of_them_does(tmp_path):
     config = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
     config = dataclasses.replace(config, projection=dataclasses.replace(config.projection, remove_close="all"))
     detector = TrainedDetector(build_detector(config, sensor), untrained(config, sensor))
-    here = before_turning(sensor, yaw).origin_m[:2]
+    here = sensor_before_rotation(sensor, yaw).origin_m[:2]
     sweeps = [
         dataclasses.replace(s, points=np.concatenate([s.points, s.points[:5] * 0 + np.float32([*here, 0, 1, 0])]))
         for s in drive(2)
@@ -105,10 +105,10 @@ def test_turned_sweeps_lose_the_same_points_as_a_list_of_them_does(tmp_path):
         entries.insert(0, {"file": f"{i}.npy", **pose})
     (tmp_path / "sweeps.json").write_text(json.dumps(entries))
     *_, found = detect_stream(sweeps, detector, yaw_rad=yaw)
-    files = CloudFiles((tmp_path / "sweeps.json",), before_turning(sensor, yaw), "all", config.projection.close_m)
+    files = CloudFiles((tmp_path / "sweeps.json",), sensor_before_rotation(sensor, yaw), config.reading)
     frame = TurnedClouds(files, yaw).frame(0)
     assert frame.num_close == found.cloud.num_close >= 10
-    cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close, remove_close="none")
+    cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close)
     assert bits((cloud.points, cloud.valid)) == bits((found.cloud.points, found.cloud.valid))
 
 

@@ -17,7 +17,7 @@ from commands import child_environment
 from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.frame import GivenFrames
+from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.input_pipeline.database import (
     DatabaseError,
@@ -341,7 +341,7 @@ def test_columns_must_agree(tmp_path):
     for folder, scenes in (("a", (("s", (0, 1)),)), ("b", (("s", (0,)), ("t", (1,))))):
         with pytest.raises(ValueError, match="frame 1: points: got 6 columns, expected 5 of the sensor"):
             build(tmp_path / folder, frames, scenes=scenes)
-    six = GivenFrames(frames.frames[1:], ARGOVERSE2, NUSCENES_CLASSES)
+    six = InMemoryFrames(frames.frames[1:], ARGOVERSE2, NUSCENES_CLASSES)
     assert build(tmp_path / "c", six, scenes=(("t", (0,)),)).points(0).shape[1] == 6
 
 

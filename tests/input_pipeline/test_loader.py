@@ -19,12 +19,13 @@ from toy_frames import ListedFrames, ToyFrames, toy_frame
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig
-from fcos_lidar_jax.data.frame import Frame, GivenFrames
+from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.input_pipeline.database import prepare_database
+from fcos_lidar_jax.input_pipeline.database import cut_reading, prepare_database
 from fcos_lidar_jax.input_pipeline.loader import (
     SampleOrder,
+    check_loader_options,
     default_threads,
     make_batches,
     packing_for,
@@ -320,7 +321,7 @@ def test_boxes_with_the_fewest_points_go_and_are_counted():
 
 
 def test_a_laser_column_travels_too(objects):
-    frames = GivenFrames((toy_frame(0, columns=6),), ARGOVERSE2, NUSCENES_CLASSES)
+    frames = InMemoryFrames((toy_frame(0, columns=6),), ARGOVERSE2, NUSCENES_CLASSES)
     [batch] = run(frames, count=1)
     assert batch.batch.points.shape == (4, 3000, 6)
     with pytest.raises(ValueError, match="got points of 5 columns, expected 6 as in the frames"):
@@ -368,7 +369,7 @@ def test_workers_need_shared_memory(monkeypatch):
     config = dataclasses.replace(PLAIN, max_points=300_000)
     # Five batches of four rows of 300,000 points of 25 bytes, and the boxes.
     with pytest.raises(ValueError, match="workers: got 2, for which /dev/shm has 64 MiB free, expected 143 MiB"):
-        run(config=config, workers=2)
+        check_loader_options(config, None, threads=None, workers=2)
     assert len(run(config=config, threads=1, count=1)) == 1
 
 
@@ -376,7 +377,7 @@ def test_workers_need_shared_memory(monkeypatch):
 @pytest.mark.parametrize("preset", [NUSCENES, NUSCENES_SINGLE])
 def test_real_samples_fit_the_presets(real_data, tmp_path, preset):
     data = NuScenes(real_data / "nuscenes_scene0523", "v1.0-scene0523")
-    frames = NuScenesFrames(data, tuple(data.split("scene0523")[-6:]), preset.num_sweeps)
+    frames = NuScenesFrames(data, tuple(data.split("scene0523")[-6:]), cut_reading(preset.num_sweeps))
     objects = prepare_database(frames, tmp_path)
     config = dataclasses.replace(preset, optimizer=dataclasses.replace(preset.optimizer, batch_size=3))
     for batch in run(frames, config, objects=objects, count=2):
@@ -394,7 +395,7 @@ def test_real_samples_fit_the_presets(real_data, tmp_path, preset):
 @pytest.mark.parametrize(("preset", "row_bytes"), [(NUSCENES, 15), (NUSCENES_SINGLE, 14)])
 def test_real_samples_are_packed_whole(real_data, tmp_path, preset, row_bytes):
     data = NuScenes(real_data / "nuscenes_scene0523", "v1.0-scene0523")
-    frames = NuScenesFrames(data, tuple(data.split("scene0523")[-6:]), preset.num_sweeps)
+    frames = NuScenesFrames(data, tuple(data.split("scene0523")[-6:]), cut_reading(preset.num_sweeps))
     options = {"objects": prepare_database(frames, tmp_path), "count": 2}
     config = dataclasses.replace(preset, optimizer=dataclasses.replace(preset.optimizer, batch_size=3))
     packing = packing_for(frames, config)
@@ -422,18 +423,28 @@ def test_an_unreadable_file_stops_the_run_with_its_line(threads, workers):
     ("frames", "config", "options", "message"),
     [
         (ToyFrames(0), PLAIN, {}, "training frames: got none"),
-        (ToyFrames(), CONFIG, {}, "copy_paste: got no ground-truth database"),
         (ToyFrames(), PLAIN, {"num_processes": 3}, "process 0 of 3: expected a number that divides .* of 4"),
         (ToyFrames(), PLAIN, {"num_processes": 2, "process_index": 2}, "process 2 of 2"),
         (ToyFrames(), PLAIN, {"num_processes": 0}, "process 0 of 0"),
         (ToyFrames(), PLAIN, {"first_step": 2}, "first_step: got 2, expected 0 to 1"),
-        (ToyFrames(), PLAIN, {"workers": -1}, "workers: got -1, expected at least 0"),
-        (ToyFrames(), PLAIN, {"threads": -1}, "threads: got -1, expected at least 0"),
     ],
 )
 def test_what_cannot_run_is_refused_before_it_begins(frames, config, options, message):
     with pytest.raises(ValueError, match=message), make_batches(frames, config, seed=0, num_steps=1, **options):
         pass
+
+
+@pytest.mark.parametrize(
+    ("config", "threads", "workers", "message"),
+    [
+        (CONFIG, 0, 0, "copy_paste: got no ground-truth database"),
+        (PLAIN, 0, -1, "workers: got -1, expected at least 0"),
+        (PLAIN, -1, 0, "threads: got -1, expected at least 0"),
+    ],
+)
+def test_options_of_the_loader_are_refused_before_there_is_a_run(config, threads, workers, message):
+    with pytest.raises(ValueError, match=message):
+        check_loader_options(config, None, threads=threads, workers=workers)
 
 
 ORPHANED = """

@@ -13,13 +13,14 @@ from made_folder import CLASSES, make_folder
 from made_kitti import make_kitti
 from made_nuscenes import VERSION, make_tables, token, write
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
-from fcos_lidar_jax.data.classes import MappedFrames
+from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.input_pipeline.open import default_split, find_layout, open_frames
+from fcos_lidar_jax.input_pipeline.open import default_split, find_data_set, open_frames
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
@@ -57,7 +58,7 @@ def roots(tmp_path_factory):
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_layout_is_recognised_and_its_frames_offer_the_contract(roots, format):
-    assert find_layout(roots[format]).format == format
+    assert find_data_set(roots[format]).reader.name == format
     frames = open_frames(roots[format])
     assert type(frames) is FORMATS[format].reader
     assert len(frames) == FORMATS[format].frames
@@ -80,15 +81,16 @@ def test_a_split_is_a_part(roots, format):
 
 
 def test_options_reach_the_readers(roots):
-    frames = open_frames(roots["nuscenes"], split="scene-1", num_sweeps=3, remove_close="none", sensor=TINY)
+    frames = open_frames(roots["nuscenes"], split="scene-1", reading=CloudReading(3, "none"), sensor=TINY)
     data = NuScenes(roots["nuscenes"], VERSION)
     sample = token("sample", 1, 3)
-    np.testing.assert_array_equal(frames.frame(3).points, data.sweeps(sample, 3, remove_close="none"))
+    np.testing.assert_array_equal(frames.frame(3).points, data.fuse_sweeps(sample, CloudReading(3, "none"))[0])
     np.testing.assert_array_equal(frames.pose(3), data.sensor_to_global(sample))
     assert (frames.sensor, frames.name(3), frames.scene(3)) == (TINY, sample, "scene-1")
     assert frames.time_us(3) == 1_600_000_000_000_000 + 10**8 + 9 * 50_000
     for format in FORMATS:
-        close = [open_frames(roots[format], remove_close=mode, close_m=6.0).frame(0) for mode in ("all", "sweeps")]
+        readings = CloudReading(1, "all", 6.0), CloudReading(1, "sweeps", 6.0)
+        close = [open_frames(roots[format], reading=reading).frame(0) for reading in readings]
         kept, all_of_them = (len(frame.points) for frame in close)
         assert kept + close[0].num_close == all_of_them + close[1].num_close
         assert kept < all_of_them
@@ -113,7 +115,7 @@ def test_a_fingerprint_follows_from_files_and_options(roots, tmp_path, format):
     assert open_frames(root).fingerprint() == same
     if format != "nuscenes":  # whose index is what counts: copied trees have other times there
         assert open_frames(roots[format]).fingerprint() == same
-    changes = ({"split": FORMATS[format].split}, {"close_m": 2.0})
+    changes = ({"split": FORMATS[format].split}, {"reading": CloudReading(1, "all", 2.0)})
     prints = [same, *(open_frames(root, **change).fingerprint() for change in changes)]
     file = next(root.rglob(FORMATS[format].boxes))
     if format == "nuscenes":
@@ -128,7 +130,7 @@ BAD = {
     "nothing": ({}, "no known data set, expected one of */sample.json (nuscenes), training/velodyne (kitti)"),
     "gone": ({"root": "gone"}, "gone: no such folder, expected a data set"),
     "format": ({"root": "kitti", "format": "kiti"}, "format: got 'kiti', expected kitti"),
-    "version of kitti": ({"root": "kitti", "version": "v1"}, "version: got 'v1', expected none"),
+    "version of kitti": ({"root": "kitti", "version": "v1"}, "version: got v1, expected none"),
     "index of a folder": ({"root": "folder", "index": "x"}, "index: got x, expected none"),
     "splits of kitti": ({"root": "kitti", "splits": "x"}, "splits: got x, expected none"),
     "missing sweeps": ({"root": "kitti", "allow_missing_sweeps": True}, "allow_missing_sweeps: got True"),
@@ -162,7 +164,7 @@ def test_several_formats_or_versions_are_to_be_named(roots, tmp_path):
 
 def test_default_splits(roots, tmp_path):
     def split(root, purpose, required=True, **more):
-        return default_split(find_layout(root), purpose, required=required, **more)
+        return default_split(find_data_set(root), purpose, required=required, **more)
 
     for format in ("kitti", "argoverse2", "folder"):
         assert (split(roots[format], "train"), split(roots[format], "val", required=False)) == ("train", "val")

@@ -191,7 +191,7 @@ def test_a_networks_losses_and_gradients_are_those_with_the_librarys(precision, 
 SHARDED = """
 import jax, re
 from jax.sharding import NamedSharding, PartitionSpec
-from fcos_lidar_jax.training.sharding import make_mesh, replicate, shard_batch
+from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from test_convolution import CASES, TOLERANCES, assert_close, convolution, example, gradients
 convolution.LARGE = 0
 mesh = make_mesh()

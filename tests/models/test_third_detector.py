@@ -14,9 +14,10 @@ from tiny_run import CONFIG, SENSOR
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.data.frame import Frame, GivenFrames
+from fcos_lidar_jax.inference import evaluate
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.simulation.frames import make_frame
-from fcos_lidar_jax.trainer import evaluate, train
+from fcos_lidar_jax.training import train
 from fcos_lidar_jax.types import Sums
 
 BOX = np.array([6, -3, 0.5, 4, 2, 1.5, 0.3, 0, 0], np.float32)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax import cli
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import WHOLE_SWEEP
 from fcos_lidar_jax.data.box_geometry import inside_box
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.files import folder_lock
@@ -118,7 +119,7 @@ def test_annotated_point_counts_are_exact(street):
     found, data = tables(street), NuScenes(street, VERSION)
     counted = 0
     for sample in data.sample_tokens:
-        points = data.sweeps(sample, 1, remove_close="none")[:, :3].astype(np.float64)
+        points = data.fuse_sweeps(sample, WHOLE_SWEEP)[0][:, :3].astype(np.float64)
         pose = data.sensor_to_global(sample)
         world = points @ pose[:3, :3].T + pose[:3, 3]
         for row in (row for row in found["sample_annotation"] if row["sample_token"] == sample):

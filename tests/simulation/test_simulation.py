@@ -5,6 +5,7 @@ import oracles
 import pytest
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.input_pipeline.batching import make_batch
@@ -15,7 +16,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 
 LAGS = (np.arange(10) * 0.05).astype(np.float32)
 NEAR = {"num_objects": 14, "reach_m": 10.0}
-FUSED = NEAR | {"num_sweeps": 10, "fast_traffic": True}
+FUSED = NEAR | {"reading": CloudReading(10, "none"), "fast_traffic": True}
 
 
 def assert_equal(a, b):
@@ -106,11 +107,9 @@ def test_fused_frames_are_reproducible_and_annotated_by_the_current_sweep(fast_f
         np.testing.assert_array_equal(frame.num_points, count_inside(now, frame.boxes))
         assert (np.bincount(np.searchsorted(LAGS, lags)) > 0.8 * len(now)).all()
     assert any((count_inside(f.points, f.boxes) > 5 * f.num_points).any() for f in fast_frames)
-    laser = make_frame(0, ARGOVERSE2, num_sweeps=2)
+    laser = make_frame(0, ARGOVERSE2, reading=CloudReading(2, "none"))
     assert laser.points.shape[1] == 6
     assert set(np.unique(laser.points[:, 5])) <= set(range(64))
-    with pytest.raises(ValueError, match="num_sweeps: got 0, expected at least 1"):
-        make_frame(0, TINY, num_sweeps=0)
 
 
 def test_most_objects_in_fast_traffic_move_fast(fast_frames):
@@ -154,7 +153,7 @@ def test_old_points_of_moving_objects_trail_by_velocity_times_lag(fast_frames):
 
 
 def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep():
-    frames = SimulatedFrames(SHORT_RANGE, 3, 5, num_sweeps=10, fast_traffic=True)
+    frames = SimulatedFrames(SHORT_RANGE, 3, 5, reading=CloudReading(10), fast_traffic=True)
     passed = 0
     for i in range(3):
         frame = frames.frame(i)

@@ -11,6 +11,7 @@ from numpy.random import default_rng
 from scipy.integrate import cumulative_trapezoid
 from shapely import STRtree
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.sensors import TINY, Sensor, even_inclinations, sector
 from fcos_lidar_jax.simulation.frames import scan_sweeps
 from fcos_lidar_jax.simulation.ground import Ground
@@ -227,7 +228,7 @@ def assert_wall_is_sharp(points, least=0):
 def test_fused_sweeps_align_static_objects_and_trail_behind_moving_objects():
     ego = make_motion(speed=14.0, straight=4, curvature=1 / 30, turn=np.pi / 2)
     world = made_by_hand(ego, [(8, 12, 8.0, (4, 2, 3))], WALL)
-    points, _ = scan_sweeps(world, FINE, LEVEL, 1.0, default_rng(7), num_sweeps=10)
+    points, _ = scan_sweeps(world, FINE, LEVEL, 1.0, default_rng(7), CloudReading(10, "none"))
     lags = (np.arange(10) * SWEEP_S).astype(np.float32)
     np.testing.assert_array_equal(points[np.r_[True, np.diff(points[:, 4]) != 0], 4], lags)
     current = scan_fine(world, 1.0, 7)

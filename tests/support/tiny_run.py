@@ -14,7 +14,7 @@ from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.trainer import Schedule, train
+from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.types import Batch, RangeImage, TrainState
 
 STEPS = 4

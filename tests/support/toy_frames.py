@@ -7,7 +7,7 @@ import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import count_inside
-from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf, GivenFrames
+from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, WrappedFrames
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
 
@@ -58,7 +58,7 @@ class ToyFrames(FrameSet):
 
 
 @dataclasses.dataclass(frozen=True)
-class SceneFrames(FramesOf):
+class SceneFrames(WrappedFrames):
     """Given frames by scene."""
 
     scenes: tuple[tuple[str, tuple[int, ...]], ...]
@@ -77,7 +77,7 @@ class SceneFrames(FramesOf):
         return self.source
 
 
-class ListedFrames(GivenFrames):
+class ListedFrames(InMemoryFrames):
     """Given frames, labelled by the ten classes."""
 
     def __init__(self, frames: tuple[Frame, ...]) -> None:

@@ -4,11 +4,13 @@ import dataclasses
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.classes import unknown_name
+from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, has_index, open_index
@@ -131,19 +133,15 @@ class NuScenes:
         """Name of a keyframe's scene."""
         return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
 
-    def sweeps(
-        self, sample_token: str, num: int = 10, *, remove_close: str = "all", close_m: float = 1.0
-    ) -> np.ndarray:
-        """The nearest sweeps up to a keyframe, fused in its LiDAR frame.
+    def sweeps(self, sample_token: str, num: int = 10) -> np.ndarray:
+        """The nearest sweeps up to a keyframe as the official devkit fuses them, in its LiDAR frame.
 
-        The current sweep comes first, then the others by age; fewer at the start of a scene. Poses are composed
-        in float64 and times subtracted as whole microseconds.
+        The current sweep comes first, then the others by age; fewer at the start of a scene. All sweeps lose the
+        points on the ego vehicle, ``|x|, |y| < 1`` m in their own frame. Poses are composed in float64 and times
+        subtracted as whole microseconds.
 
         Args:
             num: sweeps at most, the current one included.
-            remove_close: drop the points on the ego vehicle, ``|x|, |y| < close_m`` in their own sweep's frame: of
-                ``"all"`` sweeps as the official devkit does, of the older ``"sweeps"``, or ``"none"``.
-            close_m: half the side of the square that is emptied.
 
         Returns:
             f32[n, 5]: x, y, z, intensity (0-255), time lag in seconds, exactly 0 for the current sweep.
@@ -151,18 +149,18 @@ class NuScenes:
         Raises:
             ValueError: a file that is missing, cut, empty, or not below the data root.
         """
-        return self.fuse_sweeps(sample_token, num, remove_close=remove_close, close_m=close_m)[0]
+        return self.fuse_sweeps(sample_token, CloudReading(num, "all"))[0]
 
     def fuse_sweeps(
-        self, sample_token: str, num: int, *, remove_close: str, close_m: float, sensor: Sensor = NUSCENES_HDL32E
+        self, sample_token: str, reading: CloudReading, sensor: Sensor = NUSCENES_HDL32E
     ) -> tuple[np.ndarray, int]:
-        """As :meth:`sweeps`, and how many points on the ego vehicle, those near the sensor, were dropped."""
-        chain = self._chain(sample_token, num)
+        """As :meth:`sweeps`, read in another way, and how many points on the ego vehicle were dropped."""
+        chain = self._chain(sample_token, reading.num_sweeps)
         if self.allow_missing_sweeps:
             chain = [row for row in chain if row == chain[0] or os.path.isfile(self._path(row))]
         times = self.index.sweep_time_us
         sweeps = (Sweep(self._read(row), self._sensor_to_global(row), times[row]) for row in chain)
-        return fuse_sweeps(sweeps, sensor, remove_close=remove_close, close_m=close_m)
+        return fuse_sweeps(sweeps, sensor, reading)
 
     def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
         """The sweeps of a scene in the order of time, read as they are asked for; only keyframes if so wished.
@@ -267,8 +265,6 @@ class NuScenes:
         return int(self.index.sample_sweep[self._row(sample_token)])
 
     def _chain(self, sample_token: str, num: int) -> list[int]:
-        if num < 1:
-            raise ValueError(f"num: got {num}, expected at least 1 sweep")
         return self._chain_of(self._sweep(sample_token), num)
 
     def _chain_of(self, row: int, num: int) -> list[int]:
@@ -311,9 +307,7 @@ class NuScenesFrames(FrameSet):
 
     nuscenes: NuScenes
     tokens: tuple[str, ...]  # keyframes, in order
-    num_sweeps: int = 10  # this and the next two as in NuScenes.sweeps
-    remove_close: str = "all"
-    close_m: float = 1.0
+    reading: CloudReading = CloudReading()
     sensor: Sensor = NUSCENES_HDL32E  # whose points they are
     classes = NUSCENES_CLASSES
 
@@ -321,11 +315,8 @@ class NuScenesFrames(FrameSet):
         return len(self.tokens)
 
     def frame(self, index: int) -> Frame:
-        data, token = self.nuscenes, self.tokens[index]
-        close = {"remove_close": self.remove_close, "close_m": self.close_m, "sensor": self.sensor}
-        truth = self.truth(index)
-        points, num_close = data.fuse_sweeps(token, self.num_sweeps, **close)
-        return dataclasses.replace(truth, points=points, num_close=num_close)
+        points, num_close = self.nuscenes.fuse_sweeps(self.tokens[index], self.reading, self.sensor)
+        return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 
     def truth(self, index: int) -> Frame:
         """As of any frame set; of the tables alone."""
@@ -348,10 +339,26 @@ class NuScenesFrames(FrameSet):
         return self.nuscenes.scene_of(self.tokens[index])
 
     def clouds_fingerprint(self, indices: Iterable[int]) -> str:
-        data = self.nuscenes
-        files = {file for index in indices for file in data.sweep_files(self.tokens[index], self.num_sweeps)}
-        return files_fingerprint(files, data.root, None)
+        tokens, number = (self.tokens[index] for index in indices), self.reading.num_sweeps
+        files = {file for token in tokens for file in self.nuscenes.sweep_files(token, number)}
+        return files_fingerprint(files, self.nuscenes.root, None)
 
     def fingerprint(self) -> str:
-        how = self.num_sweeps, self.remove_close, self.close_m
+        how = dataclasses.astuple(self.reading)
         return checksum(repr((column_checksums(self.nuscenes.index), self.tokens, how)).encode())
+
+
+def open_keyframes(
+    root: Path,
+    version: str,
+    split: str | None,
+    sensor: Sensor,
+    reading: CloudReading,
+    *,
+    splits: str | Path | None = None,
+    **options: Any,
+) -> NuScenesFrames:
+    """The keyframes of a split, or all; ``splits`` is a file of own ones, ``options`` are of :class:`NuScenes`."""
+    data = NuScenes(root, version, **options)
+    tokens = data.sample_tokens if split is None else data.split(split, file=splits)
+    return NuScenesFrames(data, tuple(tokens), reading, sensor)

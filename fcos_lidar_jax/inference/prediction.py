@@ -11,15 +11,15 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from fcos_lidar_jax.data.classes import MappedFrames
+from fcos_lidar_jax.data.class_mapping import MappedFrames
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.frame import Frame, FrameSet, without_points
+from fcos_lidar_jax.devices.agreement import agreed
+from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
-from fcos_lidar_jax.inference.cloud import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
-from fcos_lidar_jax.training.agreement import agreed
-from fcos_lidar_jax.training.sharding import make_mesh, shard_batch
 from fcos_lidar_jax.types import Detections
 
 _AHEAD = 2  # Groups of frames that are read while the devices work on others.
@@ -114,9 +114,7 @@ def predict_groups(
                 frame = frames.frame(group[row])
                 if group is groups[0] and slot == 0 and (line := sensor_mismatch(frame.points, sensor)):
                     print(f"warning: {line}", file=sys.stderr, flush=True)
-                cloud = make_cloud(
-                    frame.points, config, sensor=sensor, num_close=frame.num_close, remove_close="none"
-                )
+                cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close)
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud
         return loaded, (points, valid)

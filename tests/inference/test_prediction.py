@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from tiny_run import CONFIG, FRAMES, TESTS, weights
 
-from fcos_lidar_jax.data.frame import Frame, FramesOf
-from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.data.frame import Frame, WrappedFrames
+from fcos_lidar_jax.inference import TrainedDetector, prediction
+from fcos_lidar_jax.inference.prediction import evaluate, predict, predict_groups
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.trainer import evaluate, predict, prediction
-from fcos_lidar_jax.trainer.prediction import predict_groups
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +21,8 @@ def detector():
 @pytest.fixture
 def compared(monkeypatch) -> list[Frame]:
     """The truth that an evaluation compares with."""
-    kept: list[Frame] = []
-    monkeypatch.setattr(prediction, "evaluate_frames", lambda found, truths, metric: kept.extend(truths))
+    kept, compare = list[Frame](), prediction.evaluate_frames
+    monkeypatch.setattr(prediction, "evaluate_frames", lambda *of: kept.extend(of[1]) or compare(*of))
     return kept
 
 
@@ -33,7 +32,7 @@ def test_an_evaluation_keeps_no_cloud(detector, compared):
     assert all(frame.points.base is None for frame in compared), "a view of the whole cloud"
 
 
-class TruthAlone(FramesOf):
+class TruthAlone(WrappedFrames):
     """Test frames whose clouds are on another machine."""
 
     def frame(self, index: int) -> Frame:

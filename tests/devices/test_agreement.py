@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.training import agreement
-from fcos_lidar_jax.training.agreement import agreed, check_same
+from fcos_lidar_jax.devices import agreement
+from fcos_lidar_jax.devices.agreement import agreed, check_same
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from fcos_lidar_jax.data.frame import Frame, FrameSet
-from fcos_lidar_jax.inference.records import confident
-from fcos_lidar_jax.trainer.prediction import Prediction
+from fcos_lidar_jax.evaluation.records import confident
+from fcos_lidar_jax.inference.prediction import Prediction
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Detections
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from toy_frames import ToyFrames
 
+from fcos_lidar_jax.devices import feeding
+from fcos_lidar_jax.devices.feeding import feed
+from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.presets import QUICKSTART
-from fcos_lidar_jax.training import feed as feeding
-from fcos_lidar_jax.training.feed import feed
-from fcos_lidar_jax.training.sharding import make_mesh
 from fcos_lidar_jax.types import HostBatch
 
 PLAIN = dataclasses.replace(QUICKSTART, copy_paste=None, class_balanced=False, max_points=3000)

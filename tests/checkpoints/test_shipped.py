@@ -8,13 +8,13 @@ import pytest
 
 from experiments.changes import change
 from experiments.studies.shipped_weights import CONFIGS
+from fcos_lidar_jax.checkpoints import load_checkpoint
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint, shipped_checkpoints
 from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.inference import load_detector
+from fcos_lidar_jax.inference.prediction import evaluate
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frame_set import unseen_frames
-from fcos_lidar_jax.trainer import evaluate
-from fcos_lidar_jax.training import load_checkpoint
-from fcos_lidar_jax.training.checkpoints import find_checkpoint, shipped_checkpoints
 
 NAMES = sorted(shipped_checkpoints())
 

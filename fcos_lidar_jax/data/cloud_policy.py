@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.projection import image_cells
-from fcos_lidar_jax.projection import remove_close as without_close
+from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
 
 MAX_INTENSITY = 65_535.0
@@ -56,9 +55,7 @@ class Cloud:
         return self.num_close + self.num_invalid + self.num_truncated
 
 
-def make_cloud(
-    points: np.ndarray, config: Config, *, sensor: Sensor, num_close: int = 0, remove_close: str | None = None
-) -> Cloud:
+def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close: int | None = None) -> Cloud:
     """Remove what no detector should see, and truncate or pad to ``config.max_points`` rows.
 
     Where more rows than fit are left, the oldest sweeps lose theirs first; of the sweep at the boundary, which may
@@ -69,10 +66,8 @@ def make_cloud(
             where missing; columns that the sensor has no use for are left out.
         config: ``max_points``, and which close points are removed.
         sensor: of the points.
-        num_close: points on the ego vehicle that the reader has removed already.
-        remove_close: ``"all"``, ``"sweeps"`` or ``"none"``, see :func:`fcos_lidar_jax.projection.remove_close`;
-            default: as configured. Readers that fuse sweeps have removed theirs, in each sweep's own frame:
-            ``"none"``.
+        num_close: points on the ego vehicle that the reader has removed, in each sweep's own frame; None where it
+            has removed none: they are removed here, as configured.
 
     Raises:
         ValueError: another number of columns.
@@ -86,8 +81,8 @@ def make_cloud(
     points = _with_columns(points, sensor)
     valid = usable_rows(points)
     num_invalid = int((~valid).sum())
-    mode = remove_close or config.projection.remove_close
-    kept = np.asarray(without_close(points, valid, sensor, mode=mode, close_m=config.projection.close_m))
+    kept = np.asarray(valid if num_close is not None else remove_close(points, valid, sensor, config.reading))
+    num_close = num_close or 0
     num_removed = int((~kept).sum())
     padded = np.zeros((config.max_points, points.shape[1]), np.float32)
     padded_valid = np.zeros(config.max_points, bool)
@@ -208,8 +203,7 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     if len(points) >= _MIN_ROWS and (wrong := _no_coordinates(points)):
         return f"points hardly of {about}{wrong}; expect poor detections"
     points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
-    far = without_close(points, np.ones(len(points), bool), sensor, mode="all", close_m=_NEAR_M)
-    points = points[np.asarray(far)]
+    points = points[~np.asarray(close_to_sensor(points, sensor, _NEAR_M))]
     if sensor.azimuth_limits_rad is not None:
         x, y = points[:, 0] - sensor.origin_m[0], points[:, 1] - sensor.origin_m[1]
         behind = (sensor.first_azimuth_rad - np.arctan2(y, x)) % (2 * np.pi)

@@ -19,12 +19,12 @@ import numpy as np
 
 import fcos_lidar_jax.presets  # noqa: F401  (a checkpoint may hold the configuration of any of them)
 from fcos_lidar_jax import __version__
+from fcos_lidar_jax.checkpoints.preemption import after_the_block
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.files import atomic_write, checksum, naming, read_json
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
-from fcos_lidar_jax.training.preemption import after_the_block
 from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
@@ -159,7 +159,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
 
     >>> load_checkpoint("/no/such/folder")
     Traceback (most recent call last):
-    fcos_lidar_jax.training.checkpoint.CheckpointError: /no/such/folder: found nothing, ...
+    fcos_lidar_jax.checkpoints.storage.CheckpointError: /no/such/folder: found nothing, ...
     """
     folder = Path(folder).absolute()
     description = _verify(folder)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from fcos_lidar_jax.training.sharding import shard_batch
+from fcos_lidar_jax.devices.mesh import shard_batch
 from fcos_lidar_jax.types import HostBatch
 
 _ALIGNMENT = 64  # Bytes; an array at another address is copied again by JAX.
@@ -32,7 +32,7 @@ def feed(batches: Iterable[HostBatch], mesh: Mesh, *, ahead: int = 2) -> Iterato
         an iterator over the batches as device arrays. What ``batches`` raises is raised there. Leaving the context
         stops the thread, which finishes the batch it is at; batches that wait are dropped.
 
-    >>> from fcos_lidar_jax.training.sharding import make_mesh
+    >>> from fcos_lidar_jax.devices.mesh import make_mesh
     >>> mesh = make_mesh(jax.devices()[:1])
     >>> given = (HostBatch({"x": np.full((2, 3), step)}, {}, ("a", "b")) for step in range(3))
     >>> with feed(given, mesh) as stream:

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from fcos_lidar_jax.training.step import TrainStep
-
 Tree = TypeVar("Tree")
+Step = Callable[[Any, Any], tuple[Any, Any]]
+"""A training step: ``(state, batch) -> (state, metrics)``."""
 
 _AXIS = "data"
 
@@ -65,7 +65,7 @@ def check_batch_size(batch_size: int, mesh: Mesh) -> None:
         raise ValueError(f"batch_size: got {batch_size}, expected a multiple of the {mesh.size} devices")
 
 
-def jit_step(step: TrainStep, mesh: Mesh) -> TrainStep:
+def jit_step(step: Step, mesh: Mesh) -> Step:
     """The step compiled for a mesh; the state's buffers are given away.
 
     >>> step = jit_step(lambda state, batch: (state + batch.sum(), {"count": batch.size}), mesh := make_mesh())
@@ -77,11 +77,16 @@ def jit_step(step: TrainStep, mesh: Mesh) -> TrainStep:
     return jax.jit(step, donate_argnums=0, out_shardings=(everywhere, everywhere))
 
 
-def pmap_step(step: TrainStep, mesh: Mesh) -> Callable[[Any, Any], Any]:
+def pmap_step(step: Step, mesh: Mesh) -> Callable[[Any, Any], Any]:
     """The step for callers of ``pmap``, with a leading device axis on state and batch.
 
     A thin wrapper: it drops the state's axis, joins the batch's axes and runs :func:`jit_step`; a real ``pmap``
     would need the collectives written into the network.
+
+    >>> step = pmap_step(lambda state, batch: (state + batch.sum(), {"count": batch.size}), mesh := make_mesh())
+    >>> state, _ = step(np.ones(mesh.size, np.float32), np.ones((mesh.size, 1)))
+    >>> bool((state == 1 + mesh.size).all())
+    True
     """
     compiled = jit_step(step, mesh)
 

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from fcos_lidar_jax.data.classes import MappedFrames, map_labels, mapped_classes
-from fcos_lidar_jax.data.frame import ChosenFrames, Frame, GivenFrames
+from fcos_lidar_jax.data.class_mapping import MappedFrames, map_labels, mapped_classes
+from fcos_lidar_jax.data.frame import Frame, InMemoryFrames, SelectedFrames
 from fcos_lidar_jax.sensors import TINY
 
 OWN = ("ant", "bee", "cow", "dog")
 LABELS = ([0, 2, 1, 2], [3], [])
 
 
-def make(labels=LABELS) -> GivenFrames:
+def make(labels=LABELS) -> InMemoryFrames:
     """Boxes whose first number says of which frame and place they are."""
     frames = []
     for i, own in enumerate(labels):
         boxes = np.arange(len(own) * 9, dtype=np.float32).reshape(-1, 9) + 100 * i
         counts = np.arange(len(own), dtype=np.int32) + 10 * i
         frames.append(Frame(np.full((4, 5), i, np.float32), boxes, np.array(own, np.int32), counts, num_close=i))
-    return GivenFrames(tuple(frames), TINY, OWN)
+    return InMemoryFrames(tuple(frames), TINY, OWN)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_fingerprint_tells_mappings_apart_and_stays_without_one():
     assert len(set(prints)) == 6
 
 
-class Placed(GivenFrames):
+class Placed(InMemoryFrames):
     """Frames that know where, when and of which drive they are."""
 
     def pose(self, index: int) -> np.ndarray:
@@ -83,12 +83,12 @@ class Placed(GivenFrames):
 
 def test_what_frames_know_besides_boxes_stays():
     placed = Placed(make(([0], [0], [0])).frames, TINY, ("ant",))
-    frames = ChosenFrames(MappedFrames(placed, ("bee", "ant")), (2, 0))
+    frames = SelectedFrames(MappedFrames(placed, ("bee", "ant")), (2, 0))
     assert (len(frames), frames.classes, frames.sensor) == (2, ("bee", "ant"), TINY)
     np.testing.assert_array_equal(frames.pose(0), 2 * np.eye(4))
     assert (frames.time_us(0), frames.scene(0), frames.name(0)) == (200, "drive 2", "frame 2")
     assert (frames.frame(0).num_close, frames.labels(1).tolist(), frames.name(1)) == (2, [1], "frame 0")
-    other = ChosenFrames(frames.frames, (0, 2)).fingerprint()
+    other = SelectedFrames(frames.frames, (0, 2)).fingerprint()
     assert len({frames.fingerprint(), other, frames.frames.fingerprint()}) == 3
     plain = make()
     assert (plain.pose(0), plain.time_us(0), plain.scene(0)) == (None, None, "")

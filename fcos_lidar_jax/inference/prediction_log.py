@@ -13,13 +13,13 @@ from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.inference.detector import CloudDetector
+from fcos_lidar_jax.inference.prediction import Prediction, predict_groups
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.trainer.prediction import Prediction, predict_groups
-from fcos_lidar_jax.training.agreement import agreed, check_same
 from fcos_lidar_jax.types import Detections
 
 _REMOVED = ("close", "invalid", "truncated")  # Why points were removed.
@@ -45,7 +45,7 @@ def write_predictions(
         path: of the results file.
         entries: index of a frame and its detections -> what the file shall hold of them.
         write: writes the file from the frames' names with their entries as JSON.
-        batch_size: as in :func:`fcos_lidar_jax.trainer.prediction.predict`.
+        batch_size: as in :func:`fcos_lidar_jax.inference.prediction.predict`.
 
     Returns:
         points that were removed in this run, by all processes, and why: ``close``, ``invalid``, ``truncated``.

@@ -1,12 +1,11 @@
 """What is counted while a results file is written; the file itself is in tests/cli/test_evaluate.py."""
 
-from types import SimpleNamespace
-
 import numpy as np
-import pytest
 
-from fcos_lidar_jax.trainer import results
-from fcos_lidar_jax.trainer.prediction import Prediction
+from fcos_lidar_jax.data.cloud_policy import Cloud
+from fcos_lidar_jax.inference import prediction_log as results
+from fcos_lidar_jax.inference.prediction import Prediction
+from fcos_lidar_jax.types import Detections
 
 
 def test_counts_of_all_processes_are_added_without_loss(monkeypatch):
@@ -21,8 +20,7 @@ def test_counts_of_all_processes_are_added_without_loss(monkeypatch):
 
 
 def test_of_a_cloud_that_another_process_has_read_nothing_is_counted():
-    cloud = SimpleNamespace(num_close=1, num_invalid=2, num_truncated=3)
-    assert results._removed(Prediction(0, None, None, cloud)) == [1, 2, 3]
-    assert results._removed(Prediction(0, None, None, None)) == [0, 0, 0]
-    with pytest.raises(AttributeError, match="num_close"):
-        results._removed(Prediction(0, None, None, SimpleNamespace()))
+    cloud = Cloud(np.zeros((0, 5)), np.zeros(0, bool), num_points=9, num_close=1, num_invalid=2, num_truncated=3)
+    nothing = Detections(*np.zeros((3, 0)), valid=np.zeros(0, bool), num_dropped=np.int32(0))
+    assert results._removed(Prediction(0, nothing, None, cloud)) == [1, 2, 3]
+    assert results._removed(Prediction(0, nothing, None, None)) == [0, 0, 0]

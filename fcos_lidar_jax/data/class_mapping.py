@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from fcos_lidar_jax.data.frame import Frame, FrameSet, FramesOf
+from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames
 from fcos_lidar_jax.files import checksum
 
 ClassMap = Mapping[str, str | None]
@@ -52,7 +52,7 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class MappedFrames(FramesOf):
+class MappedFrames(WrappedFrames):
     """Frames whose labels count other classes, mapped by name; boxes of classes that are not there are left out.
 
     Raises:

@@ -15,15 +15,16 @@ import pytest
 from commands import run_python
 from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 
+from fcos_lidar_jax.checkpoints import load_checkpoint
+from fcos_lidar_jax.checkpoints.storage import CheckpointError, load_state
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
-from fcos_lidar_jax.data.frame import GivenFrames
+from fcos_lidar_jax.data.frame import InMemoryFrames
+from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.input_pipeline.database import prepare_database
-from fcos_lidar_jax.trainer import run as runs
-from fcos_lidar_jax.training import NonFiniteLossError, load_checkpoint
-from fcos_lidar_jax.training.checkpoint import CheckpointError, load_state
-from fcos_lidar_jax.training.feed import feed
+from fcos_lidar_jax.training import NonFiniteLossError
+from fcos_lidar_jax.training import run as runs
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Batch, PackedBatch
 
@@ -223,7 +224,12 @@ def test_processes_of_other_data_or_packing_are_refused_before_there_is_a_run(tm
 
     found = []
     monkeypatch.setattr(runs, "check_same", refuse)
-    others = {"frames": GivenFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)}, {"packing": True}, {}, {}
+    others = (
+        {"frames": InMemoryFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)},
+        {"packing": True},
+        {},
+        {},
+    )
     for other in others:
         with pytest.raises(ValueError, match=r"^process 1: configuration, data or packing: got another$"):
             train_tiny(tmp_path / "run", **other)
@@ -287,7 +293,7 @@ def test_without_a_mean_ap_a_checkpoint_is_saved_without_a_score(tmp_path, capsy
     """Test frames without boxes: the mean over no class is not a number."""
     none = np.zeros(0, np.int32)
     bare = dataclasses.replace(TESTS.frame(0), boxes=np.zeros((0, 9), np.float32), labels=none, num_points=none)
-    tests = GivenFrames((bare,), TESTS.sensor, NUSCENES_CLASSES)
+    tests = InMemoryFrames((bare,), TESTS.sensor, NUSCENES_CLASSES)
     train_tiny(tmp_path, steps=1, evaluate=1, tests=tests, weights=weights())
     assert "step 1: mAP by centre distance nan" in capsys.readouterr().err
     assert load_checkpoint(tmp_path / "checkpoints" / "00000001").score is None
@@ -356,12 +362,12 @@ def test_frames_whose_boxes_have_no_point_are_refused(tmp_path):
     frames = [FRAMES.frame(index) for index in range(3)]
     empty = tuple(dataclasses.replace(frame, num_points=0 * frame.num_points) for frame in frames)
     with pytest.raises(ValueError, match=r"^frame 'frame 0': box 0: got 0 points, as for all boxes of 3 frames"):
-        train_tiny(tmp_path / "run", frames=GivenFrames(empty, FRAMES.sensor, FRAMES.classes))
+        train_tiny(tmp_path / "run", frames=InMemoryFrames(empty, FRAMES.sensor, FRAMES.classes))
     assert not (tmp_path / "run").exists()
 
 
 def test_a_first_frame_that_cannot_be_read_leaves_no_run(tmp_path):
-    class Broken(GivenFrames):
+    class Broken(InMemoryFrames):
         def frame(self, index):
             raise ValueError("clouds/0.npy: empty file")
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.training.sharding import (
+from fcos_lidar_jax.devices.mesh import (
     check_batch_size,
     jit_step,
     make_mesh,
@@ -103,7 +103,7 @@ def test_the_pmap_form_is_the_same_step(mesh):
 
 def test_two_devices_share_a_batch_in_both_forms():
     code = (
-        "import jax, numpy as np, test_sharding as t; mesh = t.make_mesh(); assert mesh.size == 2; "
+        "import jax, numpy as np, test_mesh as t; mesh = t.make_mesh(); assert mesh.size == 2; "
         "t.check_pmap_form(mesh); t.check_odd_batch(mesh); "
         "x = t.shard_batch({'x': np.arange(12.).reshape(4, 3)}, mesh)['x']; "
         "assert [s.data.shape for s in x.addressable_shards] == [(2, 3)] * 2; "

@@ -6,7 +6,7 @@ import socket
 import pytest
 from commands import run_python
 
-from fcos_lidar_jax.training.launcher import local_device_ids
+from fcos_lidar_jax.devices.launcher import local_device_ids
 
 SRUN = {"SLURM_JOB_ID": "7", "SLURM_STEP_NODELIST": "n[1-2]", "SLURM_NTASKS": "16", "SLURM_PROCID": "11"}
 FIRST, FOURTH = SRUN | {"SLURM_LOCALID": "0"}, SRUN | {"SLURM_LOCALID": "3"}
@@ -87,7 +87,7 @@ def test_a_launcher_that_cannot_be_read_is_named(case):
 def test_jax_hides_no_gpu_from_the_only_process_of_a_machine(tasks, seen):
     """What the installed JAX makes of the ids: the setting that its CUDA backend starts with."""
     code = (
-        "import os, jax; from fcos_lidar_jax.training.launcher import local_device_ids as ids; "
+        "import os, jax; from fcos_lidar_jax.devices.launcher import local_device_ids as ids; "
         "jax.distributed.initialize(local_device_ids=ids(os.environ)); "
         "print(jax.config.read('jax_cuda_visible_devices'))"
     )

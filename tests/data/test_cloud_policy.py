@@ -6,14 +6,15 @@ import re
 import numpy as np
 import pytest
 
-from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.inference.cloud import (
+from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.cloud_policy import (
     MAX_INTENSITY,
     MAX_TIME_LAG_S,
     expect_points,
     make_cloud,
     sensor_mismatch,
 )
+from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, PRESETS, TINY
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -22,8 +23,9 @@ LAGS = np.repeat(np.array([0, 0.05, 0.1], np.float32), [40, 50, 60])
 
 
 def cloud_of(points, size=200, *, sensor=TINY, remove="all", **options):
-    config = dataclasses.replace(QUICKSTART, max_points=size)
-    return make_cloud(points, config, sensor=sensor, remove_close=remove, **options)
+    projection = dataclasses.replace(QUICKSTART.projection, remove_close=remove)
+    config = dataclasses.replace(QUICKSTART, max_points=size, projection=projection)
+    return make_cloud(points, config, sensor=sensor, **options)
 
 
 def numbered(lags=LAGS, *, columns=5):
@@ -64,10 +66,13 @@ def test_close_points_are_removed_once(mode, removed):
     points[:4, :2] = [[0.5, -0.5], [1.0, 0], [-0.99, 0.99], [0, 0]]
     points[:4, 4] = [0, 0, 0.05, 0.05]
     points[3, 3] = np.nan  # close, and not finite: counted as that
-    cloud = cloud_of(points, remove=mode, num_close=11)
+    cloud = cloud_of(points, remove=mode)
     assert np.flatnonzero(~cloud.valid[:150]).tolist() == [*removed, 3]
-    assert (cloud.num_close, cloud.num_invalid) == (len(removed) + 11, 1)
-    assert (cloud.num_points, cloud.num_removed) == (161, len(removed) + 12)
+    assert (cloud.num_close, cloud.num_invalid) == (len(removed), 1)
+    assert (cloud.num_points, cloud.num_removed) == (150, len(removed) + 1)
+    read = cloud_of(points, remove=mode, num_close=11)  # the reader has removed its own
+    assert np.flatnonzero(~read.valid[:150]).tolist() == [3]
+    assert (read.num_points, read.num_close, read.num_removed) == (161, 11, 12)
 
 
 def test_the_configuration_says_which_close_points_go():
@@ -159,7 +164,7 @@ def test_a_sensor_knows_its_own_clouds(clouds, name):
 
 
 def test_older_sweeps_do_not_count():
-    points = make_frame(1, TINY, num_sweeps=4).points
+    points = make_frame(1, TINY, reading=CloudReading(4, "none")).points
     assert sensor_mismatch(points, TINY) is None
     points[:, 4] = 0
     assert sensor_mismatch(points, TINY) is not None

@@ -5,7 +5,7 @@ import sys
 from importlib.resources import files
 from pathlib import Path
 
-from fcos_lidar_jax.training.checkpoint import (
+from fcos_lidar_jax.checkpoints.storage import (
     Checkpoint,
     CheckpointError,
     load_checkpoint,

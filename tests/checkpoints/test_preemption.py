@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from fcos_lidar_jax.training.preemption import after_the_block, stop_requests
+from fcos_lidar_jax.checkpoints.preemption import after_the_block, stop_requests
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

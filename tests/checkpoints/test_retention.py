@@ -11,17 +11,11 @@ import numpy as np
 import pytest
 from tiny_run import CONFIG, SENSOR, bits
 
+from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint
+from fcos_lidar_jax.checkpoints import storage as checkpoint
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_of, find_checkpoint
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.training import (
-    Checkpoint,
-    CheckpointError,
-    checkpoint,
-    detection_variables,
-    load_checkpoint,
-    make_optimizer,
-    make_state,
-)
-from fcos_lidar_jax.training.checkpoints import CHECKPOINTS, Checkpoints, best_of, find_checkpoint
+from fcos_lidar_jax.training import detection_variables, make_optimizer, make_state
 
 
 @functools.cache
@@ -163,7 +157,7 @@ def test_a_failed_save_leaves_the_others_and_nothing_of_itself(copy, monkeypatch
     def full(*_, **__):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("fcos_lidar_jax.training.checkpoint._save_arrays", full)
+    monkeypatch.setattr("fcos_lidar_jax.checkpoints.storage._save_arrays", full)
     with pytest.raises(OSError, match="No space left"):
         save(copy, 8)
     assert {p: p.read_bytes() for p in copy.folder.rglob("*") if p.is_file()} == before

@@ -1,0 +1,6 @@
+"""Work shared over devices and processes: mesh, batches on their way, agreement, launchers."""
+
+from fcos_lidar_jax.devices.feeding import feed
+from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, pmap_step, replicate, shard_batch
+
+__all__ = ["feed", "jit_step", "make_mesh", "pmap_step", "replicate", "shard_batch"]

@@ -1,0 +1,83 @@
+"""What the detections of a data set are written to, read from and compared with."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
+from fcos_lidar_jax.evaluation.frames import frame_columns, read_detections, write_detections
+from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Metric, metric_of
+from fcos_lidar_jax.evaluation.records import as_records
+from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
+from fcos_lidar_jax.evaluation.truth import split_truth
+from fcos_lidar_jax.types import Detections
+
+
+class Compared(NamedTuple):
+    """Predictions beside the truth."""
+
+    predictions: BoxColumns
+    truth: GroundTruth
+    meta: dict[str, Any]  # of the results file
+    warnings: Sequence[str] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """A metric with its results file."""
+
+    file: str  # name of the results file
+    metric: Metric
+    entries: Callable[[int, Detections], list[dict[str, Any]]]
+    """Index of a frame and its detections -> its boxes as the file has them."""
+    write: Callable[[Path, Iterable[tuple[str, bytes]]], None]  # names of the frames with their boxes as JSON
+    read: Callable[[Path], Compared]
+
+
+RESULT_FILES = ("results_nusc.json", "detections.json")
+
+
+def compare_by_benchmark(
+    truth: GroundTruth | NuScenesFrames, of: str, classes: Sequence[str] = NUSCENES_CLASSES
+) -> Comparison:
+    """By nuScenes' own metric.
+
+    Args:
+        truth: keyframes, or the truth of a file, for which no detections can be written.
+        of: what the samples are of, for messages.
+        classes: that the labels of detections index.
+    """
+    frames = truth
+    known = split_truth(frames.nuscenes, frames.tokens) if isinstance(frames, NuScenesFrames) else frames
+
+    def entries(index: int, detections: Detections) -> list[dict[str, Any]]:
+        assert isinstance(frames, NuScenesFrames)
+        return result_entries(detections, frames.tokens[index], frames.pose(index), classes)
+
+    def read(file: Path) -> Compared:
+        results = read_results(file, known.tokens, of=of)
+        return Compared(results.boxes, known, results.meta, results.warnings)
+
+    return Comparison(RESULT_FILES[0], NUSCENES_METRIC, entries, write_results, read)
+
+
+def compare_by_distance(frames: FrameSet, ranges_m: dict[str, float]) -> Comparison:
+    """By the average precision and the errors of centre distance, over the classes of ``ranges_m``."""
+    classes, names = tuple(ranges_m), [frames.name(index) for index in range(len(frames))]
+
+    def read(file: Path) -> Compared:
+        truths = (frames.truth(index) for index in range(len(frames)))
+        return Compared(*frame_columns(read_detections(file, names, classes), truths, names), {})
+
+    return Comparison(
+        RESULT_FILES[1],
+        metric_of(classes, tuple(ranges_m.values())),
+        lambda _, detections: as_records(detections, classes),
+        partial(write_detections, classes=classes),
+        read,
+    )

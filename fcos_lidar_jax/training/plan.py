@@ -1,0 +1,256 @@
+"""The plan of a run: the one place that refuses what cannot be trained, before the folder becomes a run's."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from fcos_lidar_jax.augment import check_augmentation
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
+from fcos_lidar_jax.checkpoints.storage import CheckpointError, check_arrays, load_checkpoint, with_later_fields
+from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.devices.mesh import check_batch_size
+from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.input_pipeline.batching import check_counts
+from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
+from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
+from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options, packing_for
+from fcos_lidar_jax.models import Detector, Variables, build_detector
+from fcos_lidar_jax.packing import Packing
+from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.training.metrics_log import evaluated_steps
+from fcos_lidar_jax.training.optimizer import make_optimizer
+from fcos_lidar_jax.training.step import make_state
+
+_LATER_FIELDS = ("ground_truth_database", "tests")  # that the specification did not have at first
+NUM_SEEDS = 2**32  # JAX keeps 32 bits of a seed: larger ones would be others' again.
+RUN_SPEC = "run.json"  # Name of the file in a run's folder that says what the run is.
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """When a run saves and evaluates.
+
+    >>> Schedule(save_every=100).keep
+    2
+    """
+
+    save_every: int | None = None  # Steps between two checkpoints; default: a fiftieth of the run.
+    evaluate_every: int | None = None
+    """Steps between two evaluations; each saves a checkpoint, too; default: a tenth of the run."""
+    keep: int = 2  # Newest checkpoints that are kept, beside the best.
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is not None and (type(value) is not int or value < 1):
+                raise ValueError(f"schedule.{field.name}: got {value!r}, expected an integer of at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What stays the same through a run."""
+
+    folder: Path
+    detector: Detector
+    optimizer: Any  # optax's pair of functions
+    schedule: Schedule
+    num_steps: int
+    seed: int
+    frames: FrameSet
+    order: SampleOrder
+    tests: FrameSet | None
+    devices: Sequence[Any] | None
+    spec: dict[str, Any]
+    weights: Variables | None  # to begin with
+    packing: Packing | None
+    warnings: tuple[str, ...]
+
+    def evaluation_pending(self, step: int) -> bool:
+        """Whether a run was stopped during the evaluation after a step, whose record is written last."""
+        return step > 0 and self.evaluates_at(step) and step not in evaluated_steps(self.folder)
+
+    @property
+    def checkpoints(self) -> Checkpoints:
+        return Checkpoints(self.folder / CHECKPOINTS, keep=self.schedule.keep)
+
+    def evaluates_at(self, step: int) -> bool:
+        every = self.schedule.evaluate_every or -(-self.num_steps // 10)
+        return self.tests is not None and (step % every == 0 or step == self.num_steps)
+
+    def saves_at(self, step: int) -> bool:
+        return step % (self.schedule.save_every or -(-self.num_steps // 50)) == 0 or self.evaluates_at(step)
+
+
+def plan_run(
+    config: Config,
+    frames: FrameSet,
+    out: Path,
+    mesh: Mesh,
+    *,
+    steps: int,
+    seed: int,
+    tests: FrameSet | None,
+    objects: GroundTruthDatabase | None,
+    resume: bool,
+    weights: str | Path | Variables | None,
+    devices: Sequence[Any] | None,
+    schedule: Schedule,
+    threads: int | None,
+    workers: int,
+    packing: bool | None,
+) -> Run:
+    """All that a run follows from; arguments as of :func:`fcos_lidar_jax.training.train`, labels of its classes.
+
+    Raises:
+        ValueError: what cannot be trained.
+    """
+    check_numbers(steps, seed)
+    order = SampleOrder(frames, config, seed=seed)
+    an_epoch = -(-order.epoch_size // config.optimizer.batch_size)
+    if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:
+        raise ValueError(
+            f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
+            f"{steps} steps: nothing would ever be pasted"
+        )
+    check_counts(frames)
+    check_batch_size(config.optimizer.batch_size, mesh)
+    check_loader_options(config, objects, threads=threads, workers=workers, num_processes=jax.process_count())
+    if config.augment is not None:
+        check_augmentation(config.augment, frames.sensor)
+    detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, steps)
+    jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(seed))
+    # Only the same run can be resumed. Weights given as arrays are not recorded.
+    spec = {
+        "config": config_to_json(config),
+        "sensor": sensor_to_json(frames.sensor),
+        "steps": steps,
+        "seed": seed,
+        "frames": len(frames),
+        "data": frames.fingerprint(),
+        "tests": None if tests is None else tests.fingerprint(),
+        "objects": None if objects is None else objects.manifest.source,
+        "ground_truth_database": None if objects is None else objects.fingerprint(),
+        "weights": str(weights) if isinstance(weights, str | Path) else None,
+    }
+    spec = json.loads(json.dumps(spec))
+    check_run(out, spec, resume=resume)
+    if config.copy_paste is not None and objects is not None:
+        make_paste(objects, config)
+    on_cpus = mesh.devices.flat[0].platform == "cpu"
+    return Run(
+        folder=out,
+        detector=detector,
+        optimizer=optimizer,
+        schedule=schedule,
+        num_steps=steps,
+        seed=seed,
+        frames=frames,
+        order=order,
+        tests=tests,
+        devices=devices,
+        spec=spec,
+        weights=_given_weights(detector, weights) if not resume or not _any_checkpoint(out) else None,
+        packing=packing_for(frames, config) if packing or (packing is None and not on_cpus) else None,
+        warnings=tuple(_warnings(frames, config)),
+    )
+
+
+def check_numbers(steps: int, seed: int) -> None:
+    """Refuse numbers of steps and seeds that no run can have: ValueError."""
+    if type(steps) is not int or steps < 1:
+        raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
+    if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
+        raise ValueError(f"seed: got {seed!r}, expected an integer from 0 to {NUM_SEEDS - 1}")
+
+
+def _any_checkpoint(out: Path) -> bool:
+    return bool(Checkpoints(out / CHECKPOINTS).paths())
+
+
+def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
+    """What is odd about the frames, by some of them, spread over the set."""
+    indices = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
+    clouds = (frames.frame(int(index)).points for index in indices)
+    first = next(clouds)
+    if mismatch := sensor_mismatch(first, frames.sensor):
+        yield f"{frames.name(0)}: {mismatch}"
+    if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in (first, *clouds)):
+        yield (
+            f"num_sweeps: got {config.num_sweeps}, but the frames hold one sweep each: expected 1, for `stream` "
+            "will fuse as many, which the detector has not seen"
+        )
+
+
+def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
+    """Refuse a folder that cannot take a run.
+
+    Args:
+        folder: of the run.
+        spec: what ``run.json`` must hold; None to check only whether there is a run.
+        resume: the run is to be resumed.
+
+    Returns:
+        fields of the specification that an older run does not have, and that were not compared.
+
+    Raises:
+        ValueError: there is a run and it is not to be resumed, or none to resume, or another one, with the first
+            field that differs.
+    """
+    folder = Path(folder)
+    file = folder / RUN_SPEC
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: found a file, expected a folder")
+    if not file.is_file():
+        if resume:
+            raise ValueError(f"{file}: found nothing, expected the run to resume")
+        return []
+    if not resume:
+        raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
+    found = read_json(file, dict[str, Any], what="the specification of a run")
+    if spec is None:
+        return []
+    missing = [name for name in _LATER_FIELDS if name in spec and name not in found]
+    found |= {name: spec[name] for name in missing}
+    if isinstance(config := found.get("config"), dict):
+        found["config"] = with_later_fields(config)
+    for name, (was, wanted) in _differences(found, spec):
+        raise ValueError(f"{file}: {name}: was {was!r}, got {wanted!r}: only the same run can be resumed")
+    return missing
+
+
+def _given_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
+    if not isinstance(weights, str | Path):
+        return weights
+    folder = find_checkpoint(Path(weights))
+    checkpoint = load_checkpoint(folder)
+    classes = checkpoint.config.classes
+    if classes != detector.config.classes:
+        raise CheckpointError(
+            f"{folder}: classes: got {classes}, expected {detector.config.classes}, which are to be trained"
+        )
+    expected = jax.eval_shape(detector.init, jax.random.key(0))
+    check_arrays(folder, expected, checkpoint.variables, whose="the network that is to be trained")
+    # Arrays of the same shapes may still mean something else.
+    given, own = config_to_json(checkpoint.config)["model"], config_to_json(detector.config)["model"]
+    if jax.process_index() == 0:
+        for name, (was, now) in _differences(given, own, "model"):
+            print(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}", file=sys.stderr, flush=True)
+    return checkpoint.variables
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
+    """Where two JSON values differ."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in sorted(found.keys() | wanted.keys()):
+            yield from _differences(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
+    elif found != wanted:
+        yield name, (found, wanted)

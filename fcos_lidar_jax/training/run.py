@@ -1,0 +1,273 @@
+"""Training as a run in a folder: begun, stopped, resumed, evaluated along the way.
+
+``run.json`` is the run's specification, ``metrics.jsonl`` and ``tensorboard/`` hold the metrics, ``checkpoints/``
+the last checkpoints and the best one, ``pictures/`` some test frames at every evaluation, ``loss.png`` and
+``scores.png`` the curves.
+"""
+
+import contextlib
+import dataclasses
+import json
+import math
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from fcos_lidar_jax.checkpoints.preemption import stop_requests
+from fcos_lidar_jax.checkpoints.storage import Checkpoint, NonFiniteStateError
+from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.class_mapping import MappedFrames
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.devices.agreement import agreed, check_same
+from fcos_lidar_jax.devices.feeding import feed
+from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, replicate
+from fcos_lidar_jax.files import atomic_write, checksum, folder_lock
+from fcos_lidar_jax.inference.detector import TrainedDetector
+from fcos_lidar_jax.inference.prediction import evaluate, predict
+from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
+from fcos_lidar_jax.input_pipeline.loader import make_batches
+from fcos_lidar_jax.models import Variables
+from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
+from fcos_lidar_jax.training.metrics_log import MetricsLog
+from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
+from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, plan_run
+from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
+from fcos_lidar_jax.types import TrainState
+
+_NUM_PICTURES = 2  # Test frames that are drawn at an evaluation.
+
+Hook = Callable[[int, Record], None]  # Called with (steps done, metrics of the last of them) after every step.
+
+
+def train(
+    config: Config,
+    frames: FrameSet,
+    out: str | Path,
+    *,
+    steps: int,
+    seed: int = 0,
+    tests: FrameSet | None = None,
+    objects: GroundTruthDatabase | None = None,
+    resume: bool = False,
+    weights: str | Path | Variables | None = None,
+    devices: Sequence[Any] | None = None,
+    hooks: Sequence[Hook] = (),
+    schedule: Schedule = Schedule(),
+    threads: int | None = None,
+    workers: int = 0,
+    packing: bool | None = None,
+) -> TrainState:
+    """Train to the end, or until Ctrl-C or SIGTERM, which save a checkpoint first.
+
+    Args:
+        config: what to train.
+        frames: to train on; their classes are matched to ``config.classes`` by name, and their sensor is the
+            detector's.
+        out: folder of the run.
+        steps: updates of the whole run.
+        seed: of weights, order, pasted objects and augmentation.
+        tests: frames to evaluate on along the way.
+        objects: ground-truth database for copy-paste; needed unless ``config.copy_paste`` is None.
+        resume: from the newest whole checkpoint in the folder; the run must be the same.
+        weights: to begin with, instead of random ones: a checkpoint, or arrays.
+        devices: to share each batch; default: all.
+        hooks: called after every step.
+        schedule: when to save and to evaluate.
+        threads, workers: threads that prepare batches, and processes beside them; default: as many threads as
+            ``input_pipeline.loader.default_threads`` says, and no processes.
+        packing: whether batches travel to the devices in fewer bytes, see :mod:`fcos_lidar_jax.packing`; the
+            results are the same. Default: unless the devices are CPUs.
+
+    Returns:
+        the last state.
+
+    Raises:
+        ValueError: the folder holds another run, no class is shared, devices and batch do not fit, steps or seed
+            are out of range, or the augmentation does not suit the sector that the sensor covers, see
+            :func:`fcos_lidar_jax.augment.check_augmentation`; or processes were given different runs or data.
+        OSError: another process trains in the folder, or it cannot be written.
+        NonFiniteLossError, NonFiniteStateError: the last checkpoint is from before.
+        KeyboardInterrupt: after Ctrl-C, when all is saved.
+        SystemExit: after SIGTERM, likewise.
+
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.simulation.frame_set import fresh_streets
+    >>> config, frames = fresh_streets(QUICKSTART, steps=500)
+    >>> train(dataclasses.replace(config, classes=("boat",)), frames, "run", steps=500)
+    Traceback (most recent call last):
+    ValueError: ...
+    """
+    mesh = make_mesh(devices)
+    is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
+    with agreed("cannot train"):
+        run = plan_run(
+            config,
+            MappedFrames(frames, config.classes),
+            Path(out),
+            mesh,
+            steps=steps,
+            seed=seed,
+            tests=None if tests is None else MappedFrames(tests, config.classes),
+            objects=objects,
+            resume=resume,
+            weights=weights,
+            devices=devices,
+            schedule=schedule,
+            threads=threads,
+            workers=workers,
+            packing=packing,
+        )
+    packed = None if run.packing is None else dataclasses.asdict(run.packing)
+    program = json.dumps([run.spec, packed], sort_keys=True)
+    check_same(checksum(program.encode()), "configuration, data or packing")
+    with _own_folder(run, resume=resume):
+        start = _start(run, resume=resume)
+        first = int(start.step)
+        pending = run.evaluation_pending(first)
+        if first == steps and not pending:
+            print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
+            return start
+        step = jit_step(make_train_step(run.detector, run.optimizer), mesh)
+        metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
+        if is_main_process:
+            for line in run.warnings:
+                print(f"warning: {line}", file=sys.stderr, flush=True)
+            print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
+
+        def report(number: int, record: Record) -> None:
+            if metrics is not None:
+                samples = config.optimizer.batch_size / max(float(record["seconds"]), 1e-9)  # type: ignore[arg-type]
+                metrics.write(number, record | {"samples_per_second": samples})
+            for hook in hooks:
+                hook(number, record)
+
+        def pause(number: int, state: TrainState) -> None:
+            if metrics is not None:
+                metrics.flush()
+                _save(run, state)  # What is done is safe before an evaluation, which may take long.
+            if run.evaluates_at(number):
+                _evaluate(run, number, state, metrics)
+
+        batches = make_batches(
+            run.frames,
+            config,
+            seed=seed,
+            num_steps=steps,
+            first_step=first,
+            objects=objects,
+            process_index=jax.process_index(),
+            num_processes=jax.process_count(),
+            threads=threads,
+            workers=workers,
+            packing=run.packing,
+            lend=True,
+            order=run.order,
+        )
+        with stop_requests(active=not several) as request, batches as prepared, feed(prepared, mesh) as stream:
+
+            def stopping(done: int) -> bool:
+                if several:  # all stop after the same step, whichever of them was asked to
+                    return multihost_utils.reached_preemption_sync_point(done)
+                return request.signal is not None
+
+            try:
+                state = replicate(start, mesh)
+                if pending:
+                    _evaluate(run, first, state, metrics)
+                state = fit(
+                    step,
+                    state,
+                    stream,
+                    num_steps=steps,
+                    report=report,
+                    pause_at=run.saves_at,
+                    pause=pause,
+                    stopping=stopping,
+                    log_every_s=10.0 if is_main_process else math.inf,
+                )
+                done = int(state.step)
+                if is_main_process and not run.saves_at(done):
+                    _save(run, state)
+            except (NonFiniteLossError, NonFiniteStateError) as error:
+                kept = run.checkpoints.paths()
+                last = f"the last checkpoint is {kept[-1]}" if kept else "there is no checkpoint yet"
+                raise type(error)(f"{error}; {last}") from None
+            finally:
+                if metrics is not None:
+                    metrics.close()
+        if is_main_process:
+            draw_metrics(run.folder)
+    if done < steps:
+        print(f"stopped after step {done}, which is saved", file=sys.stderr)
+        if request.signal == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + signal.SIGTERM)
+    return state
+
+
+@contextlib.contextmanager
+def _own_folder(run: Run, *, resume: bool) -> Iterator[None]:
+    """Hold the run's folder in the main process; the others continue only when it does."""
+    with contextlib.ExitStack() as held:
+        error: Exception | None = None
+        if jax.process_index() == 0:
+            try:
+                held.enter_context(folder_lock(run.folder, "training"))
+                missing = check_run(run.folder, run.spec, resume=resume)  # another process may have been faster
+                if missing:
+                    print(f"{run.folder}: an older run, without {', '.join(missing)} to compare", file=sys.stderr)
+                text = json.dumps(run.spec, indent=1)
+                if not resume:
+                    atomic_write(run.folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
+            except (OSError, ValueError) as failure:
+                error = failure
+        if jax.process_count() > 1 and not multihost_utils.broadcast_one_to_all(np.array(error is None)):
+            error = error or OSError(f"{run.folder}: the main process cannot work there")
+        if error is not None:
+            raise error
+        yield
+
+
+def _start(run: Run, *, resume: bool) -> TrainState:
+    """The state of the newest checkpoint, or one of given or random weights."""
+    key = jax.random.key(run.seed)
+    if resume:
+        like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
+        newest = run.checkpoints.newest(like)
+        if newest is not None:
+            return newest[1]
+    return make_state(run.detector, run.optimizer, key, variables=run.weights)
+
+
+def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | None) -> None:
+    """Score on the test frames, which all processes share; the main process draws, saves and records."""
+    assert run.tests is not None
+    trained = TrainedDetector(run.detector, _local_variables(state))
+    summary = evaluate(trained, run.tests, devices=run.devices).summary
+    score = summary["mean_ap"]
+    first = range(min(_NUM_PICTURES, len(run.tests)))
+    shown = list(predict(trained, run.tests, indices=first, devices=run.devices))
+    if metrics is not None:
+        print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
+        draw_predictions(run.folder / "pictures", shown, run.tests, number)
+        if not math.isnan(score):
+            run.checkpoints.record_score(number, score)
+        values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
+        metrics.write(number, {"test/mAP": score, **values})  # Last: what is recorded is not done again.
+
+
+def _save(run: Run, state: TrainState) -> None:
+    data = json.dumps({name: run.spec[name] for name in ("data", "frames", "weights")}, sort_keys=True)
+    config, sensor = run.detector.config, run.detector.sensor
+    checkpoint = Checkpoint(config, sensor, _local_variables(state), int(state.step), data)
+    run.checkpoints.save(checkpoint, state)
+
+
+def _local_variables(state: TrainState) -> Variables:
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), detection_variables(state))
