@@ -92,7 +92,7 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
     assert (options["steps"], options["seed"], options["workers"]) == (5, 3, 2)
     assert {frames.scene(i) for i in range(3)} == {"scene-0001"}
     assert {tests.scene(i) for i in range(3)} == {"scene-0002"}
-    assert (frames.num_sweeps, tests.num_sweeps) == (3, 3)
+    assert (frames.reading.num_sweeps, tests.reading.num_sweeps) == (3, 3)
     assert len(options["objects"]) > 0, "those that prepare has cut from ten sweeps"
     # Another data set of the same version is another scale, and has other objects.
     other = NuScenesLayout(dataclasses.replace(layout, data_root=tmp_path / "two"))
