@@ -52,6 +52,9 @@ class Stages(NamedTuple):
         network: ``(variables, input) -> outputs``.
         candidates: ``(outputs, input) -> boxes, scores, labels, valid``, as of the detector.
         postprocess: the same after NMS, see :func:`suppress`.
+
+    >>> Stages._fields
+    ('prepare', 'network', 'candidates', 'postprocess')
     """
 
     prepare: Callable[..., Any]
@@ -61,7 +64,16 @@ class Stages(NamedTuple):
 
 
 def make_stages(detector: Detector) -> Stages:
-    """The stages of :func:`make_detect`, to be jitted, timed or replaced one by one."""
+    """Return the stages of :func:`make_detect`, to jit, time or replace one by one.
+
+    >>> from fcos_lidar_jax.models import build_detector
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> stages = make_stages(build_detector(QUICKSTART, SHORT_RANGE))
+    >>> points, valid = jax.ShapeDtypeStruct((4096, 5), jnp.float32), jax.ShapeDtypeStruct((4096,), bool)
+    >>> jax.eval_shape(stages.prepare, points, valid).point_index.shape
+    (32, 128, 1)
+    """
 
     def network(variables: Any, one: Any) -> Any:
         outputs, _ = detector.apply(variables, jax.tree.map(lambda leaf: leaf[None], one))

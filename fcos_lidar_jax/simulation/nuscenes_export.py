@@ -105,12 +105,13 @@ def _finished(spec: DatasetSpec, root: Path) -> bool:
     clouds = itertools.product(range(spec.scenes), range(spec.sweeps))
     files = (root / sweep_file(spec.seed, index, number) for index, number in clouds)
     tables = ((folder / name, checksum) for name, checksum in written.items())
+    # Names of tables are read from a file: ``Path.is_file`` raises an OSError where one is too long.
     damaged = itertools.chain(
         (file for file in files if not file.is_file() or file.stat().st_size != size),
-        (file for file, checksum in tables if not file.is_file() or file_checksum(file) != checksum),
+        (file for file, checksum in tables if not os.path.isfile(file) or file_checksum(file) != checksum),
     )
     if (file := next(damaged, None)) is not None:
-        found = "other content" if file.is_file() else "nothing"
+        found = "other content" if os.path.isfile(file) else "nothing"
         raise ValueError(f"{file}: found {found}, expected the file as written: remove {root} and run again")
     return True
 

@@ -61,9 +61,9 @@ def test_own_data_have_their_sensor_whatever_the_configuration_is_called(tmp_pat
     args += ["--copy-paste.targets", "2", "2", "2"]
     ignored = r"--sensor: got '\w+', expected none: .*/sensor.json has 'tiny'"
     for name, sensor, message in (
-        ([], [], "fade_epochs: got 4"),  # refused after the sensor
+        ([], [], "no objects here"),  # refused after the sensor
         ([], ["--sensor", "kitti_hdl64e"], ignored),
-        (["--name", "mine"], [], "fade_epochs: got 4"),
+        (["--name", "mine"], [], "no objects here"),
         (["--name", "mine"], ["--sensor", "waymo_top"], ignored),
     ):
         assert_one_line_error(capsys, [*args, *name, *sensor], message)
