@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
 from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
 from fcos_lidar_jax.evaluation.frames import frame_columns, read_detections, write_detections
+from fcos_lidar_jax.evaluation.kitti import describe_kitti
+from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, write_kitti
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation, Metric, evaluate, metric_of
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
@@ -52,7 +54,8 @@ class Evaluate:
     annotations of a data set (--data-root) or, for an official results file, a file of ground truth
     (--ground-truth). Writes metrics_summary.json, curves.json, report.html with its pictures, frames.html, which
     shows the worst and the best frames with their truth, and the detections: results_nusc.json for nuScenes, else
-    detections.json. Ctrl-C, or a kill, loses one batch of a detector's work: the same command resumes.
+    detections.json. For KITTI, its own metric is added as metrics_kitti.json, with its result files in
+    results_kitti. Ctrl-C, or a kill, loses one batch of a detector's work: the same command resumes.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
@@ -127,7 +130,7 @@ def _check(args: Evaluate) -> None:
         check_outside("--out", args.out, args.checkpoint)
     given = [] if args.results is None else [args.results]
     truth = [] if args.ground_truth is None else [args.ground_truth]
-    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE):
+    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY):
         check_out_file("--out", args.out / name, keep=[*given, *truth])
     for name in _DETECTIONS.values():  # may be evaluated again where they are
         check_out_file("--out", args.out / name, keep=truth)
@@ -155,6 +158,7 @@ class _Compared:
     truth: GroundTruth
     metric: Metric
     meta: dict[str, object]
+    found: Sequence[Detections] = ()  # the predictions by frame; none by the benchmark's metric
 
 
 def _open(args: Evaluate) -> _Task:
@@ -208,7 +212,7 @@ def _compare(args: Evaluate, task: _Task) -> _Compared:
     found = read_detections(file, names, detector.classes)
     predictions, truth = frame_columns(found, (frames.truth(i) for i in range(len(frames))), names)
     metric = metric_of(detector.classes, tuple(detector.config.ranges_m.values()))
-    return _Compared(task, predictions, truth, metric, {})
+    return _Compared(task, predictions, truth, metric, {}, found)
 
 
 def _score(args: Evaluate, compared: _Compared) -> None:
@@ -223,6 +227,8 @@ def _score(args: Evaluate, compared: _Compared) -> None:
     for line in warnings(evaluation, len(compared.predictions), compared.truth):
         tell(line)
     print(describe(evaluation, intervals), flush=True)
+    if (kitti := write_kitti(args.out, compared.found, compared.task.frames)) is not None:
+        print(describe_kitti(kitti), flush=True)
     if args.report:
         _report(args, compared, evaluation)
     print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")

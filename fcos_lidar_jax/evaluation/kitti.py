@@ -107,7 +107,7 @@ class _Objects:
 
 
 def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Rows of truth and detections that overlap enough to match, i64[n, 2], by truth; and their overlaps f64[n]."""
+    """Rows of truth and detections that overlap enough to match, i64[n, 2], ascending, and overlaps f64[n]."""
     parts = [np.zeros((0, 2), np.int64)]
     radius = [np.hypot(o.boxes[:, 1], o.boxes[:, 2]) / 2 for o in (truth, found)]
     first = 0, 0
