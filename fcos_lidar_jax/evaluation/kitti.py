@@ -12,7 +12,7 @@ from fcos_lidar_jax.data.kitti import read_objects
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
 """The classes that KITTI evaluates -> overlap that a detection must exceed, from above and in space."""
 DIFFICULTIES = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
-"""Least height in the image (pixels), greatest occlusion and truncation of the objects that count."""
+"""Of the objects that count: height in the image (pixels) that they exceed, greatest occlusion and truncation."""
 
 _NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _POSITIONS = 40
@@ -89,7 +89,7 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
     if few:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
     if metrics.get("left_out"):
-        lines.append(f"left out, not in KITTI's metric: {', '.join(metrics['left_out'])}")
+        lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
     return "\n".join(lines)
 
 
@@ -169,7 +169,7 @@ def _evaluate_class(
     scores: dict[str, Any] = {"min_overlap": MIN_OVERLAP[name], "num_truth": {}, "bev": {}, "3d": {}}
     ours, neighbour = truth.types == name, truth.types == _NEIGHBOURS.get(name, name)
     for difficulty, (height, occlusion, truncation) in DIFFICULTIES.items():
-        within = (truth.height >= height) & (truth.occlusion <= occlusion) & (truth.truncation <= truncation)
+        within = (truth.height > height) & (truth.occlusion <= occlusion) & (truth.truncation <= truncation)
         counted, high = ours & within, found.height >= height
         scores["num_truth"][difficulty] = int(counted.sum())
         # Low detections of any class may be taken by an object, as in the development kit.

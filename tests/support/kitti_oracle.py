@@ -41,7 +41,7 @@ def truth_state(o, name, difficulty):
         return 1
     if o["type"] != name:
         return -1
-    low = o["bottom"] - o["top"] < height
+    low = o["bottom"] - o["top"] <= height
     return int(low or o["occlusion"] > occlusion or o["truncation"] > truncation)
 
 
