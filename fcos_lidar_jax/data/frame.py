@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -37,6 +37,7 @@ class Frame:
     num_close: int = 0
 
 
+@runtime_checkable
 class FrameSet(Protocol):
     """Frames in a fixed order: what every reader offers to the training pipeline and the commands.
 

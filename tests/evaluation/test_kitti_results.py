@@ -101,22 +101,22 @@ def test_what_no_object_can_be_is_left_out(tmp_path, calibration):
     assert len(read_result(tmp_path / "a.txt", calibration)[0]) == 1
 
 
-STREET = [(12.0 + 5 * (i // 5), 3.0 * (i % 5) - 6, -0.9, 4.0, 1.7, 1.5, 0.1) for i in range(60)]
-"""Cars in rows, all before the camera: more than the 41 positions."""
+CARS = [(x, y, -0.9, 4.0, 1.7, 1.5, 0.1) for x in (10.0, 15.0, 20.0) for y in (-4.0, 0.0, 4.0)]
+"""Higher than 40 pixels. Six frames of them are more than the 41 positions."""
 
 
 @pytest.fixture
 def root(tmp_path):
-    """Two frames of cars, a pedestrian in the second, and an area without labels."""
+    """Six frames of cars, with a pedestrian and an area without labels."""
     root = tmp_path / "kitti"
-    walker = label_text((11.0, 0.0, -0.8, 0.6, 0.7, 1.8, -2.0), "Pedestrian")
-    dont_care = "DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"
-    for name, boxes, more in (("000000", STREET[:30], dont_care), ("000001", STREET[30:], walker)):
-        labels = "".join(label_text(box) for box in boxes) + more
-        write(root / "training" / "calib" / f"{name}.txt", calibration_text())
-        write(root / "training" / "label_2" / f"{name}.txt", labels.replace("1.0 2.0 3.0 4.0", "100 100 200 200"))
+    walker = label_text((11.0, -2.0, -0.8, 0.6, 0.7, 1.8, -2.0), "Pedestrian")
+    labels = ("".join(map(label_text, CARS)) + walker).replace("1.0 2.0 3.0 4.0", "100 100 200 200")
+    labels += "DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"
+    for i in range(6):
+        write(root / "training" / "calib" / f"00000{i}.txt", calibration_text())
+        write(root / "training" / "label_2" / f"00000{i}.txt", labels)
         (root / "training" / "velodyne").mkdir(exist_ok=True)
-        np.array([[15, 2, -1, 0.2]], np.float32).tofile(root / "training" / "velodyne" / f"{name}.bin")
+        np.array([[15, 0, -1, 0.2]], np.float32).tofile(root / "training" / "velodyne" / f"00000{i}.bin")
     return root
 
 
@@ -137,9 +137,9 @@ def test_the_metric_of_what_was_written(root, tmp_path):
     assert metrics is not None
     assert json.loads((out / "metrics_kitti.json").read_text()) == metrics
     car = metrics["classes"]["Car"]
-    assert (car["num_truth"]["hard"], car["bev"]["easy"], car["3d"]["hard"]) == (60, 100.0, 100.0)
-    assert (metrics["num_frames"], metrics["left_out"]) == (2, ["Truck", "Cyclist"])
-    assert sorted(f.name for f in (out / "results_kitti").iterdir()) == ["000000.txt", "000001.txt"]
+    assert (car["num_truth"]["hard"], car["bev"]["easy"], car["3d"]["hard"]) == (54, 100.0, 100.0)
+    assert (metrics["num_frames"], metrics["left_out"]) == (6, ["Truck", "Cyclist"])
+    assert sorted(f.name for f in (out / "results_kitti").iterdir()) == [f"00000{i}.txt" for i in range(6)]
     assert "left out, not in both the detector and KITTI's metric: Truck, Cyclist" in describe_kitti(metrics)
     # Some of the frames; then frames of other data, which leave no numbers of these.
     some = ChosenFrames(frames, (1,))
@@ -160,7 +160,7 @@ def test_a_class_map_is_undone_and_names_match_in_lower_case(root, tmp_path):
         ["cyclist", "Misc", "Cyclist"],
     )
     types = [line.split()[0] for line in (tmp_path / "results_kitti" / "000001.txt").read_text().splitlines()]
-    assert types == ["Car"] * 30 + ["Pedestrian"]
+    assert types == ["Car"] * 9 + ["Pedestrian"]
 
 
 def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
@@ -170,19 +170,11 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     records = [json.dumps(as_records(found, frames.classes)).encode() for found in perfect(frames)]
     named = [(frames.name(i), record) for i, record in enumerate(records)]
     write_detections(tmp_path / "given.json", named, frames.classes)
-    command(
-        *(
-            "evaluate --data-root",
-            root,
-            "--class-map",
-            tmp_path / "map.json",
-            "--checkpoint quickstart --no-report",
-        ),
-        *("--results", tmp_path / "given.json", "--out", tmp_path / "out"),
-    )
+    data = f"--data-root {root} --class-map {tmp_path}/map.json --checkpoint quickstart"
+    command("evaluate", data, f"--no-report --results {tmp_path}/given.json --out {tmp_path}/out")
     metrics = json.loads((tmp_path / "out" / "metrics_kitti.json").read_text())
     assert metrics["classes"]["Car"]["3d"] == {"easy": 100.0, "moderate": 100.0, "hard": 100.0}
     assert list(metrics["classes"]) == ["Car", "Pedestrian", "Cyclist"]
     printed = capsys.readouterr().out
-    assert "KITTI AP_R40 on 2 frames" in printed
+    assert "KITTI AP_R40 on 6 frames" in printed
     assert "mAP by centre distance" in printed
