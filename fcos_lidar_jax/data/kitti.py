@@ -35,6 +35,7 @@ _FIELDS = (
     *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
+_LARGEST = float(np.finfo(np.float32).max)
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -259,6 +260,6 @@ def _number(word: str, where: str) -> float:
         value = float(word)
     except ValueError:
         value = np.nan
-    if not abs(value) <= float(np.finfo(np.float32).max):
+    if not abs(value) <= _LARGEST:
         raise ValueError(f"{where}: got {word!r}, expected a finite number")
     return value

@@ -24,13 +24,13 @@ def evaluate_kitti(
     """The average precision of result files, in percent, by the rules of KITTI's development kit.
 
     Every file of the results is a frame; labels of other frames are not read. An object counts if it has the class
-    and is within the limits of the difficulty. All other objects of the class and its neighbours (vans for cars,
-    sitting persons for pedestrians) are ignored: they may be detected or not. So are detections that are lower in
-    the image than the objects that count. DontCare areas have no place in space and excuse no detection here; they
-    concern the overlap of image boxes, which is not evaluated.
+    and is within the limits of the difficulty. Other objects of the class, and its neighbours (vans for cars,
+    sitting persons for pedestrians), are ignored: they may be detected or missed. Detections that are lower in the
+    image than the difficulty's limit are ignored, too. DontCare areas excuse no detection: they have no place in
+    space. The overlap of image boxes and the orientation (AOS) are not evaluated.
 
-    There are 41 positions, of which the first does not enter the mean. With fewer than 41 objects that count,
-    perfect detections therefore stay below 100, as in the development kit.
+    The mean is over 40 of 41 positions, without the first. With fewer than 41 objects that count, perfect
+    detections therefore stay below 100, as in the development kit.
 
     Args:
         results_dir: folder of files ``NAME.txt``, a detection per line, with a score.
@@ -45,21 +45,19 @@ def evaluate_kitti(
         ValueError: naming the file, the line and the field, what was found and what was expected.
 
     >>> import tempfile
-    >>> folders = [Path(tempfile.mkdtemp()) for _ in range(2)]
-    >>> line = "Car 0 0 0 100 100 200 {} 1.5 1.6 4 {} 1.7 20 0"
-    >>> cars = [line.format(150, x) for x in range(0, 250, 5)]
-    >>> for folder, ending in zip(folders, (" 0.9", ""), strict=True):
-    ...     _ = folder.joinpath("000000.txt").write_text("\\n".join(car + ending for car in cars))
-    >>> evaluate_kitti(*folders)["classes"]["Car"]["3d"]
-    {'easy': 100.0, 'moderate': 100.0, 'hard': 100.0}
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> cars = [f"Car 0 0 0 100 100 200 135 1.5 1.6 4 {x} 1.7 20 0 0.9\\n" for x in range(0, 250, 5)]
+    >>> folder.joinpath("000000.txt").write_text("".join(cars)) > 0
+    True
+    >>> evaluate_kitti(folder, folder)["classes"]["Car"]["3d"]  # 35 pixels high
+    {'easy': None, 'moderate': 100.0, 'hard': 100.0}
     """
     files = sorted(Path(results_dir).glob("*.txt"))
     if not files:
         raise ValueError(f"{results_dir}: no .txt file in it, expected one for every frame")
     truth, found = _Objects([Path(label_dir) / file.name for file in files]), _Objects(files)
-    unscored = np.flatnonzero(np.isnan(found.scores))
-    if len(unscored):
-        file = files[int(found.frame[unscored[0]])]
+    for row in np.flatnonzero(np.isnan(found.scores)):
+        file = files[np.searchsorted(found.ends, row, side="right")]
         raise ValueError(f"{file}: score: got 15 values in a line, expected 16, the score last")
     pairs, overlaps = _overlapping(truth, found)
     return {
@@ -70,15 +68,7 @@ def evaluate_kitti(
 
 
 def describe_kitti(metrics: dict[str, Any]) -> str:
-    """What :func:`evaluate_kitti` found, as lines of text.
-
-    >>> ap = {"easy": 90.5, "moderate": 81.25, "hard": None}
-    >>> car = {"min_overlap": 0.7, "num_truth": {"easy": 60, "moderate": 80, "hard": 90}, "bev": ap, "3d": ap}
-    >>> print(describe_kitti({"num_frames": 9, "classes": {"Car": car}}))
-    KITTI AP_R40 on 9 frames     easy moderate     hard
-    Car 0.7 bev                 90.50    81.25        -
-    Car 0.7 3d                  90.50    81.25        -
-    """
+    """What :func:`evaluate_kitti` returns, as lines of text."""
     title = f"KITTI AP_R40 on {metrics['num_frames']} frames"
     lines = [title.ljust(24) + "".join(f"{name:>9}" for name in DIFFICULTIES)]
     for name, scores in metrics["classes"].items():
@@ -100,7 +90,6 @@ class _Objects:
         read = [read_objects(file) for file in files]
         fields = np.concatenate([fields for _, fields in read])
         self.ends = np.cumsum([len(types) for types, _ in read])
-        self.frame = np.repeat(np.arange(len(read)), [len(types) for types, _ in read])
         self.types = np.array([name for types, _ in read for name in types], np.str_)
         self.truncation, self.occlusion, self.boxes, self.scores = *fields[:, :2].T, fields[:, 7:14], fields[:, 14]
         self.height = np.abs(fields[:, 6] - fields[:, 4])
@@ -109,16 +98,12 @@ class _Objects:
 def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Rows of truth and detections that overlap enough to match, i64[n, 2], ascending, and overlaps f64[n]."""
     parts = [np.zeros((0, 2), np.int64)]
-    radius = [np.hypot(o.boxes[:, 1], o.boxes[:, 2]) / 2 for o in (truth, found)]
-    first = 0, 0
-    for last in zip(truth.ends, found.ends, strict=True):
-        (a, r), (b, s) = (
-            (o.boxes[i:j, [3, 5]], size[i:j])
-            for o, size, i, j in zip((truth, found), radius, first, last, strict=True)
-        )
-        near = np.hypot(*np.moveaxis(a[:, None] - b[None], -1, 0)) < r[:, None] + s
-        parts.append(np.argwhere(near) + first)
-        first = last
+    (x, z, r), (u, v, s) = (
+        (*o.boxes[:, [3, 5]].T, np.hypot(o.boxes[:, 1], o.boxes[:, 2]) / 2) for o in (truth, found)
+    )
+    for (a, b), (c, d) in pairwise([(0, 0), *zip(truth.ends, found.ends, strict=True)]):
+        distance = np.hypot(x[a:c, None] - u[b:d], z[a:c, None] - v[b:d])
+        parts.append(np.argwhere(distance < r[a:c, None] + s[b:d]) + np.array([a, b]))
     pairs = np.concatenate(parts)
     bev, volume = overlaps(truth.boxes[pairs[:, 0]], found.boxes[pairs[:, 1]])
     kept = bev > min(MIN_OVERLAP.values())  # the overlap in space is never greater
@@ -126,15 +111,7 @@ def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str
 
 
 def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """IoU of boxes, elementwise, from above and in space, f64[n] each.
-
-    Args:
-        a, b: f64[n, 7]: ``height, width, length, x, y, z, rotation_y`` as in KITTI's files.
-
-    >>> box = np.array([[1.5, 1.6, 4, 2, 1.7, 20, 0.3]])
-    >>> [v.round(6).tolist() for v in overlaps(box, box - [0, 0, 0, 0, 0.75, 0, 0])]
-    [[1.0], [0.333333]]
-    """
+    """IoU from above and in space, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of KITTI's files."""
     (ha, wa, la, _, ya, _, _), (hb, wb, lb, _, yb, _, _) = a.T, b.T
     area = _shared_area(a, b)
     volume = area * np.maximum(np.minimum(ya, yb) - np.maximum(ya - ha, yb - hb), 0.0)

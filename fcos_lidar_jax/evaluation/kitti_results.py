@@ -10,15 +10,7 @@ import numpy as np
 from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.classes import MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, FramesOf
-from fcos_lidar_jax.data.kitti import (
-    CLASSES,
-    IMAGE_SIZE,
-    KittiFrames,
-    read_calibration,
-    read_labels,
-    read_objects,
-    to_lidar,
-)
+from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration, read_objects, to_lidar
 from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, evaluate_kitti
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.geometry import wrap_angle
@@ -35,20 +27,17 @@ def write_kitti(out: Path, detections: Iterable[Detections], frames: FrameSet | 
     """Write detections as ``results_kitti/NAME.txt``, and KITTI's metric of them as ``metrics_kitti.json``.
 
     Classes match KITTI's types by name, in lower or upper case, after the class map that the frames were opened
-    with; boxes of other classes are not written. Only classes of the metric are evaluated.
+    with. Boxes of other classes are not written, and only classes of the metric are evaluated.
 
     Args:
-        out: folder. Other .txt files in its ``results_kitti`` are removed.
-        detections: one for each frame, labels by ``frames.classes``.
+        out: folder; other .txt files in its ``results_kitti`` are removed.
+        detections: of each frame, labels by ``frames.classes``.
         frames: :class:`~fcos_lidar_jax.data.kitti.KittiFrames`, or some of them with mapped classes.
 
     Returns:
         what :func:`~fcos_lidar_jax.evaluation.kitti.evaluate_kitti` returns, and ``left_out``: classes of the
         frames and of the metric without a counterpart. None for other frames: nothing is written, and an older
         ``metrics_kitti.json`` is removed.
-
-    Raises:
-        ValueError: a calibration or a label file cannot be read.
     """
     summary, folder = out / KITTI_SUMMARY, out / "results_kitti"
     opened = _kitti_frames(frames)
@@ -103,18 +92,27 @@ def write_result(
     *,
     image_size: tuple[int, int] = IMAGE_SIZE,
 ) -> int:
-    """Write the detections of a frame; what is outside of the image, or larger than any object, is left out.
+    """Write the detections of a frame; boxes outside the image, or beyond the size of any object, are left out.
 
     Args:
-        path: of the file; the benchmark's are called ``000123.txt``.
+        path: the benchmark's files are called ``000123.txt``.
         boxes: [m, >= 7], ``x, y, z, l, w, h, yaw`` in the Velodyne's frame.
-        types: of KITTI's, one for each box.
+        types: KITTI's, one for each box.
         scores: [m].
         calibration: of :func:`~fcos_lidar_jax.data.kitti.read_calibration`.
-        image_size: width and height that the boxes in the image are clipped to, pixels.
+        image_size: width and height, pixels.
 
     Returns:
         number of boxes that were left out.
+
+    >>> import tempfile
+    >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+    >>> calibration = {"velo_to_rect": axes, "P2": np.array([[700, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1.0, 0]])}
+    >>> file, car = Path(tempfile.mkdtemp()) / "000000.txt", np.array([[20, -2, -0.95, 4, 1.6, 1.5, 0]])
+    >>> write_result(file, car, ["Car"], np.array([0.9]), calibration)
+    0
+    >>> file.read_text()
+    'Car -1 -1 -1.6705 638.18 186.36 708.89 246.11 1.5 1.6 4 2 1.7 20 -1.5708 0.9\\n'
     """
     boxes = np.asarray(boxes, np.float64)[:, :7]
     camera = to_camera(boxes, calibration["velo_to_rect"])
@@ -132,40 +130,27 @@ def write_result(
     return len(boxes) - len(lines)
 
 
-def read_result(path: Path, calibration: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Boxes f64[m, 9] in the Velodyne's frame, labels i32[m] and scores f64[m] of a result file.
-
-    As :func:`~fcos_lidar_jax.data.kitti.to_lidar` and :func:`~fcos_lidar_jax.data.kitti.read_labels` give them;
-    scores are NaN where the file has none.
+def read_result(path: Path, calibration: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str], np.ndarray]:
+    """Boxes f64[m, 9] in the Velodyne's frame, velocities NaN, types and scores f64[m] of a result file.
 
     Raises:
         ValueError: naming the file, the line, the field, what was found and what was expected.
 
     >>> import tempfile
-    >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
-    >>> calibration = {"velo_to_rect": axes, "P2": np.array([[700, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1.0, 0]])}
-    >>> file, car = Path(tempfile.mkdtemp()) / "000000.txt", np.array([[20, -2, -0.95, 4, 1.6, 1.5, 0]])
-    >>> write_result(file, car, ["Car"], np.array([0.9]), calibration)
-    0
-    >>> file.read_text()
-    'Car -1 -1 -1.6705 638.18 186.36 708.89 246.11 1.5 1.6 4 2 1.7 20 -1.5708 0.9\\n'
+    >>> calibration = {"velo_to_rect": np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])}
+    >>> file = Path(tempfile.mkdtemp()) / "000000.txt"
+    >>> file.write_text("Car -1 -1 -1.67 638 186 709 246 1.5 1.6 4 2 1.7 20 -1.5708 0.9") > 0
+    True
     >>> (read_result(file, calibration)[0][0, :7].round(3) + 0).tolist()
     [20.0, -2.0, -0.95, 4.0, 1.6, 1.5, 0.0]
     """
     types, fields = read_objects(path)
-    boxes, labels = read_labels(path)
-    scores = fields[[name != "DontCare" for name in types], 14]
-    return to_lidar(boxes, calibration["velo_to_rect"]), labels, scores
+    return to_lidar(fields[:, 7:14], calibration["velo_to_rect"]), types, fields[:, 14]
 
 
 def to_camera(boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
-    """Boxes ``x, y, z, l, w, h, yaw`` as labels, f64[m, 7]: the way back of
-    :func:`~fcos_lidar_jax.data.kitti.to_lidar`.
-
-    >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
-    >>> to_camera(np.array([[20, -2, -0.95, 4, 1.6, 1.5, 0]]), axes)[0].round(2).tolist()
-    [1.5, 1.6, 4.0, 2.0, 1.7, 20.0, -1.57]
-    """
+    """Boxes ``x, y, z, l, w, h, yaw`` as labels f64[m, 7]: the inverse of
+    :func:`~fcos_lidar_jax.data.kitti.to_lidar`."""
     turn, (length, width, height, yaw) = velo_to_rect[:3, :3], boxes[:, 3:7].T
     x, y, z = turn @ boxes[:, :3].T + velo_to_rect[:3, 3:]
     # The direction in the camera's ground plane that the Velodyne's sees at the yaw: what is across it is zero.
@@ -176,17 +161,12 @@ def to_camera(boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
 def image_boxes(
     camera_boxes: np.ndarray, to_image: np.ndarray, image_size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The rectangles around boxes in the image, f64[m, 4] (left, top, right, bottom), and which are not empty.
+    """Left, top, right and bottom of boxes in the image, clipped to it, f64[m, 4], and which have an area.
 
     Args:
-        camera_boxes: f64[m, 7]: ``height, width, length, x, y, z, rotation_y``.
+        camera_boxes: of :func:`to_camera`.
         to_image: f64[3, 4], ``P2``.
-        image_size: width and height that they are clipped to, pixels.
-
-    >>> to_image = np.array([[700, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1.0, 0]])
-    >>> pixels, visible = image_boxes(np.array([[2, 2, 2, 0, 1, 21, 0.0]]), to_image, (1200, 375))
-    >>> pixels.tolist(), visible.tolist()
-    ([[565.0, 145.0, 635.0, 215.0]], [True])
+        image_size: width and height, pixels.
     """
     height, width, length, x, y, z, turn = camera_boxes.T[..., None]
     a = np.array([1, 1, -1, -1, 1, 1, -1, -1]) * length / 2

@@ -36,13 +36,13 @@ def test_boxes_return_from_a_file(tmp_path, calibration):
     boxes, scores = random_boxes(300), np.random.default_rng(1).random(300).astype(np.float32)
     types = [CLASSES[i % len(CLASSES)] for i in range(300)]
     left_out = write_result(tmp_path / "000123.txt", boxes, types, scores, calibration)
-    back, labels, back_scores = read_result(tmp_path / "000123.txt", calibration)
+    back, back_types, back_scores = read_result(tmp_path / "000123.txt", calibration)
     seen = image_boxes(to_camera(boxes, calibration["velo_to_rect"]), calibration["P2"], IMAGE_SIZE)[1]
     assert 0 < left_out == (~seen).sum() < 100
     np.testing.assert_allclose(back[:, :6], boxes[seen, :6], atol=1e-4)
     turn = (back[:, 6] - boxes[seen, 6] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(turn).max() < 1e-4
-    assert [CLASSES[i] for i in labels] == [name for name, there in zip(types, seen, strict=True) if there]
+    assert back_types == [name for name, there in zip(types, seen, strict=True) if there]
     np.testing.assert_array_equal(back_scores.astype(np.float32), scores[seen])
 
 
