@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.data.classes import unknown_name
 from fcos_lidar_jax.data.kitti import read_objects
 
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
@@ -52,6 +53,9 @@ def evaluate_kitti(
     >>> evaluate_kitti(folder, folder)["classes"]["Car"]["3d"]  # 35 pixels high
     {'easy': None, 'moderate': 100.0, 'hard': 100.0}
     """
+    for name in classes:
+        if name not in MIN_OVERLAP:
+            raise ValueError(f"classes: {unknown_name(name, MIN_OVERLAP)}")
     files = sorted(Path(results_dir).glob("*.txt"))
     if not files:
         raise ValueError(f"{results_dir}: no .txt file in it, expected one for every frame")
@@ -59,22 +63,19 @@ def evaluate_kitti(
     for row in np.flatnonzero(np.isnan(found.scores)):
         file = files[np.searchsorted(found.ends, row, side="right")]
         raise ValueError(f"{file}: score: got 15 values in a line, expected 16, the score last")
-    pairs, overlaps = _overlapping(truth, found)
-    return {
-        "metric": "AP_R40",
-        "num_frames": len(files),
-        "classes": {name: _evaluate_class(name, truth, found, pairs, overlaps) for name in classes},
-    }
+    pairs, overlap = _overlapping(truth, found)
+    scores = {name: _evaluate_class(name, truth, found, pairs, overlap) for name in classes}
+    return {"metric": "AP_R40", "num_frames": len(files), "classes": scores}
 
 
 def describe_kitti(metrics: dict[str, Any]) -> str:
     """What :func:`evaluate_kitti` returns, as lines of text."""
-    title = f"KITTI AP_R40 on {metrics['num_frames']} frames"
-    lines = [title.ljust(24) + "".join(f"{name:>9}" for name in DIFFICULTIES)]
+    rows = [(f"KITTI AP_R40 on {metrics['num_frames']} frames", [*DIFFICULTIES])]
     for name, scores in metrics["classes"].items():
         for kind in ("bev", "3d"):
-            values = ("-" if v is None else f"{v:.2f}" for v in scores[kind].values())
-            lines.append(f"{name} {scores['min_overlap']} {kind}".ljust(24) + "".join(f"{v:>9}" for v in values))
+            values = ["-" if v is None else f"{v:.2f}" for v in scores[kind].values()]
+            rows.append((f"{name} {scores['min_overlap']} {kind}", values))
+    lines = [title.ljust(28) + "".join(value.rjust(9) for value in values) for title, values in rows]
     few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
     if few:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
@@ -93,17 +94,16 @@ class _Objects:
         self.types = np.array([name for types, _ in read for name in types], np.str_)
         self.truncation, self.occlusion, self.boxes, self.scores = *fields[:, :2].T, fields[:, 7:14], fields[:, 14]
         self.height = np.abs(fields[:, 6] - fields[:, 4])
+        self.reach = np.hypot(self.boxes[:, 1], self.boxes[:, 2]) / 2
 
 
 def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Rows of truth and detections that overlap enough to match, i64[n, 2], ascending, and overlaps f64[n]."""
     parts = [np.zeros((0, 2), np.int64)]
-    (x, z, r), (u, v, s) = (
-        (*o.boxes[:, [3, 5]].T, np.hypot(o.boxes[:, 1], o.boxes[:, 2]) / 2) for o in (truth, found)
-    )
-    for (a, b), (c, d) in pairwise([(0, 0), *zip(truth.ends, found.ends, strict=True)]):
-        distance = np.hypot(x[a:c, None] - u[b:d], z[a:c, None] - v[b:d])
-        parts.append(np.argwhere(distance < r[a:c, None] + s[b:d]) + np.array([a, b]))
+    for (i, j), (k, l) in pairwise([(0, 0), *zip(truth.ends, found.ends, strict=True)]):
+        a, b = truth.boxes[i:k, None], found.boxes[j:l]
+        distance = np.hypot(a[..., 3] - b[..., 3], a[..., 5] - b[..., 5])
+        parts.append(np.argwhere(distance < truth.reach[i:k, None] + found.reach[j:l]) + np.array([i, j]))
     pairs = np.concatenate(parts)
     bev, volume = overlaps(truth.boxes[pairs[:, 0]], found.boxes[pairs[:, 1]])
     kept = bev > min(MIN_OVERLAP.values())  # the overlap in space is never greater
@@ -111,7 +111,7 @@ def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str
 
 
 def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """IoU from above and in space, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of KITTI's files."""
+    """IoU from above and in space, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of the files."""
     (ha, wa, la, _, ya, _, _), (hb, wb, lb, _, yb, _, _) = a.T, b.T
     area = _shared_area(a, b)
     volume = area * np.maximum(np.minimum(ya, yb) - np.maximum(ya - ha, yb - hb), 0.0)
@@ -182,13 +182,8 @@ def _average_precision(
 
 
 def _match(truth: np.ndarray, found: np.ndarray, priority: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Which pairs match, bool[n, t]: objects take in their order the free detection of the highest priority.
-
-    Args:
-        truth, found: i64[n]: object and detection of each pair, in ascending order.
-        priority: f64[n]; of equals the first is taken.
-        present: bool[detections, t]: which are there, for each of t matchings.
-    """
+    """Which pairs match, bool[n, t]: each object takes the free detection of the highest priority, of equals the
+    first. Objects and pairs are in ascending order; ``present`` bool[detections, t] differs in the t matchings."""
     free, taken = present.copy(), np.zeros((len(found), present.shape[1]), bool)
     matching = np.arange(present.shape[1])
     for first, last in pairwise([*np.flatnonzero(np.diff(truth, prepend=-1)).tolist(), len(truth)]):

@@ -92,7 +92,8 @@ def write_result(
     *,
     image_size: tuple[int, int] = IMAGE_SIZE,
 ) -> int:
-    """Write the detections of a frame; boxes outside the image, or beyond the size of any object, are left out.
+    """Write the detections of a frame, which :func:`read_result` reads; boxes that are outside of the image, or
+    larger than any object, are left out.
 
     Args:
         path: the benchmark's files are called ``000123.txt``.
@@ -111,15 +112,14 @@ def write_result(
     >>> file, car = Path(tempfile.mkdtemp()) / "000000.txt", np.array([[20, -2, -0.95, 4, 1.6, 1.5, 0]])
     >>> write_result(file, car, ["Car"], np.array([0.9]), calibration)
     0
-    >>> file.read_text()
+    >>> file.read_text()  # type, truncation, occlusion, alpha, 4 pixels, h, w, l, x, y, z, rotation_y, score
     'Car -1 -1 -1.6705 638.18 186.36 708.89 246.11 1.5 1.6 4 2 1.7 20 -1.5708 0.9\\n'
     """
     boxes = np.asarray(boxes, np.float64)[:, :7]
     camera = to_camera(boxes, calibration["velo_to_rect"])
     image, visible = image_boxes(camera, calibration["P2"], image_size)
-    visible &= (np.abs(boxes) <= list(LIMITS.values())[:7]).all(axis=1) & (boxes[:, 3:6] >= _SMALLEST_M).all(
-        axis=1
-    )
+    visible &= (np.abs(boxes) <= list(LIMITS.values())[:7]).all(axis=1)
+    visible &= (boxes[:, 3:6] >= _SMALLEST_M).all(axis=1)
     alpha = wrap_angle(camera[:, 6] - np.arctan2(camera[:, 3], camera[:, 5]))
     lines = []
     for i in np.flatnonzero(visible).tolist():
@@ -135,14 +135,6 @@ def read_result(path: Path, calibration: dict[str, np.ndarray]) -> tuple[np.ndar
 
     Raises:
         ValueError: naming the file, the line, the field, what was found and what was expected.
-
-    >>> import tempfile
-    >>> calibration = {"velo_to_rect": np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])}
-    >>> file = Path(tempfile.mkdtemp()) / "000000.txt"
-    >>> file.write_text("Car -1 -1 -1.67 638 186 709 246 1.5 1.6 4 2 1.7 20 -1.5708 0.9") > 0
-    True
-    >>> (read_result(file, calibration)[0][0, :7].round(3) + 0).tolist()
-    [20.0, -2.0, -0.95, 4.0, 1.6, 1.5, 0.0]
     """
     types, fields = read_objects(path)
     return to_lidar(fields[:, 7:14], calibration["velo_to_rect"]), types, fields[:, 14]
@@ -153,7 +145,7 @@ def to_camera(boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
     :func:`~fcos_lidar_jax.data.kitti.to_lidar`."""
     turn, (length, width, height, yaw) = velo_to_rect[:3, :3], boxes[:, 3:7].T
     x, y, z = turn @ boxes[:, :3].T + velo_to_rect[:3, 3:]
-    # The direction in the camera's ground plane that the Velodyne's sees at the yaw: what is across it is zero.
+    # The heading in the camera's ground plane that has this yaw for the Velodyne.
     across = turn[:, :2] @ np.stack([-np.sin(yaw), np.cos(yaw)])
     return np.stack([height, width, length, x, y + height / 2, z, np.arctan2(across[0], across[2])], -1)
 
@@ -161,20 +153,14 @@ def to_camera(boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
 def image_boxes(
     camera_boxes: np.ndarray, to_image: np.ndarray, image_size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Left, top, right and bottom of boxes in the image, clipped to it, f64[m, 4], and which have an area.
-
-    Args:
-        camera_boxes: of :func:`to_camera`.
-        to_image: f64[3, 4], ``P2``.
-        image_size: width and height, pixels.
-    """
+    """Left, top, right and bottom in the image, clipped to it, of boxes of :func:`to_camera`; which have an area."""
     height, width, length, x, y, z, turn = camera_boxes.T[..., None]
     a = np.array([1, 1, -1, -1, 1, 1, -1, -1]) * length / 2
     b = np.array([1, -1, -1, 1, 1, -1, -1, 1]) * width / 2
     cos, sin = np.cos(turn), np.sin(turn)
     xyz = x + cos * a + sin * b, y - height * (np.arange(8) > 3), z + cos * b - sin * a
     points = np.stack([*xyz, np.ones_like(a)], -1) @ to_image.T  # [m, 8, 3]: pixels times depth, depth
-    # Where a box crosses the plane near the camera, so do the lines between its corners: they give its outline.
+    # A box that crosses the plane near the camera is cut there, and so are the lines between its corners.
     i, j = np.triu_indices(8, 1)
     depth = points[..., 2]
     crosses = (depth[:, i] < _NEAR_M) != (depth[:, j] < _NEAR_M)
