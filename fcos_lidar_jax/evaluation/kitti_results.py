@@ -153,7 +153,7 @@ def to_camera(boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
 def image_boxes(
     camera_boxes: np.ndarray, to_image: np.ndarray, image_size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Left, top, right and bottom in the image, clipped to it, of boxes of :func:`to_camera`; which have an area."""
+    """Left, top, right, bottom in the image, clipped to it, of boxes of :func:`to_camera`; which have an area."""
     height, width, length, x, y, z, turn = camera_boxes.T[..., None]
     a = np.array([1, 1, -1, -1, 1, 1, -1, -1]) * length / 2
     b = np.array([1, -1, -1, 1, 1, -1, -1, 1]) * width / 2

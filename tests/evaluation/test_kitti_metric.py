@@ -32,8 +32,11 @@ def evaluate_texts(tmp_path, texts, **options):
     return evaluate_kitti(*folders, **options)
 
 
-def random_frame(rng):
-    """Objects in clumps, and detections near them: equal ones, equal scores, other classes, limits met exactly."""
+def random_frame(rng, *, plain=False):
+    """Objects in clumps, and detections near them: equal ones, equal scores, other classes, limits met exactly.
+
+    In plain frames most are cars that count, so that there are more objects than positions.
+    """
     truths, found = [], []
     for _ in range(rng.integers(0, 9)):
         kind, place = str(rng.choice(TYPES, p=(0.3, 0.1, 0.05, 0.2, 0.1, 0.15, 0.05, 0.05))), {}
@@ -41,6 +44,8 @@ def random_frame(rng):
             place[name] = float(rng.uniform(low, high))
         limits = {"high": float(rng.choice([20, 25, 25.01, 30, 40, 40.01, 60])), "occlusion": rng.integers(0, 4)}
         limits["truncation"] = rng.choice([0, 0, 0.15, 0.16, 0.3, 0.5, 0.51])
+        if plain and rng.random() < 0.8:
+            kind, limits = "Car", {}
         for _ in range(rng.choice([1, 1, 2])):
             truths.append(line(kind, **place, **limits))
             place["x"] += 0.15
@@ -57,8 +62,8 @@ def random_frame(rng):
 
 
 def deviation_from_oracle(tmp_path, seed):
-    rng = np.random.default_rng(seed)
-    texts = [random_frame(rng) for _ in range(rng.integers(1, 20))]
+    rng, plain = np.random.default_rng(seed), bool(seed % 2)
+    texts = [random_frame(rng, plain=plain) for _ in range(rng.integers(20, 50) if plain else rng.integers(1, 20))]
     summary, largest = evaluate_texts(tmp_path, texts), 0.0
     assert summary["num_frames"] == len(texts)
     for (name, metric, difficulty), (number, percent) in score(texts).items():
@@ -202,8 +207,27 @@ def test_the_score_decides_first_and_the_overlap_then(tmp_path):
     assert ap(tmp_path, [*pair, *street()[1:]], [*crossed, *street(score=0.8)[1:]]) == all_of(100)
 
 
+def test_a_detection_that_counts_goes_before_a_nearer_one_that_does_not(tmp_path):
+    found = [*street(score=0.8)[1:], line(score=0.85, high=30.0), line(x=0.3, score=0.9)]
+    assert ap(tmp_path, street(), found)["easy"] == pytest.approx(100)
+
+
+def test_the_precision_of_a_position_is_the_best_from_there_on(tmp_path):
+    found = [line(x=6.0 * i, score=0.8 - i / 1000) for i in range(NUMBER)]
+    assert ap(tmp_path, street(), [*found, line(x=-9.0, score=0.9)]) == all_of(100 * 50 / 51)
+
+
+def test_the_last_true_positive_is_a_threshold_anyhow(tmp_path):
+    """Of 80 objects, every second one is a position; the one after the last position is averaged, too."""
+    for number, percent in ((2, 2.5), (3, 5.0), (4, 5.0), (5, 7.5), (40, 50.0), (80, 100.0)):
+        found = [line(x=6.0 * i, score=0.8 - i / 1000) for i in range(number)]
+        assert ap(tmp_path, street(number=80), found) == all_of(percent)
+
+
 def test_bad_results_get_one_line(tmp_path):
     labels = tmp_path / "labels"
+    with refused("classes: got 'Vans', expected"):
+        evaluate_kitti(tmp_path, labels, classes=["Vans"])
     with refused(f"{tmp_path / 'none'}: no .txt file in it, expected one for every frame"):
         evaluate_kitti(tmp_path / "none", labels)
     for result, message in (
