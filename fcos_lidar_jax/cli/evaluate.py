@@ -24,6 +24,8 @@ from fcos_lidar_jax.evaluation.comparison import (
     compare_by_distance,
 )
 from fcos_lidar_jax.evaluation.examples import choose_examples
+from fcos_lidar_jax.evaluation.kitti import describe_kitti
+from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, write_kitti
 from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
 from fcos_lidar_jax.evaluation.truth import read_truth
@@ -51,7 +53,8 @@ class Evaluate:
     annotations of a data set (--data-root) or, for an official results file, a file of ground truth
     (--ground-truth). Writes metrics_summary.json, curves.json, report.html with its pictures, frames.html, which
     shows the worst and the best frames with their truth, and the detections: results_nusc.json for nuScenes, else
-    detections.json. Ctrl-C, or a kill, loses one batch of a detector's work: the same command resumes.
+    detections.json. For KITTI, its own metric is added as metrics_kitti.json, with its result files in
+    results_kitti. Ctrl-C, or a kill, loses one batch of a detector's work: the same command resumes.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
@@ -124,7 +127,7 @@ def _check(args: Evaluate) -> None:
         check_outside("--out", args.out, args.checkpoint)
     given = [] if args.results is None else [args.results]
     truth = [] if args.ground_truth is None else [args.ground_truth]
-    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE):
+    for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY):
         check_out_file("--out", args.out / name, keep=[*given, *truth])
     for name in RESULT_FILES:  # may be evaluated again where they are
         check_out_file("--out", args.out / name, keep=truth)
@@ -213,6 +216,8 @@ def _score(args: Evaluate, task: _Task, compared: Compared) -> None:
     for line in warnings(evaluation, len(compared.predictions), compared.truth):
         tell(line)
     print(describe(evaluation, intervals), flush=True)
+    if (kitti := write_kitti(args.out, compared.detections, task.frames)) is not None:
+        print(describe_kitti(kitti), flush=True)
     if args.report:
         _report(args, task, compared, evaluation)
     print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")

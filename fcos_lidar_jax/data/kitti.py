@@ -35,6 +35,7 @@ _FIELDS = (
     *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
+_LARGEST = float(np.finfo(np.float32).max)
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -167,21 +168,36 @@ def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: naming the file, the line, the field, what was found and what was expected.
     """
-    boxes, labels = [], []
+    types, fields = read_objects(file)
+    kept = [i for i, name in enumerate(types) if name != "DontCare"]
+    return fields[kept, 7:14], np.array([CLASSES.index(types[i]) for i in kept], np.int32)
+
+
+def read_objects(file: Path) -> tuple[list[str], np.ndarray]:
+    """All lines of a label or result file, DontCare too: types, and the numbers that follow them, f64[m, 15].
+
+    The columns are truncation, occlusion, alpha, left, top, right, bottom, height, width, length, x, y, z,
+    rotation_y and score; the score is NaN where the line has none.
+
+    Raises:
+        ValueError: as :func:`read_labels`.
+    """
+    types, rows, places = [], [], []
     for where, words in _lines(file):
         if len(words) not in (15, 16):
             raise ValueError(f"{where}: got {len(words)} values, expected 15, or 16 with a score")
         if words[0] not in (*CLASSES, "DontCare"):
             raise ValueError(f"{where}: type: {unknown_name(words[0], CLASSES)}")
-        numbers = [_number(word, f"{where}: {name}") for name, word in zip(_FIELDS, words[1:], strict=False)]
-        if words[0] == "DontCare":
-            continue
-        h, w, l, x, y, z, yaw = box = numbers[7:14]
-        if (bad := find_bad_box(np.array([[x, y, z, l, w, h, yaw, np.nan, np.nan]]))) is not None:
-            raise ValueError(f"{where}: {bad[1]}")
-        boxes.append(box)
-        labels.append(CLASSES.index(words[0]))
-    return np.array(boxes, np.float64).reshape(-1, 7), np.array(labels, np.int32)
+        rows.append([_number(word, f"{where}: {name}") for name, word in zip(_FIELDS, words[1:], strict=False)])
+        rows[-1] += [np.nan] * (16 - len(words))
+        types.append(words[0])
+        places.append(where)
+    fields = np.array(rows, np.float64).reshape(-1, 15)
+    objects = np.flatnonzero(np.array(types, object) != "DontCare")
+    boxes = np.pad(fields[objects][:, [10, 11, 12, 9, 8, 7, 13]], ((0, 0), (0, 2)), constant_values=np.nan)
+    if (bad := find_bad_box(boxes)) is not None:
+        raise ValueError(f"{places[objects[bad[0]]]}: {bad[1]}")
+    return types, fields
 
 
 def read_calibration(file: Path) -> dict[str, np.ndarray]:
@@ -242,6 +258,6 @@ def _number(word: str, where: str) -> float:
         value = float(word)
     except ValueError:
         value = np.nan
-    if not abs(value) <= float(np.finfo(np.float32).max):
+    if not abs(value) <= _LARGEST:
         raise ValueError(f"{where}: got {word!r}, expected a finite number")
     return value

@@ -25,6 +25,7 @@ class Compared(NamedTuple):
     truth: GroundTruth
     meta: dict[str, Any]  # of the results file
     warnings: Sequence[str] = ()
+    detections: Sequence[Detections] = ()  # by frame; empty with the benchmark's metric
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +73,8 @@ def compare_by_distance(frames: FrameSet, ranges_m: dict[str, float]) -> Compari
 
     def read(file: Path) -> Compared:
         truths = (frames.truth(index) for index in range(len(frames)))
-        return Compared(*frame_columns(read_detections(file, names, classes), truths, names), {})
+        detections = read_detections(file, names, classes)
+        return Compared(*frame_columns(detections, truths, names), {}, detections=detections)
 
     return Comparison(
         RESULT_FILES[1],

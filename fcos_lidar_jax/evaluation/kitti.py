@@ -1,0 +1,207 @@
+"""KITTI's own metric: average precision at 40 recall positions, by overlap from above and in space."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcos_lidar_jax.data.class_mapping import unknown_name
+from fcos_lidar_jax.data.kitti import read_objects
+
+MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
+"""The classes that KITTI evaluates -> overlap that a detection must exceed, from above and in space."""
+DIFFICULTIES = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
+"""Of the objects that count: height in the image (pixels) that they exceed, greatest occlusion and truncation."""
+
+_NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
+_POSITIONS = 40
+
+
+def evaluate_kitti(
+    results_dir: str | Path, label_dir: str | Path, *, classes: Sequence[str] = tuple(MIN_OVERLAP)
+) -> dict[str, Any]:
+    """The average precision of result files, in percent, by the rules of KITTI's development kit.
+
+    Every file of the results is a frame; labels of other frames are not read. An object counts if it has the class
+    and is within the limits of the difficulty. Other objects of the class, and its neighbours (vans for cars,
+    sitting persons for pedestrians), are ignored: they may be detected or missed. Detections that are lower in the
+    image than the difficulty's limit are ignored, too. DontCare areas excuse no detection: they have no place in
+    space. The overlap of image boxes and the orientation (AOS) are not evaluated.
+
+    The mean is over 40 of 41 positions, without the first. With fewer than 41 objects that count, perfect
+    detections therefore stay below 100, as in the development kit.
+
+    Args:
+        results_dir: folder of files ``NAME.txt``, a detection per line, with a score.
+        label_dir: folder of the label files of the same names, such as ``training/label_2``.
+        classes: of :data:`MIN_OVERLAP`.
+
+    Returns:
+        ``{"metric": "AP_R40", "num_frames", "classes": {class: {"min_overlap", "num_truth", "bev", "3d"}}}``; the
+        last three by difficulty. An average precision without an object that counts is None.
+
+    Raises:
+        ValueError: naming the file, the line and the field, what was found and what was expected.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> cars = [f"Car 0 0 0 100 100 200 135 1.5 1.6 4 {x} 1.7 20 0 0.9\\n" for x in range(0, 250, 5)]
+    >>> folder.joinpath("000000.txt").write_text("".join(cars)) > 0
+    True
+    >>> evaluate_kitti(folder, folder)["classes"]["Car"]["3d"]  # 35 pixels high
+    {'easy': None, 'moderate': 100.0, 'hard': 100.0}
+    """
+    for name in classes:
+        if name not in MIN_OVERLAP:
+            raise ValueError(f"classes: {unknown_name(name, MIN_OVERLAP)}")
+    files = sorted(Path(results_dir).glob("*.txt"))
+    if not files:
+        raise ValueError(f"{results_dir}: no .txt file in it, expected one for every frame")
+    truth, found = _Objects([Path(label_dir) / file.name for file in files]), _Objects(files)
+    for row in np.flatnonzero(np.isnan(found.scores)):
+        file = files[np.searchsorted(found.ends, row, side="right")]
+        raise ValueError(f"{file}: score: got 15 values in a line, expected 16, the score last")
+    pairs, overlap = _overlapping(truth, found)
+    scores = {name: _evaluate_class(name, truth, found, pairs, overlap) for name in classes}
+    return {"metric": "AP_R40", "num_frames": len(files), "classes": scores}
+
+
+def describe_kitti(metrics: dict[str, Any]) -> str:
+    """What :func:`evaluate_kitti` returns, as lines of text."""
+    rows = [(f"KITTI AP_R40 on {metrics['num_frames']} frames", [*DIFFICULTIES])]
+    for name, scores in metrics["classes"].items():
+        for kind in ("bev", "3d"):
+            values = ["-" if v is None else f"{v:.2f}" for v in scores[kind].values()]
+            rows.append((f"{name} {scores['min_overlap']} {kind}", values))
+    lines = [title.ljust(28) + "".join(value.rjust(9) for value in values) for title, values in rows]
+    few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
+    if few:
+        lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
+    if metrics.get("left_out"):
+        lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
+    return "\n".join(lines)
+
+
+class _Objects:
+    """The lines of files as arrays, in their order."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        read = [read_objects(file) for file in files]
+        fields = np.concatenate([fields for _, fields in read])
+        self.ends = np.cumsum([len(types) for types, _ in read])
+        self.types = np.array([name for types, _ in read for name in types], np.str_)
+        self.truncation, self.occlusion, self.boxes, self.scores = *fields[:, :2].T, fields[:, 7:14], fields[:, 14]
+        self.height = np.abs(fields[:, 6] - fields[:, 4])
+        self.reach = np.hypot(self.boxes[:, 1], self.boxes[:, 2]) / 2
+
+
+def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Rows of truth and detections that overlap enough to match, i64[n, 2], ascending, and overlaps f64[n]."""
+    parts = [np.zeros((0, 2), np.int64)]
+    for (i, j), (k, l) in pairwise([(0, 0), *zip(truth.ends, found.ends, strict=True)]):
+        a, b = truth.boxes[i:k, None], found.boxes[j:l]
+        distance = np.hypot(a[..., 3] - b[..., 3], a[..., 5] - b[..., 5])
+        parts.append(np.argwhere(distance < truth.reach[i:k, None] + found.reach[j:l]) + np.array([i, j]))
+    pairs = np.concatenate(parts)
+    bev, volume = overlaps(truth.boxes[pairs[:, 0]], found.boxes[pairs[:, 1]])
+    kept = bev > min(MIN_OVERLAP.values())  # the overlap in space is never greater
+    return pairs[kept], {"bev": bev[kept], "3d": volume[kept]}
+
+
+def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """IoU from above and in space, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of the files."""
+    (ha, wa, la, _, ya, _, _), (hb, wb, lb, _, yb, _, _) = a.T, b.T
+    area = _shared_area(a, b)
+    volume = area * np.maximum(np.minimum(ya, yb) - np.maximum(ya - ha, yb - hb), 0.0)
+    return area / (wa * la + wb * lb - area), volume / (wa * la * ha + wb * lb * hb - volume)
+
+
+def _shared_area(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Area that boxes share from above: in float64 what :mod:`fcos_lidar_jax.iou` explains."""
+    half = a[:, None, [2, 1]] / 2
+    cos, sin = np.cos(a[:, 6]), np.sin(a[:, 6])
+    dx, dz = b[:, 3] - a[:, 3], b[:, 5] - a[:, 5]
+    centre = np.stack([cos * dx - sin * dz, sin * dx + cos * dz], -1)
+    turn = a[:, 6] - b[:, 6]
+    along = np.stack([np.cos(turn), np.sin(turn)], -1) * b[:, 2:3] / 2
+    across = np.stack([-np.sin(turn), np.cos(turn)], -1) * b[:, 1:2] / 2
+    corners = (along - across, along + across, across - along, -along - across)
+    start = np.stack([centre + corner for corner in corners], axis=1)
+    step = np.roll(start, -1, axis=1) - start
+    slope = np.where(np.abs(step) < 1e-12, 1e-12, step)
+    into, out = np.sort(np.stack([(-half - start) / slope, (half - start) / slope]), axis=0)
+    low, high = np.clip(into[..., 1], 0, 1), np.clip(out[..., 1], 0, 1)
+    enter, leave = np.clip(into[..., 0], low, high), np.clip(out[..., 0], low, high)
+    times = np.stack([low, enter, leave, high])
+    at = np.clip(start[..., 0] + times * step[..., 0], -half[..., 0], half[..., 0])
+    return (step[..., 1] / 2 * ((at[1:] + at[:-1]) * np.diff(times, axis=0)).sum(axis=0)).sum(axis=1)
+
+
+def _evaluate_class(
+    name: str, truth: _Objects, found: _Objects, pairs: np.ndarray, overlap: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """Number of objects that count and average precisions of a class, by difficulty."""
+    scores: dict[str, Any] = {"min_overlap": MIN_OVERLAP[name], "num_truth": {}, "bev": {}, "3d": {}}
+    ours, neighbour = truth.types == name, truth.types == _NEIGHBOURS.get(name, name)
+    for difficulty, (height, occlusion, truncation) in DIFFICULTIES.items():
+        within = (truth.height > height) & (truth.occlusion <= occlusion) & (truth.truncation <= truncation)
+        counted, high = ours & within, found.height >= height
+        scores["num_truth"][difficulty] = int(counted.sum())
+        # Low detections of any class may be taken by an object, as in the development kit.
+        found_counted, found_taken = high & (found.types == name), ~high | (found.types == name)
+        for kind, values in overlap.items():
+            possible = values > MIN_OVERLAP[name]
+            possible &= (ours | neighbour)[pairs[:, 0]] & found_taken[pairs[:, 1]]
+            given = pairs[possible], values[possible], counted, found_counted, found.scores
+            scores[kind][difficulty] = _average_precision(*given) if counted.any() else None
+    return scores
+
+
+def _average_precision(
+    pairs: np.ndarray, overlap: np.ndarray, counted: np.ndarray, found_counted: np.ndarray, scores: np.ndarray
+) -> float:
+    """Percent, from the pairs that may match; which objects and which detections count, and all scores."""
+    truth, (rows, column) = pairs[:, 0], np.unique(pairs[:, 1], return_inverse=True)
+    valid = found_counted[pairs[:, 1]]
+    true_positive = valid & counted[truth]
+    # First, each object takes the detection of the highest score: their scores are the thresholds.
+    taken = _match(truth, column, scores[rows][column], np.ones((len(rows), 1), bool))[:, 0]
+    thresholds = _thresholds(scores[pairs[taken & true_positive, 1]], int(counted.sum()))
+    # Then, at each threshold, the one of the greatest overlap; one that does not count only for want of others.
+    present = scores[rows][:, None] >= thresholds
+    taken = _match(truth, column, np.where(valid, overlap, 0.0), present)
+    num_true = (taken & true_positive[:, None]).sum(axis=0)
+    ordered = np.sort(scores[found_counted])
+    num_false = len(ordered) - np.searchsorted(ordered, thresholds) - (taken & valid[:, None]).sum(axis=0)
+    precision = np.zeros(_POSITIONS + 1)
+    # Where nothing counts the development kit has 0 / 0; here the precision is 0.
+    precision[: len(thresholds)] = num_true / np.maximum(num_true + num_false, 1)
+    return float(100 * np.maximum.accumulate(precision[::-1])[::-1][1:].mean())
+
+
+def _match(truth: np.ndarray, found: np.ndarray, priority: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Which pairs match, bool[n, t]: each object takes the free detection of the highest priority, of equals the
+    first. Objects and pairs are in ascending order; ``present`` bool[detections, t] differs in the t matchings."""
+    free, taken = present.copy(), np.zeros((len(found), present.shape[1]), bool)
+    matching = np.arange(present.shape[1])
+    for first, last in pairwise([*np.flatnonzero(np.diff(truth, prepend=-1)).tolist(), len(truth)]):
+        rivals = found[first:last]
+        best = np.where(free[rivals], priority[first:last, None], -np.inf).argmax(axis=0)
+        hit = free[rivals[best], matching]
+        taken[first + best[hit], matching[hit]] = True
+        free[rivals[best[hit]], matching[hit]] = False
+    return taken
+
+
+def _thresholds(scores: np.ndarray, num_truth: int) -> np.ndarray:
+    """The scores of true positives whose recall is nearest to each position, descending, 41 at most."""
+    kept, position = list[float](), 0.0
+    recall = np.arange(1, len(scores) + 2) / num_truth
+    for i, score in enumerate(np.sort(scores)[::-1].tolist()):
+        is_last = i == len(scores) - 1
+        if is_last or recall[i + 1] - position >= position - recall[i]:
+            kept.append(score)
+            position += 1 / _POSITIONS
+    return np.array(kept[: _POSITIONS + 1])

@@ -1,0 +1,243 @@
+"""KITTI's metric: plain loops with Shapely as oracle, cases by hand, a case for each rule on what is ignored."""
+
+import numpy as np
+import pytest
+from kitti_oracle import overlap, score
+from refusal import refused
+
+from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, describe_kitti, evaluate_kitti, overlaps
+
+TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
+SIZES = {"Pedestrian": (1.7, 0.6, 0.8), "Person_sitting": (1.3, 0.6, 0.8), "Cyclist": (1.7, 0.6, 1.8)}
+NUMBER = 50
+"""Objects in the cases by hand: more than the 41 positions."""
+
+
+def line(kind="Car", x=0.0, *, score=None, high=50.0, occlusion=0, truncation=0.0, z=20.0, y=1.7, ry=0.0) -> str:
+    h, w, l = SIZES.get(kind, (1.5, 1.6, 4.0))
+    ending = "" if score is None else f" {score!r}"
+    pixels = f"100 100 150 {100 + high!r}"
+    return f"{kind} {truncation} {occlusion} 0 {pixels} {h} {w} {l} {x!r} {y!r} {z!r} {ry!r}{ending}\n"
+
+
+def evaluate_texts(tmp_path, texts, **options):
+    folders = tmp_path / "results", tmp_path / "labels"
+    for folder in folders:
+        folder.mkdir(exist_ok=True)
+        for file in folder.iterdir():
+            file.unlink()
+    for i, (label, result) in enumerate(texts):
+        (folders[0] / f"{i:06d}.txt").write_text(result)
+        (folders[1] / f"{i:06d}.txt").write_text(label)
+    return evaluate_kitti(*folders, **options)
+
+
+def random_frame(rng, *, plain=False):
+    """Objects in clumps, and detections near them: equal ones, equal scores, other classes, limits met exactly.
+
+    In plain frames most are cars that count, so that there are more objects than positions.
+    """
+    truths, found = [], []
+    for _ in range(rng.integers(0, 9)):
+        kind, place = str(rng.choice(TYPES, p=(0.3, 0.1, 0.05, 0.2, 0.1, 0.15, 0.05, 0.05))), {}
+        for name, low, high in (("x", -20, 20), ("z", 5, 40), ("y", 1, 2), ("ry", -np.pi, np.pi)):
+            place[name] = float(rng.uniform(low, high))
+        limits = {"high": float(rng.choice([20, 25, 25.01, 30, 40, 40.01, 60])), "occlusion": rng.integers(0, 4)}
+        limits["truncation"] = rng.choice([0, 0, 0.15, 0.16, 0.3, 0.5, 0.51])
+        if plain and rng.random() < 0.8:
+            kind, limits = "Car", {}
+        for _ in range(rng.choice([1, 1, 2])):
+            truths.append(line(kind, **place, **limits))
+            place["x"] += 0.15
+        for _ in range(rng.integers(0, 5)):
+            guess = kind if rng.random() < 0.8 else str(rng.choice(TYPES))
+            near = {name: float(v + rng.normal(0, 0.08)) for name, v in place.items()}
+            high = float(rng.choice([20, 24.99, 25, 39.99, 40, 60]))
+            text = line(guess, **near, score=float(rng.random().__round__(rng.choice([1, 6]))), high=high)
+            found += [text] * rng.choice([1, 1, 2])
+    truths += ["DontCare -1 -1 -10 0 0 2000 2000 -1 -1 -1 -1000 -1000 -1000 -10\n"] * rng.integers(0, 2)
+    rng.shuffle(truths)
+    rng.shuffle(found)
+    return "".join(truths), "".join(found)
+
+
+def deviation_from_oracle(tmp_path, seed):
+    rng, plain = np.random.default_rng(seed), bool(seed % 2)
+    texts = [random_frame(rng, plain=plain) for _ in range(rng.integers(20, 50) if plain else rng.integers(1, 20))]
+    summary, largest = evaluate_texts(tmp_path, texts), 0.0
+    assert summary["num_frames"] == len(texts)
+    for (name, metric, difficulty), (number, percent) in score(texts).items():
+        ours = summary["classes"][name.capitalize()]
+        assert ours["num_truth"][difficulty] == number
+        value = ours[metric][difficulty]
+        assert (value is None) == (number == 0)
+        largest = max(largest, abs((value or 0.0) - percent))
+    return largest
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_equals_the_plain_loops(tmp_path, seed):
+    assert deviation_from_oracle(tmp_path, seed) < 1e-6
+
+
+def test_overlaps_equal_shapelys():
+    """Of boxes that lie anyhow, and of equal ones."""
+    rng = np.random.default_rng(0)
+    a = np.concatenate(
+        [rng.uniform(0.5, 4, (300, 3)), rng.uniform(-1, 1, (300, 3)), rng.uniform(-4, 4, (300, 1))], 1
+    )
+    b = np.where(np.arange(300)[:, None] < 20, a, a[rng.permutation(300)])
+    rows = [
+        [dict(zip(("h", "w", "l", "x", "y", "z", "ry"), row, strict=True)) for row in m.tolist()] for m in (a, b)
+    ]
+    for values, metric in zip(overlaps(a, b), ("bev", "3d"), strict=True):
+        np.testing.assert_allclose(values, [overlap(p, q, metric) for p, q in zip(*rows, strict=True)], atol=1e-9)
+
+
+def street(kind="Car", number=NUMBER, **options):
+    """Objects side by side, all of which count."""
+    return [line(kind, 6.0 * i, **options) for i in range(number)]
+
+
+def ap(tmp_path, truths, found, name="Car", metric="3d"):
+    return evaluate_texts(tmp_path, [("".join(truths), "".join(found))])["classes"][name][metric]
+
+
+def all_of(value):
+    return pytest.approx(dict.fromkeys(("easy", "moderate", "hard"), value))
+
+
+@pytest.mark.parametrize("metric", ["bev", "3d"])
+@pytest.mark.parametrize("name", MIN_OVERLAP)
+def test_perfect_one_missing_and_one_too_many(tmp_path, name, metric):
+    truths, found, where = street(name), street(name, score=0.8), (name, metric)
+    assert ap(tmp_path, truths, found, *where) == all_of(100)
+    # Recall 49 / 50 reaches the positions up to 39 / 40, the first of which is not averaged.
+    assert ap(tmp_path, truths, found[1:], *where) == all_of(97.5)
+    assert ap(tmp_path, truths, [*found, line(name, -9.0, score=0.9)], *where) == all_of(100 * 50 / 51)
+    assert ap(tmp_path, truths, [*found, line(name, -9.0, score=0.1)], *where) == all_of(100)
+    assert ap(tmp_path, truths, [], *where) == all_of(0)
+    assert ap(tmp_path, [], found, *where) == dict.fromkeys(("easy", "moderate", "hard"))
+
+
+def test_few_objects_stay_below_100_as_in_the_development_kit(tmp_path):
+    few = [("".join(street(number=21)), "".join(street(number=21, score=0.8)))]
+    summary = evaluate_texts(tmp_path, few, classes=["Car"])
+    assert summary["classes"]["Car"]["bev"] == all_of(50)
+    assert "few objects of Car" in describe_kitti(summary)
+    assert "Car 0.7 bev" in describe_kitti(summary)
+
+
+@pytest.mark.parametrize(
+    ("name", "neighbour", "other"), [("Car", "Van", "Truck"), ("Pedestrian", "Person_sitting", "Van")]
+)
+def test_neighbours_are_neither_true_nor_missing_and_other_classes_are_false(tmp_path, name, neighbour, other):
+    truths, found = street(name), street(name, score=0.8)
+    for kind, expected in ((neighbour, 100), (other, 100 * 50 / 51)):
+        there = line(kind, -9.0)
+        as_named = line(name, -9.0, score=0.9).split()
+        as_named[8:11] = there.split()[8:11]  # a detection of the size of what is there
+        assert ap(tmp_path, [*truths, there], [*found, " ".join(as_named)], name) == all_of(expected)
+        assert ap(tmp_path, [*truths, there], found, name) == all_of(100)
+        assert ap(tmp_path, truths, [*found, line(kind, -9.0, score=0.9)], name) == all_of(100)
+
+
+BEYOND = [
+    ("high", {"easy": (40.01, 40.0), "moderate": (25.01, 25.0), "hard": (25.01, 25.0)}),
+    ("occlusion", {"easy": (0, 1), "moderate": (1, 2), "hard": (2, 3)}),
+    ("truncation", {"easy": (0.15, 0.16), "moderate": (0.3, 0.31), "hard": (0.5, 0.51)}),
+]
+
+
+@pytest.mark.parametrize(("field", "limits"), BEYOND, ids=[field for field, _ in BEYOND])
+def test_objects_beyond_a_limit_may_be_found_or_missed(tmp_path, field, limits):
+    truths, found = street(), street(score=0.8)
+    for difficulty, (within, beyond) in limits.items():
+        for value, expected in ((within, 97.5), (beyond, 100)):
+            hidden = line("Car", -9.0, **{field: value})
+            # 50 of 51: 40 positions are reached.
+            assert ap(tmp_path, [*truths, hidden], found)[difficulty] == pytest.approx(expected), difficulty
+            detected = [*found, line("Car", -9.0, score=0.9)]
+            assert ap(tmp_path, [*truths, hidden], detected)[difficulty] == pytest.approx(100)
+
+
+def test_detections_lower_than_what_counts_are_ignored(tmp_path):
+    truths, found = street(), street(score=0.8)
+    for high, easy, others in ((24.99, 100, 100), (25.0, 100, 98.04), (39.99, 100, 98.04), (40.0, 98.04, 98.04)):
+        result = ap(tmp_path, truths, [*found, line("Car", -9.0, score=0.9, high=high)])
+        assert [round(v, 2) for v in result.values()] == [easy, others, others]
+    # One that finds an object takes it out of the true positives.
+    assert ap(tmp_path, truths, [line(score=0.8, high=30.0), *found[1:]])["easy"] == pytest.approx(97.5)
+    # So does one of another class, if its score is higher: that object's own detection gives no threshold.
+    other = line(score=0.9, high=20.0).replace("Car", "Tram")
+    assert ap(tmp_path, truths, [*found, other]) == all_of(97.5)
+    assert ap(tmp_path, truths, [*found, other.replace("0.9", "0.7")]) == all_of(100)
+
+
+def test_areas_of_the_image_that_are_not_labelled_excuse_nothing_in_space(tmp_path):
+    everywhere = "DontCare -1 -1 -10 0 0 2000 2000 -1 -1 -1 -1000 -1000 -1000 -10\n"
+    for metric in ("bev", "3d"):
+        found = [*street(score=0.8), line(x=-9.0, score=0.9)]
+        assert ap(tmp_path, [*street(), everywhere], found, metric=metric) == all_of(100 * 50 / 51)
+
+
+def test_an_overlap_must_exceed_the_least_and_space_counts_the_height(tmp_path):
+    """A pedestrian shifted by a third of its extent overlaps by exactly a half."""
+    truths = [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in street("Pedestrian")]
+    for shift, bev in ((0.5, 0), (0.499, 100)):
+        found = [line("Pedestrian", 6.0 * i + shift, score=0.8) for i in range(NUMBER)]
+        found = [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in found]
+        assert ap(tmp_path, truths, found, "Pedestrian", "bev") == all_of(bev)
+    for lift, space in ((0.499, 100), (0.501, 0)):
+        found = [
+            row.replace(" 1.7 20.0", f" {1.7 - lift} 20.0")
+            for row in (line("Pedestrian", 6.0 * i, score=0.8) for i in range(NUMBER))
+        ]
+        found = [row.replace("1.7 0.6 0.8", "1.5 0.5 1.5") for row in found]
+        assert ap(tmp_path, truths, found, "Pedestrian") == all_of(space)
+        assert ap(tmp_path, truths, found, "Pedestrian", "bev") == all_of(100)
+
+
+def test_the_score_decides_first_and_the_overlap_then(tmp_path):
+    """Two detections of an object: the thresholds are the better score's, the true positive is the nearer one."""
+    found = [row for i in range(NUMBER) for row in (line(x=6.0 * i + 0.3, score=0.9), line(x=6.0 * i, score=0.5))]
+    assert ap(tmp_path, street(), found) == all_of(100)  # at 0.9 there are no others
+    pair = [line(), line(x=0.3)]
+    crossed = [line(x=0.3, score=0.9), line(score=0.9)]  # the nearer one each, in whatever order
+    assert ap(tmp_path, [*pair, *street()[1:]], [*crossed, *street(score=0.8)[1:]]) == all_of(100)
+
+
+def test_a_detection_that_counts_goes_before_a_nearer_one_that_does_not(tmp_path):
+    found = [*street(score=0.8)[1:], line(score=0.85, high=30.0), line(x=0.3, score=0.9)]
+    assert ap(tmp_path, street(), found)["easy"] == pytest.approx(100)
+
+
+def test_the_precision_of_a_position_is_the_best_from_there_on(tmp_path):
+    found = [line(x=6.0 * i, score=0.8 - i / 1000) for i in range(NUMBER)]
+    assert ap(tmp_path, street(), [*found, line(x=-9.0, score=0.9)]) == all_of(100 * 50 / 51)
+
+
+def test_the_last_true_positive_is_a_threshold_anyhow(tmp_path):
+    """Of 80 objects, every second one is a position; the one after the last position is averaged, too."""
+    for number, percent in ((2, 2.5), (3, 5.0), (4, 5.0), (5, 7.5), (40, 50.0), (80, 100.0)):
+        found = [line(x=6.0 * i, score=0.8 - i / 1000) for i in range(number)]
+        assert ap(tmp_path, street(number=80), found) == all_of(percent)
+
+
+def test_bad_results_get_one_line(tmp_path):
+    labels = tmp_path / "labels"
+    with refused("classes: got 'Vans', expected"):
+        evaluate_kitti(tmp_path, labels, classes=["Vans"])
+    with refused(f"{tmp_path / 'none'}: no .txt file in it, expected one for every frame"):
+        evaluate_kitti(tmp_path / "none", labels)
+    for result, message in (
+        (line(), "000000.txt: score: got 15 values in a line, expected 16"),
+        (line(score=0.5).replace("Car", "car"), "line 1: type: got 'car', expected Car"),
+        (line(score=0.5).replace("0.5", "nan"), "line 1: score: got 'nan', expected a finite number"),
+    ):
+        with refused(message):
+            evaluate_texts(tmp_path, [(line(), result)])
+    (labels / "000000.txt").unlink()
+    (tmp_path / "results" / "000000.txt").write_text(line(score=0.5))
+    with refused(f"{labels / '000000.txt'}: cannot be read"):
+        evaluate_kitti(tmp_path / "results", labels)

@@ -1,0 +1,180 @@
+"""KITTI's result files: boxes come back, their rectangles in the image, and the metric that evaluate writes."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import command
+from made_kitti import AXES, MOUNTED, P2, RECTIFIED, calibration_text, label_text, write
+
+import fcos_lidar_jax as fcos
+from fcos_lidar_jax.data.class_mapping import MappedFrames
+from fcos_lidar_jax.data.frame import SelectedFrames
+from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration, to_lidar
+from fcos_lidar_jax.evaluation.frames import write_detections
+from fcos_lidar_jax.evaluation.kitti import describe_kitti
+from fcos_lidar_jax.evaluation.kitti_results import image_boxes, read_result, to_camera, write_kitti, write_result
+from fcos_lidar_jax.evaluation.records import as_records
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.types import Detections
+
+
+def random_boxes(number, seed=0):
+    """Boxes ahead, most of which the camera sees."""
+    low, high = (3, -15, -3, 0.5, 0.5, 0.5, -np.pi), (60, 15, 2, 12, 3, 4, np.pi)
+    return np.random.default_rng(seed).uniform(low, high, (number, 7))
+
+
+@pytest.fixture(params=[(AXES, np.eye(3)), (MOUNTED, RECTIFIED)], ids=["upright", "tilted"])
+def calibration(request, tmp_path):
+    write(tmp_path / "calib.txt", calibration_text(*request.param))
+    return read_calibration(tmp_path / "calib.txt")
+
+
+def test_boxes_return_from_a_file(tmp_path, calibration):
+    boxes, scores = random_boxes(300), np.random.default_rng(1).random(300).astype(np.float32)
+    types = [CLASSES[i % len(CLASSES)] for i in range(300)]
+    left_out = write_result(tmp_path / "000123.txt", boxes, types, scores, calibration)
+    back, back_types, back_scores = read_result(tmp_path / "000123.txt", calibration)
+    seen = image_boxes(to_camera(boxes, calibration["velo_to_rect"]), calibration["P2"], IMAGE_SIZE)[1]
+    assert 0 < left_out == (~seen).sum() < 100
+    np.testing.assert_allclose(back[:, :6], boxes[seen, :6], atol=1e-4)
+    turn = (back[:, 6] - boxes[seen, 6] + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(turn).max() < 1e-4
+    assert back_types == [name for name, there in zip(types, seen, strict=True) if there]
+    np.testing.assert_array_equal(back_scores.astype(np.float32), scores[seen])
+
+
+def test_the_camera_frame_is_the_way_back_of_to_lidar(calibration):
+    labels = np.random.default_rng(2).uniform((1, 1, 1, -20, -1, 4, -3.1), (3, 3, 9, 20, 3, 60, 3.1), (200, 7))
+    back = to_camera(to_lidar(labels, calibration["velo_to_rect"]), calibration["velo_to_rect"])
+    np.testing.assert_allclose(back, labels, atol=1e-9)
+
+
+def test_fields_are_those_of_the_benchmark(tmp_path, calibration):
+    """Truncation and occlusion are -1, and alpha is the heading as the camera sees it."""
+    write_result(tmp_path / "a.txt", random_boxes(40), ["Car"] * 40, np.full(40, 0.5), calibration)
+    rows = [line.split() for line in (tmp_path / "a.txt").read_text().splitlines()]
+    assert {tuple([*row[:3], row[15]]) for row in rows} == {("Car", "-1", "-1", "0.5")}
+    for row in rows:
+        alpha, left, top, right, bottom, *_, x, _, z, turn, _ = map(float, row[3:])
+        difference = alpha - (turn - np.arctan2(x, z))
+        assert abs((difference + np.pi) % (2 * np.pi) - np.pi) < 1e-3
+        assert 0 <= left < right <= IMAGE_SIZE[0] - 1
+        assert 0 <= top < bottom <= IMAGE_SIZE[1] - 1
+
+
+def test_rectangles_in_the_image_hold_the_surface_and_no_more():
+    """Points on all faces, those before the camera, projected one by one; some boxes reach behind the camera."""
+    rng = np.random.default_rng(3)
+    boxes = rng.uniform((1, 1, 1, -8, 0, -3, -3.1), (3, 3, 9, 8, 3, 30, 3.1), (150, 7))
+    found, visible = image_boxes(boxes, P2, IMAGE_SIZE)
+    grid = np.linspace(-1, 1, 161)
+    edges = [np.roll([a, b, c], k) for k in range(3) for a in grid for b in (-1, 1) for c in (-1, 1)]
+    last, crossing = np.array(IMAGE_SIZE) - 1, 0
+    for (h, w, l, x, y, z, turn), rectangle, seen in zip(boxes, found, visible, strict=True):
+        a, b, up = (np.array(edges) * (l / 2, w / 2, h / 2)).T
+        points = np.stack(
+            [x + np.cos(turn) * a + np.sin(turn) * b, y - h / 2 + up, z + np.cos(turn) * b - np.sin(turn) * a]
+        )
+        u, v, depth = P2[:, :3] @ points + P2[:, 3:]
+        ahead = depth > 0.1
+        crossing += 0 < ahead.sum() < len(ahead)
+        if not ahead.any():
+            assert not seen
+            continue
+        pixels = np.stack([u, v])[:, ahead] / depth[ahead]
+        low, high = np.clip(pixels.min(axis=1), 0, last), np.clip(pixels.max(axis=1), 0, last)
+        assert (rectangle[:2] <= low + 1e-9).all()
+        assert (rectangle[2:] >= high - 1e-9).all()
+        if (depth > 0.1).all():
+            np.testing.assert_allclose(rectangle, [*low, *high], atol=1e-9)
+        assert seen or not (high > low).all()
+    assert crossing > 10
+
+
+def test_what_no_object_can_be_is_left_out(tmp_path, calibration):
+    boxes = np.tile([20, 0, -1, 4, 1.6, 1.5, 0.0], (6, 1))
+    boxes[1, 0], boxes[2, 3], boxes[3, 5], boxes[4, 0], boxes[5, 6] = -20, 600, 1e-7, 20_000, np.nan
+    assert write_result(tmp_path / "a.txt", boxes, ["Car"] * 6, np.ones(6), calibration) == 5
+    assert len(read_result(tmp_path / "a.txt", calibration)[0]) == 1
+
+
+CARS = [(x, y, -0.9, 4.0, 1.7, 1.5, 0.1) for x in (10.0, 15.0, 20.0) for y in (-4.0, 0.0, 4.0)]
+"""Higher than 40 pixels. Six frames of them are more than the 41 positions."""
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Six frames of cars, with a pedestrian and an area without labels."""
+    root = tmp_path / "kitti"
+    walker = label_text((11.0, -2.0, -0.8, 0.6, 0.7, 1.8, -2.0), "Pedestrian")
+    labels = ("".join(map(label_text, CARS)) + walker).replace("1.0 2.0 3.0 4.0", "100 100 200 200")
+    labels += "DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"
+    for i in range(6):
+        write(root / "training" / "calib" / f"00000{i}.txt", calibration_text())
+        write(root / "training" / "label_2" / f"00000{i}.txt", labels)
+        (root / "training" / "velodyne").mkdir(exist_ok=True)
+        np.array([[15, 0, -1, 0.2]], np.float32).tofile(root / "training" / "velodyne" / f"00000{i}.bin")
+    return root
+
+
+def perfect(frames):
+    """Detections that are the truth, with a row of padding."""
+    for index in range(len(frames)):
+        frame = frames.truth(index)
+        number = len(frame.boxes) + 1
+        boxes = np.nan_to_num(np.concatenate([frame.boxes, np.ones((1, 9))]))
+        labels = np.concatenate([frame.labels, [0]]).astype(np.int32)
+        yield Detections(boxes, np.full(number, 0.7), labels, np.arange(number) < number - 1, np.int32(0))
+
+
+def test_the_metric_of_what_was_written(root, tmp_path):
+    frames, out = MappedFrames(KittiFrames(root), ("Truck", "Car", "Pedestrian")), tmp_path / "out"
+    write(out / "results_kitti" / "000009.txt", "of an older evaluation")
+    metrics = write_kitti(out, perfect(frames), frames)
+    assert metrics is not None
+    assert json.loads((out / "metrics_kitti.json").read_text()) == metrics
+    car = metrics["classes"]["Car"]
+    assert (car["num_truth"]["hard"], car["bev"]["easy"], car["3d"]["hard"]) == (54, 100.0, 100.0)
+    assert (metrics["num_frames"], metrics["left_out"]) == (6, ["Truck", "Cyclist"])
+    assert sorted(f.name for f in (out / "results_kitti").iterdir()) == [f"00000{i}.txt" for i in range(6)]
+    assert "left out, not in both the detector and KITTI's metric: Truck, Cyclist" in describe_kitti(metrics)
+    # Some of the frames; then frames of other data, which leave no numbers of these.
+    some = SelectedFrames(frames, (1,))
+    assert write_kitti(out, perfect(some), some)["num_frames"] == 1
+    assert [f.name for f in (out / "results_kitti").iterdir()] == ["000001.txt"]
+    assert write_kitti(out, [], SimulatedFrames(TINY, 2)) is None
+    assert not (out / "metrics_kitti.json").exists()
+
+
+def test_a_class_map_is_undone_and_names_match_in_lower_case(root, tmp_path):
+    """A class of several types stands for the one of the metric."""
+    names = {"Van": "vehicle", "Car": "vehicle", "Cyclist": None}
+    frames = MappedFrames(KittiFrames(root), ("cyclist", "vehicle", "pedestrian", "Misc", "Pedestrian"), names)
+    metrics = write_kitti(tmp_path, perfect(frames), frames)
+    assert metrics is not None
+    assert (list(metrics["classes"]), metrics["left_out"]) == (
+        ["Car", "Pedestrian"],
+        ["cyclist", "Misc", "Cyclist"],
+    )
+    types = [line.split()[0] for line in (tmp_path / "results_kitti" / "000001.txt").read_text().splitlines()]
+    assert types == ["Car"] * 9 + ["Pedestrian"]
+
+
+def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
+    names = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
+    write(tmp_path / "map.json", json.dumps(names))
+    frames = MappedFrames(KittiFrames(root), fcos.load_detector("quickstart").classes, names)
+    records = [json.dumps(as_records(found, frames.classes)).encode() for found in perfect(frames)]
+    named = [(frames.name(i), record) for i, record in enumerate(records)]
+    write_detections(tmp_path / "given.json", named, frames.classes)
+    data = f"--data-root {root} --class-map {tmp_path}/map.json --checkpoint quickstart"
+    command("evaluate", data, f"--no-report --results {tmp_path}/given.json --out {tmp_path}/out")
+    metrics = json.loads((tmp_path / "out" / "metrics_kitti.json").read_text())
+    assert metrics["classes"]["Car"]["3d"] == {"easy": 100.0, "moderate": 100.0, "hard": 100.0}
+    assert list(metrics["classes"]) == ["Car", "Pedestrian", "Cyclist"]
+    printed = capsys.readouterr().out
+    assert "KITTI AP_R40 on 6 frames" in printed
+    assert "mAP by centre distance" in printed
