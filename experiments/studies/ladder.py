@@ -6,8 +6,9 @@
 Every trial is ``compact`` with changes, on a quarter of the turn of nuScenes' HDL-32E (32 x 272 pixels), one sweep
 and one round, 4,000 frames of varied streets that are simulated once and kept, 3,000 steps of one frame in a
 single one-cycle. The score is the mAP of nuScenes' form on 200 unseen frames, and on 60 of them at each quarter.
-A trial that was stopped is resumed by the same command. ``experiments/LOG.md`` has a line per trial. Cost: about
-half an hour of one core per trial, and some minutes once for the frames.
+The same command resumes a trial that was stopped. Trials that the file of ``--out`` has are not repeated: with
+``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has a
+line per trial. Cost: about half an hour of one core per trial, and some minutes once for the frames.
 """
 
 import dataclasses
@@ -19,11 +20,13 @@ from typing import Any
 
 from experiments.changes import Change, change
 from experiments.runs import benchmark, detections, trained
-from experiments.script import Options, run_measurement
+from experiments.script import Options, run_script, save
+from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
@@ -87,6 +90,7 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     seconds = [r["seconds"] for r in records if "seconds" in r]
     return {
         "trial": name,
+        "steps": args.steps,
         "seed": seed,
         "mAP": round(summary["mean_ap"], 4),
         "curve": [round(r["test/mAP"], 4) for r in records if "test/mAP" in r],
@@ -96,17 +100,51 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     }
 
 
-def measure(args: Args) -> dict[str, Any]:
-    """Train, evaluate, print a line for each."""
+def measure(args: Args) -> None:
+    """Train and score what the file does not have yet, save after each trial, print the table."""
     if unknown := [name for name in args.trials if name not in TRIALS]:
         raise ValueError(f"--trials: got {unknown[0]!r}, expected some of {', '.join(TRIALS)}")
-    rows = []
+    out = args.out or Path("outputs/ladder.json")
+    rows: list[dict[str, Any]] = read_json(out, dict[str, Any])["rows"] if out.exists() else []
     for seed in args.seeds:
         for name in args.trials:
-            rows.append(trial(name, TRIALS[name](BASE(COMPACT)), seed, args))
-            print(json.dumps(rows[-1]), flush=True)
-    return {"rows": rows}
+            if not any((r["trial"], r["steps"], r["seed"]) == (name, args.steps, seed) for r in rows):
+                rows.append(trial(name, TRIALS[name](BASE(COMPACT)), seed, args))
+                save({"rows": rows}, out, json.dumps(rows[-1]))
+    print(table(rows))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: mean score per trial and length, and the difference from the base of the same seeds.
+
+    >>> rows = [{"trial": n, "steps": 9, "seed": s, "mAP": m + 0.01 * s, "step_s": 0.3, "parameters": 7}
+    ...         for n, m in (("base", 0.1), ("wide", 0.2)) for s in (0, 1)]
+    >>> print(table(rows).splitlines()[-1])
+    | wide | 9 | 0.2000, 0.2100 | 0.2050 | +0.1000 [+0.1000, +0.1000] | 1.95 | 0.30 | 7 |
+    """
+    lines = [
+        "| trial | steps | mAP by seed | mean | minus base, 95 % | times base | s per step | parameters |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    scores: dict[tuple[int, str], dict[int, float]] = {}
+    for row in rows:
+        scores.setdefault((row["steps"], row["trial"]), {})[row["seed"]] = row["mAP"]
+    for (steps, name), own in sorted(scores.items()):
+        last = next(r for r in rows if (r["steps"], r["trial"]) == (steps, name))
+        base = scores.get((steps, "base"), {})
+        seeds = sorted(own.keys() & base.keys())
+        difference, ratio = "", ""
+        if name != "base" and seeds:
+            ratio = f"{sum(own[s] for s in seeds) / max(sum(base[s] for s in seeds), 1e-9):.2f}"
+            if bounds := interval([own[s] - base[s] for s in seeds]):
+                difference = "{:+.4f} [{:+.4f}, {:+.4f}]".format(*bounds)
+        each, mean = ", ".join(f"{own[s]:.4f}" for s in sorted(own)), statistics.mean(own.values())
+        lines.append(
+            f"| {name} | {steps:,} | {each} | {mean:.4f} "
+            f"| {difference} | {ratio} | {last['step_s']:.2f} | {last['parameters']:,} |"
+        )
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    run_measurement(measure, Args, __doc__)
+    run_script(measure, Args, __doc__)

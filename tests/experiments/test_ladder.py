@@ -1,5 +1,7 @@
 """The learning ladder: its trials are possible networks, and differ from the base in what they say."""
 
+import json
+
 import jax
 import pytest
 
@@ -28,9 +30,15 @@ def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys)
     """Two steps on four frames: that everything is there, not what it is."""
     for name, value in (("TRAIN_FRAMES", 4), ("TEST_FRAMES", 3), ("CURVE_FRAMES", 2)):
         monkeypatch.setattr(ladder, name, value)
-    (row,) = measure(Args(trials=("local geometry",), steps=4, work=tmp_path))["rows"]
+    out = tmp_path / "ladder.json"
+    args = Args(trials=("local geometry",), steps=4, work=tmp_path, out=out)
+    measure(args)
+    (row,) = json.loads(out.read_text())["rows"]
     assert (row["trial"], row["seed"], len(row["curve"])) == ("local geometry", 0, 4)
     assert 0 <= row["mAP"] <= 1
     assert row["step_s"] > 0
     assert row["parameters"] == 1_288_574
     assert '"trial": "local geometry"' in capsys.readouterr().out
+    monkeypatch.setattr(ladder, "trial", None)  # nothing is trained again
+    measure(args)
+    assert capsys.readouterr().out.count("| local geometry | 4 |") == 1
