@@ -100,7 +100,7 @@ def write_result(
         boxes: [m, >= 7], ``x, y, z, l, w, h, yaw`` in the Velodyne's frame.
         types: KITTI's, one for each box.
         scores: [m].
-        calibration: of :func:`~fcos_lidar_jax.data.kitti.read_calibration`.
+        calibration: as ``fcos_lidar_jax.data.kitti.read_calibration`` returns it.
         image_size: width and height, pixels.
 
     Returns:
