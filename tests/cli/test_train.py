@@ -184,7 +184,7 @@ BAD = {
     "weights": ("--weights gone", "gone: found nothing, expected a checkpoint folder"),
     "weights of another network": (
         "--weights HOME/start --model.fpn-channels 16",
-        r"start: params/.*: got \(.*8.*\), expected \(.*16.*\): the arrays are not of the network",
+        r"start: params/.*: got \(.*8.*\), expected \(.*16.*\): the arrays do not belong to the network",
     ),
     "weights of other classes": (
         "--no-copy-paste --weights HOME/start --classes " + " ".join(NUSCENES_CLASSES[::-1]),
