@@ -155,7 +155,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
 
 
 def detection_variables(state: TrainState) -> dict[str, Any]:
-    """Variables for detection: the running mean of the weights, if any, otherwise the weights; and batch statistics.
+    """Variables for detection: batch statistics, and the running mean of the weights if there is one.
 
     >>> state = TrainState(jnp.int32(9), {"w": 3.0}, {"mean": 0.0}, (), {"w": 2.0}, jax.random.key(0))
     >>> detection_variables(state)
