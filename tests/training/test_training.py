@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from tiny_run import bits
+from tiny_run import TINY_CONFIG, bits
 
 from fcos_lidar_jax.coding import encode
 from fcos_lidar_jax.config import OptimizerConfig
@@ -123,8 +123,8 @@ def test_a_step_is_finite_without_boxes_and_points(trainer, num_points, with_box
 @pytest.mark.parametrize("augmented", [False, True])
 def test_a_step_on_a_packed_batch_is_bit_identical(augmented):
     """To a step on a plain batch with its valid rows in front; in any order, the metrics are bit-identical."""
-    config = dataclasses.replace(CONFIG, augment=QUICKSTART.augment if augmented else None)
-    detector, optimizer = toy_detector(config), make_optimizer(config.optimizer, STEPS)
+    config = dataclasses.replace(TINY_CONFIG, augment=QUICKSTART.augment if augmented else None)
+    detector, optimizer = build_detector(config, TINY), make_optimizer(config.optimizer, STEPS)
     state, step = make_state(detector, optimizer, jax.random.key(0)), jax.jit(make_train_step(detector, optimizer))
     scene = frame(3)
     scattered = make_batch([scene], **SIZES)
