@@ -119,7 +119,7 @@ def plan_run(
     if config.copy_paste is not None and config.fade_epochs * epoch_steps >= steps:
         raise ValueError(
             f"fade_epochs: got {config.fade_epochs}, of {epoch_steps} steps each, expected less than the run's "
-            f"{steps} steps: no object would ever be pasted"
+            f"{steps} steps: nothing would be pasted"
         )
     check_counts(frames)
     check_batch_size(config.optimizer.batch_size, mesh)

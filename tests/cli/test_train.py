@@ -169,7 +169,7 @@ BAD = {
     "seed": ("--seed -1", "seed: got -1"),
     "all faded": (
         "--fade-epochs 4 --steps 4",
-        "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: no object would ever be pasted",
+        "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: nothing would be pasted",
     ),
     "no data": ("--data-root gone", "gone: no such folder, expected a data set"),
     "version": ("--version v9", "v9: no such folder"),
