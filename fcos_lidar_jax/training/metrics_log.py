@@ -46,7 +46,11 @@ class MetricsLog:
         for name, value in values.items():
             many = isinstance(value, list)
             scalars |= {f"{name}/{i}": v for i, v in enumerate(value)} if many else {name: value}
-        numbers: Any = [{"tag": t, "simple_value": float(v)} for t, v in scalars.items() if np.isscalar(v)]
+        numbers = [
+            {"tag": tag, "simple_value": float(value)}  # type: ignore[arg-type]
+            for tag, value in scalars.items()
+            if np.isscalar(value)
+        ]
         with naming(self._folder):
             self._write_event(step, summary={"value": numbers})
 

@@ -235,8 +235,8 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
     shapes = jax.eval_shape(detector.init, jax.random.key(0))
     check_arrays(folder, shapes, checkpoint.variables, whose="the network to be trained")
     if jax.process_index() == 0:
-        models = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
-        for name, was, now in _differences(*models, "model"):
+        own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
+        for name, was, now in _differences(own, new, "model"):
             print(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}", file=sys.stderr, flush=True)
     return checkpoint.variables
 
