@@ -101,8 +101,9 @@ def make_detect(detector: Detector) -> Detect:
         for view, sample in zip(views, inputs, strict=True):
             boxes, *rest = stages.candidates(stages.network(variables, sample), sample)
             candidates.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
-        of_all_views = (jnp.concatenate(parts) for parts in zip(*candidates, strict=True))
-        return Detections(*suppress(*of_all_views, config.inference), inputs[0].num_dropped)
+        boxes, scores, labels, used = (jnp.concatenate(parts) for parts in zip(*candidates, strict=True))
+        best = suppress(boxes, scores, labels, used, config.inference)
+        return Detections(*best, inputs[0].num_dropped)
 
     return detect
 
