@@ -57,7 +57,7 @@ def candidates_by_loops(outputs, locations, config):
     return found
 
 
-@pytest.mark.parametrize(("iou_exponent", "axes"), [(1.0, "lidar"), (0.5, "ray"), (0.0, "lidar")])
+@pytest.mark.parametrize(("iou_exponent", "axes"), [(1.0, "lidar"), (0.5, "ray")])
 def test_candidates_are_the_best_pairs_of_each_level(scene, iou_exponent, axes):
     outputs, locations = scene
     config = InferenceConfig(min_probability=0.2, candidates_per_level=150, iou_exponent=iou_exponent)
@@ -168,10 +168,9 @@ def test_weights_are_transferred_once(monkeypatch):
     assert "placed" not in repr(detector)
 
 
-@pytest.mark.parametrize("flips", ["x", "xy"])
-def test_detections_with_flips_are_equivariant_to_mirrored_clouds(flips):
+def test_detections_with_flips_are_equivariant_to_mirrored_clouds():
     sensor = dataclasses.replace(SENSOR, origin_m=(0.5, -0.25, 0.0))
-    inference = dataclasses.replace(CONFIG.inference, flips=flips, merge_iou=0.3)
+    inference = dataclasses.replace(CONFIG.inference, flips="xy", merge_iou=0.3)
     config, variables = dataclasses.replace(CONFIG, inference=inference, augment=AugmentConfig()), weights()
     detect = jax.jit(make_detect(build_detector(config, sensor)))
     points = make_frame(0, SENSOR).points
