@@ -1,4 +1,4 @@
-"""Trained detectors on disk: one checkpoint, the checkpoints of a run, and how a run is asked to stop."""
+"""Trained detectors on disk: single checkpoints, the checkpoints of a run, and requests to stop a run."""
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, CheckpointError, load_checkpoint, save_checkpoint

@@ -12,53 +12,56 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequest:
-    """Whether a run has been asked to stop, and by what."""
+    """Whether a run has been asked to stop."""
 
-    signal: int | None = None  # SIGINT (Ctrl-C) or SIGTERM; None as long as nothing has been asked.
+    signal: int | None = None  # SIGINT (Ctrl-C) or SIGTERM; None without a request
 
 
 @contextlib.contextmanager
 def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a request that the run sees between two steps; the second one ends it.
+    """Turn the first Ctrl-C or SIGTERM into a request that the run checks between steps; a second one ends it.
 
-    Outside the main thread, which alone Python tells of signals, and with ``active=False`` they are left alone.
+    Signals keep their handlers with ``active=False`` and outside the main thread, where Python delivers none.
     """
     request = StopRequest()
-    own = active and threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in _SIGNALS if own}
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handlers = {number: signal.getsignal(number) for number in _SIGNALS if active and in_main_thread}
+
+    def restore() -> None:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
     def ask(number: int, _: FrameType | None) -> None:
         request.signal = number
-        for again, handler in before.items():
-            signal.signal(again, handler)
+        restore()
 
-    for number in before:
+    for number in handlers:
         signal.signal(number, ask)
     try:
         yield request
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        restore()
 
 
 def take_sigterm_back() -> None:
-    """Let SIGTERM reach Python again, from which JAX's preemption service takes it in a cluster.
+    """Deliver SIGTERM to Python again; in a cluster, JAX's preemption service has taken it over.
 
-    For work during which no sync point is asked for. JAX hears of no later SIGTERM.
+    For work without preemption sync points. JAX does not notice later SIGTERMs.
     """
-    own = threading.current_thread() is threading.main_thread()
-    # Python still knows its handler, of which JAX has not told it that it is not called.
-    if own and jax.distributed.is_initialized() and (handler := signal.getsignal(signal.SIGTERM)) is not None:
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or not jax.distributed.is_initialized():
+        return
+    # Python still reports its own handler: it does not know that JAX has replaced it.
+    if (handler := signal.getsignal(signal.SIGTERM)) is not None:
         signal.signal(signal.SIGTERM, handler)
 
 
 @contextlib.contextmanager
 def after_the_block() -> Iterator[None]:
-    """Let the first Ctrl-C or SIGTERM act only when the block has ended.
+    """Delay the first Ctrl-C or SIGTERM until the end of the block.
 
-    In a library's event loop it would be reported as a failure of the library. Outside the main thread, which no
-    signal interrupts, nothing changes; nor in a cluster, where JAX's preemption service has taken SIGTERM by a
-    handler that Python cannot see and could not restore.
+    A library's event loop would report it as a failure of the library. Nothing is delayed outside the main thread,
+    or in a cluster, where JAX's preemption service handles SIGTERM.
     """
     with stop_requests(active=not jax.distributed.is_initialized()) as request:
         yield

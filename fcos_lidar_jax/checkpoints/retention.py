@@ -1,4 +1,8 @@
-"""The checkpoints of a run: the newest ones, to resume from, and the best."""
+"""The checkpoints of a run: the newest, to resume from, and the best.
+
+Orbax's ``CheckpointManager`` is not used: it restores corrupt arrays without an error, does not fall back to an
+older checkpoint, and lets two processes write into one folder (``tests/checkpoints/test_orbax_manager.py``).
+"""
 
 import shutil
 import sys
@@ -16,54 +20,53 @@ from fcos_lidar_jax.checkpoints.storage import (
 )
 from fcos_lidar_jax.types import TrainState
 
-CHECKPOINTS = "checkpoints"  # Folder of the checkpoints in a run's folder.
-BEST = "best"  # Below a run's folder: name for its best checkpoint.
+CHECKPOINTS = "checkpoints"  # folder of the checkpoints in the folder of a run
+BEST = "best"  # RUN/best stands for the best checkpoint of a run
 
 
 class Checkpoints:
-    """Checkpoints below a folder, one a step; the ``keep`` newest are kept, and the one of the best score."""
+    """Folder of checkpoints, at most one per step; keeps the ``keep`` newest and the one with the best score."""
 
     def __init__(self, folder: Path, *, keep: int = 2) -> None:
         self.folder, self.keep = folder, keep
 
     def save(self, checkpoint: Checkpoint, state: TrainState) -> Path:
-        """Write a checkpoint, then remove what is no longer kept.
+        """Write a checkpoint, then remove old ones.
 
         Raises:
-            OSError: it cannot be written; the others stay.
+            OSError: writing failed; the other checkpoints are unchanged.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{checkpoint.step:08d}"
         save_checkpoint(path, checkpoint, state=state)
-        for leftover in self.folder.glob(".*"):  # of saves that were killed
+        for leftover in self.folder.glob(".*"):  # from saves that were killed
             shutil.rmtree(leftover, ignore_errors=True)
         self._prune(path)
         return path
 
     def record_score(self, step: int, score: float) -> None:
-        """Record what the checkpoint of a step scored, then remove what is no longer kept."""
+        """Record the score of the checkpoint of a step, then remove old checkpoints."""
         path = self.folder / f"{step:08d}"
         save_score(path, score)
         self._prune(path)
 
-    def _prune(self, path: Path) -> None:
-        """Remove all but the best and the newest up to a checkpoint."""
-        # Later ones are damaged: the run went back to before them. They would be taken for the newest.
-        paths, passed_over = ([p for p in self.paths() if (p > path) == later] for later in (False, True))
-        for old in {*passed_over, *paths[: -self.keep]} - {best_of(paths)}:
+    def _prune(self, newest: Path) -> None:
+        # The run resumed before any later checkpoints because they are corrupt. They must not count as the newest.
+        paths, corrupt = ([p for p in self.paths() if (p > newest) == later] for later in (False, True))
+        for old in {*corrupt, *paths[: -self.keep]} - {best_of(paths)}:
             shutil.rmtree(old)
 
     def paths(self) -> list[Path]:
-        """All checkpoints, the oldest first, unread."""
+        """All checkpoints, oldest first, without verification."""
         return sorted(path for path in self.folder.glob("[0-9]*") if path.is_dir())
 
     def newest(self, like: TrainState) -> tuple[Checkpoint, TrainState] | None:
-        """The newest checkpoint that is whole, with its state; None where there are none.
+        """The newest intact checkpoint with its state; None if the folder has no checkpoints.
 
-        A damaged one is passed over with a warning on standard error. ``like`` is any state of the same run.
+        Corrupt checkpoints are skipped with a warning on standard error. ``like`` is any state of the same run.
 
         Raises:
-            CheckpointError: there are some, and all are damaged.
+            CheckpointError: all checkpoints are corrupt.
         """
         paths = self.paths()
         for path in reversed(paths):
@@ -77,7 +80,7 @@ class Checkpoints:
 
 
 def best_of(paths: list[Path]) -> Path | None:
-    """The checkpoint of the highest score, of equal ones the newest; None where none has one."""
+    """The checkpoint with the highest score, the newest of equal ones; None if no checkpoint has a score."""
     scored = []
     for path in paths:
         try:
@@ -90,11 +93,10 @@ def best_of(paths: list[Path]) -> Path | None:
 
 
 def find_checkpoint(folder: Path) -> Path:
-    """The checkpoint that a path or a name stands for.
+    """The checkpoint that a path or name stands for.
 
-    A checkpoint's folder stands for itself, a run's for its last checkpoint, ``RUN/best`` for the one that scored
-    best while it was trained; or it is the name of weights that come with the package, where there is no
-    folder of that name.
+    The folder of a checkpoint stands for itself, the folder of a run for its last checkpoint, and ``RUN/best`` for
+    the checkpoint with the best score. The name of shipped weights stands for them unless a folder has that name.
 
     >>> find_checkpoint(Path("nowhere"))
     PosixPath('nowhere')
@@ -108,7 +110,7 @@ def find_checkpoint(folder: Path) -> Path:
 
 
 def shipped_checkpoints() -> dict[str, Path]:
-    """Name -> folder of the checkpoints that come with the package.
+    """Names and folders of the checkpoints that come with the package.
 
     >>> "quickstart" in shipped_checkpoints()
     True

@@ -1,8 +1,8 @@
-"""Checkpoints that explain themselves: orbax arrays beside the configuration and the sensor as JSON.
+"""Self-describing checkpoints: Orbax arrays, with configuration and sensor as JSON.
 
-A checkpoint is a folder: ``checkpoint.json`` says what it is and lists every file with its hash, ``variables`` is
-what detection needs, ``state`` is there where training can resume from it. A ``README.md`` beside them is no part
-of it and may say more.
+A checkpoint is a folder. ``checkpoint.json`` describes it and lists the hash of every file, ``variables`` holds
+the arrays for detection, and ``state``, if present, the arrays to resume training from. An optional ``README.md``
+is not hashed.
 """
 
 import dataclasses
@@ -34,20 +34,20 @@ LATER_FIELDS = {
     "loss": {"quality": "iou", "centreness_m": 0.75},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
 }
-"""Configuration fields that format 3 did not have at first, and the values that checkpoints without them mean."""
+"""Configuration fields added to format 3 later, and their values in checkpoints without them."""
 GONE_FIELDS = {"model": {"meta_kernel": False}}
-"""Configuration fields that are gone, and the only values with which a configuration is still read."""
+"""Removed configuration fields, and the only values with which a configuration is still accepted."""
 _DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
 _CARD = "README.md"
-_ROOM_FOR_NAMES = 2**20  # Bytes on disk for what describes the arrays.
+_METADATA_BYTES = 2**20  # disk space for the metadata of the arrays
 
 
 class NonFiniteStateError(ArithmeticError):
-    """A state that holds a number that is not finite; the message names the first such array."""
+    """A value to be saved is not finite; the message names the first such array."""
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used: the message names the folder, the finding and the expectation.
+    """A checkpoint that cannot be used; the message names the folder, what was found and what was expected.
 
     >>> issubclass(CheckpointError, ValueError)
     True
@@ -56,7 +56,7 @@ class CheckpointError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A trained detector; weights of another precision, such as float16, are read as float32.
+    """A trained detector. Weights of another precision, such as float16, are loaded as float32.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -66,21 +66,21 @@ class Checkpoint:
 
     config: Config
     sensor: Sensor
-    variables: Variables  # ``params`` and ``batch_stats``.
-    step: int  # Updates done.
-    data: str = ""  # What it was trained on, as text; a run resumes with the same alone.
-    score: float | None = None  # Mean average precision when it was evaluated; None where it was not.
+    variables: Variables  # ``params`` and ``batch_stats``
+    step: int  # number of updates
+    data: str = ""  # description of the training data; a run resumes only with the same data
+    score: float | None = None  # mean average precision; None if it was not evaluated
 
 
 def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainState | None = None) -> None:
-    """Write a checkpoint, whole or not at all, with the state to resume from where one is given.
+    """Write a checkpoint atomically, with ``state`` to resume from if given.
 
-    It is written beside the folder, whose parent must exist, and renamed; a checkpoint that was there before is
-    kept until then. Of several processes, one calls.
+    It is written next to ``folder``, whose parent must exist, and then replaces ``folder``. Only one of several
+    processes may call this function.
 
     Raises:
-        NonFiniteStateError: nothing is written.
-        OSError: it cannot be written; in one line.
+        NonFiniteStateError: a value is not finite; nothing is written.
+        OSError: writing failed; the message is one line.
 
     >>> from fcos_lidar_jax.inference import load_trained
     >>> detector = load_trained("quickstart")
@@ -92,12 +92,12 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     """
     folder = Path(folder).absolute()
     parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
-    # Replicated arrays are whole on every device.
+    # Replicated arrays are complete on every device.
     parts = jax.tree.map(lambda x: np.asarray(x.addressable_data(0) if isinstance(x, jax.Array) else x), parts)
     for name, leaf in _by_name(parts).items():
         if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
             raise NonFiniteStateError(f"{folder}: not saved: {name}: not finite")
-    _check_room(folder, parts)
+    _check_space(folder, parts)
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         for name, tree in parts.items():
@@ -121,7 +121,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
 
 
 def _replace_folder(beside: Path, folder: Path) -> None:
-    """Replace a folder by another one; if that fails, the old one stays."""
+    """Rename ``beside`` to ``folder``; if this fails, an existing folder stays."""
     old = beside.with_name(beside.name + ".old")
     try:
         if folder.exists():
@@ -135,14 +135,14 @@ def _replace_folder(beside: Path, folder: Path) -> None:
 
 
 def save_score(folder: str | Path, score: float) -> None:
-    """Record the score of a checkpoint; its arrays are left alone.
+    """Record the score of a checkpoint without touching its arrays.
 
     Raises:
-        CheckpointError: there is no checkpoint.
-        OSError: it cannot be written; the checkpoint is as it was.
+        CheckpointError: there is no checkpoint, or its description is corrupt.
+        OSError: writing failed; the checkpoint is unchanged.
     """
     file = Path(folder).absolute() / _DESCRIPTION
-    read_description(file.parent)  # Refuses a damaged one.
+    read_description(file.parent)
     text = _with_hash(read_json(file, dict[str, Any]) | {"score": score})
     atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
 
@@ -152,10 +152,10 @@ def _with_hash(description: dict[str, Any]) -> str:
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
-    """Read a checkpoint, and check that its files are as written and its arrays those of its configuration.
+    """Read a checkpoint after checking the hashes of its files and the shapes of its arrays.
 
     Raises:
-        CheckpointError: naming the folder, what was found and what was expected.
+        CheckpointError: names the folder, what was found and what was expected.
 
     >>> load_checkpoint("/no/such/folder")
     Traceback (most recent call last):
@@ -173,15 +173,15 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
 
 
 def load_state(folder: str | Path, like: TrainState) -> TrainState:
-    """Read the state to resume from, bit for bit; ``like`` is any state of the same run.
+    """Read the bit-identical state to resume from; ``like`` is any state of the same run.
 
     Raises:
-        CheckpointError: as :func:`load_checkpoint`, or there is no state.
+        CheckpointError: see :func:`load_checkpoint`; also if the checkpoint has no state.
     """
     folder = Path(folder).absolute()
     description = _verify(folder)
     if not (folder / _STATE).is_dir():
-        raise CheckpointError(f"{folder}: found a detector, expected a training state beside it")
+        raise CheckpointError(f"{folder}: found a detector without a training state, expected both")
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     loaded = _load_arrays(folder / _STATE, jax.eval_shape(_as_arrays, like), config)
     state = jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _by_name(like, ".")])
@@ -189,18 +189,17 @@ def load_state(folder: str | Path, like: TrainState) -> TrainState:
 
 
 def _as_arrays(state: TrainState) -> dict[str, Any]:
-    """The state's leaves by name; the random key as numbers."""
+    """Leaves of the state by name, with the random key as raw data."""
     return _by_name(dataclasses.replace(state, key=jax.random.key_data(state.key)), ".")
 
 
 def _by_name(tree: Any, separator: str = "/") -> dict[str, Any]:
-    """All leaves, in their order."""
     leaves = jax.tree.leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator=separator): leaf for path, leaf in leaves}
 
 
 def _checkpointer() -> Any:
-    """Orbax in this process alone, whatever others there are."""
+    """An Orbax checkpointer that does not synchronise with other processes."""
     import orbax.checkpoint as ocp
 
     own = jax.process_index()
@@ -210,9 +209,9 @@ def _checkpointer() -> Any:
     return ocp.StandardCheckpointer(multiprocessing_options=options)
 
 
-def _check_room(folder: Path, tree: Any) -> None:
-    """Where a disk, a quota or a limit of file sizes is full, orbax's threads print tracebacks: try before."""
-    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) * 9 // 8 + _ROOM_FOR_NAMES
+def _check_space(folder: Path, tree: Any) -> None:
+    """Raise an OSError without free space; Orbax's threads would print tracebacks."""
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) * 9 // 8 + _METADATA_BYTES
     free = shutil.disk_usage(folder.parent).free
     if free < needed:
         raise OSError(
@@ -228,24 +227,23 @@ def _save_arrays(folder: Path, tree: Any) -> None:
     try:
         with after_the_block(), _checkpointer() as checkpointer:
             checkpointer.save(folder, tree)
-        # It holds a path of this machine; that the checkpoint is whole follows from its hashes.
+        # It contains a path of this machine, and is not needed: the hashes show that the checkpoint is complete.
         (folder / "commit_success.txt").unlink(missing_ok=True)
-    except Exception as error:  # orbax and its storage raise what they like on a full disk
+    except Exception as error:  # on a full disk, Orbax raises arbitrary exceptions
         raise OSError(f"{folder}: cannot be written: {_one_line(error)}") from error
 
 
 def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
-    where = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    target = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where), expected)
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    target = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), expected)
     try:
         with after_the_block(), _checkpointer() as checkpointer:
             metadata: Any = checkpointer.metadata(folder).item_metadata
-            whose = f"the configuration {config.name!r} beside them"
-            check_arrays(folder.parent, expected, metadata.tree, whose=whose)
+            check_arrays(folder.parent, expected, metadata.tree, whose=f"the configuration {config.name!r}")
             return checkpointer.restore(folder, target)
     except CheckpointError:
         raise
-    except Exception as error:  # likewise on damaged files
+    except Exception as error:  # so does it for corrupt files
         raise CheckpointError(f"{folder}: cannot be read: {_one_line(error)}") from error
 
 
@@ -254,12 +252,12 @@ def _one_line(error: Exception) -> str:
 
 
 def _canonical(description: dict[str, Any]) -> bytes:
-    """The description without its own hash, the same for the same content."""
+    """Canonical JSON of a description without its own hash."""
     return json.dumps({k: v for k, v in description.items() if k != "hash"}, sort_keys=True).encode()
 
 
 def _hashes(folder: Path) -> dict[str, str]:
-    """Checksum of every file below a folder but the description and the card."""
+    """Checksums of all files in a folder except the description and the card."""
     return {
         file.relative_to(folder).as_posix(): checksum(file.read_bytes())
         for file in sorted(folder.rglob("*"))
@@ -268,27 +266,27 @@ def _hashes(folder: Path) -> dict[str, str]:
 
 
 def _verify(folder: Path) -> dict[str, Any]:
-    """The description of a checkpoint whose files are all as written."""
+    """Check the hashes of all files of a checkpoint, and return its description."""
     if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        raise CheckpointError(f"{folder}: found {found}, expected a checkpoint folder")
+        kind = "a file" if folder.exists() else "nothing"
+        raise CheckpointError(f"{folder}: found {kind}, expected a checkpoint folder")
     description = read_description(folder)
-    written, found = description["files"], _hashes(folder)
-    for name in sorted(written.keys() | found.keys()):
-        if name not in found:
+    expected, hashes = description["files"], _hashes(folder)
+    for name in sorted(expected.keys() | hashes.keys()):
+        if name not in hashes:
             raise CheckpointError(f"{folder / name}: found nothing, expected a file of the checkpoint")
-        if name not in written:
-            raise CheckpointError(f"{folder / name}: found a file that is not of the checkpoint")
-        if written[name] != found[name]:
-            raise CheckpointError(f"{folder / name}: hash {found[name]}, expected {written[name]}: damaged")
+        if name not in expected:
+            raise CheckpointError(f"{folder / name}: found a file that does not belong to the checkpoint")
+        if expected[name] != hashes[name]:
+            raise CheckpointError(f"{folder / name}: hash {hashes[name]}, expected {expected[name]}: damaged")
     return description
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """What a checkpoint says of itself; its arrays are not looked at.
+    """Read and check the description of a checkpoint, but not its arrays.
 
     Raises:
-        CheckpointError: it is not one, or not as it was written.
+        CheckpointError: the folder is not a checkpoint, or its description is corrupt.
     """
     file = folder / _DESCRIPTION
     if not file.is_file():
@@ -298,54 +296,52 @@ def read_description(folder: Path) -> dict[str, Any]:
     except ValueError as error:
         raise CheckpointError(str(error)) from None
     if not isinstance(description, dict) or description.get("format") not in (_OLD_FORMAT, _FORMAT):
-        found = description.get("format") if isinstance(description, dict) else type(description).__name__
-        raise CheckpointError(f"{file}: format: got {found!r}, expected {_FORMAT}")
+        version = description.get("format") if isinstance(description, dict) else type(description).__name__
+        raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
     if description.get("hash") != checksum(_canonical(description)):
-        raise CheckpointError(f"{file}: not as it was written: its hash does not match its content")
+        raise CheckpointError(f"{file}: damaged: its hash does not match its content")
     for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
         if not isinstance(description.get(name), kind):
             raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
     try:
         config = with_later_fields(_converted(description["config"], description["format"]))
-    except (KeyError, TypeError, AttributeError):  # with a hash that fits: forged
-        written = description["format"]
-        raise CheckpointError(f"{file}: config: got fields that format {written} does not have") from None
+    except (KeyError, TypeError, AttributeError):  # forged, since the hash matches
+        version = description["format"]
+        raise CheckpointError(f"{file}: config: got fields that format {version} does not have") from None
     return {**description, "format": _FORMAT, "config": config}
 
 
-def _converted(config: dict[str, Any], written: int) -> dict[str, Any]:
-    """A configuration of an older format in today's."""
-    if written == _OLD_FORMAT:
+def _converted(config: dict[str, Any], version: int) -> dict[str, Any]:
+    """Convert a configuration of an older format to the current format."""
+    if version == _OLD_FORMAT:
         del config["model"]["stem"]["form"], config["model"]["num_classes"], config["inference"]["nms_form"]
         config |= {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}
     return config
 
 
 def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
-    """A configuration's JSON object with the fields that older ones do not have, without those that are gone.
+    """Add the fields that a configuration of an earlier version lacks, and drop removed fields.
 
     >>> with_later_fields({"model": {"remat": True, "meta_kernel": False}})["model"]
     {'remat': True, 'regression_axes': 'lidar', 'local_geometry': False}
     """
     later = dict[str, Any]()
     for section, fields in LATER_FIELDS.items():
-        if isinstance(found := config.get(section, {}), dict):
+        if isinstance(values := config.get(section, {}), dict):
             gone = GONE_FIELDS.get(section, {})
-            kept = {name: value for name, value in found.items() if name not in gone or value != gone[name]}
+            kept = {name: value for name, value in values.items() if name not in gone or value != gone[name]}
             later[section] = {**fields, **kept}
     return {**config, **later}
 
 
 def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:
-    """Compare the names and shapes of arrays found at ``where`` with those expected of ``whose``.
+    """Compare names and shapes of the arrays found at ``where`` with the expected arrays.
 
     Raises:
-        CheckpointError: naming the first array that differs.
+        CheckpointError: names the first difference; ``whose`` says what the expected arrays belong to.
     """
-    wanted, there = ({name: tuple(leaf.shape) for name, leaf in _by_name(t).items()} for t in (expected, found))
-    for name in sorted(wanted.keys() | there.keys()):
-        if wanted.get(name) != there.get(name):
-            raise CheckpointError(
-                f"{where}: {name}: got {there.get(name, 'nothing')}, "
-                f"expected {wanted.get(name, 'nothing')}: the arrays are not of {whose}"
-            )
+    shapes, got = ({name: tuple(leaf.shape) for name, leaf in _by_name(t).items()} for t in (expected, found))
+    for name in sorted(shapes.keys() | got.keys()):
+        if shapes.get(name) != got.get(name):
+            difference = f"got {got.get(name, 'nothing')}, expected {shapes.get(name, 'nothing')}"
+            raise CheckpointError(f"{where}: {name}: {difference}: the arrays do not belong to {whose}")

@@ -1,4 +1,4 @@
-"""Work shared over devices and processes: mesh, batches on their way, agreement, launchers."""
+"""Work on several devices and processes: mesh, transfer of batches, agreement, launchers."""
 
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, pmap_step, replicate, shard_batch

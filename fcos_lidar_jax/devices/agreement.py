@@ -1,4 +1,4 @@
-"""Agreement between processes: they continue together, or none does."""
+"""Agreement between processes: all continue, or none does."""
 
 import contextlib
 from collections.abc import Iterator
@@ -10,15 +10,15 @@ from jax.experimental import multihost_utils
 
 @contextlib.contextmanager
 def agreed(failed: str) -> Iterator[None]:
-    """Let all processes go on after the block, or none: where one fails in it, the others stop behind it.
+    """Continue after the block only if no process failed in it.
 
-    Every process enters the same blocks in the same order, and within them does nothing that waits for another.
+    All processes enter the same blocks in the same order, and must not wait for each other inside a block.
 
     Args:
-        failed: what a process could not do if it fails, for the others to say.
+        failed: what a failing process could not do, for the messages of the other processes.
 
     Raises:
-        OSError: another process failed; the one that did raises its own error.
+        OSError: another process failed. The failing process raises its own error.
 
     >>> with agreed("cannot read"):
     ...     value = 1
@@ -26,14 +26,14 @@ def agreed(failed: str) -> Iterator[None]:
     error: BaseException | None = None
     try:
         yield
-    except BaseException as failure:  # an interruption, too
+    except BaseException as failure:  # including interruptions
         error = failure
     if jax.process_count() > 1:
         try:
-            fine = multihost_utils.process_allgather(np.array(error is None))
-            if error is None and not fine.all():
-                error = OSError(f"process {int(np.argmin(fine))}: {failed}, see what it says")
-        except Exception:  # Another process ended: what is known of this one's own failure says more.
+            succeeded = multihost_utils.process_allgather(np.array(error is None))
+            if error is None and not succeeded.all():
+                error = OSError(f"process {int(np.argmin(succeeded))}: {failed}, see what it says")
+        except Exception:  # Another process ended. The failure of this process, if any, says more.
             if error is None:
                 raise
     if error is not None:
@@ -41,22 +41,20 @@ def agreed(failed: str) -> Iterator[None]:
 
 
 def check_same(checksum: str, what: str) -> None:
-    """Refuse to work with processes that do not start from the same.
+    """Refuse processes with different inputs.
 
     Args:
-        checksum: of what shall be the same, hexadecimal.
-        what: that is.
+        checksum: hexadecimal checksum of the inputs.
+        what: description of the inputs, for the message.
 
     Raises:
-        ValueError: on all processes, naming the first that differs from the first one.
+        ValueError: on all processes; names the first process that differs from process 0.
 
     >>> check_same("cae66941", "frames")
     """
     if jax.process_count() == 1:
         return
-    found = multihost_utils.process_allgather(np.frombuffer(bytes.fromhex(checksum), np.uint8))
-    differs = (found != found[0]).any(axis=1)
+    checksums = multihost_utils.process_allgather(np.frombuffer(bytes.fromhex(checksum), np.uint8))
+    differs = (checksums != checksums[0]).any(axis=1)
     if differs.any():
-        raise ValueError(
-            f"process {int(np.argmax(differs))}: {what}: got another than process 0, expected the same"
-        )
+        raise ValueError(f"process {int(np.argmax(differs))}: {what}: different from process 0, expected the same")

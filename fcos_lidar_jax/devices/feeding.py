@@ -1,4 +1,4 @@
-"""The feed of the devices: batches are transferred in a background thread while the step before them runs."""
+"""Transfer of batches to the devices in a background thread, while the previous step runs."""
 
 import contextlib
 import dataclasses
@@ -13,24 +13,24 @@ from jax.sharding import Mesh
 from fcos_lidar_jax.devices.mesh import shard_batch
 from fcos_lidar_jax.types import HostBatch
 
-_ALIGNMENT = 64  # Bytes; an array at another address is copied again by JAX.
+_ALIGNMENT = 64  # bytes; JAX copies arrays at other addresses again
 
 
 @contextlib.contextmanager
 def feed(batches: Iterable[HostBatch], mesh: Mesh, *, ahead: int = 2) -> Iterator[Iterator[HostBatch]]:
-    """Batches split over the devices of a mesh, in their order, transferred in a background thread.
+    """Split batches over the devices of a mesh, in order, in a background thread.
 
-    The memory of a batch is not read any more when the next one is asked for, so it may be on loan. On
-    accelerators the transfer is the only copy; on a CPU, where JAX would go on using the memory, one copy is made.
+    A batch is not read after the next one has been requested, so its memory may be reused. On accelerators, the
+    transfer is the only copy. On a CPU, where JAX would keep using the memory, the batch is copied once.
 
     Args:
-        batches: NumPy arrays of this process's rows; only the thread takes from them.
-        mesh: of the devices.
-        ahead: batches that wait on the devices at most, beside the one that was taken last.
+        batches: NumPy arrays with the rows of this process; only the thread may iterate over them.
+        mesh: mesh of the devices.
+        ahead: maximum number of batches waiting on the devices, besides the last one that was taken.
 
     Yields:
-        an iterator over the batches as device arrays. What ``batches`` raises is raised there. Leaving the context
-        stops the thread, which finishes the batch it is at; batches that wait are dropped.
+        iterator over the batches as device arrays, which raises the errors of ``batches``. Leaving the context
+        stops the thread after its current batch and drops waiting batches.
 
     >>> from fcos_lidar_jax.devices.mesh import make_mesh
     >>> mesh = make_mesh(jax.devices()[:1])
@@ -50,7 +50,7 @@ def feed(batches: Iterable[HostBatch], mesh: Mesh, *, ahead: int = 2) -> Iterato
                 ready.put(None if host is None else _transferred(host, mesh))
                 if host is None:
                     return
-                del host  # which may be on loan, before the wait for room
+                del host  # its memory may be reused while this thread waits
         except BaseException as error:
             ready.put(error)
 
@@ -60,7 +60,7 @@ def feed(batches: Iterable[HostBatch], mesh: Mesh, *, ahead: int = 2) -> Iterato
                 raise host
             room.release()
             held = [host]
-            del host  # The caller alone keeps it: it fills memory of the devices.
+            del host  # Only the caller keeps a reference: the batch occupies memory of the devices.
             yield held.pop()
 
     thread = threading.Thread(target=transfer, name="feed", daemon=True)
@@ -81,7 +81,7 @@ def _transferred(host: HostBatch, mesh: Mesh) -> HostBatch:
 
 
 def _aligned_copy(array: np.ndarray) -> np.ndarray:
-    """A copy that JAX takes for a CPU device as it is, instead of making another."""
+    """A copy that JAX uses on a CPU device without copying again."""
     memory = np.empty(array.nbytes + _ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % _ALIGNMENT
     copy = memory[start : start + array.nbytes].view(array.dtype).reshape(array.shape)

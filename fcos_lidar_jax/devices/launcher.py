@@ -1,60 +1,54 @@
-"""What the program that started a process, Slurm or Open MPI, says of its GPUs."""
+"""GPUs of a process, from the variables of its launcher: Slurm or Open MPI."""
 
 import re
 from collections.abc import Mapping
 
-# As JAX: only with all of them was a process started by srun, and not within a job in another way.
 _SLURM = ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_NTASKS", "SLURM_PROCID", "SLURM_LOCALID")
-# Of the step, what was asked for, of the whole job: the first that is there.
+"""Variables of processes started by srun, as in JAX; inside a job, other processes lack some of them."""
 _TASKS = ("SLURM_STEP_TASKS_PER_NODE", "SLURM_NTASKS_PER_NODE", "SLURM_TASKS_PER_NODE")
+"""Tasks per node, of which the first one set counts: of the step, as requested, of the job."""
 _VISIBLE = ("CUDA_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
 
 
 def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
-    """Which GPUs a process takes, for ``jax.distributed.initialize``.
+    """Choose the GPUs of a process, for ``jax.distributed.initialize``.
 
-    The only process on its machine takes all GPUs that it may see. Of several, each takes the one of its own
-    number; where the launcher shows each its own GPUs alone, it takes those.
+    The only process of a machine uses all visible GPUs. One of several processes uses the GPU with its local rank,
+    or all visible GPUs if the launcher only shows each process its own.
 
     Args:
-        environment: variables of the process.
+        environment: environment variables of the process.
 
     Returns:
-        places among the GPUs that the process may see; ``()`` for all of them; None where neither Slurm nor Open
-        MPI started it, or ``JAX_LOCAL_DEVICE_IDS`` says it, so that JAX decides.
+        indices into the visible GPUs; ``()`` for all of them; None to let JAX decide, if the process was started
+        by neither Slurm nor Open MPI, or if ``JAX_LOCAL_DEVICE_IDS`` is set.
 
     Raises:
-        ValueError: a variable of the launcher, or JAX's, that cannot be read, with its name.
+        ValueError: names a variable with an invalid value.
 
     >>> local_device_ids({"OMPI_COMM_WORLD_LOCAL_SIZE": "8", "OMPI_COMM_WORLD_LOCAL_RANK": "3"})
     (3,)
     >>> local_device_ids({"OMPI_COMM_WORLD_LOCAL_SIZE": "1", "OMPI_COMM_WORLD_LOCAL_RANK": "0"})
     ()
     """
-    place = None if _said_to_jax(environment) else _place(environment)
-    if place is None:
+    ids = environment.get("JAX_LOCAL_DEVICE_IDS", "")
+    if ids and not all(part.strip().isdecimal() for part in ids.split(",")):
+        raise ValueError(f"JAX_LOCAL_DEVICE_IDS: got {ids!r}, expected numbers of GPUs, as 0 or 0,1")
+    local = None if ids else _local_rank(environment)
+    if local is None:
         return None
-    rank, size = place
-    # Left to itself JAX gives every process of these launchers the one GPU of its rank: the others of a machine
-    # with one process would stay idle, and where each process sees a single GPU, rank 1 would have none. Only
-    # None makes JAX do so, and only ids hide the GPUs that are not among them, so an empty sequence leaves all
-    # visible: jax 0.10 asks `local_device_ids is None`, then `if local_device_ids`. To spell out the ids would be
-    # the documented way, but how many there are is not known before JAX's backend starts, which must be later:
-    # CUDA_VISIBLE_DEVICES may be missing, or name them by UUID. A JAX that took "none" at its word would find no
-    # GPU and stop: nothing would stay idle unseen.
-    return () if size == 1 or _sees_its_own(environment) else (rank,)
+    rank, size = local
+    # By default, JAX gives each process of these launchers the GPU of its rank. On a machine with one process, the
+    # other GPUs would stay idle, and if each process only sees its own GPU, rank 1 would have none. An empty
+    # sequence leaves all GPUs visible, because jax 0.10 tests `local_device_ids is None`, then
+    # `if local_device_ids`. Listing all ids would be the documented way, but their number is unknown until JAX's
+    # backend starts: CUDA_VISIBLE_DEVICES may be unset or contain UUIDs. If a later JAX takes an empty sequence as
+    # no GPUs, it fails instead of leaving GPUs idle.
+    return () if size == 1 or _sees_only_its_own(environment) else (rank,)
 
 
-def _said_to_jax(environment: Mapping[str, str]) -> bool:
-    """Whether JAX's own variable says which GPUs; as in JAX, an empty one says nothing."""
-    text = environment.get("JAX_LOCAL_DEVICE_IDS", "")
-    if text and not all(part.strip().isdecimal() for part in text.split(",")):
-        raise ValueError(f"JAX_LOCAL_DEVICE_IDS: got {text!r}, expected numbers of GPUs, as 0 or 0,1")
-    return text != ""
-
-
-def _place(environment: Mapping[str, str]) -> tuple[int, int] | None:
-    """The process's rank on its machine and how many there are; Open MPI comes first, as in JAX."""
+def _local_rank(environment: Mapping[str, str]) -> tuple[int, int] | None:
+    """Rank on the machine, and number of processes there (0 if unknown); Open MPI has priority, as in JAX."""
     if "OMPI_COMM_WORLD_LOCAL_SIZE" in environment:
         names = "OMPI_COMM_WORLD_LOCAL_RANK", "OMPI_COMM_WORLD_LOCAL_SIZE"
         rank, size = (_number(environment, name) for name in names)
@@ -66,16 +60,16 @@ def _place(environment: Mapping[str, str]) -> tuple[int, int] | None:
     return rank, 0 if name is None else _tasks_of_node(environment, name)
 
 
-def _sees_its_own(environment: Mapping[str, str]) -> bool:
-    """Whether the GPUs that the process may see are no other process's: one, or as many as a task was promised."""
-    seen = next((environment[name] for name in _VISIBLE if name in environment), "")
-    number = len([entry for entry in seen.split(",") if entry.strip()])
-    promised = environment.get("SLURM_GPUS_PER_TASK", "").rpartition(":")[2]  # 2 or a100:2
-    return number == 1 or str(number) == promised
+def _sees_only_its_own(environment: Mapping[str, str]) -> bool:
+    """Whether exactly one GPU is visible, or as many as requested per task."""
+    visible = next((environment[name] for name in _VISIBLE if name in environment), "")
+    number = len([entry for entry in visible.split(",") if entry.strip()])
+    per_task = environment.get("SLURM_GPUS_PER_TASK", "").rpartition(":")[2]  # 2 or a100:2
+    return number == 1 or str(number) == per_task
 
 
 def _tasks_of_node(environment: Mapping[str, str], name: str) -> int:
-    """How many tasks Slurm started on this node: of ``8``, or node by node of ``2(x3),1``."""
+    """Number of Slurm's tasks on this node, from ``8`` for all nodes, or ``2(x3),1`` node by node."""
     parts = [re.fullmatch(r"(\d+)(?:\(x(\d+)\))?", part) for part in environment[name].split(",")]
     counts = [int(part[1]) for part in parts if part for _ in range(int(part[2] or 1))]
     if not all(parts) or not counts:

@@ -1,7 +1,7 @@
-"""Data parallelism: the batch is split over a mesh of devices, the state is on all of them.
+"""Data parallelism: the batch is split over a mesh of devices, and the state is replicated.
 
-The step is written for the global batch; under ``jit`` sums and batch statistics then run over all devices, so
-results do not depend on how many there are, but for rounding.
+The step is written for the global batch. Under ``jit``, sums and batch statistics cover all devices, so results
+depend on the number of devices only by rounding.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ _AXIS = "data"
 
 
 def make_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """A mesh of one axis, over all devices of all processes by default.
+    """Create a mesh with one axis, by default over all devices of all processes.
 
     >>> make_mesh().axis_names
     ('data',)
@@ -30,9 +30,9 @@ def make_mesh(devices: Sequence[Any] | None = None) -> Mesh:
 
 
 def replicate(tree: Tree, mesh: Mesh) -> Tree:
-    """The same arrays on every device; every process gives the same values.
+    """Copy arrays to every device; all processes must pass the same values.
 
-    The arrays are copies: what is given may be donated or kept.
+    The arguments stay valid when the copies are donated.
 
     >>> replicate({"kernel": np.ones(3)}, make_mesh())["kernel"].is_fully_replicated
     True
@@ -43,14 +43,14 @@ def replicate(tree: Tree, mesh: Mesh) -> Tree:
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(place(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
         host = np.asarray(leaf)
-        # Fresh memory: the step may take it, what was given stays the caller's.
+        # In new memory, because the step donates the result.
         return jax.make_array_from_callback(host.shape, everywhere, lambda index: host[index].copy())
 
     return jax.tree.map(place, tree)
 
 
 def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
-    """A batch split along its first axis; every process gives its own rows of the global batch, in its order.
+    """Split a batch along its first axis; each process passes its own rows of the global batch, in order.
 
     >>> shard_batch(np.zeros((4, 3)), make_mesh(jax.devices()[:1])).shape
     (4, 3)
@@ -60,13 +60,13 @@ def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
 
 
 def check_batch_size(batch_size: int, mesh: Mesh) -> None:
-    """Raise a ValueError, with both numbers, for a global batch that the devices cannot share evenly."""
+    """Raise a ValueError if the devices cannot share a global batch evenly."""
     if batch_size % mesh.size:
         raise ValueError(f"batch_size: got {batch_size}, expected a multiple of the {mesh.size} devices")
 
 
 def jit_step(step: Step, mesh: Mesh) -> Step:
-    """The step compiled for a mesh; the state's buffers are given away.
+    """Compile a step for a mesh; the buffers of the state are donated.
 
     >>> step = jit_step(lambda state, batch: (state + batch.sum(), {"count": batch.size}), mesh := make_mesh())
     >>> state, metrics = step(replicate(np.float32(1), mesh), shard_batch(np.ones((4 * mesh.size, 2)), mesh))
@@ -78,10 +78,10 @@ def jit_step(step: Step, mesh: Mesh) -> Step:
 
 
 def pmap_step(step: Step, mesh: Mesh) -> Callable[[Any, Any], Any]:
-    """The step for callers of ``pmap``, with a leading device axis on state and batch.
+    """Wrap a step for callers of ``pmap``, with a leading device axis on state and batch.
 
-    A thin wrapper: it drops the state's axis, joins the batch's axes and runs :func:`jit_step`; a real ``pmap``
-    would need the collectives written into the network.
+    Runs :func:`jit_step` on the state without this axis and the joined batch. A real ``pmap`` would need explicit
+    collectives in the network.
 
     >>> step = pmap_step(lambda state, batch: (state + batch.sum(), {"count": batch.size}), mesh := make_mesh())
     >>> state, _ = step(np.ones(mesh.size, np.float32), np.ones((mesh.size, 1)))

@@ -1,4 +1,4 @@
-"""From points to boxes: one cloud, many frames, drives."""
+"""From points to boxes, for single clouds, frames and drives."""
 
 from fcos_lidar_jax.inference.detect import Stages, make_detect, make_stages
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector

@@ -22,10 +22,10 @@ _MIRRORS = {"none": ("",), "x": ("", "x"), "y": ("", "y"), "xy": ("", "x", "y", 
 def suppress(
     boxes: Array, scores: Array, labels: Array, valid: Array, config: InferenceConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """Class-wise rotated NMS of the candidates of one cloud.
+    """Apply class-wise rotated NMS to the candidates of one cloud.
 
     Returns:
-        boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], the best first; zero where invalid.
+        boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
     """
     options: dict[str, Any] = {"labels": labels, "overlap": config.nms_overlap}
     with jax.named_scope("nms"):
@@ -45,13 +45,13 @@ def suppress(
 
 
 class Stages(NamedTuple):
-    """The stages of detection in one cloud, pure functions.
+    """Stages of detection in one cloud, as pure functions.
 
     Attributes:
-        prepare: ``(points f32[n, c], valid bool[n]) -> input``, as of the detector.
+        prepare: ``(points f32[n, c], valid bool[n]) -> input``.
         network: ``(variables, input) -> outputs``.
-        candidates: ``(outputs, input) -> boxes, scores, labels, valid``, as of the detector.
-        postprocess: the same after NMS, see :func:`suppress`.
+        candidates: ``(outputs, input) -> boxes, scores, labels, valid``.
+        postprocess: candidates after NMS, see :func:`suppress`.
 
     >>> Stages._fields
     ('prepare', 'network', 'candidates', 'postprocess')
@@ -64,7 +64,7 @@ class Stages(NamedTuple):
 
 
 def make_stages(detector: Detector) -> Stages:
-    """Return the stages of :func:`make_detect`, to jit, time or replace one by one.
+    """Make the stages of :func:`make_detect`, to be jitted, timed or replaced separately.
 
     >>> from fcos_lidar_jax.models import build_detector
     >>> from fcos_lidar_jax.presets import QUICKSTART
@@ -75,22 +75,22 @@ def make_stages(detector: Detector) -> Stages:
     (32, 128, 1)
     """
 
-    def network(variables: Any, one: Any) -> Any:
-        outputs, _ = detector.apply(variables, jax.tree.map(lambda leaf: leaf[None], one))
+    def network(variables: Any, sample: Any) -> Any:
+        outputs, _ = detector.apply(variables, jax.tree.map(lambda leaf: leaf[None], sample))
         return jax.tree.map(lambda leaf: leaf[0], outputs)
 
-    def postprocess(outputs: Any, one: Any) -> tuple[Array, Array, Array, Array]:
-        return suppress(*detector.candidates(outputs, one), detector.config.inference)
+    def postprocess(outputs: Any, sample: Any) -> tuple[Array, Array, Array, Array]:
+        return suppress(*detector.candidates(outputs, sample), detector.config.inference)
 
     return Stages(detector.prepare, network, detector.candidates, postprocess)
 
 
 def make_detect(detector: Detector) -> Detect:
-    """The whole path from points to boxes: prepare, network, candidates, NMS.
+    """Make the whole path from points to boxes: prepare, network, candidates, NMS.
 
     Returns:
-        pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` of one cloud, to be jitted by the
-        caller: one compilation for a point count. Close points are the caller's to drop, see
+        pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` for one cloud, to be jitted by the
+        caller; compiled once per number of points. Does not remove close points, see
         :func:`fcos_lidar_jax.projection.remove_close`.
 
     >>> from fcos_lidar_jax.models import build_detector
@@ -109,11 +109,11 @@ def make_detect(detector: Detector) -> Detect:
     def detect(variables: Any, points: Array | np.ndarray, valid: Array | np.ndarray) -> Detections:
         clouds = [_mirror(view, sensor, jnp.asarray(points), no_boxes)[0] for view in views]
         inputs = [stages.prepare(cloud, valid) for cloud in clouds]
-        found = []
-        for view, one in zip(views, inputs, strict=True):
-            boxes, *rest = stages.candidates(stages.network(variables, one), one)
-            found.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
-        boxes, scores, labels, used = (jnp.concatenate(parts) for parts in zip(*found, strict=True))
+        candidates = []
+        for view, sample in zip(views, inputs, strict=True):
+            boxes, *rest = stages.candidates(stages.network(variables, sample), sample)
+            candidates.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
+        boxes, scores, labels, used = (jnp.concatenate(parts) for parts in zip(*candidates, strict=True))
         best = suppress(boxes, scores, labels, used, config.inference)
         return Detections(*best, inputs[0].num_dropped)
 
@@ -121,10 +121,10 @@ def make_detect(detector: Detector) -> Detect:
 
 
 def over_clouds(detect: Callable[..., Detections], batch: int | str) -> Callable[..., Detections]:
-    """The detection of ``batch`` clouds by the detection of one, ``(variables, points[b, n, c], valid[b, n])``.
+    """Extend detection in one cloud to ``batch`` clouds: ``(variables, points[b, n, c], valid[b, n])``.
 
-    Further arguments are shared. A single cloud runs the program of one cloud: under ``vmap`` NMS is computed for
-    every number of candidates.
+    All clouds share further arguments. A batch of one cloud runs the program for a single cloud, because NMS under
+    ``vmap`` does not stop early.
     """
 
     def several(variables: Any, points: Array, valid: Array, *shared: Any) -> Detections:
@@ -136,7 +136,7 @@ def over_clouds(detect: Callable[..., Detections], batch: int | str) -> Callable
 
 
 def _mirror(view: str, sensor: Sensor, points: Array, boxes: Array) -> tuple[Array, Array]:
-    """Points and boxes in a view that is mirrored at the sensor, or back from there."""
+    """Mirror points and boxes at the axes of the sensor; applied twice, this is the identity."""
     origin = jnp.asarray(sensor.origin_m[:2], jnp.float32)
     for axis in view:
         points, boxes = points.at[:, :2].add(-origin), boxes.at[:, :2].add(-origin)

@@ -1,4 +1,4 @@
-"""A trained detector: weights with the network that they are for."""
+"""Trained detectors: a network with its weights."""
 
 import abc
 import dataclasses
@@ -25,7 +25,7 @@ from fcos_lidar_jax.types import Detections
 
 @dataclasses.dataclass(frozen=True)
 class CloudDetector(abc.ABC):
-    """A detector that maps a point cloud to boxes, whether from a checkpoint or from an exported file.
+    """A detector from a checkpoint or an exported file, which maps point clouds to boxes.
 
     >>> from fcos_lidar_jax.inference import load_detector
     >>> detector = load_detector("quickstart")
@@ -33,7 +33,7 @@ class CloudDetector(abc.ABC):
     ('short_range', 10)
     """
 
-    model: Detector  # The network's functions, with the configuration and the sensor.
+    model: Detector  # functions of the network, with its configuration and sensor
 
     @property
     def config(self) -> Config:
@@ -50,13 +50,13 @@ class CloudDetector(abc.ABC):
     @property
     @abc.abstractmethod
     def fingerprint(self) -> str:
-        """Of the program and its weights: other weights have another one."""
+        """Fingerprint of program and weights."""
 
     @abc.abstractmethod
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
-        """Detection of many clouds, each device of the mesh working on its own.
+        """Detection in ``batch_size`` clouds per device.
 
-        With one cloud a device every device runs the program of a single cloud, so the boxes do not depend on the
+        With a batch size of 1, every device runs the program for a single cloud, so the boxes do not depend on the
         number of devices.
 
         Returns:
@@ -65,20 +65,20 @@ class CloudDetector(abc.ABC):
         """
 
     def __call__(self, points: np.ndarray | str | Path) -> Detections:
-        """Boxes in one cloud of any length; compiled once.
+        """Detect boxes in one cloud of any length; compiled once.
 
-        Warns in one line where the cloud does not look like one of the detector's sensor.
+        Warns in one line if the cloud does not fit the sensor of the detector.
 
         Args:
-            points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6], x, y, z
-                in metres, intensity, time lag in seconds, laser number, as it takes them from an array file.
+            points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
+                in metres, intensity, time lag in seconds, laser number, as in an array file.
 
         Returns:
-            NumPy arrays, the best score first, padded to ``config.inference.max_detections`` boxes; ``valid`` says
-            which are none of the padding.
+            NumPy arrays, best score first, padded to ``config.inference.max_detections`` boxes; ``valid`` is False
+            for padding.
 
         Raises:
-            ValueError: another shape or type, or a fifth column that is a ring and no time lag.
+            ValueError: invalid shape or type, or a fifth column that contains rings instead of time lags.
         """
         sensor = self.sensor
         read = read_points if isinstance(points, str | Path) else points_from_array
@@ -88,7 +88,7 @@ class CloudDetector(abc.ABC):
         return self.detect(make_cloud(cloud, self.config, sensor=sensor))
 
     def detect(self, cloud: Cloud) -> Detections:
-        """Boxes in one cloud of :func:`~fcos_lidar_jax.data.cloud_policy.make_cloud`, as NumPy arrays."""
+        """Detect boxes in a cloud from :func:`~fcos_lidar_jax.data.cloud_policy.make_cloud`, as NumPy arrays."""
         mesh = make_mesh(jax.local_devices()[:1])
         found = self.program(mesh)(*shard_batch((cloud.points[None], cloud.valid[None]), mesh))
         return jax.tree.map(lambda leaf: leaf[0], jax.device_get(found))
@@ -103,9 +103,9 @@ class TrainedDetector(CloudDetector):
     ['batch_stats', 'params']
     """
 
-    variables: Variables  # ``params`` and ``batch_stats``.
+    variables: Variables  # ``params`` and ``batch_stats``
     _placed: dict[Mesh, Any] = dataclasses.field(default_factory=dict, init=False, repr=False, compare=False)
-    """The variables on the devices of each mesh: to place them anew for every cloud takes a while."""
+    """Variables on the devices of each mesh, because a transfer for every cloud would be slow."""
 
     @property
     def fingerprint(self) -> str:
@@ -115,13 +115,13 @@ class TrainedDetector(CloudDetector):
         return digest.hexdigest()
 
     def with_inference(self, **fields: Any) -> "TrainedDetector":
-        """The same weights with other post-processing, which no training depends on.
+        """Change the post-processing, on which training does not depend.
 
         Args:
-            fields: of :class:`~fcos_lidar_jax.config.InferenceConfig`; the others stay.
+            fields: fields of :class:`~fcos_lidar_jax.config.InferenceConfig` to change.
 
         Raises:
-            ValueError: a value that the field does not take, or flips that the training did not have.
+            ValueError: an invalid value, or flips that were not used in training.
 
         >>> from fcos_lidar_jax.inference import load_trained
         >>> load_trained("hdl32e").with_inference(merge_iou=None).config.inference.merge_iou is None
@@ -143,7 +143,7 @@ def _split_detect(detector: Detector, mesh: Mesh, batch_size: int) -> Callable[.
 
 
 def jit_split(on_one_device: Callable[..., Any], mesh: Mesh, *, shared: int = 0) -> Callable[..., Any]:
-    """A function that every device runs on its rows of all arguments but the first ``shared`` ones, compiled."""
+    """Compile a function that every device runs on its rows of the last two arguments, after ``shared`` others."""
     rows = PartitionSpec(mesh.axis_names[0])
     specs = {"in_specs": (*[PartitionSpec()] * shared, rows, rows), "out_specs": rows}
     return jax.jit(jax.shard_map(on_one_device, mesh=mesh, **specs, check_vma=False))

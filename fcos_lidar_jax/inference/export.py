@@ -1,7 +1,7 @@
-"""A detector as one file: a program of ``jax.export`` from points to boxes, with the weights inside.
+"""Detectors in one file: a program of ``jax.export`` from points to boxes that includes the weights.
 
-The file is a line with its format and the checksum of what follows, a line of JSON that says what the detector is,
-and the serialised program. docs/export.md shows how to run it without this package.
+The file consists of a line with its format and the checksum of the rest, a line of JSON that describes the
+detector, and the serialised program. docs/export.md shows how to run it without this package.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ class _Weights(TypedDict):
 
 
 class _Record(TypedDict):
-    """What the package itself needs of the record of a file."""
+    """Fields of the record that this package uses."""
 
     written_by: str
     name: str
@@ -59,9 +59,9 @@ class _Record(TypedDict):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExportedDetector(CloudDetector):
-    """A detector of a file that ``fcos-lidar export`` has written, see :func:`load_exported`."""
+    """A detector from a file of ``fcos-lidar export``, see :func:`load_exported`."""
 
-    record: dict[str, Any]  # What the file says of itself.
+    record: dict[str, Any]  # description of the detector in the file
     exported: export.Exported
 
     @property
@@ -79,25 +79,25 @@ class ExportedDetector(CloudDetector):
 @functools.lru_cache(maxsize=8)
 def _split_program(detector: ExportedDetector, mesh: Mesh) -> Callable[..., Any]:
     def on_one_device(points: jax.Array, valid: jax.Array) -> Detections:
-        # Clouds of this package have been cleaned, each sweep in its own frame.
-        found: Any = detector.exported.call(points, valid, np.False_)
-        return Detections(**found)
+        # This package has already removed close points, in the frame of each sweep.
+        arrays: Any = detector.exported.call(points, valid, np.False_)
+        return Detections(**arrays)
 
     return jit_split(on_one_device, mesh)
 
 
 def export_detector(detector: TrainedDetector, *, num_points: Size | None = None, batch: Size = 1) -> bytes:
-    """The bytes of a file that detects without this package, the same for the same detector and versions.
+    """Export a detector to the bytes of a file that runs without this package; deterministic for fixed versions.
 
-    Its program takes points f32[b, n, c], valid bool[b, n] and remove_close bool[], and returns a dictionary of
+    The program takes points f32[b, n, c], valid bool[b, n] and remove_close bool[], and returns a dictionary of
     the arrays of :class:`~fcos_lidar_jax.types.Detections`. It drops rows that are not finite or beyond physical
-    limits and, with ``remove_close``, those on the ego vehicle, as the configuration says.
+    limits and, with ``remove_close``, points on the ego vehicle as configured.
 
     Args:
         detector: network with its weights.
-        num_points: n, rows of a cloud with its padding; ``"any"`` compiles anew for each number. Default:
-            ``config.max_points``.
-        batch: b, clouds at once, or ``"any"``. With more than one, boxes and scores differ by rounding.
+        num_points: n, number of rows of a padded cloud, by default ``config.max_points``; ``"any"`` compiles for
+            each number.
+        batch: b, number of clouds, or ``"any"``. With several clouds, boxes and scores differ by rounding.
 
     Raises:
         ValueError: a size below 1.
@@ -156,17 +156,16 @@ def _whole_path(detector: TrainedDetector, batch: Size) -> Callable[..., dict[st
         return detect(variables, points, jnp.where(removes_close, far, usable))
 
     def whole(points: jax.Array, valid: jax.Array, removes_close: jax.Array) -> dict[str, jax.Array]:
-        # As constants that are not folded, so that they are computed with as if they were arguments.
+        # The barrier prevents constant folding, so that the program computes as with weights as arguments.
         variables = lax.optimization_barrier(jax.tree.map(jnp.asarray, weights))
-        found = over_clouds(one, batch)(variables, points, valid, removes_close)
-        return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+        return vars(over_clouds(one, batch)(variables, points, valid, removes_close))
 
     return whole
 
 
 @contextlib.contextmanager
 def _settings(values: dict[str, Any]) -> Iterator[None]:
-    """Settings of JAX for a while."""
+    """Change settings of JAX temporarily."""
     before = {name: getattr(jax.config, name) for name in values}
     try:
         for name, value in values.items():
@@ -178,26 +177,26 @@ def _settings(values: dict[str, Any]) -> Iterator[None]:
 
 
 def read_record(file: Path) -> dict[str, Any]:
-    """What an exported detector says of itself; nothing of its program is deserialised.
+    """Read the description of an exported detector without deserialising its program.
 
     Raises:
-        CheckpointError: another file, another format, or not as it was written.
+        CheckpointError: not an exported detector, another format, or corrupt.
     """
     return _read(file)[0]
 
 
 def load_exported(file: Path) -> ExportedDetector:
-    """Read a file of :func:`export_detector`; compiled at the first cloud.
+    """Load a file of :func:`export_detector`; the program is compiled for the first cloud.
 
     Raises:
-        CheckpointError: as :func:`read_record`, or written for a newer JAX.
+        CheckpointError: see :func:`read_record`; also if the file needs another version of JAX.
     """
     record, program = _read(file)
     config = config_from_json(with_later_fields(record["config"]), f"{file}: config")
     sensor = sensor_from_json(record["sensor"], f"{file}: sensor")
     try:
         exported = export.deserialize(bytearray(program))
-    except Exception as error:  # a version that this JAX does not read
+    except Exception as error:  # a version that this JAX cannot read
         raise CheckpointError(
             f"{file}: not readable by jax {jax.__version__}: found the program of {record['written_by']}: "
             f"{' '.join(str(error).split())[:200]}"
@@ -211,18 +210,18 @@ def _read(file: Path) -> tuple[dict[str, Any], bytes]:
             first = stream.readline(_MAX_FIRST_LINE)
             if not first.startswith(_MAGIC.encode() + b" "):
                 raise CheckpointError(f"{file}: found a file, {_EXPECTED}")
-            content = stream.read(min(file.stat().st_size, _MAX_BYTES))  # as much memory as is asked for is taken
+            content = stream.read(min(file.stat().st_size, _MAX_BYTES))  # read() allocates its whole argument
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read: {error.strerror}") from None
     version, _, expected = first.decode("ascii", "replace").removeprefix(_MAGIC).strip().partition(" ")
     if version != str(_FORMAT):
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
-    if (found := checksum(content)) != expected:
-        raise CheckpointError(f"{file}: checksum {found!r}, expected {expected!r}: damaged")
+    if (actual := checksum(content)) != expected:
+        raise CheckpointError(f"{file}: checksum {actual!r}, expected {expected!r}: damaged")
     line, _, program = content.partition(b"\n")
     try:
         record = json.loads(line[:_MAX_RECORD])
         msgspec.convert(record, _Record)
-    except (ValueError, RecursionError):  # of which msgspec's is one
+    except (ValueError, RecursionError):  # includes msgspec's errors
         raise CheckpointError(f"{file}: found a forged record, {_EXPECTED}") from None
     return record, program

@@ -14,37 +14,35 @@ Backend = Literal["xla", "openvino"]
 
 
 def load_detector(checkpoint: str | Path, *, backend: Backend = "xla") -> CloudDetector:
-    """A detector from a checkpoint, a run, weights that come with the package, or an exported file.
-
-    See :func:`find_checkpoint` and :func:`~fcos_lidar_jax.inference.export.load_exported`.
+    """Load a detector from a checkpoint, a run, shipped weights, or an exported file.
 
     Args:
-        checkpoint: where the detector is.
-        backend: what the network runs in: XLA, or, faster on CPUs, OpenVINO, which needs the extra ``cpu``; see
+        checkpoint: path or name, see :func:`~fcos_lidar_jax.checkpoints.find_checkpoint`.
+        backend: runtime of the network: XLA, or OpenVINO, which is faster on CPUs and needs the extra ``cpu``, see
             :func:`~fcos_lidar_jax.inference.openvino.with_openvino`.
 
     Raises:
-        CheckpointError: naming the folder or file, what was found and what was expected.
-        ValueError: the backend is not installed, or does not run here.
+        CheckpointError: names the folder or file, what was found and what was expected.
+        ValueError: the backend is not installed or does not run here.
 
     >>> load_detector("quickstart").classes[:2]
     ('car', 'truck')
     """
     if backend not in get_args(Backend):
         raise ValueError(f"backend: got {backend!r}, expected one of {', '.join(get_args(Backend))}")
-    found = find_checkpoint(Path(checkpoint))
+    path = find_checkpoint(Path(checkpoint))
     if backend == "openvino":
-        if found.is_file():
-            raise ValueError(f"backend openvino: {found}: found an exported program, expected a checkpoint")
-        return with_openvino(load_trained(found))
-    return load_exported(found) if found.is_file() else load_trained(found)
+        if path.is_file():
+            raise ValueError(f"backend openvino: {path}: found an exported program, expected a checkpoint")
+        return with_openvino(load_trained(path))
+    return load_exported(path) if path.is_file() else load_trained(path)
 
 
 def load_trained(checkpoint: str | Path) -> TrainedDetector:
-    """As :func:`load_detector`, with the weights: an exported file is refused.
+    """Load a detector with access to its weights, from anything :func:`load_detector` takes but exported files.
 
     >>> load_trained("quickstart").config.name
     'quickstart'
     """
-    read = load_checkpoint(find_checkpoint(Path(checkpoint)))
-    return TrainedDetector(build_detector(read.config, read.sensor), read.variables)
+    loaded = load_checkpoint(find_checkpoint(Path(checkpoint)))
+    return TrainedDetector(build_detector(loaded.config, loaded.sensor), loaded.variables)

@@ -1,7 +1,7 @@
-"""The network alone as an ONNX graph in float32, made from its parameters, batch norms folded into convolutions.
+"""The network as an ONNX graph in float32, with batch norms folded into convolutions.
 
-From the features of a range image to the raw predictions of all levels, as ``Detector.apply``: neither projection
-nor decoding nor NMS is in it. Images are [b, c, h, w] inside.
+Like ``Detector.apply``, it maps the features of a range image to the raw predictions of all levels, without
+projection, decoding and NMS. Images inside the graph are [b, c, h, w].
 """
 
 import importlib
@@ -24,19 +24,19 @@ from fcos_lidar_jax.models.modality import channel_groups
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import CHANNELS
 
-_OPSET, _IR_VERSION = 17, 8  # Of 2022: any runtime of today reads them.
+_OPSET, _IR_VERSION = 17, 8  # from 2022, supported by all current runtimes
 _TELEMETRY = "openvino_telemetry"
 _END = np.iinfo(np.int64).max
 
 
 def cpu_package(name: str) -> Any:
-    """A package of the extra ``cpu``; OpenVINO without its telemetry.
+    """Import a package of the extra ``cpu``; OpenVINO is imported without its telemetry.
 
-    Telemetry would report every import to OpenVINO's makers, from a fork of this process, whose threads may then
-    hang. OpenVINO does without where it cannot be imported.
+    Telemetry would report every import, from a fork of this process that may make threads hang. OpenVINO works
+    without telemetry if importing it fails.
 
     Raises:
-        ValueError: it is not installed.
+        ValueError: the package is not installed.
     """
     reporter = sys.modules.get(_TELEMETRY)
     sys.modules[_TELEMETRY] = None  # type: ignore[assignment]
@@ -52,15 +52,15 @@ def cpu_package(name: str) -> Any:
 
 
 def network_graph(detector: TrainedDetector) -> bytes:
-    """The network as an ONNX file, the same bytes for the same detector and versions.
+    """Convert the network to an ONNX file, deterministic for fixed versions.
 
-    Its input is ``features`` f32[b, h, w, 9, r], a range image as ``project_points`` gives it, in raw units; its
-    outputs are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. All is
-    float32, whatever ``config.model.precision`` is. The metadata hold classes, configuration and sensor as JSON.
+    The input is ``features`` f32[b, h, w, 9, r], a range image from ``project_points`` in raw units. The outputs
+    are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. Everything is
+    float32 regardless of ``config.model.precision``. The metadata hold classes, configuration and sensor as JSON.
 
     Raises:
-        ValueError: the detector is another one than FCOS-LiDAR, onnx is not installed, or the network has
-            parameters that the graph does not know.
+        ValueError: the detector is not FCOS-LiDAR, onnx is not installed, or the network has parameters that are
+            not part of the graph.
     """
     config, model = detector.config, detector.config.model
     if type(config) is not Config:
@@ -103,7 +103,7 @@ def network_graph(detector: TrainedDetector) -> bytes:
 
 
 class _Network:
-    """Nodes and constants in the order in which they are made, and the parameters by their paths."""
+    """Nodes and constants of a graph in order of creation, and the parameters by path."""
 
     def __init__(self, onnx: Any, variables: Any, *, circular: bool) -> None:
         self.onnx, self.circular = onnx, circular
@@ -114,16 +114,16 @@ class _Network:
         self.used: set[str] = set()
 
     def parameter(self, path: str, kind: str = "params") -> np.ndarray:
-        """In float64, so that what is folded is rounded once."""
+        """A parameter in float64, so that folding rounds only once."""
         self.used.add(f"{kind}/{path}")
         return self.parameters[f"{kind}/{path}"].astype(np.float64)
 
     def check_all_used(self) -> None:
         if unknown := sorted(self.parameters.keys() - self.used):
-            raise ValueError(f"ONNX: found the parameters {unknown[0]}, which the graph does not know")
+            raise ValueError(f"ONNX: found the parameters {unknown[0]}, which are not part of the graph")
 
     def constant(self, value: Any) -> str:
-        """Numbers as float32, whole ones as int64; equal ones are one constant."""
+        """A constant of float32, or int64 for integers; equal constants are shared."""
         array = np.asarray(value)
         array = np.ascontiguousarray(array, np.int64 if array.dtype.kind == "i" else np.float32)
         key = array.dtype.kind, array.shape, array.tobytes()
@@ -133,7 +133,7 @@ class _Network:
         return self.constants[key].name
 
     def __call__(self, kind: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
-        """A node with one output, which is named here by default; inputs that are no names are constants."""
+        """Add a node and return the name of its output; inputs other than names become constants."""
         names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
         output = output or f"{kind.lower()}{len(self.nodes)}"
         self.nodes.append(self.onnx.helper.make_node(kind, names, [output], **attributes))
@@ -142,18 +142,10 @@ class _Network:
     def conv(
         self, x: str, kernel: np.ndarray, *bias: np.ndarray, stride: int = 1, dilation: int = 1, groups: int = 1
     ) -> str:
-        """As :func:`fcos_lidar_jax.models.convolution.convolve`, with the kernel in its layout."""
-        high, wide = (size // 2 * dilation for size in kernel.shape[:2])
-        if self.circular and wide:
-            last, first = self("Slice", x, [-wide], [_END], [3]), self("Slice", x, [0], [wide], [3])
-            x, wide = self("Concat", last, x, first, axis=3), 0
-        shape: Any = {
-            "strides": [stride] * 2,
-            "dilations": [dilation] * 2,
-            "pads": [high, wide] * 2,
-            "group": groups,
-        }
-        return self("Conv", x, kernel.transpose(3, 2, 0, 1), *bias, **shape)
+        """See :func:`fcos_lidar_jax.models.convolution.convolve`, including the layout of the kernel."""
+        x, high, wide = self.wrapped(x, *(size // 2 * dilation for size in kernel.shape[:2]))
+        options: Any = {"strides": [stride] * 2, "dilations": [dilation] * 2, "pads": [high, wide] * 2}
+        return self("Conv", x, kernel.transpose(3, 2, 0, 1), *bias, group=groups, **options)
 
     def conv_norm(self, x: str, path: str, *, stride: int = 1, relu: bool = True) -> str:
         gain, shift = self.batch_norm(f"{path}/norm")
@@ -164,7 +156,7 @@ class _Network:
         return self.conv(x, self.parameter(f"{path}/kernel"), self.parameter(f"{path}/bias"), stride=stride)
 
     def batch_norm(self, path: str) -> tuple[np.ndarray, np.ndarray]:
-        """What a channel is multiplied by, and what is added then."""
+        """Factor and offset per channel."""
         mean, var = (self.parameter(f"{path}/{name}", "batch_stats") for name in ("mean", "var"))
         gain = self.parameter(f"{path}/scale") / np.sqrt(var + EPSILON)
         return gain, self.parameter(f"{path}/bias") - mean * gain
@@ -184,25 +176,30 @@ class _Network:
         return x
 
     def padded(self, x: str, high: int, wide: int) -> str:
-        """With more pixels on every side: zeros, or wrapped around the width."""
-        if self.circular:
-            last, first = self("Slice", x, [-wide], [_END], [3]), self("Slice", x, [0], [wide], [3])
-            x, wide = self("Concat", last, x, first, axis=3), 0
+        """Pad an image on all sides with zeros, or with its other end along a circular width."""
+        x, high, wide = self.wrapped(x, high, wide)
         return self("Pad", x, [0, 0, high, wide, 0, 0, high, wide])
 
+    def wrapped(self, x: str, high: int, wide: int) -> tuple[str, int, int]:
+        """Wrap a circular image around its width; returns the rows and columns of zeros left to pad."""
+        if not self.circular or not wide:
+            return x, high, wide
+        last, first = self("Slice", x, [-wide], [_END], [3]), self("Slice", x, [0], [wide], [3])
+        return self("Concat", last, x, first, axis=3), high, 0
+
     def cut(self, x: str, row: int, column: int, high: int, wide: int) -> str:
-        """A window of a padded image; its end is counted from the image's, whose size the graph need not know."""
+        """A window of a padded image; its end is relative to the end of the image, whose size may be unknown."""
         ends = [_END if place == 2 * pad else place - 2 * pad for place, pad in ((row, high), (column, wide))]
         return self("Slice", x, [row, column], ends, [2, 3])
 
     def upsample(self, x: str, rows: int, columns: int) -> str:
-        """Every row and column repeated."""
+        """Repeat rows and columns."""
         how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         return self("Resize", x, "", [1.0, 1.0, rows, columns], **how)
 
 
 def _preprocessing(network: _Network, features: str, model: ModelConfig, layout: ImageLayout) -> str:
-    """As :func:`fcos_lidar_jax.models.detector.network_input`."""
+    """See :func:`fcos_lidar_jax.models.detector.network_input`."""
     mean, scale = (np.array(values)[:, None] for values in (model.channel_mean, model.channel_scale))
     exists = network("Greater", network("Slice", features, [7], [8], [3]), 0.0)
     scaled = network("Div", network("Sub", features, mean), scale)
@@ -239,7 +236,7 @@ def _stem(network: _Network, image: str, config: StemConfig, groups: Sequence[tu
 
 
 _LANES = 16
-"""Channels of a group of which the widths must be multiples: grouped convolutions of others are slow on CPUs."""
+"""Grouped convolutions on CPUs are slow unless the width of a group is a multiple of this."""
 
 
 def _block_diagonal(kernels: Sequence[np.ndarray]) -> np.ndarray:
@@ -251,7 +248,7 @@ def _block_diagonal(kernels: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConfig) -> str:
-    """As :class:`fcos_lidar_jax.models.local_geometry.LocalGeometry`."""
+    """See :class:`fcos_lidar_jax.models.local_geometry.LocalGeometry`."""
     points = network("Gather", image, [0, rounds, 2 * rounds], axis=1)
     points = network("Mul", points, np.array(model.channel_scale[:3])[:, None, None])
     filled = network("Greater", network("Gather", image, [7 * rounds], axis=1), 0.0)
@@ -259,12 +256,12 @@ def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConf
     azimuth = network("Mul", network("Gather", image, [4 * rounds], axis=1), model.channel_scale[4])
     azimuth = network("Add", azimuth, model.channel_mean[4])
     cos, sin = network("Cos", azimuth), network("Sin", azimuth)
-    around, there = (network.padded(x, ROWS, COLUMNS) for x in (points, exists))
+    padded_points, padded_exists = (network.padded(x, ROWS, COLUMNS) for x in (points, exists))
     channels = []
     for row, column in window():
-        offset = network("Sub", network.cut(around, row, column, ROWS, COLUMNS), points)
+        offset = network("Sub", network.cut(padded_points, row, column, ROWS, COLUMNS), points)
         dx, dy, dz = (network("Slice", offset, [axis], [axis + 1], [1]) for axis in range(3))
-        both = network("Mul", network.cut(there, row, column, ROWS, COLUMNS), exists)
+        both = network("Mul", network.cut(padded_exists, row, column, ROWS, COLUMNS), exists)
         radial = network("Add", network("Mul", cos, dx), network("Mul", sin, dy))
         tangential = network("Sub", network("Mul", cos, dy), network("Mul", sin, dx))
         turned = network("Concat", radial, tangential, dz, axis=1)
@@ -308,7 +305,7 @@ _PREDICTIONS = {
     "regression": ("regression", ("centre", "size", "heading", "velocity")),
     "iou_logits": ("regression", ("iou",)),
 }
-"""Output -> tower, and the layers whose predictions it holds."""
+"""Tower and layers of each output."""
 
 
 def _heads(
@@ -318,8 +315,8 @@ def _heads(
     model: ModelConfig,
     shapes: Mapping[str, Sequence[int]],
 ) -> None:
-    """The outputs, at the locations of all levels."""
-    found: dict[str, list[str]] = {name: [] for name in _PREDICTIONS}
+    """Add the outputs at the locations of all levels."""
+    outputs: dict[str, list[str]] = {name: [] for name in _PREDICTIONS}
     for level, image in enumerate(levels):
         path = "heads/shared" if model.tied_heads else f"heads/level{level + 2}"
         here = network("Slice", local, [0, 0], [_END] * 2, [2, 3], [STRIDES[level]] * 2) if local else None
@@ -335,6 +332,6 @@ def _heads(
                 for part in ("kernel", "bias")
             )
             y = network("Transpose", network.conv(towers[tower], kernel, bias), perm=[0, 2, 3, 1])
-            found[name].append(network("Reshape", y, [0, -1, *shapes[name]]))
-    for name, of_levels in found.items():
+            outputs[name].append(network("Reshape", y, [0, -1, *shapes[name]]))
+    for name, of_levels in outputs.items():
         network("Concat", *of_levels, axis=1, output=name)

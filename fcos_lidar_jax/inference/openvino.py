@@ -1,6 +1,6 @@
-"""A detector whose network runs in OpenVINO: the fast path on CPUs.
+"""Detectors whose network runs in OpenVINO, which is fast on CPUs.
 
-Three programs per cloud: projection, compiled by XLA; the network, by OpenVINO; decoding and NMS, by XLA again.
+XLA compiles the projection, OpenVINO the network, and XLA decoding and NMS.
 """
 
 import dataclasses
@@ -26,24 +26,24 @@ _HINT = {"float32": "f32", "bfloat16": "bf16"}
 
 @dataclasses.dataclass(frozen=True)
 class OpenVinoDetector(TrainedDetector):
-    """As :class:`TrainedDetector`, with the network in OpenVINO, see :func:`with_openvino`."""
+    """A :class:`TrainedDetector` whose network runs in OpenVINO, see :func:`with_openvino`."""
 
-    precision: Precision  # That the network computes in.
-    network: Callable[[RangeImage], Outputs]  # Of one sample.
+    precision: Precision  # precision of the network
+    network: Callable[[RangeImage], Outputs]  # for one sample
 
     @property
     def fingerprint(self) -> str:
         return f"{super().fingerprint} openvino {cpu_package('openvino').__version__} {self.precision}"
 
     def with_inference(self, **fields: Any) -> TrainedDetector:
-        """As of any detector; flips are refused."""
+        """See :meth:`TrainedDetector.with_inference`; refuses flips."""
         detector = super().with_inference(**fields)
         _check_flips(detector.config)
         return detector
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
-        """As of any detector, but one cloud after the other: a batch changes nothing."""
-        prepare, postprocess = _ends(self.model)
+        """See :meth:`CloudDetector.program`; clouds of a batch run one by one, with identical results."""
+        prepare, postprocess = _jitted_stages(self.model)
 
         def one(points: np.ndarray, valid: np.ndarray) -> Detections:
             image = prepare(points, valid)
@@ -51,15 +51,15 @@ class OpenVinoDetector(TrainedDetector):
             return Detections(boxes, scores, labels, used, image.num_dropped)
 
         def several(points: Any, valid: Any) -> Detections:
-            found = [one(*cloud) for cloud in zip(np.asarray(points), np.asarray(valid), strict=True)]
-            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+            detections = [one(*cloud) for cloud in zip(np.asarray(points), np.asarray(valid), strict=True)]
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *detections)
 
         return several
 
 
 @functools.lru_cache(maxsize=8)
-def _ends(detector: Detector) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The stages before and behind the network, compiled once."""
+def _jitted_stages(detector: Detector) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The stages before and after the network."""
     stages = make_stages(detector)
     return jax.jit(stages.prepare), jax.jit(stages.postprocess)
 
@@ -70,24 +70,24 @@ def _check_flips(config: Config) -> None:
 
 
 def processor_precision() -> Precision:
-    """bfloat16 where the processor computes in it, else float32.
+    """bfloat16 if the processor supports it, else float32.
 
     Raises:
         ValueError: OpenVINO is not installed.
     """
-    abilities = cpu_package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-    return "bfloat16" if "BF16" in abilities else "float32"
+    capabilities = cpu_package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    return "bfloat16" if "BF16" in capabilities else "float32"
 
 
 def with_openvino(detector: TrainedDetector, *, precision: Precision | None = None) -> OpenVinoDetector:
-    """The detector with its network in OpenVINO, compiled for one cloud at once.
+    """Compile the network of a detector with OpenVINO, for one cloud at a time.
 
     Args:
         detector: network with its weights.
-        precision: of the network but for its ends; default: :func:`processor_precision`.
+        precision: precision of the network except its input and outputs; by default :func:`processor_precision`.
 
     Raises:
-        ValueError: OpenVINO or onnx is not installed, or JAX does not run on the CPU of this process alone.
+        ValueError: OpenVINO or onnx is not installed, or JAX runs on another device or in several processes.
     """
     if jax.default_backend() != "cpu" or jax.process_count() > 1:
         found = f"{jax.process_count()} processes on {jax.default_backend()}"
@@ -104,8 +104,8 @@ def with_openvino(detector: TrainedDetector, *, precision: Precision | None = No
     request = core.compile_model(model, "CPU", options).create_infer_request()
 
     def network(image: RangeImage) -> Outputs:
-        # Inputs are read where they are; outputs are copied, for the next cloud overwrites them.
-        found = request.infer([np.asarray(image.features)[None]], share_inputs=True)
-        return Outputs(*(found[name][0] for name in ("logits", "regression", "iou_logits")))
+        # The input is shared. Outputs are copied, because the next cloud overwrites them.
+        outputs = request.infer([np.asarray(image.features)[None]], share_inputs=True)
+        return Outputs(*(outputs[name][0] for name in ("logits", "regression", "iou_logits")))
 
     return OpenVinoDetector(detector.model, detector.variables, precision, network)

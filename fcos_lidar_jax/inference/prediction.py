@@ -1,4 +1,4 @@
-"""A detector on many frames, read ahead, spread over the devices: its boxes, and how good they are."""
+"""Detection in many frames, read ahead and spread over the devices, and its evaluation."""
 
 import dataclasses
 import sys
@@ -22,22 +22,22 @@ from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.types import Detections
 
-_AHEAD = 2  # Groups of frames that are read while the devices work on others.
+_AHEAD = 2  # number of groups of frames to read ahead of the devices
 
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
-    """What was found in a frame.
+    """Detections in one frame.
 
     >>> nothing = Detections(*np.zeros((3, 0)), valid=np.zeros(0, bool), num_dropped=np.int32(0))
     >>> Prediction(7, nothing, frame=None, cloud=None).detections.valid.sum()
     np.int64(0)
     """
 
-    index: int  # Of the frame.
-    detections: Detections  # NumPy arrays.
-    frame: Frame | None  # As it was read; None where another process has read it.
-    cloud: Cloud | None  # What the network was given of it, and how many points were dropped; likewise.
+    index: int  # index of the frame
+    detections: Detections  # NumPy arrays
+    frame: Frame | None  # the frame; None if another process has read it
+    cloud: Cloud | None  # input of the network, with counts of dropped points; None if another process has read it
 
 
 def predict(
@@ -48,18 +48,18 @@ def predict(
     batch_size: int = 1,
     devices: Sequence[Any] | None = None,
 ) -> Iterator[Prediction]:
-    """Boxes in every frame, in order.
+    """Detect boxes in frames, in order.
 
-    Every device runs the program of a single cloud on its own frames, so the boxes are bit-identical on any number
-    of devices and processes. Frames are read in threads while the devices work.
+    Every device runs the program for a single cloud, so the boxes are bit-identical for any number of devices and
+    processes. Threads read frames while the devices work.
 
     Args:
-        detector, frames: network with its weights, and what to detect in.
-        indices: which of the frames; default: all.
-        batch_size: clouds that a device takes at once; more than one changes scores and boxes by rounding, at most
-            1e-4.
-        devices: to work on; default: all, those of other processes too. Every process then makes the same call,
-            reads its share of the frames, and is given all predictions.
+        detector: the detector.
+        frames: the frames.
+        indices: indices of the frames to process; by default all.
+        batch_size: number of clouds per device; more than one changes scores and boxes by rounding, at most 1e-4.
+        devices: devices to use; by default all, including those of other processes. Then every process makes the
+            same call, reads its share of the frames, and gets all predictions.
 
     Raises:
         ValueError: a batch size below 1, or a frame that cannot be read.
@@ -82,8 +82,8 @@ def predict_groups(
     batch_size: int = 1,
     devices: Sequence[Any] | None = None,
 ) -> Iterator[list[Prediction]]:
-    """As :func:`predict`, the frames together that the devices work on at once: between two groups processes may
-    agree on something.
+    """Like :func:`predict`, in groups of frames that the devices process together, so that processes can
+    synchronise between two groups.
 
     Raises:
         OSError: another process cannot read its frames of the next group.
@@ -102,14 +102,13 @@ def predict_groups(
     todo = list(range(len(frames)) if indices is None else indices)
     size = batch_size * mesh.size
     groups = [todo[i : i + size] for i in range(0, len(todo), size)]
-    # The rows of a group that this process reads.
-    own = [r for r in range(size) if mesh.devices[r // batch_size].process_index == jax.process_index()]
+    own_rows = [r for r in range(size) if mesh.devices[r // batch_size].process_index == jax.process_index()]
 
     def read(group: list[int]) -> tuple[dict[int, tuple[Frame, Cloud]], tuple[np.ndarray, np.ndarray]]:
-        shape = (len(own), config.max_points, sensor.point_columns)
+        shape = (len(own_rows), config.max_points, sensor.point_columns)
         points, valid = np.zeros(shape, np.float32), np.zeros(shape[:2], bool)
         loaded = {}
-        for slot, row in enumerate(own):
+        for slot, row in enumerate(own_rows):
             if row < len(group):
                 frame = frames.frame(group[row])
                 if group is groups[0] and slot == 0 and (line := sensor_mismatch(frame.points, sensor)):
@@ -119,11 +118,11 @@ def predict_groups(
                 loaded[row] = frame, cloud
         return loaded, (points, valid)
 
-    def finished(group: list[int], loaded: dict[int, tuple[Frame, Cloud]], found: Any) -> list[Prediction]:
-        arrays = multihost_utils.process_allgather(found, tiled=True) if jax.process_count() > 1 else found
+    def collect(group: list[int], loaded: dict[int, tuple[Frame, Cloud]], outputs: Any) -> list[Prediction]:
+        arrays = multihost_utils.process_allgather(outputs, tiled=True) if jax.process_count() > 1 else outputs
         arrays = jax.device_get(arrays)
         rows = (jax.tree.map(lambda leaf, row=row: leaf[row], arrays) for row in range(len(group)))
-        return [Prediction(group[r], found, *loaded.get(r, (None, None))) for r, found in enumerate(rows)]
+        return [Prediction(group[r], each, *loaded.get(r, (None, None))) for r, each in enumerate(rows)]
 
     with ThreadPoolExecutor(_AHEAD) as pool:
         reading = deque(pool.submit(read, group) for group in groups[:_AHEAD])
@@ -133,24 +132,23 @@ def predict_groups(
                 loaded, clouds = reading.popleft().result()
             if number + _AHEAD < len(groups):
                 reading.append(pool.submit(read, groups[number + _AHEAD]))
-            found = program(*shard_batch(clouds, mesh))
+            outputs = program(*shard_batch(clouds, mesh))
             if running is not None:
-                yield finished(*running)
-            running = group, loaded, found
+                yield collect(*running)
+            running = group, loaded, outputs
         if running is not None:
-            yield finished(*running)
+            yield collect(*running)
 
 
 def evaluate(
     detector: CloudDetector, frames: FrameSet, *, batch_size: int = 1, devices: Sequence[Any] | None = None
 ) -> Evaluation:
-    """Detect in every frame and compare with its boxes, by centre distance; arguments as in :func:`predict`.
+    """Evaluate detections in all frames by centre distance; arguments as for :func:`predict`.
 
-    Classes are matched by name; boxes of other classes are left out.
+    Classes are matched by name; boxes of other classes are ignored.
 
     Returns:
-        precision and errors over the detector's classes, see
-        :func:`fcos_lidar_jax.evaluation.frames.evaluate_frames`.
+        scores over the classes of the detector, see :func:`fcos_lidar_jax.evaluation.frames.evaluate_frames`.
 
     >>> from fcos_lidar_jax.inference import load_detector
     >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
@@ -163,13 +161,9 @@ def evaluate(
     found, truths = list[Detections](), list[Frame]()
     for group in predict_groups(detector, mapped, batch_size=batch_size, devices=devices):
         with agreed("cannot read its boxes"):
-            truths += [_truth(prediction, mapped) for prediction in group]
+            # Without points: the clouds of a data set need not fit into memory.
+            truths += [mapped.truth(p.index) if p.frame is None else without_points(p.frame) for p in group]
         found += [prediction.detections for prediction in group]
         if jax.process_index() == 0:
             progress.show(len(found))
     return evaluate_frames(found, truths, metric_of(detector.classes, tuple(detector.config.ranges_m.values())))
-
-
-def _truth(prediction: Prediction, frames: FrameSet) -> Frame:
-    """The boxes alone: the clouds of a data set need not fit into memory."""
-    return frames.truth(prediction.index) if prediction.frame is None else without_points(prediction.frame)

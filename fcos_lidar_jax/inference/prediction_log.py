@@ -1,4 +1,4 @@
-"""Detections of many frames in a results file; an interrupted run resumes."""
+"""Detections of many frames in a results file, written by a run that can be interrupted and resumed."""
 
 import contextlib
 import json
@@ -22,7 +22,7 @@ from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import Detections
 
-_REMOVED = ("close", "invalid", "truncated")  # Why points were removed.
+_REASONS = ("close", "invalid", "truncated")  # reasons for removing points
 
 
 def write_predictions(
@@ -34,21 +34,22 @@ def write_predictions(
     write: Callable[[Path, Iterator[tuple[str, bytes]]], None],
     batch_size: int = 1,
 ) -> dict[str, int]:
-    """Detect in every frame and write a results file.
+    """Detect boxes in all frames and write a results file.
 
-    What is done is kept in a resume log beside the file, which is removed when the file is written. Several
-    processes share the frames, and the first writes; the path is the same for all. SIGTERM to any of them stops
+    A resume log next to the file keeps the detections of finished frames until the file is written. Several
+    processes share the frames, and the first writes; the path is the same for all. A SIGTERM to any process stops
     all after the same frames.
 
     Args:
-        detector, frames: network with its weights, and what to detect in; the frames' names differ.
-        path: of the results file.
-        entries: index of a frame and its detections -> what the file shall hold of them.
-        write: writes the file from the frames' names with their entries as JSON.
-        batch_size: as in :func:`fcos_lidar_jax.inference.prediction.predict`.
+        detector: the detector.
+        frames: the frames; their names are unique.
+        path: results file.
+        entries: converts the index of a frame and its detections to the entries of the file.
+        write: writes the file from names of frames with entries as JSON.
+        batch_size: see :func:`fcos_lidar_jax.inference.prediction.predict`.
 
     Returns:
-        points that were removed in this run, by all processes, and why: ``close``, ``invalid``, ``truncated``.
+        number of points removed by all processes in this run, by reason: ``close``, ``invalid``, ``truncated``.
 
     Raises:
         ValueError: the processes have different detectors or frames.
@@ -56,15 +57,15 @@ def write_predictions(
         SystemExit: after SIGTERM, in a cluster.
     """
     file = path.with_name(f"{path.stem}.resume_log")
-    removed = [0] * len(_REMOVED)
+    removed = [0] * len(_REASONS)
     with contextlib.ExitStack() as held:
         log = None
         with agreed("cannot detect"):
             names = [frames.name(index) for index in range(len(frames))]
-            same = detections_fingerprint(detector, names, batch_size)
+            shared = detections_fingerprint(detector, names, batch_size)
             if jax.process_index() == 0:
                 log = held.enter_context(ResumeLog(file, _fingerprint(detector, frames, batch_size)))
-        check_same(same, "detector, frames or batch size")
+        check_same(shared, "detector, frames or batch size")
         done = multihost_utils.broadcast_one_to_all(np.array([log is not None and name in log for name in names]))
         progress = Progress("frames", len(frames))
         if log is not None:
@@ -79,44 +80,42 @@ def write_predictions(
                         log.add(names[prediction.index], entries(prediction.index, prediction.detections))
                         progress.show(len(log))
             _stop_after_sigterm(number)
-        _stop_after_sigterm(number + 1)  # If it came in the last group.
+        _stop_after_sigterm(number + 1)  # if it arrived during the last group
         with agreed("cannot write"):
             if log is not None:
                 write(path, log.entries(names))
                 file.unlink(missing_ok=True)
-    return dict(zip(_REMOVED, _sum_over_processes(removed), strict=True))
+    return dict(zip(_REASONS, _sum_over_processes(removed), strict=True))
 
 
 def _stop_after_sigterm(number: int) -> None:
-    """In a cluster, even of one process, JAX has taken SIGTERM from Python, and tells all processes of it.
+    """In a cluster, even with one process, JAX handles SIGTERM and notifies all processes.
 
-    Args:
-        number: of groups done; every process calls this with the same numbers.
+    All processes must call this function with the same numbers.
     """
     if jax.distributed.is_initialized() and multihost_utils.reached_preemption_sync_point(number):
         raise SystemExit(128 + signal.SIGTERM)
 
 
 def _removed(prediction: Prediction) -> list[int]:
-    """Points that this process removed from a cloud, by reason; of one that another has read, none."""
+    """Points that this process removed from a cloud, by reason; 0 for a cloud that another process has read."""
     cloud = prediction.cloud
-    return [0] * len(_REMOVED) if cloud is None else [int(getattr(cloud, f"num_{reason}")) for reason in _REMOVED]
+    return [0] * len(_REASONS) if cloud is None else [int(getattr(cloud, f"num_{reason}")) for reason in _REASONS]
 
 
 def _sum_over_processes(counts: list[int]) -> list[int]:
-    """Sums of counts below 2**64, which travel as two words: JAX would keep 32 bits."""
+    """Sum counts below 2**64, each sent as two words, because JAX would truncate it to 32 bits."""
     words = np.array([divmod(count, 2**32) for count in counts], np.uint32)
     of_all = multihost_utils.process_allgather(words[None], tiled=True).astype(object)
     return (of_all[..., 0] * 2**32 + of_all[..., 1]).sum(axis=0).tolist()
 
 
 def detections_fingerprint(detector: CloudDetector, *others: object) -> str:
-    """Checksum of what detections follow from: weights, configuration, sensor, and other things, as JSON."""
-    described = detector.fingerprint, config_to_json(detector.config), sensor_to_json(detector.sensor), *others
-    return checksum(json.dumps(described, sort_keys=True).encode())
+    """Checksum of everything detections depend on: weights, configuration, sensor, and other values, as JSON."""
+    inputs = detector.fingerprint, config_to_json(detector.config), sensor_to_json(detector.sensor), *others
+    return checksum(json.dumps(inputs, sort_keys=True).encode())
 
 
 def _fingerprint(detector: CloudDetector, frames: FrameSet, batch_size: int) -> str:
-    """That of the detections in frames, of which so many are computed at once."""
-    seen = frames.fingerprint(), frames.clouds_fingerprint(range(len(frames)))
-    return detections_fingerprint(detector, *seen, batch_size)
+    data = frames.fingerprint(), frames.clouds_fingerprint(range(len(frames)))
+    return detections_fingerprint(detector, *data, batch_size)

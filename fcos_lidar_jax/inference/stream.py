@@ -1,4 +1,4 @@
-"""Boxes in a drive, sweep by sweep: a rolling window of sweeps on the host, one compiled program."""
+"""Detection in a drive, sweep by sweep, with a rolling window of sweeps and one compiled program."""
 
 import dataclasses
 from collections import deque
@@ -16,11 +16,11 @@ from fcos_lidar_jax.types import Detections
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What was found in one sweep and those before it."""
+    """Detections in one sweep, fused with the sweeps before it."""
 
-    sweep: Sweep  # The current one, as it was given.
-    cloud: Cloud  # What the network was given: the window's sweeps in the frame of the current one, turned.
-    detections: Detections  # NumPy arrays, in the frame of the sweep.
+    sweep: Sweep  # the current sweep, unchanged
+    cloud: Cloud  # input of the network: the sweeps of the window in the frame of the current one, rotated
+    detections: Detections  # NumPy arrays, in the frame of the sweep
 
 
 def detect_stream(
@@ -31,22 +31,21 @@ def detect_stream(
     at_us: Collection[int] | None = None,
     yaw_rad: float = 0.0,
 ) -> Iterator[Found]:
-    """Boxes in every sweep as it comes, with the sweeps before it fused into its frame.
+    """Detect boxes in every sweep as it arrives, fused with the sweeps before it.
 
-    The boxes are bit-identical to those of ``fcos-lidar detect --sweeps`` with the same sweeps.
+    The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps.
 
     Args:
-        sweeps: in the order of time; an iterator that waits for the next sweep will do.
-        detector: compiled once, for the first sweep.
-        reading: sweeps to fuse and points to drop; default: as the detector was trained. One sweep where poses are
-            not known.
-        at_us: times of the sweeps to detect in; the others are only fused into later ones. Default: all.
-        yaw_rad: by which sweeps are turned about z for the detector, and boxes back: pi / 2 for a sensor whose x
-            axis points ahead and a detector of one whose y axis does. A detector finds less in clouds that are
-            turned as its training's never were.
+        sweeps: sweeps in temporal order; may be an iterator that waits for the next sweep.
+        detector: the detector, compiled once for the first sweep.
+        reading: number of sweeps to fuse and points to drop; by default as in training. Use one sweep if the poses
+            are unknown.
+        at_us: times of the sweeps to detect in; other sweeps are only fused into later ones. By default all.
+        yaw_rad: rotation of the sweeps about z before detection, undone for the boxes: pi / 2 if x points forward
+            in the sweeps and y in the training data. Detection degrades for orientations absent from training.
 
     Raises:
-        ValueError: naming the sweep: its time is not after that of the one before, or no point of it is usable.
+        ValueError: names a sweep that is not later than the sweep before, or has no usable points.
 
     >>> import numpy as np
     >>> from fcos_lidar_jax.inference import load_detector
@@ -74,8 +73,9 @@ def detect_stream(
         if yaw_rad:
             points = turned(points, turn)
         cloud = make_cloud(points, detector.config, sensor=sensor, num_close=num_close)
-        found = detector.detect(cloud)
-        expect_points(sweep.name, cloud, int(found.num_dropped), sensor)
+        detections = detector.detect(cloud)
+        expect_points(sweep.name, cloud, int(detections.num_dropped), sensor)
         if yaw_rad:
-            found = dataclasses.replace(found, boxes=to_world(np.asarray(found.boxes), turn.T).astype(np.float32))
-        yield Found(sweep, cloud, found)
+            boxes = to_world(np.asarray(detections.boxes), turn.T).astype(np.float32)
+            detections = dataclasses.replace(detections, boxes=boxes)
+        yield Found(sweep, cloud, detections)

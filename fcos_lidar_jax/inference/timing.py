@@ -1,4 +1,4 @@
-"""Times of calls that take turns, and the machine they were taken on."""
+"""Interleaved timing of calls, and a description of the machine."""
 
 import os
 import platform
@@ -18,13 +18,12 @@ K = TypeVar("K")
 
 
 def interleaved(calls: Mapping[K, Call], repeats: int, *, percentile: int = 99) -> dict[K, Times]:
-    """Median and a percentile of calls that take turns, in milliseconds, after one run each that compiles.
+    """Time calls in turn, after one call each to compile: median and a percentile in milliseconds.
 
-    The speed of a machine drifts: turns keep comparisons fair. With few turns a high percentile is close to the
-    slowest.
+    Interleaving keeps comparisons fair when the speed of the machine drifts.
 
     Raises:
-        ValueError: no turn at all.
+        ValueError: ``repeats`` is below 1.
 
     >>> sorted(interleaved({"nothing": lambda: None}, 2, percentile=95)["nothing"])
     ['median_ms', 'p95_ms']
@@ -33,23 +32,21 @@ def interleaved(calls: Mapping[K, Call], repeats: int, *, percentile: int = 99) 
         raise ValueError(f"repeats: got {repeats}, expected at least 1")
     for call in calls.values():
         jax.block_until_ready(call())
-    found: dict[K, list[float]] = {name: [] for name in calls}
+    times_ms: dict[K, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
         for name, call in calls.items():
             began = time.perf_counter()
             jax.block_until_ready(call())
-            found[name].append(1e3 * (time.perf_counter() - began))
+            times_ms[name].append(1e3 * (time.perf_counter() - began))
+    places = {"median_ms": 50, f"p{percentile}_ms": percentile}
     return {
-        name: {
-            "median_ms": round(float(np.median(ms)), 3),
-            f"p{percentile}_ms": round(float(np.percentile(ms, percentile)), 3),
-        }
-        for name, ms in found.items()
+        name: {key: round(float(np.percentile(ms, place)), 3) for key, place in places.items()}
+        for name, ms in times_ms.items()
     }
 
 
 def machine() -> dict[str, Any]:
-    """Device, processor, cores and versions, as JSON.
+    """Device, processor, number of cores, and versions, as a JSON object.
 
     >>> machine()["jax"] == jax.__version__
     True

@@ -1,23 +1,25 @@
-"""Identities of boxes over time, by the distance between their centres."""
+"""Tracking of boxes by the distance between their centres."""
 
 import dataclasses
 
 import numpy as np
 
-MAX_DISTANCE_M = 2.0  # Between a box and where its track is expected.
-MAX_UNSEEN_S = 2.0  # After which a track ends.
-_CLOCK_S = 0.05  # By which sweeps may be early or late.
+MAX_DISTANCE_M = 2.0  # maximum distance between a box and the expected position of its track
+MAX_UNSEEN_S = 2.0  # a track without boxes ends after this time
+_CLOCK_S = 0.05  # tolerance of the times of sweeps
 
 
 @dataclasses.dataclass(frozen=True)
 class Tracks:
-    """Objects that have been seen, in a frame that does not move; by default none yet."""
+    """Tracked objects in a static coordinate frame; empty by default."""
 
     ids: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))  # i64[t]
     labels: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int32))  # i32[t]
     centres: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))  # f64[t, 2]: x, y, metres
     velocities: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))  # f64[t, 2]: m/s
-    unseen_s: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))  # f64[t]: since the last box
+    unseen_s: np.ndarray = dataclasses.field(
+        default_factory=lambda: np.zeros(0)
+    )  # f64[t]: time since the last box
     next_id: int = 0
 
 
@@ -31,21 +33,20 @@ def track(
     max_distance_m: float = MAX_DISTANCE_M,
     max_unseen_s: float = MAX_UNSEEN_S,
 ) -> tuple[Tracks, np.ndarray]:
-    """Greedy matching of boxes to tracks of their class, the nearest pair first.
+    """Match boxes greedily to tracks of their class, nearest pairs first, regardless of the order of the boxes.
 
-    A track is expected where its velocity has brought it, and ends ``max_unseen_s`` after its last box. Boxes
-    without a track begin one, the best score first.
-    The order of the boxes does not matter.
+    The position of a track is extrapolated by its velocity, and a track ends ``max_unseen_s`` after its last box.
+    Unmatched boxes start new tracks, by decreasing score.
 
     Args:
-        tracks: of the time before.
-        boxes: f32[m, 9], ``x, y, z, l, w, h, yaw, vx, vy`` in a frame that does not move, see :func:`to_world`;
+        tracks: tracks of the previous time.
+        boxes: f32[m, 9], ``x, y, z, l, w, h, yaw, vx, vy`` in a static coordinate frame, see :func:`to_world`;
             unknown (NaN) velocities count as 0.
         labels, scores: i32[m], f32[m].
-        dt: seconds since the time before.
+        dt: seconds since the previous time.
 
     Returns:
-        the tracks from now on, and the identity of every box, i64[m], 0 and up.
+        the new tracks, and the track number of every box, i64[m], starting at 0.
 
     >>> car = np.array([[10.0, 0, 0, 4, 2, 1.5, 0, 8, 0]])
     >>> tracks, ids = track(Tracks(), car, np.zeros(1, int), np.ones(1), 0.0)
@@ -81,7 +82,7 @@ def track(
 
 
 def to_world(boxes: np.ndarray, sensor_to_world: np.ndarray) -> np.ndarray:
-    """Boxes f32[m, 9] of a sensor's frame in the world's, f64[m, 9]; the sensor's tilt is lost.
+    """Transform boxes f32[m, 9] from the frame of a sensor to the world, f64[m, 9]; ignores the tilt of headings.
 
     >>> quarter = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     >>> to_world(np.array([[10.0, 0, 0, 4, 2, 1, 0, 8, 0]]), quarter).round(4).tolist()

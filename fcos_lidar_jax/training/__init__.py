@@ -1,4 +1,4 @@
-"""Objective, optimizer, step, loop, and the run in a folder."""
+"""Training: objective, optimizer, step, loop, and runs."""
 
 from fcos_lidar_jax.training.loop import NonFiniteLossError, fit
 from fcos_lidar_jax.training.optimizer import make_optimizer

@@ -1,4 +1,4 @@
-"""The Python loop around the step: progress, finite checks, pauses, a clean stop."""
+"""The Python loop around the training step: progress, finite checks, pauses, and a clean stop."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ Record = dict[str, float | list[float]]
 
 
 class NonFiniteLossError(ArithmeticError):
-    """Loss or gradient stopped being a number; the message names the step, the parts and the samples.
+    """A loss or gradient is not finite; the message names the step, the losses and the samples.
 
     >>> issubclass(NonFiniteLossError, ArithmeticError)
     True
@@ -35,28 +35,28 @@ def fit(
     stopping: Callable[[int], bool] = lambda _: False,
     log_every_s: float = 10.0,
 ) -> TrainState:
-    """Run the step over batches.
+    """Run the training step over batches.
 
-    Metrics are read one step late, so that the host never waits for the device; at a pause, and at the end, all
-    have been read, so what is saved there has been found finite.
+    Metrics are read one step late, so that the host never waits for the device. Before a pause and at the end, all
+    metrics have been read, so a state that is saved there has finite losses.
 
     Args:
-        step: compiled ``(state, batch) -> (state, metrics)``; it may take the state's buffers.
-        state: where to begin; the run ends when ``state.step`` is ``num_steps``.
-        batches: at least as many as there are steps left; the time that each takes to come is recorded as
-            ``waiting_seconds``.
-        num_steps: of the whole run.
-        report: called with (steps done, metrics of the last of them) after every step.
-        pause_at: whether to pause after so many steps.
-        pause: called with (steps done, state) at a pause; the state is on loan.
-        stopping: asked after every step; True ends the run.
-        log_every_s: seconds between two progress lines on standard error.
+        step: compiled ``(state, batch) -> (state, metrics)``; may donate the buffers of the state.
+        state: initial state; the run ends when ``state.step`` reaches ``num_steps``.
+        batches: at least one batch per remaining step; the time to get one is recorded as ``waiting_seconds``.
+        num_steps: number of steps of the whole run.
+        report: called after every step with the number of steps and the metrics of the last one.
+        pause_at: called with the number of steps; returns whether to pause.
+        pause: called at a pause with the number of steps and the state; do not keep a reference to the state: its
+            buffers are donated.
+        stopping: called after every step with the number of steps; returns whether to stop.
+        log_every_s: seconds between progress lines on standard error.
 
     Returns:
         the last state.
 
     Raises:
-        NonFiniteLossError: with the step's number, the parts of the loss and the samples.
+        NonFiniteLossError: a loss or gradient is not finite.
 
     >>> import dataclasses
     >>> def count(state, batch):
@@ -93,7 +93,7 @@ def fit(
         host = next(iterator)
         waited = time.monotonic() - began
         state, metrics = step(state, host.batch)
-        host = dataclasses.replace(host, batch=None)  # The step is its last user: its memory is free for the next.
+        host = dataclasses.replace(host, batch=None)  # frees the memory for the next batch
         done += 1
         read()
         unread = done, host, metrics, waited
@@ -110,7 +110,7 @@ def fit(
 
 def _check_finite(number: int, record: Record, names: Sequence[str]) -> None:
     checked = {k: v for k, v in record.items() if k.startswith("loss/") or k == "gradient_norm"}
-    broken = {k: v for k, v in checked.items() if not isinstance(v, float) or not math.isfinite(v)}
-    if broken:
-        parts = ", ".join(f"{name.removeprefix('loss/')} {value}" for name, value in broken.items())
+    bad = {k: v for k, v in checked.items() if not isinstance(v, float) or not math.isfinite(v)}
+    if bad:
+        parts = ", ".join(f"{name.removeprefix('loss/')} {value}" for name, value in bad.items())
         raise NonFiniteLossError(f"step {number}: not finite: {parts}; samples: {', '.join(names)}")

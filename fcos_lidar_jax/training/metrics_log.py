@@ -1,4 +1,4 @@
-"""The metrics of a run: one line of JSON a step, and the same for TensorBoard."""
+"""The metrics of a run: one line of JSON per step, and events for TensorBoard."""
 
 import contextlib
 import json
@@ -15,14 +15,14 @@ _FILE = "metrics.jsonl"
 
 
 class MetricsLog:
-    """Appends to ``metrics.jsonl`` and to TensorBoard's events below a run's folder.
+    """Appends to ``metrics.jsonl`` and writes TensorBoard events in the folder of a run.
 
-    What a killed run recorded of steps after ``first_step``, those done before, is dropped.
+    Records of steps after ``first_step``, from which the run resumes, are dropped.
     """
 
     def __init__(self, folder: Path, *, first_step: int) -> None:
         from tensorboardX.proto.event_pb2 import SessionLog  # type: ignore[attr-defined]
-        from tensorboardX.record_writer import RecordWriter  # a SummaryWriter's thread prints what fails in it
+        from tensorboardX.record_writer import RecordWriter  # the thread of SummaryWriter would print its errors
 
         file = folder / _FILE
         if file.exists():
@@ -34,7 +34,7 @@ class MetricsLog:
         with naming(self._folder):
             self._events = RecordWriter(str(self._folder / f"events.out.tfevents.{time.time_ns()}"))
             self._write_event(first_step + 1, file_version="brain.Event:2")
-            # TensorBoard drops what was written before of these steps.
+            # TensorBoard then drops earlier events of these steps.
             self._write_event(first_step + 1, session_log=SessionLog(status=SessionLog.START))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
@@ -44,9 +44,8 @@ class MetricsLog:
             self._lines.flush()
         scalars = dict[str, Any]()
         for name, value in values.items():
-            scalars |= (
-                {f"{name}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
-            )
+            many = isinstance(value, list)
+            scalars |= {f"{name}/{i}": v for i, v in enumerate(value)} if many else {name: value}
         numbers = [
             {"tag": tag, "simple_value": float(value)}  # type: ignore[arg-type]
             for tag, value in scalars.items()
@@ -56,7 +55,7 @@ class MetricsLog:
             self._write_event(step, summary={"value": numbers})
 
     def flush(self) -> None:
-        """Write what is waiting, so that a checkpoint never knows of more steps than the records."""
+        """Write buffered events, so that no checkpoint has more steps than the records."""
         with naming(self._folder):
             self._events.flush()
 
@@ -71,10 +70,10 @@ class MetricsLog:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """All lines of a run, in order; what is no line is left out, such as half of one that a killed run wrote."""
+    """All records of a run, in order, without invalid lines, such as an incomplete line of a killed run."""
     lines = []
     for text in (folder / _FILE).read_bytes().splitlines():
-        with contextlib.suppress(ValueError, RecursionError):  # of JSON and of UTF-8
+        with contextlib.suppress(ValueError, RecursionError):  # invalid JSON or UTF-8
             line = json.loads(text)
             if isinstance(line, dict) and isinstance(line.get("step"), int):
                 lines.append(line)
@@ -82,6 +81,6 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 
 
 def evaluated_steps(folder: Path) -> set[int]:
-    """The steps after which a run was evaluated; none where nothing is recorded yet."""
+    """Steps after which a run was evaluated; empty without records."""
     lines = read_metrics(folder) if (folder / _FILE).exists() else []
     return {line["step"] for line in lines if "test/mAP" in line}

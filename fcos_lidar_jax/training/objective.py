@@ -1,4 +1,4 @@
-"""The objective of any detector: weighted losses of a batch, and its metrics."""
+"""Weighted losses and metrics of a batch, for any detector."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,12 +16,12 @@ Metrics = dict[str, Array]
 
 
 def make_objective(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Metrics, tuple[Any, Sums]]]:
-    """The weighted losses of a batch of raw points before the division, summed by the count that divides them.
+    """Make the weighted losses of a batch of raw points, grouped by the count that normalises them.
 
     Sums and counts add up over micro-batches and devices; :func:`batch_metrics` divides them once.
 
     Returns:
-        pure ``(params, batch_stats, batch) -> ({count: sum}, (batch_stats, sums))``.
+        pure ``(params, batch_stats, batch) -> ({count: weighted sum}, (batch_stats, sums))``.
     """
     prepare, config = jax.vmap(detector.prepare), detector.config.loss
 
@@ -38,7 +38,7 @@ def make_objective(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Metr
 
 
 def batch_metrics(sums: Sums, config: LossConfig) -> Metrics:
-    """The metrics of a whole batch: its counts, and each loss and mean divided once by its count, at least 1."""
+    """Metrics of a whole batch: its counts, and each loss and mean divided once by its count (at least 1)."""
 
     def divided(parts: dict[str, Metrics]) -> Metrics:
         by = {count: jnp.maximum(sums.counts[count], 1) for count in parts}

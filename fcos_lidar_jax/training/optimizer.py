@@ -1,4 +1,4 @@
-"""One-cycle AdamW (paper, section 4): learning rate and momentum are functions of the step."""
+"""AdamW with one-cycle schedules of learning rate and momentum (paper, section 4)."""
 
 from typing import Any
 
@@ -8,11 +8,11 @@ import optax
 from fcos_lidar_jax.config import OptimizerConfig
 
 _FIXED = ("b2", "eps", "eps_root", "mu_dtype", "weight_decay", "mask", "nesterov")
-"""AdamW's arguments that stay out of the state."""
+"""Arguments of AdamW that are not stored in the state."""
 
 
 def learning_rate_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule:
-    """Peak / divisor, up to the peak over the warm-up, down to the last rate at ``num_steps``; cosine.
+    """Cosine schedule from a fraction of the peak to the peak at the end of the warm-up, then to the final rate.
 
     >>> schedule = learning_rate_schedule(OptimizerConfig(), 1000)
     >>> [f"{float(schedule(step)):.1e}" for step in (0, 400, 1000)]
@@ -28,7 +28,7 @@ def learning_rate_schedule(config: OptimizerConfig, num_steps: int) -> optax.Sch
 
 
 def momentum_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule:
-    """AdamW's b1: from high to low while the learning rate rises, and back; cosine.
+    """Cosine schedule of AdamW's b1: from high to low while the learning rate rises, then back.
 
     >>> schedule = momentum_schedule(OptimizerConfig(), 1000)
     >>> [round(float(schedule(step)), 3) for step in (0, 400, 1000)]
@@ -56,7 +56,7 @@ def make_optimizer(config: OptimizerConfig, num_steps: int) -> optax.GradientTra
             weight_decay=config.weight_decay,
         ),
     )
-    # All leaves as one vector: the same numbers, and half the time to compile a step.
+    # One vector of all leaves gives the same numbers and halves the compile time of a step.
     return optax.flatten(chain)
 
 

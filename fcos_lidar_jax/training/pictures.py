@@ -1,4 +1,4 @@
-"""Pictures of a run: curves of its metrics, and what it finds in a few test frames."""
+"""Pictures of a run: curves of its metrics, and detections in a few test frames."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -9,11 +9,11 @@ from fcos_lidar_jax.inference.prediction import Prediction
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Detections
 
-SHOWN_SCORE = 0.2  # Of the detections in pictures, at least: early in training the scores are still low.
+SHOWN_SCORE = 0.2  # minimum score of detections in pictures; scores are low early in training
 
 
 def draw_metrics(folder: Path) -> None:
-    """Draw a run's losses over the steps, ``loss.png``, and, where there is one, the mAP, ``scores.png``."""
+    """Draw the losses of a run as ``loss.png`` and, if it was evaluated, its mAP as ``scores.png``."""
     from fcos_lidar_jax.visualization.curves import draw_curves
 
     lines = read_metrics(folder)
@@ -26,7 +26,7 @@ def draw_metrics(folder: Path) -> None:
 
 
 def draw_predictions(folder: Path, predictions: Iterable[Prediction], frames: FrameSet, step: int) -> None:
-    """Draw test frames from above, with detections and truth, a picture each, named for step and frame."""
+    """Draw one picture per test frame: its bird's-eye view with detections and truth."""
     folder.mkdir(exist_ok=True)
     for prediction in predictions:
         frame = prediction.frame or frames.frame(prediction.index)
@@ -38,9 +38,9 @@ def draw_predictions(folder: Path, predictions: Iterable[Prediction], frames: Fr
 def draw_frame(
     path: Path, frame: Frame, detections: Detections, title: str, *, limit_m: float, classes: Sequence[str]
 ) -> None:
-    """Draw a frame from above, with its truth and the detections of a score of :data:`SHOWN_SCORE` and more."""
+    """Draw the bird's-eye view of a frame with its truth and the detections that reach :data:`SHOWN_SCORE`."""
     from fcos_lidar_jax.visualization.bev import draw_bev
 
     found, truth = confident(detections, SHOWN_SCORE), (frame.boxes, frame.labels)
-    title = f"{title}: score {SHOWN_SCORE} and more, truth dashed"
+    title = f"{title}: scores of at least {SHOWN_SCORE}, truth dashed"
     draw_bev(frame.points, path, limit_m=limit_m, classes=classes, detections=found, truth=truth, title=title)

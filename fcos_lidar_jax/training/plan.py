@@ -1,4 +1,4 @@
-"""The plan of a run: the one place that refuses what cannot be trained, before the folder becomes a run's."""
+"""The plan of a run: checks all inputs before anything is written to its folder."""
 
 import dataclasses
 import json
@@ -30,23 +30,23 @@ from fcos_lidar_jax.training.metrics_log import evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.step import make_state
 
-_LATER_FIELDS = ("ground_truth_database", "tests")  # that the specification did not have at first
-NUM_SEEDS = 2**32  # JAX keeps 32 bits of a seed: larger ones would be others' again.
-RUN_SPEC = "run.json"  # Name of the file in a run's folder that says what the run is.
+_LATER_FIELDS = ("ground_truth_database", "tests")  # fields that were added to the specification later
+NUM_SEEDS = 2**32  # JAX uses 32 bits of a seed, so larger seeds would repeat smaller ones
+RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """When a run saves and evaluates.
+    """Schedule of the checkpoints and evaluations of a run.
 
     >>> Schedule(save_every=100).keep
     2
     """
 
-    save_every: int | None = None  # Steps between two checkpoints; default: a fiftieth of the run.
+    save_every: int | None = None  # steps between checkpoints; by default a fiftieth of the run
     evaluate_every: int | None = None
-    """Steps between two evaluations; each saves a checkpoint, too; default: a tenth of the run."""
-    keep: int = 2  # Newest checkpoints that are kept, beside the best.
+    """Steps between evaluations, each of which also saves a checkpoint; by default a tenth of the run."""
+    keep: int = 2  # number of newest checkpoints to keep, in addition to the best
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -57,11 +57,11 @@ class Schedule:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What stays the same through a run."""
+    """Everything that is constant during a run."""
 
     folder: Path
     detector: Detector
-    optimizer: Any  # optax's pair of functions
+    optimizer: Any  # pair of functions from optax
     schedule: Schedule
     num_steps: int
     seed: int
@@ -70,12 +70,12 @@ class Run:
     tests: FrameSet | None
     devices: Sequence[Any] | None
     spec: dict[str, Any]
-    weights: Variables | None  # to begin with
+    weights: Variables | None  # initial weights
     packing: Packing | None
     warnings: tuple[str, ...]
 
     def evaluation_pending(self, step: int) -> bool:
-        """Whether a run was stopped during the evaluation after a step, whose record is written last."""
+        """Whether a run was stopped before the evaluation after a step was recorded."""
         return step > 0 and self.evaluates_at(step) and step not in evaluated_steps(self.folder)
 
     @property
@@ -108,18 +108,18 @@ def plan_run(
     workers: int,
     packing: bool | None,
 ) -> Run:
-    """All that a run follows from; arguments as of :func:`fcos_lidar_jax.training.train`, labels of its classes.
+    """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``.
 
     Raises:
-        ValueError: what cannot be trained.
+        ValueError: the arguments do not fit each other or the folder.
     """
     check_numbers(steps, seed)
     order = SampleOrder(frames, config, seed=seed)
-    an_epoch = -(-order.epoch_size // config.optimizer.batch_size)
-    if config.copy_paste is not None and config.fade_epochs * an_epoch >= steps:
+    epoch_steps = -(-order.epoch_size // config.optimizer.batch_size)
+    if config.copy_paste is not None and config.fade_epochs * epoch_steps >= steps:
         raise ValueError(
-            f"fade_epochs: got {config.fade_epochs}, of {an_epoch} steps each, expected less than the run's "
-            f"{steps} steps: nothing would ever be pasted"
+            f"fade_epochs: got {config.fade_epochs}, of {epoch_steps} steps each, expected less than the run's "
+            f"{steps} steps: nothing would be pasted"
         )
     check_counts(frames)
     check_batch_size(config.optimizer.batch_size, mesh)
@@ -128,7 +128,7 @@ def plan_run(
         check_augmentation(config.augment, frames.sensor)
     detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, steps)
     jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(seed))
-    # Only the same run can be resumed. Weights given as arrays are not recorded.
+    # A run resumes only with the same specification. Weights passed as arrays are not recorded.
     spec = {
         "config": config_to_json(config),
         "sensor": sensor_to_json(frames.sensor),
@@ -158,26 +158,22 @@ def plan_run(
         tests=tests,
         devices=devices,
         spec=spec,
-        weights=_given_weights(detector, weights) if not resume or not _any_checkpoint(out) else None,
+        weights=None if resume and Checkpoints(out / CHECKPOINTS).paths() else _initial_weights(detector, weights),
         packing=packing_for(frames, config) if packing or (packing is None and not on_cpus) else None,
         warnings=tuple(_warnings(frames, config)),
     )
 
 
 def check_numbers(steps: int, seed: int) -> None:
-    """Refuse numbers of steps and seeds that no run can have: ValueError."""
+    """Raise a ValueError for an invalid number of steps or seed."""
     if type(steps) is not int or steps < 1:
         raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
     if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
         raise ValueError(f"seed: got {seed!r}, expected an integer from 0 to {NUM_SEEDS - 1}")
 
 
-def _any_checkpoint(out: Path) -> bool:
-    return bool(Checkpoints(out / CHECKPOINTS).paths())
-
-
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
-    """What is odd about the frames, by some of them, spread over the set."""
+    """Warnings about the clouds of up to five frames."""
     indices = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
     clouds = (frames.frame(int(index)).points for index in indices)
     first = next(clouds)
@@ -185,25 +181,25 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
         yield f"{frames.name(0)}: {mismatch}"
     if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in (first, *clouds)):
         yield (
-            f"num_sweeps: got {config.num_sweeps}, but the frames hold one sweep each: expected 1, for `stream` "
-            "will fuse as many, which the detector has not seen"
+            f"num_sweeps: got {config.num_sweeps}, but the frames hold one sweep each: expected 1, because "
+            f"`stream` would fuse {config.num_sweeps} sweeps, which the detector has not been trained for"
         )
 
 
 def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
-    """Refuse a folder that cannot take a run.
+    """Check that a run can be started or resumed in a folder.
 
     Args:
-        folder: of the run.
-        spec: what ``run.json`` must hold; None to check only whether there is a run.
-        resume: the run is to be resumed.
+        folder: folder of the run.
+        spec: expected content of ``run.json``; None to check only whether there is a run.
+        resume: whether the run is to be resumed.
 
     Returns:
-        fields of the specification that an older run does not have, and that were not compared.
+        fields that the specification of an older run lacks and that were not compared.
 
     Raises:
-        ValueError: there is a run and it is not to be resumed, or none to resume, or another one, with the first
-            field that differs.
+        ValueError: the folder unexpectedly holds a run, holds no run to resume, or holds a different run; names
+            the first field that differs.
     """
     folder = Path(folder)
     file = folder / RUN_SPEC
@@ -215,42 +211,40 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
         return []
     if not resume:
         raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
-    found = read_json(file, dict[str, Any], what="the specification of a run")
+    recorded = read_json(file, dict[str, Any], what="the specification of a run")
     if spec is None:
         return []
-    missing = [name for name in _LATER_FIELDS if name in spec and name not in found]
-    found |= {name: spec[name] for name in missing}
-    if isinstance(config := found.get("config"), dict):
-        found["config"] = with_later_fields(config)
-    for name, (was, wanted) in _differences(found, spec):
-        raise ValueError(f"{file}: {name}: was {was!r}, got {wanted!r}: only the same run can be resumed")
+    missing = [name for name in _LATER_FIELDS if name in spec and name not in recorded]
+    recorded |= {name: spec[name] for name in missing}
+    if isinstance(config := recorded.get("config"), dict):
+        recorded["config"] = with_later_fields(config)
+    for name, was, now in _differences(recorded, spec):
+        raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
     return missing
 
 
-def _given_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
+def _initial_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
+    """Load initial weights, and report differences of the network's configuration that shapes do not show."""
     if not isinstance(weights, str | Path):
         return weights
     folder = find_checkpoint(Path(weights))
     checkpoint = load_checkpoint(folder)
-    classes = checkpoint.config.classes
-    if classes != detector.config.classes:
-        raise CheckpointError(
-            f"{folder}: classes: got {classes}, expected {detector.config.classes}, which are to be trained"
-        )
-    expected = jax.eval_shape(detector.init, jax.random.key(0))
-    check_arrays(folder, expected, checkpoint.variables, whose="the network that is to be trained")
-    # Arrays of the same shapes may still mean something else.
-    given, own = config_to_json(checkpoint.config)["model"], config_to_json(detector.config)["model"]
+    classes, expected = checkpoint.config.classes, detector.config.classes
+    if classes != expected:
+        raise CheckpointError(f"{folder}: classes: got {classes}, expected the classes to be trained, {expected}")
+    shapes = jax.eval_shape(detector.init, jax.random.key(0))
+    check_arrays(folder, shapes, checkpoint.variables, whose="the network to be trained")
     if jax.process_index() == 0:
-        for name, (was, now) in _differences(given, own, "model"):
+        own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
+        for name, was, now in _differences(own, new, "model"):
             print(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}", file=sys.stderr, flush=True)
     return checkpoint.variables
 
 
-def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
-    """Where two JSON values differ."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in sorted(found.keys() | wanted.keys()):
-            yield from _differences(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
-    elif found != wanted:
-        yield name, (found, wanted)
+def _differences(was: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Names and values of the fields in which two JSON values differ."""
+    if isinstance(was, dict) and isinstance(now, dict):
+        for key in sorted(was.keys() | now.keys()):
+            yield from _differences(was.get(key), now.get(key), f"{name}.{key}" if name else key)
+    elif was != now:
+        yield name, was, now

@@ -1,8 +1,7 @@
-"""Training as a run in a folder: begun, stopped, resumed, evaluated along the way.
+"""Training in the folder of a run, which can be stopped and resumed, with evaluations along the way.
 
-``run.json`` is the run's specification, ``metrics.jsonl`` and ``tensorboard/`` hold the metrics, ``checkpoints/``
-the last checkpoints and the best one, ``pictures/`` some test frames at every evaluation, ``loss.png`` and
-``scores.png`` the curves.
+The folder holds the specification ``run.json``, the metrics ``metrics.jsonl`` and ``tensorboard/``, the last and
+the best of the ``checkpoints/``, ``pictures/`` of test frames, and the curves ``loss.png`` and ``scores.png``.
 """
 
 import contextlib
@@ -40,9 +39,9 @@ from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, pla
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 from fcos_lidar_jax.types import TrainState
 
-_NUM_PICTURES = 2  # Test frames that are drawn at an evaluation.
+_NUM_PICTURES = 2  # number of test frames drawn at an evaluation
 
-Hook = Callable[[int, Record], None]  # Called with (steps done, metrics of the last of them) after every step.
+Hook = Callable[[int, Record], None]  # called after every step with the number of steps and the last metrics
 
 
 def train(
@@ -63,38 +62,38 @@ def train(
     workers: int = 0,
     packing: bool | None = None,
 ) -> TrainState:
-    """Train to the end, or until Ctrl-C or SIGTERM, which save a checkpoint first.
+    """Train a detector; Ctrl-C and SIGTERM save a checkpoint and stop.
 
     Args:
-        config: what to train.
-        frames: to train on; their classes are matched to ``config.classes`` by name, and their sensor is the
-            detector's.
+        config: configuration of the detector.
+        frames: training frames; classes are matched to ``config.classes`` by name, and the detector is built for
+            their sensor.
         out: folder of the run.
-        steps: updates of the whole run.
-        seed: of weights, order, pasted objects and augmentation.
+        steps: number of updates of the whole run.
+        seed: seed of weights, order, pasted objects and augmentation.
         tests: frames to evaluate on along the way.
-        objects: ground-truth database for copy-paste; needed unless ``config.copy_paste`` is None.
-        resume: from the newest whole checkpoint in the folder; the run must be the same.
-        weights: to begin with, instead of random ones: a checkpoint, or arrays.
-        devices: to share each batch; default: all.
-        hooks: called after every step.
-        schedule: when to save and to evaluate.
-        threads, workers: threads that prepare batches, and processes beside them; default: as many threads as
-            ``input_pipeline.loader.default_threads`` says, and no processes.
-        packing: whether batches travel to the devices in fewer bytes, see :mod:`fcos_lidar_jax.packing`; the
-            results are the same. Default: unless the devices are CPUs.
+        objects: ground-truth database for copy-paste; required unless ``config.copy_paste`` is None.
+        resume: resume the same run from the newest intact checkpoint in the folder.
+        weights: initial weights, as a checkpoint or arrays; random by default.
+        devices: devices that share each batch; by default all.
+        hooks: functions to call after every step.
+        schedule: when to save and evaluate.
+        threads, workers: number of threads and additional processes that prepare batches; by default as many
+            threads as ``input_pipeline.loader.default_threads`` returns, and no processes.
+        packing: transfer batches to the devices in fewer bytes, with the same results, see
+            :mod:`fcos_lidar_jax.packing`; by default unless the devices are CPUs.
 
     Returns:
         the last state.
 
     Raises:
-        ValueError: the folder holds another run, no class is shared, devices and batch do not fit, steps or seed
-            are out of range, or the augmentation does not suit the sector that the sensor covers, see
-            :func:`fcos_lidar_jax.augment.check_augmentation`; or processes were given different runs or data.
-        OSError: another process trains in the folder, or it cannot be written.
-        NonFiniteLossError, NonFiniteStateError: the last checkpoint is from before.
-        KeyboardInterrupt: after Ctrl-C, when all is saved.
-        SystemExit: after SIGTERM, likewise.
+        ValueError: the folder holds another run, no class is shared, the devices cannot share the batch, steps or
+            seed are out of range, the augmentation does not suit the sector of the sensor, see
+            :func:`fcos_lidar_jax.augment.check_augmentation`, or processes have different runs or data.
+        OSError: another process trains in the folder, or writing failed.
+        NonFiniteLossError, NonFiniteStateError: a value is not finite; earlier checkpoints remain.
+        KeyboardInterrupt: after Ctrl-C, once the state is saved.
+        SystemExit: after SIGTERM, once the state is saved.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.simulation.frame_set import fresh_streets
@@ -131,7 +130,7 @@ def train(
         first = int(start.step)
         pending = run.evaluation_pending(first)
         if first == steps and not pending:
-            print(f"{run.folder}: the run has done all of its {first} steps", file=sys.stderr)
+            print(f"{run.folder}: the run is complete, with {first} steps", file=sys.stderr)
             return start
         step = jit_step(make_train_step(run.detector, run.optimizer), mesh)
         metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
@@ -150,7 +149,7 @@ def train(
         def pause(number: int, state: TrainState) -> None:
             if metrics is not None:
                 metrics.flush()
-                _save(run, state)  # What is done is safe before an evaluation, which may take long.
+                _save(run, state)  # before the evaluation, which may take long
             if run.evaluates_at(number):
                 _evaluate(run, number, state, metrics)
 
@@ -172,7 +171,7 @@ def train(
         with stop_requests(active=not several) as request, batches as prepared, feed(prepared, mesh) as stream:
 
             def stopping(done: int) -> bool:
-                if several:  # all stop after the same step, whichever of them was asked to
+                if several:  # all stop after the same step, whichever of them received the signal
                     return multihost_utils.reached_preemption_sync_point(done)
                 return request.signal is not None
 
@@ -195,8 +194,8 @@ def train(
                 if is_main_process and not run.saves_at(done):
                     _save(run, state)
             except (NonFiniteLossError, NonFiniteStateError) as error:
-                kept = run.checkpoints.paths()
-                last = f"the last checkpoint is {kept[-1]}" if kept else "there is no checkpoint yet"
+                saved = run.checkpoints.paths()
+                last = f"the last checkpoint is {saved[-1]}" if saved else "there is no checkpoint yet"
                 raise type(error)(f"{error}; {last}") from None
             finally:
                 if metrics is not None:
@@ -213,7 +212,7 @@ def train(
 
 @contextlib.contextmanager
 def _own_folder(run: Run, *, resume: bool) -> Iterator[None]:
-    """Hold the run's folder in the main process; the others continue only when it does."""
+    """Lock the folder in the main process, check it and write the specification; the others wait for this."""
     with contextlib.ExitStack() as held:
         error: Exception | None = None
         if jax.process_index() == 0:
@@ -221,7 +220,7 @@ def _own_folder(run: Run, *, resume: bool) -> Iterator[None]:
                 held.enter_context(folder_lock(run.folder, "training"))
                 missing = check_run(run.folder, run.spec, resume=resume)  # another process may have been faster
                 if missing:
-                    print(f"{run.folder}: an older run, without {', '.join(missing)} to compare", file=sys.stderr)
+                    print(f"{run.folder}: an older run; not compared: {', '.join(missing)}", file=sys.stderr)
                 text = json.dumps(run.spec, indent=1)
                 if not resume:
                     atomic_write(run.folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
@@ -235,7 +234,7 @@ def _own_folder(run: Run, *, resume: bool) -> Iterator[None]:
 
 
 def _start(run: Run, *, resume: bool) -> TrainState:
-    """The state of the newest checkpoint, or one of given or random weights."""
+    """The state of the newest checkpoint, or a new state with initial weights."""
     key = jax.random.key(run.seed)
     if resume:
         like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
@@ -246,20 +245,20 @@ def _start(run: Run, *, resume: bool) -> TrainState:
 
 
 def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | None) -> None:
-    """Score on the test frames, which all processes share; the main process draws, saves and records."""
+    """Evaluate on the test frames in all processes; the main process draws, saves and records."""
     assert run.tests is not None
     trained = TrainedDetector(run.detector, _local_variables(state))
     summary = evaluate(trained, run.tests, devices=run.devices).summary
     score = summary["mean_ap"]
     first = range(min(_NUM_PICTURES, len(run.tests)))
-    shown = list(predict(trained, run.tests, indices=first, devices=run.devices))
+    examples = list(predict(trained, run.tests, indices=first, devices=run.devices))
     if metrics is not None:
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
-        draw_predictions(run.folder / "pictures", shown, run.tests, number)
+        draw_predictions(run.folder / "pictures", examples, run.tests, number)
         if not math.isnan(score):
             run.checkpoints.record_score(number, score)
         values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
-        metrics.write(number, {"test/mAP": score, **values})  # Last: what is recorded is not done again.
+        metrics.write(number, {"test/mAP": score, **values})  # last, because a recorded evaluation is not repeated
 
 
 def _save(run: Run, state: TrainState) -> None:

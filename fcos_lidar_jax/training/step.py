@@ -1,4 +1,4 @@
-"""One training step as a pure function: raw points in, new state and metrics out."""
+"""The training step as a pure function from state and raw points to new state and metrics."""
 
 import dataclasses
 import functools
@@ -27,10 +27,12 @@ def make_state(
     *,
     variables: Variables | None = None,
 ) -> TrainState:
-    """The state before the first step, with a running mean of the weights if ``ema_decay`` asks for one.
+    """Make the state before the first step, with a running mean of the weights if ``ema_decay`` is not 0.
 
-    ``key`` is the run's random key; ``variables`` are ``params`` and ``batch_stats`` to start from, by default
-    random ones.
+    Args:
+        detector, optimizer: network and optimizer.
+        key: random key of the run.
+        variables: initial ``params`` and ``batch_stats``; random by default.
 
     >>> from fcos_lidar_jax.models import build_detector
     >>> from fcos_lidar_jax.presets import QUICKSTART
@@ -47,27 +49,27 @@ def make_state(
         params=variables["params"],
         batch_stats=variables["batch_stats"],
         opt_state=optimizer.init(variables["params"]),
-        # A copy: the step gives its input's buffers away, and none twice.
+        # A copy, because the step donates its buffers and cannot donate one twice.
         ema=jax.tree.map(jnp.copy, variables["params"]) if detector.config.optimizer.ema_decay > 0 else None,
         key=key,
     )
-    # Strong types throughout: a weakly typed leaf would compile the step a second time.
+    # A weakly typed leaf would compile the step a second time.
     state = jax.tree.map(lambda x: lax.convert_element_type(x, x.dtype), dataclasses.replace(state, key=None))
     return dataclasses.replace(state, key=key)
 
 
 def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, Any, Metrics]]:
-    """The gradient of the loss of a batch, in ``config.optimizer.accumulate`` micro-batches.
+    """Make the gradient of the loss of a batch, in ``config.optimizer.accumulate`` micro-batches.
 
-    The gradients of the sums are summed and divided once by the positives of all micro-batches, so their number
-    does not change what is weighed how; only batch norm sees smaller batches. Where the box losses are divided by
-    the candidates instead, their gradient is a second one.
+    Gradients of sums are added up and divided once by the count over all micro-batches, so the number of
+    micro-batches does not change any weight; only batch norm sees smaller batches. Each count, such as positives
+    and candidates, has a gradient of its own.
 
     Returns:
         pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``.
     """
     config, objective = detector.config, make_objective(detector)
-    pieces = config.optimizer.accumulate
+    num_micro = config.optimizer.accumulate
 
     def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
         def visit(batch_stats: Any, micro: Batch) -> tuple[Any, tuple[Any, Sums]]:
@@ -78,7 +80,7 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
             grads = {name: pull_back(zero | {name: jnp.ones_like(t)})[0] for name, t in totals.items()}
             return batch_stats, (grads, sums)
 
-        if pieces == 1:
+        if num_micro == 1:
             batch_stats, (grads, sums) = visit(batch_stats, batch)
         else:
 
@@ -87,11 +89,11 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
                 batch_stats, new = visit(batch_stats, micro)
                 return (batch_stats, jax.tree.map(jnp.add, summed, new)), None
 
-            # Strided, so that every device has its share of every micro-batch.
-            micros = jax.tree.map(lambda leaf: leaf.reshape(-1, pieces, *leaf.shape[1:]).swapaxes(0, 1), batch)
+            # Strided, so that every device holds a part of every micro-batch.
+            micros = jax.tree.map(lambda leaf: leaf.reshape(-1, num_micro, *leaf.shape[1:]).swapaxes(0, 1), batch)
             shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
-            nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-            (batch_stats, (grads, sums)), _ = lax.scan(add, (batch_stats, nothing), micros)
+            zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+            (batch_stats, (grads, sums)), _ = lax.scan(add, (batch_stats, zeros), micros)
 
         def divided(name: str) -> Any:
             scale = 1 / jnp.maximum(sums.counts[name], 1)
@@ -104,11 +106,11 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
 
 
 def make_train_step(detector: Detector, optimizer: optax.GradientTransformation) -> TrainStep:
-    """A training step: augment unless ``config.augment`` is None, prepare, predict, differentiate, update.
+    """Make a training step: augment unless ``config.augment`` is None, predict, differentiate, update.
 
     Returns:
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. A packed batch is unpacked first.
-        The metrics are scalars but for ``positives_per_level`` i32[6].
+        Metrics are scalars except ``positives_per_level`` i32[6].
 
     >>> from fcos_lidar_jax.models import build_detector
     >>> from fcos_lidar_jax.presets import QUICKSTART
@@ -144,7 +146,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         metrics.update(current_hyperparameters(opt_state))
         ema = state.ema
         if ema is not None:
-            # EMA warm-up: a slow mean would remember the random start.
+            # EMA warm-up: a slow mean would retain the random initial weights.
             kept = jnp.minimum(decay, (1 + state.step) / (10 + state.step)).astype(jnp.float32)
             ema = jax.tree.map(lambda old, new: old + (1 - kept.astype(old.dtype)) * (new - old), ema, params)
         return TrainState(state.step + 1, params, batch_stats, opt_state, ema, state.key), metrics
@@ -153,7 +155,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
 
 
 def detection_variables(state: TrainState) -> dict[str, Any]:
-    """What to detect with: the running mean of the weights where there is one, and the batch statistics.
+    """Variables for detection: batch statistics, and the running mean of the weights if there is one.
 
     >>> state = TrainState(jnp.int32(9), {"w": 3.0}, {"mean": 0.0}, (), {"w": 2.0}, jax.random.key(0))
     >>> detection_variables(state)

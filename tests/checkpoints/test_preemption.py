@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM become requests; the second one acts as it would have without us."""
+"""Ctrl-C and SIGTERM become requests; a second signal reaches the previous handler."""
 
 import os
 import signal
@@ -11,54 +11,63 @@ from fcos_lidar_jax.checkpoints.preemption import after_the_block, stop_requests
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Before(Exception):
-    """What the handlers raise that were there before."""
+class Handled(Exception):
+    """Raised by the previous handlers."""
 
 
 @pytest.fixture
-def before():
-    """Handlers of our own, so that a second SIGTERM does not end the tests."""
+def previous():
+    """Install handlers of our own, so that a second SIGTERM does not end the tests."""
 
     def handler(number, _):
-        raise Before(number)
+        raise Handled(number)
 
-    kept = {number: signal.signal(number, handler) for number in SIGNALS}
+    originals = {number: signal.signal(number, handler) for number in SIGNALS}
     yield handler
-    for number, old in kept.items():
-        signal.signal(number, old)
+    for number, original in originals.items():
+        signal.signal(number, original)
+
+
+def handlers():
+    return [signal.getsignal(number) for number in SIGNALS]
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_the_first_signal_asks_and_the_second_acts_as_before(before, number):
+def test_the_first_signal_is_a_request_and_the_second_is_handled_as_before(previous, number):
     with stop_requests() as request:
         assert request.signal is None
         os.kill(os.getpid(), number)
         assert request.signal == number
-        for again in SIGNALS:
-            with pytest.raises(Before):
-                os.kill(os.getpid(), again)
+        for second in SIGNALS:
+            with pytest.raises(Handled):
+                os.kill(os.getpid(), second)
     assert request.signal == number
 
 
-def test_handlers_are_restored_after_the_work_and_after_an_error(before):
+def test_handlers_are_restored_after_the_block_and_after_an_error(previous):
     with stop_requests():
-        assert all(signal.getsignal(number) is not before for number in SIGNALS)
-    assert all(signal.getsignal(number) is before for number in SIGNALS)
+        assert previous not in handlers()
+    assert handlers() == [previous] * 2
     with pytest.raises(KeyError), stop_requests():
         raise KeyError
-    assert all(signal.getsignal(number) is before for number in SIGNALS)
+    assert handlers() == [previous] * 2
 
 
-def test_inactive_leaves_the_signals_alone(before):
+def test_signals_keep_their_handlers_when_inactive_or_outside_the_main_thread(previous):
     with stop_requests(active=False) as request:
-        assert all(signal.getsignal(number) is before for number in SIGNALS)
-        with pytest.raises(Before):
-            os.kill(os.getpid(), signal.SIGINT)
+        assert handlers() == [previous] * 2
     assert request.signal is None
+
+    def inside():
+        with after_the_block():
+            return handlers()
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(inside).result() == [previous] * 2
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_acts_when_the_block_has_ended(before, number):
+def test_a_signal_is_delayed_until_the_end_of_the_block(previous, number):
     done = []
 
     def work():
@@ -66,18 +75,7 @@ def test_a_signal_acts_when_the_block_has_ended(before, number):
             os.kill(os.getpid(), number)
             done.append(number)
 
-    with pytest.raises(Before):
+    with pytest.raises(Handled):
         work()
     assert done == [number]
-    assert signal.getsignal(number) == before
-
-
-def test_elsewhere_than_in_the_main_thread_nothing_changes(before):
-    with ThreadPoolExecutor(1) as pool, after_the_block():
-        held = signal.getsignal(signal.SIGINT)
-
-        def inside():
-            with after_the_block():
-                return signal.getsignal(signal.SIGINT)
-
-        assert pool.submit(inside).result() == held
+    assert signal.getsignal(number) == previous

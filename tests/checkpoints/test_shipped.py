@@ -1,4 +1,4 @@
-"""The weights that come with the package are whole, small, of today's preset, and find what they should."""
+"""Shipped weights are intact, small, match the current presets, and detect objects."""
 
 import dataclasses
 from pathlib import Path
@@ -20,12 +20,12 @@ NAMES = sorted(shipped_checkpoints())
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_weights_are_small_and_of_todays_preset(name):
+def test_shipped_weights_are_small_and_match_the_preset(name):
     folder, config = shipped_checkpoints()[name], CONFIGS[name]
     assert sum(path.stat().st_size for path in folder.rglob("*")) < 8 * 2**20
     shipped = load_checkpoint(folder)
     assert shipped.sensor == load_sensor(config.sensor)
-    if name == "hdl32e":  # Trained before the preset had local geometry.
+    if name == "hdl32e":  # trained before the preset had local geometry
         config = change(model__local_geometry=False)(config)
     assert dataclasses.replace(shipped.config, optimizer=config.optimizer) == config
 
@@ -35,7 +35,7 @@ def test_shipped_weights_detect_on_unseen_streets():
     assert evaluate(detector, unseen_frames(detector.sensor, 12)).summary["mean_ap"] > 0.4
 
 
-def test_a_name_stands_for_shipped_weights_where_no_folder_has_it(tmp_path, monkeypatch, capsys):
+def test_a_name_stands_for_shipped_weights_unless_a_folder_has_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert find_checkpoint(Path("quickstart")) == shipped_checkpoints()["quickstart"]
     (tmp_path / "quickstart").mkdir()
@@ -47,7 +47,7 @@ def test_a_name_stands_for_shipped_weights_where_no_folder_has_it(tmp_path, monk
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_weights_name_no_folder_of_the_machine_that_made_them(name):
+def test_shipped_weights_contain_no_path_of_the_machine_that_made_them(name):
     for path in shipped_checkpoints()[name].rglob("*"):
         assert path.is_dir() or not any(
             root in path.read_bytes() for root in (b"/tmp/", b"/home/", b"/root/", b"/work")

@@ -289,7 +289,7 @@ BAD = {
     "old format": ("detect HOME/good.npy --checkpoint HOME/old", "format: got 0, expected 3"),
     "bad field": (
         "detect HOME/good.npy --checkpoint HOME/fields",
-        "fields/checkpoint.json: not as it was written",
+        "fields/checkpoint.json: damaged",
     ),
     "project missing": ("project HOME/none.bin", "none.bin: no such file"),
     "project sensor": ("project HOME/good.npy --sensor sonar", "sonar: no such sensor"),

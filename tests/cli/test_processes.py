@@ -245,7 +245,7 @@ def test_processes_with_different_detectors_are_refused(root, tmp_path):
     other = tmp_path / "start"
     save_checkpoint(other, Checkpoint(CONFIG, SENSOR, jax.tree.map(lambda leaf: leaf + 1, weights()), 1))
     both = [evaluate(root, tmp_path / "both"), evaluate(root, tmp_path / "both", "--checkpoint", str(other))]
-    line = "process 1: detector, frames or batch size: got another than process 0, expected the same"
+    line = "process 1: detector, frames or batch size: different from process 0, expected the same"
     for code, _, errors in ended(start_two("coordinator", *both)):
         assert (code, error_lines(errors)) == (1, [f"fcos-lidar: error: {line}"])
 

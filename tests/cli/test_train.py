@@ -169,7 +169,7 @@ BAD = {
     "seed": ("--seed -1", "seed: got -1"),
     "all faded": (
         "--fade-epochs 4 --steps 4",
-        "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: nothing would ever be pasted",
+        "fade_epochs: got 4, of 1 steps each, expected less than the run's 4 steps: nothing would be pasted",
     ),
     "no data": ("--data-root gone", "gone: no such folder, expected a data set"),
     "version": ("--version v9", "v9: no such folder"),
@@ -184,11 +184,11 @@ BAD = {
     "weights": ("--weights gone", "gone: found nothing, expected a checkpoint folder"),
     "weights of another network": (
         "--weights HOME/start --model.fpn-channels 16",
-        r"start: params/.*: got \(.*8.*\), expected \(.*16.*\): the arrays are not of the network",
+        r"start: params/.*: got \(.*8.*\), expected \(.*16.*\): the arrays do not belong to the network",
     ),
     "weights of other classes": (
         "--no-copy-paste --weights HOME/start --classes " + " ".join(NUSCENES_CLASSES[::-1]),
-        r"start: classes: got \('car',.*\), expected \('barrier',.*\), which are to be trained",
+        r"start: classes: got \('car',.*\), expected the classes to be trained, \('barrier',",
     ),
     "evaluation of nothing": (
         "--val-split none --evaluate-every 4",

@@ -1,4 +1,4 @@
-"""Processes that agree; two of them, in processes of their own, are in tests/cli/test_processes.py."""
+"""Agreement of processes, mocked here; tests/cli/test_processes.py runs two real processes."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from fcos_lidar_jax.devices.agreement import agreed, check_same
 
 @pytest.fixture
 def of_three(monkeypatch):
-    """This process is the first of three; what the others send."""
+    """Mock three processes, of which this is the first: values sent by the others, and by this one."""
     sent = []
 
     def gather(own):
@@ -24,7 +24,7 @@ def of_three(monkeypatch):
 
 
 @pytest.mark.parametrize("failure", [ValueError("x"), KeyboardInterrupt(), SystemExit(143)])
-def test_a_failure_is_told_and_raised(of_three, failure):
+def test_a_failure_is_reported_to_the_others_and_raised(of_three, failure):
     _, sent = of_three
     with pytest.raises(type(failure)) as raised, agreed("cannot read"):
         raise failure
@@ -32,7 +32,7 @@ def test_a_failure_is_told_and_raised(of_three, failure):
     assert [bool(own) for own in sent] == [False]
 
 
-def test_the_failure_of_another_stops_all(of_three):
+def test_the_failure_of_another_process_stops_this_one(of_three):
     others, sent = of_three
     with agreed("cannot read"):
         pass
@@ -42,7 +42,7 @@ def test_the_failure_of_another_stops_all(of_three):
     assert [bool(own) for own in sent] == [True, True]
 
 
-def test_where_the_others_cannot_be_told_the_own_failure_is_raised(of_three, monkeypatch):
+def test_the_own_failure_is_raised_if_the_others_cannot_be_reached(of_three, monkeypatch):
     def gather(_):
         raise RuntimeError("Gloo AllGather failed: Connection closed by peer")
 
@@ -53,15 +53,10 @@ def test_where_the_others_cannot_be_told_the_own_failure_is_raised(of_three, mon
         pass
 
 
-def test_alone_a_block_is_a_block():
-    with pytest.raises(ValueError, match="own"), agreed("cannot read"):
-        raise ValueError("own")
-
-
-def test_another_start_is_refused_by_all(of_three):
+def test_different_inputs_are_refused(of_three):
     others, _ = of_three
     others[:] = [np.array([0, 255], np.uint8), np.array([0, 255], np.uint8)]
     check_same("00ff", "frames")
     others[1] = np.array([0, 254], np.uint8)
-    with pytest.raises(ValueError, match=r"^process 2: frames: got another than process 0, expected the same$"):
+    with pytest.raises(ValueError, match=r"^process 2: frames: different from process 0, expected the same$"):
         check_same("00ff", "frames")

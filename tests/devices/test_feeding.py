@@ -1,4 +1,4 @@
-"""The feed of the devices: the same batches in the same order, ahead of time, and no thread left behind."""
+"""Transfer of batches: the same batches in order, ahead of time, and no thread left behind."""
 
 import dataclasses
 import os
@@ -30,7 +30,7 @@ def host(step: int) -> HostBatch:
     return HostBatch({"x": np.full((2, 3), step, np.int32)}, {"step": step}, (f"{step} a", f"{step} b"))
 
 
-def left() -> list[str]:
+def feed_threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name == "feed"]
 
 
@@ -41,42 +41,42 @@ def wait_until(holds) -> None:
         time.sleep(0.005)
 
 
-def test_batches_arrive_on_the_devices_in_their_order(mesh):
+def test_batches_arrive_on_the_devices_in_order(mesh):
     with feed((host(step) for step in range(7)), mesh) as stream:
-        found = list(stream)
+        batches = list(stream)
         assert next(stream, None) is None
-    for step, each in enumerate(found):
+    for step, each in enumerate(batches):
         assert each.batch["x"].devices() == {jax.devices()[0]}
         np.testing.assert_array_equal(each.batch["x"], host(step).batch["x"])
         assert (each.counts, each.names) == (host(step).counts, host(step).names)
-    assert left() == []
+    assert feed_threads() == []
 
 
 @pytest.mark.parametrize("ahead", [1, 2])
-def test_so_many_wait_and_no_more(mesh, ahead):
-    asked = []
-    source = (asked.append(step) or host(step) for step in range(20))
+def test_at_most_the_given_number_of_batches_waits(mesh, ahead):
+    requested = []
+    source = (requested.append(step) or host(step) for step in range(20))
     with feed(source, mesh, ahead=ahead) as stream:
         for taken in range(3):
-            wait_until(lambda: len(asked) == taken + ahead)  # noqa: B023
+            wait_until(lambda: len(requested) == taken + ahead)  # noqa: B023
             time.sleep(0.05)
-            assert len(asked) == taken + ahead
+            assert len(requested) == taken + ahead
             next(stream)
-    assert left() == []
+    assert feed_threads() == []
 
 
 @pytest.mark.parametrize("taken", [0, 1])
-def test_a_consumer_that_stops_early_leaves_no_thread(mesh, taken):
+def test_leaving_early_leaves_no_thread(mesh, taken):
     with feed((host(step) for step in range(100)), mesh) as stream:
         for _ in range(taken):
             next(stream)
-    assert left() == []
+    assert feed_threads() == []
     with pytest.raises(ArithmeticError, match="step 3"), feed(map(host, range(100)), mesh) as stream:
         raise ArithmeticError("step 3: not finite")
-    assert left() == []
+    assert feed_threads() == []
 
 
-def test_the_loader_s_error_reaches_the_caller_after_the_batches_before_it(mesh):
+def test_an_error_of_the_loader_reaches_the_caller_after_the_batches_before_it(mesh):
     def source():
         yield host(0)
         raise ValueError("sweeps/1.bin: got 3 bytes, expected 20")
@@ -86,7 +86,7 @@ def test_the_loader_s_error_reaches_the_caller_after_the_batches_before_it(mesh)
         with pytest.raises(ValueError, match=r"^sweeps/1.bin: got 3 bytes, expected 20$"):
             next(stream)
         assert next(stream, None) is None
-    assert left() == []
+    assert feed_threads() == []
 
 
 def test_ctrl_c_interrupts_the_wait_for_a_batch(mesh):
@@ -102,11 +102,11 @@ def test_ctrl_c_interrupts_the_wait_for_a_batch(mesh):
         with pytest.raises(KeyboardInterrupt):
             list(stream)
         go_on.set()
-    assert left() == []
+    assert feed_threads() == []
 
 
 class HangingFrames(ToyFrames):
-    """The frames of the second batch come when they are told to."""
+    """Frames of the second batch wait for an event."""
 
     def frame(self, index):
         reading.append(index)
@@ -119,8 +119,8 @@ go_on, reading = threading.Event(), list[int]()
 
 
 @pytest.mark.parametrize("threads", [0, 1])
-def test_ctrl_c_interrupts_the_wait_for_a_thread_that_hangs(mesh, threads):
-    """Leaving the loader as well does not replace it by a failure of its own."""
+def test_ctrl_c_interrupts_the_wait_for_a_hanging_thread(mesh, threads):
+    """Leaving the loader must not replace the interruption by another error."""
     go_on.clear()
     reading.clear()
     interrupt = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
@@ -137,11 +137,11 @@ def test_ctrl_c_interrupts_the_wait_for_a_thread_that_hangs(mesh, threads):
             leave_early()
     finally:
         go_on.set()
-    wait_until(lambda: not left())
+    wait_until(lambda: not feed_threads())
 
 
-def test_memory_on_loan_may_be_used_again_while_a_batch_is_alive(mesh):
-    """At an address where JAX would take the memory itself for the array, on a CPU."""
+def test_host_memory_may_be_reused_while_a_batch_is_alive(mesh):
+    """At an address where JAX would use the memory itself for an array on a CPU."""
     memory = np.empty(4096 + 64, np.uint8)
     start = -memory.ctypes.data % 64
     x = memory[start : start + 4096].view(np.float32).reshape(4, 256)
@@ -152,30 +152,29 @@ def test_memory_on_loan_may_be_used_again_while_a_batch_is_alive(mesh):
             yield HostBatch({"x": x}, {}, ())
 
     with feed(source(), mesh) as stream:
-        found = list(stream)
-    assert [np.unique(each.batch["x"]).tolist() for each in found] == [[step] for step in range(6)]
+        batches = list(stream)
+    assert [np.unique(each.batch["x"]).tolist() for each in batches] == [[step] for step in range(6)]
 
 
-def test_on_a_cpu_the_one_copy_is_the_array(mesh, monkeypatch):
-    copies, copy = [], feeding._aligned_copy
-    monkeypatch.setattr(feeding, "_aligned_copy", lambda array: copies.append(copy(array)) or copies[-1])
-    given = [np.arange(24, dtype=dtype).reshape(4, -1) for dtype in (np.uint8, np.uint16, np.float32, np.int32)]
-    with feed([HostBatch({"x": given}, {}, ())], mesh) as stream:
-        [found] = stream
-    for array, made, source in zip(found.batch["x"], copies, given, strict=True):
-        assert array.addressable_data(0).unsafe_buffer_pointer() == made.ctypes.data
-        assert not np.shares_memory(made, source)
+def test_batches_are_copied_once_on_a_cpu(mesh, monkeypatch):
+    copies, aligned_copy = [], feeding._aligned_copy
+    monkeypatch.setattr(feeding, "_aligned_copy", lambda array: copies.append(aligned_copy(array)) or copies[-1])
+    sources = [np.arange(24, dtype=dtype).reshape(4, -1) for dtype in (np.uint8, np.uint16, np.float32, np.int32)]
+    with feed([HostBatch({"x": sources}, {}, ())], mesh) as stream:
+        [fed] = stream
+    for array, copy, source in zip(fed.batch["x"], copies, sources, strict=True):
+        assert array.addressable_data(0).unsafe_buffer_pointer() == copy.ctypes.data
+        assert not np.shares_memory(copy, source)
         np.testing.assert_array_equal(array, source)
 
 
-def test_batches_that_workers_lend_stay_as_they_are(mesh):
-    """All alive at once, when the workers' memory is long freed; and that is the memory they came in."""
+def test_batches_in_shared_memory_of_workers_outlive_it(mesh):
     options = {"seed": 0, "num_steps": 6, "threads": 0}
     with make_batches(ToyFrames(), PLAIN, **options) as batches:
         expected = [each.batch for each in batches]
     kinds = set()
 
-    def seen(batches):
+    def noted(batches):
         for each in batches:
             kinds.add(type(each.batch.points).__name__)
             yield each
@@ -183,9 +182,9 @@ def test_batches_that_workers_lend_stay_as_they_are(mesh):
 
     with (
         make_batches(ToyFrames(), PLAIN, workers=1, lend=True, **options) as batches,
-        feed(seen(batches), mesh) as stream,
+        feed(noted(batches), mesh) as stream,
     ):
-        found = [each.batch for each in stream]
+        fed = [each.batch for each in stream]
     assert kinds == {"SharedMemoryArray"}
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    for a, b in zip(jax.tree.leaves(fed), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(a, b)

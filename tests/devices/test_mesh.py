@@ -1,22 +1,12 @@
-"""Data parallelism on the devices of the tests; the equality of 1 to 8 devices is in tests/equivalence."""
-
-import os
-import subprocess
-import sys
+"""Data parallelism on one or two devices; tests/equivalence compares one with eight."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import run_python
 
-from fcos_lidar_jax.devices.mesh import (
-    check_batch_size,
-    jit_step,
-    make_mesh,
-    pmap_step,
-    replicate,
-    shard_batch,
-)
+from fcos_lidar_jax.devices.mesh import check_batch_size, jit_step, make_mesh, pmap_step, replicate, shard_batch
 
 
 @pytest.fixture
@@ -29,43 +19,35 @@ def tree():
 
 
 def toy_step(state, batch):
-    """Sums over the whole batch; as every training step, it keeps the state's structure."""
+    """Sums over the whole batch; the state keeps its structure."""
     noise = jax.random.uniform(jax.random.fold_in(state["key"], state["step"]))
-    gained = batch["x"].sum(axis=0) + noise
-    new = {"w": state["w"] + gained, "step": state["step"] + 1, "key": state["key"]}
+    total = batch["x"].sum(axis=0) + noise
+    new = {"w": state["w"] + total, "step": state["step"] + 1, "key": state["key"]}
     return new, {"total": batch["x"].sum(), "per_level": batch["x"].sum(axis=0).astype(jnp.int32)}
 
 
-def test_the_mesh_is_one_axis_over_the_given_devices(mesh):
+def test_the_mesh_has_one_axis_over_the_given_devices(mesh):
     assert mesh.axis_names == ("data",)
     assert make_mesh().size == jax.device_count()
-    assert list(make_mesh(jax.devices()[:1]).devices.flat) == jax.devices()[:1]
+    assert list(mesh.devices.flat) == jax.devices()[:1]
 
 
-def test_replicated_arrays_are_equal_copies_that_may_be_given_away(mesh):
-    given = jax.tree.map(lambda leaf: leaf, tree())
-    placed = replicate(given, mesh)
-    for name in ("w", "step"):
-        np.testing.assert_array_equal(placed[name], given[name])
-        assert placed[name].dtype == given[name].dtype
-    assert placed["key"].dtype == given["key"].dtype
-    assert jax.random.uniform(placed["key"]) == jax.random.uniform(given["key"])
-    assert all(leaf.sharding.is_fully_replicated for leaf in (placed["w"], placed["step"]))
-    before = given["w"].copy()
-    jax.jit(lambda t: t["w"] * 0 - 7, donate_argnums=0)({"w": placed["w"]}).block_until_ready()
-    assert placed["w"].is_deleted()
-    np.testing.assert_array_equal(given["w"], before)
-
-
-def test_the_state_is_given_away_and_what_it_was_copied_from_is_not(mesh):
-    original = {**tree(), "w": jnp.asarray(tree()["w"])}
+@pytest.mark.parametrize("convert", [np.asarray, jnp.asarray])
+def test_a_step_donates_replicated_copies_and_leaves_the_originals(mesh, convert):
+    original = {**tree(), "w": convert(tree()["w"])}
     placed = replicate(original, mesh)
+    for name in ("w", "step"):
+        np.testing.assert_array_equal(placed[name], original[name])
+        assert placed[name].dtype == original[name].dtype
+        assert placed[name].sharding.is_fully_replicated
+    assert placed["key"].dtype == original["key"].dtype
+    assert jax.random.uniform(placed["key"]) == jax.random.uniform(original["key"])
     jit_step(toy_step, mesh)(placed, shard_batch({"x": np.ones((4, 3), np.float32)}, mesh))
     assert placed["w"].is_deleted()
     np.testing.assert_array_equal(original["w"], tree()["w"])
 
 
-def test_a_sharded_batch_is_the_batch(mesh):
+def test_a_sharded_batch_equals_the_batch(mesh):
     batch = {"x": np.arange(12).reshape(4, 3), "valid": np.array([True, False, True, True])}
     placed = shard_batch(batch, mesh)
     for name, leaf in batch.items():
@@ -74,31 +56,27 @@ def test_a_sharded_batch_is_the_batch(mesh):
 
 
 def check_pmap_form(mesh) -> None:
-    """Two steps of the pmap form are two steps of the jit form."""
+    """Two steps of the pmap form equal two steps of the jit form."""
     rng = np.random.default_rng(0)
     state = replicate(tree(), mesh)
     stacked = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (mesh.size, *leaf.shape)), tree())
-    one, many = jit_step(toy_step, mesh), pmap_step(toy_step, mesh)
+    by_jit, by_pmap = jit_step(toy_step, mesh), pmap_step(toy_step, mesh)
     for _ in range(2):
         batch = {"x": rng.normal(size=(4, 3)).astype(np.float32)}
-        state, metrics = one(state, shard_batch(batch, mesh))
-        stacked, told = many(stacked, {"x": batch["x"].reshape(mesh.size, -1, 3)})
+        state, metrics = by_jit(state, shard_batch(batch, mesh))
+        stacked, stacked_metrics = by_pmap(stacked, {"x": batch["x"].reshape(mesh.size, -1, 3)})
         for i in range(mesh.size):
             np.testing.assert_array_equal(stacked["w"][i], state["w"])
-            np.testing.assert_array_equal(told["total"][i], metrics["total"])
-            np.testing.assert_array_equal(told["per_level"][i], metrics["per_level"])
+            for name, value in metrics.items():
+                np.testing.assert_array_equal(stacked_metrics[name][i], value)
         assert stacked["w"].shape == (mesh.size, 2, 3)
 
 
 def check_odd_batch(mesh) -> None:
-    """Three samples are too few for two devices, or too many."""
+    """Two devices cannot share three samples evenly."""
     check_batch_size(4, mesh)
     with pytest.raises(ValueError, match=r"^batch_size: got 3, expected a multiple of the 2 devices$"):
         check_batch_size(3, mesh)
-
-
-def test_the_pmap_form_is_the_same_step(mesh):
-    check_pmap_form(mesh)
 
 
 def test_two_devices_share_a_batch_in_both_forms():
@@ -112,7 +90,5 @@ def test_two_devices_share_a_batch_in_both_forms():
         "x = np.zeros(10**5, np.float32); placed = [add(t.replicate({'w': x}, mesh)['w']) for _ in range(20)]; "
         "assert all((np.asarray(s.data) == 1).all() for p in placed for s in p.addressable_shards) and not x.any()"
     )
-    environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "2", "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = run_python("-c", code, JAX_NUM_CPU_DEVICES="2")
     assert done.returncode == 0, done.stderr[-2000:]

@@ -1,4 +1,4 @@
-"""Results do not depend on the number of devices: each test in a process that has eight."""
+"""Results do not depend on the number of devices; each test runs in a process with eight devices."""
 
 import pytest
 import quick
@@ -13,8 +13,8 @@ from fcos_lidar_jax.inference.prediction import predict
 detector = TrainedDetector(build_detector(CONFIG, SENSOR), weights())
 runs = []
 for n in (1, 2, 8):
-    found = predict(detector, FRAMES, indices=range(11), devices=jax.devices()[:n])
-    runs.append([p.detections for p in found])
+    predictions = predict(detector, FRAMES, indices=range(11), devices=jax.devices()[:n])
+    runs.append([p.detections for p in predictions])
 assert len(jax.devices()) == 8 and all(len(run) == 11 for run in runs)
 assert sum(int(d.valid.sum()) for d in runs[0]) > 20
 for run in runs[1:]:
@@ -42,8 +42,8 @@ for n in (1, 8):
     mesh = make_mesh(jax.devices()[:n])
     gradient = jax.jit(make_gradient(build_detector(CONFIG, SENSOR)),
                        out_shardings=NamedSharding(mesh, PartitionSpec()))
-    found = replicate(variables, mesh)
-    runs.append(jax.device_get(gradient(found["params"], found["batch_stats"], shard_batch(batch, mesh))))
+    placed = replicate(variables, mesh)
+    runs.append(jax.device_get(gradient(placed["params"], placed["batch_stats"], shard_batch(batch, mesh))))
 one, eight = runs
 assert int(one[2]["positives"]) > 20, int(one[2]["positives"])
 for name in ("positives", "unique_positives", "positives_per_level", "candidates"):
@@ -54,9 +54,9 @@ for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(eight), strict=True):
 
 
 @pytest.mark.parametrize(("code", "dtype"), [(PREDICTIONS, "float32"), (GRADIENTS, "float64")])
-def test_one_device_and_eight_find_the_same(code, dtype):
-    """Predictions bit by bit; gradient, statistics and metrics of very unequal samples in double precision."""
-    double = dtype == "float64"  # where rounding is not the question, nor is optimisation
+def test_results_on_one_and_eight_devices_are_equal(code, dtype):
+    """Predictions are bit-identical; gradients, statistics and metrics of unequal samples agree in float64."""
+    double = dtype == "float64"  # rounding and compiler optimisation do not matter
     modes = {"JAX_ENABLE_X64": str(int(double)), "JAX_NUM_CPU_DEVICES": "8"}
     done = run_python("-c", code, **modes, **quick.environment(double))
     assert done.returncode == 0, done.stderr

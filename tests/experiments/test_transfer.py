@@ -222,7 +222,7 @@ def test_a_card_counts_the_frames_of_all_trainings(shipped, tmp_path):
 def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
     package, _ = shipped
     (package / "hdl32e" / "notes.md").write_text("more")
-    with pytest.raises(CheckpointError, match=r"notes\.md: found a file that is not of the checkpoint"):
+    with pytest.raises(CheckpointError, match=r"notes\.md: found a file that does not belong to the checkpoint"):
         load_checkpoint(package / "hdl32e")
 
 

@@ -1,4 +1,4 @@
-"""Exported detectors: the bits of their checkpoint, the same bytes twice, and no trace of this machine."""
+"""Exported detectors are bit-identical to their checkpoint, deterministic, and free of paths of this machine."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ VARIABLES = untrained(TINY_CONFIG, TINY)
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A checkpoint, what was exported of it, and a cloud with rows that must not take part."""
+    """Folder of a checkpoint, an exported detector, and a cloud with points that must be ignored."""
     folder = tmp_path_factory.mktemp("export")
     save_checkpoint(folder / "checkpoint", Checkpoint(TINY_CONFIG, TINY, VARIABLES, 7))
     command("export --checkpoint", folder / "checkpoint", "--out", folder / "detector.fcos")
@@ -35,7 +35,7 @@ def home(tmp_path_factory):
     return folder
 
 
-def test_boxes_have_the_bits_of_the_checkpoint(home):
+def test_boxes_are_bit_identical_to_the_checkpoint(home):
     trained, exported = (fcos.load_detector(home / name) for name in ("checkpoint", "detector.fcos"))
     clouds = [*(make_frame(seed, TINY).points for seed in range(3)), np.load(home / "cloud.npy")]
     for points in clouds:
@@ -46,7 +46,7 @@ def test_boxes_have_the_bits_of_the_checkpoint(home):
     assert exported.sensor == trained.sensor
 
 
-def test_the_program_cleans_a_raw_cloud_itself(home):
+def test_the_program_cleans_raw_clouds(home):
     trained, points = fcos.load_detector(home / "checkpoint"), np.load(home / "cloud.npy")
     exported = load_exported(home / "detector.fcos").exported
     padded = np.full((1, TINY_CONFIG.max_points, 5), np.nan, np.float32)
@@ -60,12 +60,12 @@ def test_the_program_cleans_a_raw_cloud_itself(home):
     kept = program(padded, valid, False)
     assert bits(kept) != bits(found)
     close = (np.abs(points[:, :2] - TINY.origin_m[:2]) < TINY_CONFIG.projection.close_m).all(axis=1)
-    points[close] += np.float32(1000)  # beyond the limits: as if dropped
+    points[close] += np.float32(1000)  # beyond the limits, and therefore dropped
     padded[0, : len(points)] = points
     assert bits(program(padded, valid, False)["boxes"]) == bits(found["boxes"])
 
 
-def test_any_number_of_points_and_clouds(home, tmp_path, capsys):
+def test_an_export_for_any_number_of_points_and_clouds(home, tmp_path, capsys):
     out = tmp_path / "any.fcos"
     command("export --points any --batch any --checkpoint", home / "checkpoint", "--out", out)
     printed = json.loads(capsys.readouterr().out)
@@ -80,7 +80,7 @@ def test_any_number_of_points_and_clouds(home, tmp_path, capsys):
         np.testing.assert_allclose(scores, trained(cloud).scores, atol=1e-4)
 
 
-def test_the_same_bytes_twice_and_no_path_of_this_machine(home):
+def test_exports_are_deterministic_and_contain_no_path_of_this_machine(home):
     content = (home / "detector.fcos").read_bytes()
     jax.clear_caches()
     assert export_detector(fcos.load_detector(home / "checkpoint")) == content  # type: ignore[arg-type]
@@ -88,7 +88,7 @@ def test_the_same_bytes_twice_and_no_path_of_this_machine(home):
         assert trace.encode() not in content, trace
 
 
-def test_the_record_is_a_line_of_json(home):
+def test_the_record_describes_the_detector(home):
     first, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
     record = json.loads(line)
     assert record == read_record(home / "detector.fcos")
@@ -106,7 +106,7 @@ def test_the_record_is_a_line_of_json(home):
     assert first.decode() == f"fcos-lidar-detector 1 {content}"
 
 
-def test_a_file_of_older_fields_is_read(home, tmp_path):
+def test_a_file_of_an_older_version_is_read(home, tmp_path):
     _, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
     record = json.loads(line)
     later = ("model", "regression_axes"), ("model", "remat"), ("loss", "quality"), ("inference", "flips")
@@ -118,7 +118,7 @@ def test_a_file_of_older_fields_is_read(home, tmp_path):
     assert load_exported(tmp_path / "older.fcos").config == load_exported(home / "detector.fcos").config
 
 
-def test_the_documents_lines_run_without_this_package(home):
+def test_the_documented_code_runs_without_this_package(home):
     code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), re.DOTALL)
     hide = "import os, sys; sys.modules['fcos_lidar_jax'] = sys.modules['flax'] = None"
     (home / "run.py").write_text(f"{hide}\nos.chdir({str(home)!r})\n{code}")
@@ -131,7 +131,7 @@ def test_the_documents_lines_run_without_this_package(home):
     assert [np.float32(line.split()[1]) for line in lines] == list(found.scores[found.valid])
 
 
-def test_detect_takes_it_and_needs_its_batch_size(home, tmp_path, capsys):
+def test_detect_accepts_an_exported_detector_with_its_batch_size(home, tmp_path, capsys):
     for name in ("checkpoint", "detector.fcos"):
         command("detect", home / "cloud.npy", "--checkpoint", home / name, "--out", tmp_path / f"{name}.json")
     assert (tmp_path / "checkpoint.json").read_bytes() == (tmp_path / "detector.fcos.json").read_bytes()
@@ -154,7 +154,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_what_is_not_as_it_was_written_gets_one_line(home, tmp_path, capsys, name):
+def test_corrupt_files_are_reported_in_one_line(home, tmp_path, capsys, name):
     damage, message = DAMAGE[name]
     (tmp_path / "bad.fcos").write_bytes(damage((home / "detector.fcos").read_bytes()))
     words = ["detect", str(home / "cloud.npy"), "--checkpoint", str(tmp_path / "bad.fcos")]
@@ -164,7 +164,7 @@ def test_what_is_not_as_it_was_written_gets_one_line(home, tmp_path, capsys, nam
 @pytest.mark.parametrize(
     "command_line", ["detect HOME/cloud.npy", "stream HOME/cloud.npy", "benchmark HOME/cloud.npy"]
 )
-def test_no_command_writes_over_the_detector_that_it_uses(home, capsys, command_line):
+def test_no_command_overwrites_its_detector(home, capsys, command_line):
     content = (home / "detector.fcos").read_bytes()
     words = command_line.replace("HOME", str(home)).split()
     detector = str(home / "detector.fcos")
@@ -183,7 +183,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("options", WRONG)
-def test_mistakes_get_one_line(home, tmp_path, capsys, options):
+def test_invalid_options_are_reported_in_one_line(home, tmp_path, capsys, options):
     line = f"export {options}"
     line += "" if "--checkpoint " in line else " --checkpoint HOME/checkpoint"
     line += "" if "--out" in line else f" --out {tmp_path / 'a.fcos'}"

@@ -1,4 +1,4 @@
-"""Hostile clouds: finite images and boxes, each row once at most, the same bits twice."""
+"""Hostile clouds give finite images and boxes, each row at most once, bit-identical when repeated."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
 
-POINTS = 256  # Rows of a projected cloud, so that all are compiled once.
+POINTS = 256  # points of every projected cloud, so that projection is compiled once
 SENSORS = (TINY, dataclasses.replace(ARGOVERSE2, num_columns=64))
 _FINFO = np.finfo(np.float32)
 _LIMITS = (59.999, 60.0, 65_535.0, 65_536.0, 2.0**24, 2.0**31, 2.0**63)
@@ -26,7 +26,7 @@ def anywhere(rng, sensor, number):
 
 
 def on_a_beam(rng, sensor, number):
-    """Directions at the centre or on the edge of cells, or one float32 beside."""
+    """Directions at the centre or on the edge of cells, or the next float32."""
     inclination = rng.choice(np.concatenate([sensor.inclinations_rad, sensor.row_edges_rad]), number)
     azimuth = np.pi - rng.integers(0, 2 * sensor.num_columns + 1, number) * np.pi / sensor.num_columns
     range_m = rng.choice([1e-6, 0.5, 5.0, sensor.limit_xy_m, 2 * sensor.limit_xy_m], number)
@@ -50,7 +50,7 @@ def extreme(rng, sensor, number):
 
 
 def beside(rng, xyz):
-    """The values, or the float32 next to them."""
+    """The values, or the next float32."""
     return xyz if rng.random() < 0.3 else np.nextafter(xyz, np.float32(rng.choice([-np.inf, 0.0, np.inf])))
 
 
@@ -67,7 +67,7 @@ KINDS = (anywhere, on_a_beam, on_the_limits, one_point, extreme)
 
 
 def make_points(rng, sensor, number):
-    """f32[number, c]: rows of one to three kinds, at times with extreme single values."""
+    """Points f32[number, c] of one to three kinds, sometimes with extreme values."""
     kinds = [KINDS[rng.integers(len(KINDS))](rng, sensor, number) for _ in range(rng.integers(1, 4))]
     points = np.stack(kinds)[rng.integers(0, len(kinds), number), np.arange(number)].astype(np.float32)
     if rng.random() < 0.3:
@@ -77,7 +77,7 @@ def make_points(rng, sensor, number):
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda sensor: sensor.name)
-def test_a_projected_cloud_is_finite_and_has_each_row_once_at_most(sensor):
+def test_a_projected_cloud_is_finite_and_contains_each_point_at_most_once(sensor):
     dropped = filled_cells = 0
     for seed in range(150):
         rng = np.random.default_rng([0, seed])
@@ -101,7 +101,7 @@ def test_a_projected_cloud_is_finite_and_has_each_row_once_at_most(sensor):
     assert filled_cells
 
 
-def test_a_detector_finds_only_finite_boxes():
+def test_boxes_are_finite():
     detector, boxes = load_trained("quickstart"), 0
     for seed in range(10):
         rng = np.random.default_rng([0, seed, 1])

@@ -1,4 +1,4 @@
-"""The ONNX graph of the network against Flax, for every choice of a configuration that changes the network."""
+"""The ONNX graph of the network equals Flax, for every configuration field that changes the network."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ def with_model(config, **changes):
 
 
 def with_stem(rounds=2, **changes):
-    """The tiny network with another stem."""
+    """Configuration of the tiny network with a different stem."""
     config = with_model(CONFIG, stem=StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2), **changes))
     return dataclasses.replace(config, projection=dataclasses.replace(config.projection, num_rounds=rounds))
 
@@ -66,7 +66,7 @@ CASES = {
 
 
 def made_detector(config, sensor):
-    """Random parameters of every kind, so that nothing that is left out or exchanged goes unnoticed."""
+    """Random parameters of every kind, so that any omission or exchange changes the outputs."""
     rng = np.random.default_rng(0)
 
     def fill(path, leaf):
@@ -80,7 +80,7 @@ def made_detector(config, sensor):
 
 
 def made_features(detector):
-    """Of two clouds, a third of the slots empty."""
+    """Features of two clouds, with a third of the cells empty."""
     rng, model = np.random.default_rng(1), detector.config.model
     layout, rounds = image_layout(detector.sensor, model), detector.config.projection.num_rounds
     shape = 2, layout.rows, layout.columns, 9, rounds
@@ -111,14 +111,14 @@ def assert_same_outputs(found, expected):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_graph_is_the_network(name):
+def test_the_graph_equals_the_network(name):
     detector = made_detector(*CASES[name])
     content, features = network_graph(detector), made_features(detector)
     onnx.checker.check_model(onnx.load_model_from_string(content), full_check=True)
     assert_same_outputs(by_openvino(content, features), by_flax(detector, features))
 
 
-def test_it_is_not_the_graph_of_one_runtime():
+def test_another_runtime_gives_the_same_outputs():
     evaluator = pytest.importorskip("onnx.reference").ReferenceEvaluator
     detector = made_detector(with_model(CONFIG, circular_width=True, row_upscale=2), SENSOR)
     content, features = network_graph(detector), made_features(detector)
@@ -127,7 +127,7 @@ def test_it_is_not_the_graph_of_one_runtime():
     assert_same_outputs(found, by_flax(detector, features))
 
 
-def test_the_same_bytes_twice_and_what_it_is():
+def test_the_graph_is_deterministic_and_describes_itself():
     detector = made_detector(CONFIG, SENSOR)
     content = network_graph(detector)
     assert network_graph(made_detector(CONFIG, SENSOR)) == content
@@ -136,7 +136,7 @@ def test_the_same_bytes_twice_and_what_it_is():
     assert about["sensor"]["num_columns"] == SENSOR.num_columns
 
 
-def test_parameters_that_it_does_not_know_are_told():
+def test_unknown_parameters_are_refused():
     detector = made_detector(CONFIG, SENSOR)
     detector.variables["params"]["neck"] = {"kernel": np.zeros(3, np.float32)}
     with pytest.raises(ValueError, match=r"ONNX: found the parameters params/neck/kernel"):

@@ -1,4 +1,4 @@
-"""Detectors whose network runs in OpenVINO: the boxes of XLA's, one cloud after the other."""
+"""Detectors whose network runs in OpenVINO find the same boxes as XLA's, one cloud after the other."""
 
 import dataclasses
 import re
@@ -36,70 +36,64 @@ def fast(trained):
 
 
 @pytest.mark.parametrize("axes", ["lidar", "ray"])
-def test_boxes_are_those_of_xla_but_for_rounding(trained, axes):
+def test_boxes_equal_xlas_except_for_rounding(trained, axes):
     model = dataclasses.replace(TINY_CONFIG.model, regression_axes=axes)
     config = dataclasses.replace(TINY_CONFIG, model=model)
-    here = TrainedDetector(build_detector(config, TINY), trained.variables)
-    there = with_openvino(here, precision="float32")
+    by_xla = TrainedDetector(build_detector(config, TINY), trained.variables)
+    by_openvino = with_openvino(by_xla, precision="float32")
     for seed in range(3):
         points = make_frame(seed, TINY).points
-        ours, found = here(points), there(points)
-        assert found.valid.any()
-        np.testing.assert_array_equal(found.valid, ours.valid)
-        np.testing.assert_allclose(found.scores, ours.scores, atol=1e-4)
-        np.testing.assert_allclose(found.boxes, ours.boxes, atol=1e-3)
-        assert found.num_dropped == ours.num_dropped
+        expected, detections = by_xla(points), by_openvino(points)
+        assert detections.valid.any()
+        np.testing.assert_array_equal(detections.valid, expected.valid)
+        np.testing.assert_allclose(detections.scores, expected.scores, atol=1e-4)
+        np.testing.assert_allclose(detections.boxes, expected.boxes, atol=1e-3)
+        assert detections.num_dropped == expected.num_dropped
 
 
-def test_a_batch_changes_nothing_and_no_cloud_overwrites_another(fast):
+def test_batched_detections_are_bit_identical_and_do_not_overwrite_each_other(fast):
     clouds = [make_cloud(make_frame(seed, TINY).points, TINY_CONFIG, sensor=TINY) for seed in range(3)]
     points, valid = np.stack([cloud.points for cloud in clouds]), np.stack([cloud.valid for cloud in clouds])
     together = fast.program(make_mesh(), 3)(points, valid)
-    alone = [fast.detect(cloud) for cloud in clouds]
-    for row, found in enumerate(alone):
-        assert bits(jax.tree.map(lambda leaf, row=row: leaf[row], jax.device_get(together))) == bits(found)
-    assert len({bits(found)[0] for found in alone}) == 3
+    separate = [fast.detect(cloud) for cloud in clouds]
+    for row, detections in enumerate(separate):
+        assert bits(jax.tree.map(lambda leaf, row=row: leaf[row], jax.device_get(together))) == bits(detections)
+    assert len({bits(detections)[0] for detections in separate}) == 3
 
 
-def test_bfloat16_where_the_processor_has_it(trained):
+def test_bfloat16_is_used_if_the_processor_supports_it(trained):
     flags = re.search(r"^flags.*", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     if flags is None:
-        pytest.skip("not an x86 processor: its flags are not known")
+        pytest.skip("not an x86 processor: its flags are unknown")
     expected = "bfloat16" if {"avx512_bf16", "amx_bf16"} & {*flags[0].split()} else "float32"
     assert processor_precision() == with_openvino(trained).precision == expected
 
 
-def test_other_post_processing_stays_in_openvino(fast):
+def test_other_post_processing_stays_in_openvino_and_flips_are_refused(trained, fast):
     fewer, points = fast.with_inference(max_detections=3), make_frame(0, TINY).points
     assert (type(fewer), fewer.fingerprint) == (type(fast), fast.fingerprint)
     np.testing.assert_array_equal(fewer(points).scores, fast(points).scores[:3])
-    with pytest.raises(ValueError, match=r"backend openvino: found inference\.flips x, expected none"):
-        dataclasses.replace(
-            fast, model=build_detector(dataclasses.replace(TINY_CONFIG, augment=AugmentConfig()), TINY)
-        ).with_inference(flips="x")
+    flippable = build_detector(dataclasses.replace(TINY_CONFIG, augment=AugmentConfig()), TINY)
+    with pytest.raises(ValueError, match=r"^backend openvino: found inference\.flips x, expected none$"):
+        dataclasses.replace(fast, model=flippable).with_inference(flips="x")
+    with pytest.raises(ValueError, match=r"^backend openvino: found inference\.flips y, expected none$"):
+        with_openvino(dataclasses.replace(trained, model=flippable).with_inference(flips="y"))
 
 
-def test_another_backend_or_precision_is_another_detector(trained, fast):
+def test_the_fingerprint_depends_on_backend_and_precision(trained, fast):
     rough = dataclasses.replace(fast, precision="bfloat16")
     assert len({trained.fingerprint, fast.fingerprint, rough.fingerprint}) == 3
 
 
 @pytest.mark.parametrize("package", ["openvino", "onnx"])
-def test_a_missing_package_is_one_line(monkeypatch, package):
+def test_a_missing_package_is_reported_in_one_line(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ValueError, match=rf"^{package} is not installed: pip install 'fcos-lidar-jax\[cpu\]'$"):
         load_detector("quickstart", backend="openvino")
 
 
-def test_mirrored_views_are_refused(trained):
-    config = dataclasses.replace(TINY_CONFIG, inference=dataclasses.replace(TINY_CONFIG.inference, flips="y"))
-    mirrored = dataclasses.replace(trained, model=build_detector(config, TINY))
-    with pytest.raises(ValueError, match=r"^backend openvino: found inference.flips y, expected none$"):
-        with_openvino(mirrored)
-
-
-def test_openvino_reports_nothing_to_anyone():
-    """Its telemetry, a dependency, would fork the process and send."""
+def test_openvino_sends_no_telemetry():
+    """Telemetry would fork the process."""
     code = """
         import os, sys
         os.register_at_fork(before=lambda: sys.exit("forked"))

@@ -20,19 +20,19 @@ def detector():
 
 @pytest.fixture
 def compared(monkeypatch) -> list[Frame]:
-    """The truth that an evaluation compares with."""
-    kept, compare = list[Frame](), prediction.evaluate_frames
-    monkeypatch.setattr(prediction, "evaluate_frames", lambda *of: kept.extend(of[1]) or compare(*of))
-    return kept
+    """Frames that an evaluation compares with."""
+    frames, compare = list[Frame](), prediction.evaluate_frames
+    monkeypatch.setattr(prediction, "evaluate_frames", lambda *args: frames.extend(args[1]) or compare(*args))
+    return frames
 
 
-def test_an_evaluation_keeps_no_cloud(detector, compared):
+def test_an_evaluation_does_not_keep_clouds(detector, compared):
     evaluate(detector, TESTS)
     assert [frame.points.shape for frame in compared] == 2 * [(0, 5)]
     assert all(frame.points.base is None for frame in compared), "a view of the whole cloud"
 
 
-class TruthAlone(WrappedFrames):
+class OnlyTruth(WrappedFrames):
     """Test frames whose clouds are on another machine."""
 
     def frame(self, index: int) -> Frame:
@@ -44,18 +44,18 @@ class TruthAlone(WrappedFrames):
         )
 
 
-def test_of_what_another_process_has_read_the_boxes_alone_are_read(detector, compared, monkeypatch):
+def test_only_boxes_are_read_of_frames_that_another_process_has_read(detector, compared, monkeypatch):
     def groups(*args, **options):
         for group in predict_groups(detector, TESTS):
             yield [dataclasses.replace(found, frame=None, cloud=None) for found in group]
 
     monkeypatch.setattr(prediction, "predict_groups", groups)
-    evaluate(detector, TruthAlone(TESTS))
+    evaluate(detector, OnlyTruth(TESTS))
     assert [set(frame.num_points.tolist()) for frame in compared] == [{70}, {71}]
     np.testing.assert_array_equal(compared[1].boxes, TESTS.frame(1).boxes)
 
 
-def test_groups_are_what_the_devices_work_on_at_once(detector):
+def test_groups_contain_one_batch_per_device(detector):
     size = 2 * len(jax.devices())
     groups = list(predict_groups(detector, FRAMES, indices=[7, 3, 5], batch_size=2))
     indices = [[found.index for found in group] for group in groups]
@@ -65,7 +65,5 @@ def test_groups_are_what_the_devices_work_on_at_once(detector):
     for a, b in zip(one_by_one, (found for group in groups for found in group), strict=True):
         jax.tree.map(np.testing.assert_array_equal, a.detections, b.detections)
 
-
-def test_a_batch_has_at_least_one_cloud(detector):
     with pytest.raises(ValueError, match="batch_size: got 0, expected at least 1"):
         next(predict(detector, FRAMES, batch_size=0))

@@ -1,4 +1,4 @@
-"""What the default precision of GPUs and TPUs costs where boxes are predicted."""
+"""Effect of the default precision of GPUs and TPUs on predicted boxes."""
 
 import jax
 import jax.numpy as jnp
@@ -13,18 +13,15 @@ from fcos_lidar_jax.simulation.frame_set import unseen_frames
 
 
 def rounded(x, bits):
-    """To the nearest float32 with so many bits of fraction, half to even."""
+    """The nearest float32 with this number of fraction bits, ties to even."""
     word, cut = jax.lax.bitcast_convert_type(x, jnp.uint32), 23 - bits
     word = word + ((word >> cut) & 1) + jnp.uint32((1 << (cut - 1)) - 1)
     return jax.lax.bitcast_convert_type(word >> cut << cut, jnp.float32)
 
 
 @pytest.mark.parametrize(("bits", "largest_mm"), [(10, 2.0), (7, 16.0)], ids=["TF32", "bfloat16"])
-def test_rounded_inputs_of_the_predictions_move_centres_by_millimetres(bits, largest_mm, monkeypatch):
-    """As GPUs (TF32) and TPUs (bfloat16) round them by default; with the shipped weights, where a class is likely.
-
-    ``python -m pytest -s`` on this file prints by how much.
-    """
+def test_rounding_in_the_heads_moves_centres_by_millimetres(bits, largest_mm, monkeypatch):
+    """Emulates the default rounding of GPUs (TF32) and TPUs (bfloat16); with ``pytest -s``, prints the effect."""
     trained = load_trained("hdl32e")
     stages, frame = make_stages(trained.model), unseen_frames(trained.sensor, 1).frame(0)
     cloud = make_cloud(frame.points, trained.config, sensor=trained.sensor)
@@ -35,11 +32,9 @@ def test_rounded_inputs_of_the_predictions_move_centres_by_millimetres(bits, lar
     rough = jax.jit(lambda *given: stages.network(*given))(trained.variables, image)
     probability, other = (np.asarray(jax.nn.softmax(outputs.logits))[:, :-1] for outputs in (exact, rough))
     place, label = np.nonzero(probability > trained.config.inference.min_probability)
-    moved = np.abs(exact.regression - rough.regression)[place, :, label]
-    print(
-        f"{len(place)} pairs: centres move by at most {1e3 * moved[:, :3].max():.2f} mm, "
-        f"probabilities by {np.abs(probability - other).max():.5f}"
-    )
+    moved_mm = 1e3 * np.abs(exact.regression - rough.regression)[place, :3, label].max()
+    change = np.abs(probability - other).max()
+    print(f"{len(place)} predictions: centres move by at most {moved_mm:.2f} mm, probabilities by {change:.5f}")
     assert len(place) > 300
-    assert 0 < 1e3 * moved[:, :3].max() < largest_mm
-    assert np.abs(probability - other).max() < largest_mm / 1000
+    assert 0 < moved_mm < largest_mm
+    assert change < largest_mm / 1000

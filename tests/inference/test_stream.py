@@ -1,4 +1,4 @@
-"""A stream of sweeps: the window, and how often it is compiled."""
+"""Streams of sweeps: the window of sweeps, rotations, and compilation."""
 
 import dataclasses
 import json
@@ -28,18 +28,18 @@ def detector():
 
 
 def drive(number):
-    """Sweeps of different lengths, one and a half metres apart."""
+    """Sweeps with different numbers of points, 1.5 m apart."""
     for index in range(number):
         pose = np.eye(4)
         pose[0, 3] = 1.5 * index
         yield Sweep(make_frame(index, TINY).points[index * 7 :], pose, 10**5 * index, f"sweep {index}")
 
 
-def test_a_window_of_sweeps_moves_along_and_is_compiled_once(detector):
+def test_detections_in_a_rolling_window_are_bit_identical_and_compiled_once(detector):
     sweeps, config = list(drive(4)), detector.config
-    found = list(detect_stream(iter(sweeps), detector))
-    assert [each.sweep.name for each in found] == [sweep.name for sweep in sweeps]
-    for index, each in enumerate(found):
+    stream = list(detect_stream(iter(sweeps), detector))
+    assert [each.sweep.name for each in stream] == [sweep.name for sweep in sweeps]
+    for index, each in enumerate(stream):
         window = sweeps[max(0, index - 1) : index + 1][::-1]
         points, num_close = fuse_sweeps(window, TINY, config.reading)
         cloud = make_cloud(points, config, sensor=TINY, num_close=num_close)
@@ -48,15 +48,15 @@ def test_a_window_of_sweeps_moves_along_and_is_compiled_once(detector):
     assert _split_detect(detector.model, make_mesh(jax.local_devices()[:1]), 1)._cache_size() == 1
 
 
-def test_a_window_of_one_sweep_forgets_the_others(detector):
+def test_a_window_of_one_sweep_ignores_earlier_sweeps(detector):
     reading = dataclasses.replace(detector.config.reading, num_sweeps=1)
-    several = list(detect_stream(drive(3), detector, reading=reading))
-    for each, sweep in zip(several, drive(3), strict=True):
-        [alone] = detect_stream([sweep], detector)
-        assert bits(each.detections) == bits(alone.detections)
+    stream = list(detect_stream(drive(3), detector, reading=reading))
+    for each, sweep in zip(stream, drive(3), strict=True):
+        [single] = detect_stream([sweep], detector)
+        assert bits(each.detections) == bits(single.detections)
 
 
-def test_sweeps_between_are_fused_where_only_some_are_detected_in(detector):
+def test_skipped_sweeps_are_fused_into_later_ones(detector):
     sweeps = list(drive(5))
     whole, at = list(detect_stream(sweeps, detector)), {sweeps[2].time_us, sweeps[3].time_us}
     some = list(detect_stream(sweeps, detector, at_us=at))
@@ -65,30 +65,30 @@ def test_sweeps_between_are_fused_where_only_some_are_detected_in(detector):
         assert bits((each.cloud.points, each.detections)) == bits((expected.cloud.points, expected.detections))
 
 
-def test_sweeps_of_other_axes_are_turned_and_boxes_back(detector):
-    """The same drive with x ahead and y to the left instead of y ahead and x to the right."""
+def test_sweeps_are_rotated_and_boxes_rotated_back(detector):
+    """The same drive with x forward and y to the left instead of y forward and x to the right."""
     turn = np.diag([0.0, 0, 1, 1])
     turn[0, 1], turn[1, 0] = 1, -1
     other = [
         dataclasses.replace(s, points=turned(s.points, turn), sensor_to_world=s.sensor_to_world @ turn.T)
         for s in drive(3)
     ]
-    here, there = list(detect_stream(drive(3), detector)), list(detect_stream(other, detector, yaw_rad=np.pi / 2))
-    for one, two, given in zip(here, there, other, strict=True):
-        assert two.sweep is given
-        found = one.detections
-        np.testing.assert_array_equal(two.detections.valid, found.valid)
-        np.testing.assert_allclose(two.detections.scores, found.scores, atol=1e-4)
-        centres, velocities = np.asarray(found.boxes)[:, :3], np.asarray(found.boxes)[:, 7:9]
-        np.testing.assert_allclose(two.detections.boxes[:, :3], centres @ turn[:3, :3].T, atol=1e-3)
-        np.testing.assert_allclose(two.detections.boxes[:, 7:9], velocities @ turn[:2, :2].T, atol=1e-3)
-        late = np.asarray(two.detections.boxes[:, 6] - found.boxes[:, 6])[np.asarray(found.valid)]
-        np.testing.assert_allclose(np.exp(1j * late), np.exp(-0.5j * np.pi), atol=1e-3)
-        assert found.valid.any()
+    plain, rotated = detect_stream(drive(3), detector), detect_stream(other, detector, yaw_rad=np.pi / 2)
+    for one, two, sweep in zip(plain, rotated, other, strict=True):
+        assert two.sweep is sweep
+        expected, detections = one.detections, two.detections
+        np.testing.assert_array_equal(detections.valid, expected.valid)
+        np.testing.assert_allclose(detections.scores, expected.scores, atol=1e-4)
+        centres, velocities = np.asarray(expected.boxes)[:, :3], np.asarray(expected.boxes)[:, 7:9]
+        np.testing.assert_allclose(detections.boxes[:, :3], centres @ turn[:3, :3].T, atol=1e-3)
+        np.testing.assert_allclose(detections.boxes[:, 7:9], velocities @ turn[:2, :2].T, atol=1e-3)
+        angle = np.asarray(detections.boxes[:, 6] - expected.boxes[:, 6])[np.asarray(expected.valid)]
+        np.testing.assert_allclose(np.exp(1j * angle), np.exp(-0.5j * np.pi), atol=1e-3)
+        assert expected.valid.any()
 
 
-def test_turned_sweeps_lose_the_same_points_as_a_list_of_them_does(tmp_path):
-    """Those near the sensor, which is not where the frame begins."""
+def test_close_points_of_rotated_sweeps_are_removed_as_from_a_list_of_sweeps(tmp_path):
+    """The sensor is not at the origin of its frame."""
     yaw, sensor = 0.8, dataclasses.replace(TINY, origin_m=(1.0, -0.5, 0.2))
     config = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
     config = dataclasses.replace(config, projection=dataclasses.replace(config.projection, remove_close="all"))
@@ -118,16 +118,16 @@ def turned(points, turn):
     return points
 
 
-def test_boxes_come_before_the_next_sweep_is_asked_for(detector):
+def test_boxes_are_returned_before_the_next_sweep_is_requested(detector):
     def only_one():
         yield next(drive(1))
-        raise AssertionError("asked for a second sweep")
+        raise AssertionError("requested a second sweep")
 
     assert next(detect_stream(only_one(), detector)).sweep.name == "sweep 0"
 
 
 @pytest.mark.parametrize("time_us", [0, -1])
-def test_time_must_go_on(detector, time_us):
+def test_times_must_increase(detector, time_us):
     first = next(drive(1))
     second = dataclasses.replace(first, time_us=time_us, name="late")
     with refused("late: time: got", f"{time_us} us", "sweep 0"):

@@ -1,4 +1,4 @@
-"""Tracks: the identities of objects whose motion is known."""
+"""Tracks of objects with known motion."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 
 
 def objects(seed, number=60):
-    """Boxes of three classes, some of which move up to 15 m/s, at least 3 m apart at the start."""
+    """Boxes of three classes, initially at least 3 m apart; some move at up to 15 m/s per axis."""
     rng = np.random.default_rng(seed)
     boxes = np.zeros((number, 9))
     boxes[:, :2] = np.stack(np.meshgrid(np.arange(10.0), np.arange(6.0)), -1).reshape(-1, 2)[:number] * 3
@@ -23,7 +23,7 @@ def moved(boxes, dt):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_without_noise_every_object_keeps_its_identity_in_any_order(seed):
+def test_without_noise_every_object_keeps_its_track(seed):
     boxes, labels, scores = objects(seed)
     rng, tracks, expected = np.random.default_rng(seed), Tracks(), None
     for _ in range(12):
@@ -36,8 +36,8 @@ def test_without_noise_every_object_keeps_its_identity_in_any_order(seed):
     assert sorted(expected) == list(range(60))
 
 
-def test_the_order_of_noisy_boxes_changes_nothing():
-    """Not even among boxes of the same place, class and score."""
+def test_the_order_of_noisy_boxes_does_not_matter():
+    """Not even for two boxes with the same place, class and score."""
     boxes, labels, scores = objects(3)
     rng = np.random.default_rng(0)
     boxes[1], labels[1], scores[:2] = boxes[0], labels[0], 0.5
@@ -54,34 +54,29 @@ def test_the_order_of_noisy_boxes_changes_nothing():
         assert len(set(ids.tolist())) == len(ids)
 
 
-def test_a_hidden_object_comes_back_under_its_name_and_a_lost_one_under_another():
+@pytest.mark.parametrize(("hidden", "track_id"), [(3, 0), (4, 1)])
+def test_a_track_survives_a_short_occlusion(hidden, track_id):
     box, label, score = np.array([[0.0, 0, 0, 4, 2, 1, 0, 10, 0]]), np.zeros(1, int), np.ones(1)
-    none = np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)
-    for hidden, name in ((3, 0), (4, 1)):
-        tracks, _ = track(Tracks(), box, label, score, 0)
-        for _ in range(hidden):
-            tracks, ids = track(tracks, *none, 0.5)
-            assert ids.shape == (0,)
-        _, ids = track(tracks, moved(box, 0.5 * (hidden + 1)), label, score, 0.5)
-        assert ids.tolist() == [name]
-
-
-@pytest.mark.parametrize(("gap", "name"), [(2.0, 0), (2.04, 0), (2.1, 1), (100.0, 1)])
-def test_a_gap_in_the_recording_ends_tracks_too(gap, name):
-    box, label, score = np.array([[0.0, 0, 0, 4, 2, 1, 0, 0, 0]]), np.zeros(1, int), np.ones(1)
     tracks, _ = track(Tracks(), box, label, score, 0)
-    assert track(tracks, box, label, score, gap)[1].tolist() == [name]
+    for _ in range(hidden):
+        tracks, ids = track(tracks, np.zeros((0, 9)), np.zeros(0, int), np.zeros(0), 0.5)
+        assert ids.shape == (0,)
+    _, ids = track(tracks, moved(box, 0.5 * (hidden + 1)), label, score, 0.5)
+    assert ids.tolist() == [track_id]
 
 
-@pytest.mark.parametrize(("shift", "other", "name"), [(1.9, 0, 0), (2.1, 0, 1), (0, 1, 1)])
-def test_near_boxes_of_the_same_class_are_the_same_object(shift, other, name):
+@pytest.mark.parametrize(
+    ("dt", "shift", "label", "track_id"),
+    [(2.04, 0, 0, 0), (2.1, 0, 0, 1), (100, 0, 0, 1), (0.5, 1.9, 0, 0), (0.5, 2.1, 0, 1), (0.5, 0, 1, 1)],
+)
+def test_a_track_continues_with_near_boxes_of_its_class_after_a_short_time(dt, shift, label, track_id):
     box = np.array([[0.0, 0, 0, 4, 2, 1, 0, np.nan, np.nan]])
     tracks, _ = track(Tracks(), box, np.zeros(1, int), np.ones(1), 0)
     box[0, 0] += shift
-    assert track(tracks, box, np.full(1, other), np.ones(1), 0.5)[1].tolist() == [name]
+    assert track(tracks, box, np.full(1, label), np.ones(1), dt)[1].tolist() == [track_id]
 
 
-def test_boxes_in_the_world_have_their_corners_and_velocities_turned():
+def test_positions_headings_and_velocities_are_transformed_to_the_world():
     rng, angle = np.random.default_rng(0), 0.7
     boxes = rng.normal(0, 10, (20, 9))
     pose = np.eye(4)

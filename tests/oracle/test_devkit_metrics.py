@@ -1,4 +1,4 @@
-"""Every number of ``metrics_summary.json`` against the official devkit's, on random data sets."""
+"""Every number of ``metrics_summary.json`` equals the official devkit's, on random data sets."""
 
 import json
 
@@ -37,7 +37,7 @@ def assert_equal(ours, theirs):
 
 
 def summaries(root, results, tmp_path, version=VERSION, split=SPLIT):
-    """Of the command and of the devkit."""
+    """Summaries of our command and of the devkit."""
     official = NuScenesDevkit(version, str(root), verbose=False)
     theirs = devkit_summary(official, results, split, tmp_path / "official")
     place = DataOptions(data_root=root, version=version)
@@ -46,7 +46,7 @@ def summaries(root, results, tmp_path, version=VERSION, split=SPLIT):
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: "-".join(f"{k}={v}" for k, v in task.items()))
-def test_every_number_is_the_official_one(task, tmp_path):
+def test_every_number_equals_the_devkits(task, tmp_path):
     tables, results = make_task(**task)
     root = write_task(tmp_path / "root", tables, results)
     ours, theirs = summaries(root, root / "results.json", tmp_path)
@@ -54,7 +54,7 @@ def test_every_number_is_the_official_one(task, tmp_path):
     assert_equal(evaluate_detections(results, truth_of(tables)), theirs)
 
 
-def test_an_attribute_of_another_class_is_a_wrong_one_as_in_the_official_evaluation(tmp_path):
+def test_an_attribute_of_another_class_counts_as_wrong_as_in_the_devkit(tmp_path):
     tables, results = make_task(seed=40)
     boxes = [box for found in results["results"].values() for box in found]
     rng = np.random.default_rng(0)
@@ -65,8 +65,8 @@ def test_an_attribute_of_another_class_is_a_wrong_one_as_in_the_official_evaluat
 
 
 @pytest.mark.real_data
-def test_every_number_is_the_official_one_on_a_real_scene(real_data, tmp_path):
-    """The real annotations, moved and turned at random, as detections."""
+def test_every_number_equals_the_devkits_on_a_real_scene(real_data, tmp_path):
+    """The detections are real annotations with random offsets and rotations."""
     root, version, split = real_data / "nuscenes_scene0523", "v1.0-scene0523", "scene0523"
     data, rng, results = NuScenes(root, version), np.random.default_rng(0), {}
     for token in data.split(split):

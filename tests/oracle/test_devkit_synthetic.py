@@ -1,4 +1,4 @@
-"""Synthetic data sets in the official devkit's hands: tables, fused sweeps, evaluation."""
+"""The official devkit reads synthetic data sets: tables, fused sweeps, evaluation."""
 
 import itertools
 import json
@@ -46,7 +46,7 @@ def test_the_devkit_loads_every_table(official):
 
 
 def test_fused_sweeps_equal_the_devkits(root, official):
-    """``from_file_multisweep`` drops close points of every sweep and keeps the ring where we keep the lag."""
+    """``from_file_multisweep`` removes close points of every sweep, and keeps the ring instead of the lag."""
     from nuscenes.utils.data_classes import LidarPointCloud
 
     data = NuScenes(root, VERSION)
@@ -73,13 +73,13 @@ def test_boxes_equal_the_devkits(root, official):
 
 
 def test_the_devkit_evaluates_on_the_splits_of_its_own_file(root, official, tmp_path):
-    """The truth of the split as its own detections, a little off, has the scores that it must have."""
+    """Truth with an offset of 0.1 m, as detections, has the expected scores."""
     data, results = NuScenes(root, VERSION), {}
     for sample in data.split("val"):
         results[sample] = []
         for token in data.boxes(sample).tokens:
             row = official.get("sample_annotation", token)
-            if row["num_lidar_pts"] == 0:  # is no truth to the devkit
+            if row["num_lidar_pts"] == 0:  # not evaluated by the devkit
                 continue
             x, y, z = row["translation"]
             box = {"sample_token": sample, "translation": [x + 0.1, y, z], "detection_score": 0.5}

@@ -1,12 +1,12 @@
-"""A run in a folder: what it leaves there, how it is stopped and resumed, and what it refuses."""
+"""Runs: the files they write, how they stop and resume, and what they refuse."""
 
+import copy
 import dataclasses
 import functools
 import json
 import os
 import shutil
 import signal
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,10 +16,10 @@ from commands import run_python
 from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 
 from fcos_lidar_jax.checkpoints import load_checkpoint
-from fcos_lidar_jax.checkpoints.storage import CheckpointError, load_state
+from fcos_lidar_jax.checkpoints.storage import load_state
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
-from fcos_lidar_jax.data.frame import InMemoryFrames
+from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.input_pipeline.database import prepare_database
@@ -31,48 +31,75 @@ from fcos_lidar_jax.types import Batch, PackedBatch
 
 @pytest.fixture(scope="module", autouse=True)
 def traces():
-    """All runs of this module share one step; how often it was traced."""
-    found, made = [], {}
+    """All runs of this module share one step; the list grows with each trace of it."""
+    traces, made = [], {}
     with pytest.MonkeyPatch.context() as patch:
         make_train_step = runs.make_train_step
 
         def shared_step(*args):
             step = make_train_step(*args)
 
-            @functools.wraps(step)  # its name is part of the compiled program's, which other processes share
+            @functools.wraps(step)  # keeps the name of the compiled program, which other processes share
             def counted(state, batch):
-                found.append(1)
+                traces.append(1)
                 return step(state, batch)
 
             return made.setdefault("step", counted)
 
         patch.setattr(runs, "make_train_step", shared_step)
-        yield found
+        yield traces
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, traces):
-    """A run that was left alone: its folder, its last state, and how often its step was traced."""
+    """An uninterrupted run: its folder, its last state, and the number of traces of its step."""
     folder = tmp_path_factory.mktemp("finished") / "run"
     state = train_tiny(folder, evaluate=2, tests=TESTS, weights=weights())
     return folder, state, len(traces)
 
 
-def test_weights_of_another_coding_are_told(finished, tmp_path, capsys):
-    model = dataclasses.replace(CONFIG.model, regression_axes="ray")
-    for config in (CONFIG, dataclasses.replace(CONFIG, model=model)):
-        train_tiny(tmp_path / config.model.regression_axes, config=config, steps=1, weights=finished[0])
-    (told,) = [line for line in capsys.readouterr().err.splitlines() if "weights of" in line]
-    assert told.endswith("weights of model.regression_axes 'lidar', to be trained with 'ray'")
+@pytest.fixture
+def begun(finished, tmp_path) -> Path:
+    """A folder that only holds the specification of the run."""
+    folder = tmp_path / "begun"
+    folder.mkdir()
+    shutil.copy(finished[0] / "run.json", folder)
+    return folder
 
 
-def test_the_step_is_compiled_once(finished):
+def losses(folder: Path) -> list[float]:
+    return [line["loss/total"] for line in read_metrics(folder) if "loss/total" in line]
+
+
+def scores(folder: Path) -> dict[int, float]:
+    return {line["step"]: line["test/mAP"] for line in read_metrics(folder) if "test/mAP" in line}
+
+
+def checkpoint_names(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "checkpoints").iterdir())
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_step_is_compiled_once(finished):
     _, state, traces = finished
     assert int(state.step) == STEPS
     assert traces == 1
 
 
-def test_all_that_is_promised_is_recorded(finished):
+def test_initial_weights_of_another_coding_are_reported(finished, tmp_path, capsys):
+    model = dataclasses.replace(CONFIG.model, regression_axes="ray")
+    for config in (CONFIG, dataclasses.replace(CONFIG, model=model)):
+        train_tiny(tmp_path / config.model.regression_axes, config=config, steps=1, weights=finished[0])
+    lines = capsys.readouterr().err.splitlines()
+    (line,) = [line for line in lines if "weights of" in line]
+    assert line.endswith("weights of model.regression_axes 'lidar', to be trained with 'ray'")
+    assert not any(line.startswith("warning: ") for line in lines)
+
+
+def test_all_documented_metrics_are_recorded(finished):
     lines = read_metrics(finished[0])
     steps = [line for line in lines if "loss/total" in line]
     tests = [line for line in lines if "test/mAP" in line]
@@ -81,8 +108,8 @@ def test_all_that_is_promised_is_recorded(finished):
     parts = ("classification", "l1", "iou", "iou_prediction")
     counts = {"truncated_points", "truncated_boxes", "invalid_points", "pasted_objects", "dropped_points"}
     for line in steps:
-        weighed = sum(getattr(CONFIG.loss, f"{part}_weight") * line[f"loss/{part}"] for part in parts)
-        assert line["loss/total"] == pytest.approx(weighed, rel=1e-5)
+        weighted = sum(getattr(CONFIG.loss, f"{part}_weight") * line[f"loss/{part}"] for part in parts)
+        assert line["loss/total"] == pytest.approx(weighted, rel=1e-5)
         assert sum(line["positives_per_level"]) == line["positives"] > 0
         assert line["unique_positives"] <= line["positives"]
         assert line["mean_k"] == pytest.approx(line["positives"] / line["owned_boxes"])
@@ -92,7 +119,7 @@ def test_all_that_is_promised_is_recorded(finished):
         assert 0 <= line["waiting_seconds"] <= line["seconds"]
         assert counts <= line.keys()
     peak = CONFIG.optimizer.peak_learning_rate
-    # Four steps: the first at a tenth of the peak, the second at the peak.
+    # The first of four steps is at a tenth of the peak, the second at the peak.
     np.testing.assert_allclose([line["learning_rate"] for line in steps[:2]], [peak / 10, peak], rtol=1e-5)
     np.testing.assert_allclose([line["b1"] for line in steps[:2]], [0.95, 0.85], rtol=1e-5)
     for line in tests:
@@ -105,10 +132,9 @@ def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished
     folder, state, _ = finished
     names = ".lock run.json metrics.jsonl tensorboard checkpoints pictures loss.png scores.png"
     assert {path.name for path in folder.iterdir()} == set(names.split())
-    scores = {line["step"]: line["test/mAP"] for line in read_metrics(folder) if "test/mAP" in line}
-    best = max(scores, key=lambda step: (scores[step], step))
-    kept = sorted(path.name for path in (folder / "checkpoints").iterdir())
-    assert kept == [f"{step:08d}" for step in sorted({3, 4, best})]
+    maps = scores(folder)
+    best = max(maps, key=lambda step: (maps[step], step))
+    assert checkpoint_names(folder) == [f"{step:08d}" for step in sorted({3, 4, best})]
     frames = [f"step_{step:06d}_frame_{index}.png" for step in (2, 4) for index in (0, 1)]
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == frames
     for picture in folder.rglob("*.png"):
@@ -117,23 +143,22 @@ def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished
     spec = json.loads((folder / "run.json").read_text())
     assert (spec["data"], spec["frames"], spec["steps"]) == (FRAMES.fingerprint(), 12, STEPS)
     assert json.loads(last.data) == {name: spec[name] for name in ("data", "frames", "weights")}
-    assert (last.step, last.score) == (4, read_metrics(folder)[-1]["test/mAP"])
-    # Detection gets the running mean of the weights.
+    assert (last.step, last.score) == (4, maps[4])
+    # The running mean of the weights is used for detection.
     assert bits(last.variables) == bits({"params": state.ema, "batch_stats": state.batch_stats})
     assert bits(load_state(folder / "checkpoints" / "00000004", state)) == bits(state)
 
 
-def test_a_finished_run_says_so_and_nothing_changes(finished, capsys):
+def test_resuming_a_finished_run_changes_nothing(finished, capsys):
     folder, state, _ = finished
-    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    again = train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
-    assert bits(again) == bits(state)
-    assert "the run has done all of its 4 steps" in capsys.readouterr().err
-    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+    before = contents(folder)
+    assert bits(train_tiny(folder, evaluate=2, tests=TESTS, resume=True)) == bits(state)
+    assert "the run is complete, with 4 steps" in capsys.readouterr().err
+    assert contents(folder) == before
 
 
 def disturb(monkeypatch, at: int, how) -> None:
-    """Something happens while the run takes one of its batches, which may have been made long before."""
+    """Call a function when the run takes one of its batches, which may have been made long before."""
     first = 0
 
     def make_batches(*args, first_step, **kwargs):
@@ -151,21 +176,19 @@ def disturb(monkeypatch, at: int, how) -> None:
 
 
 def signalled(number: int):
-    def ask(host):
+    def send(host):
         os.kill(os.getpid(), number)
         return host
 
-    return ask
+    return send
 
 
-def broken(host):
-    points = host.batch.points.at[1, :, 3].set(3e38)  # finite, until the network adds it up
+def overflowing(host):
+    points = host.batch.points.at[1, :, 3].set(3e38)  # finite, until the network sums it
     return dataclasses.replace(host, batch=dataclasses.replace(host.batch, points=points))
 
 
-def test_stopped_failed_and_resumed_it_ends_where_the_run_left_alone_ended(
-    finished, tmp_path, capsys, monkeypatch
-):
+def test_a_run_that_stops_fails_and_resumes_is_bit_identical(finished, tmp_path, capsys, monkeypatch):
     whole, state, _ = finished
     folder = tmp_path / "run"
 
@@ -176,65 +199,55 @@ def test_stopped_failed_and_resumed_it_ends_where_the_run_left_alone_ended(
     with pytest.raises(KeyboardInterrupt):
         train(0, signalled(signal.SIGINT), weights=weights())
     assert "stopped after step 1, which is saved" in capsys.readouterr().err
-    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["00000001"]
+    assert checkpoint_names(folder) == ["00000001"]
     with pytest.raises(SystemExit) as stopped:
         train(2, signalled(signal.SIGTERM), resume=True)
     assert stopped.value.code == 143
-    newest = folder / "checkpoints" / "00000003"
-    (newest / "checkpoint.json").write_text((newest / "checkpoint.json").read_text()[:-9])
+    newest = folder / "checkpoints" / "00000003" / "checkpoint.json"
+    newest.write_text(newest.read_text()[:-9])
     message = r"^step 3: not finite: .*; samples: seed \d+, seed \d+; the last checkpoint is .*/0000000[23]$"
     with pytest.raises(NonFiniteLossError, match=message):
-        train(2, broken, resume=True)
+        train(2, overflowing, resume=True)
     assert "going back to the checkpoint before" in capsys.readouterr().err
     assert bits(train(-1, None, resume=True)) == bits(state)
-    timed = ("seconds", "waiting_seconds", "samples_per_second")
-    wanted, found = (
-        [{k: v for k, v in line.items() if k not in timed} for line in read_metrics(run)]
-        for run in (whole, folder)
+    times = {"seconds", "waiting_seconds", "samples_per_second"}
+    resumed, uninterrupted = (
+        [{name: line[name] for name in line.keys() - times} for line in read_metrics(run)]
+        for run in (folder, whole)
     )
-    assert found == wanted
+    assert resumed == uninterrupted
 
 
-def test_with_packed_batches_it_ends_in_the_same_bits(finished, tmp_path, monkeypatch):
-    whole, state, _ = finished
-    fed = []
+def test_a_run_with_packed_batches_is_bit_identical(finished, tmp_path, monkeypatch):
+    kinds = []
 
     @contextmanager
-    def seen(batches, mesh):
+    def noted(batches, mesh):
         with feed(batches, mesh) as stream:
-            yield (fed.append(type(host.batch)) or host for host in stream)
+            yield (kinds.append(type(host.batch)) or host for host in stream)
 
-    monkeypatch.setattr(runs, "feed", seen)
+    monkeypatch.setattr(runs, "feed", noted)
     packed = train_tiny(tmp_path / "packed", weights=weights(), packing=True)
-    assert fed == [PackedBatch] * STEPS
-    assert bits(packed) == bits(state)
-    wanted, found = (
-        [line["loss/total"] for line in read_metrics(f) if "loss/total" in line]
-        for f in (whole, tmp_path / "packed")
-    )
-    assert found == wanted
+    assert kinds == [PackedBatch] * STEPS
+    assert bits(packed) == bits(finished[1])
+    assert losses(tmp_path / "packed") == losses(finished[0])
     train_tiny(tmp_path / "plain", weights=weights(), steps=1)
-    assert fed[STEPS:] == [Batch]  # to a CPU, where nobody says
+    assert kinds[STEPS:] == [Batch]  # the default for CPUs
 
 
-def test_processes_of_other_data_or_packing_are_refused_before_there_is_a_run(tmp_path, monkeypatch):
+def test_processes_with_other_data_or_packing_are_refused_before_the_run_starts(tmp_path, monkeypatch):
     def refuse(checksum, what):
-        found.append(checksum)
-        raise ValueError(f"process 1: {what}: got another")
+        checksums.append(checksum)
+        raise ValueError(f"process 1: {what}")
 
-    found = []
+    checksums = []
     monkeypatch.setattr(runs, "check_same", refuse)
-    others = (
-        {"frames": InMemoryFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)},
-        {"packing": True},
-        {},
-        {},
-    )
-    for other in others:
-        with pytest.raises(ValueError, match=r"^process 1: configuration, data or packing: got another$"):
-            train_tiny(tmp_path / "run", **other)
-    assert len(set(found)) == 3
-    assert found[2] == found[3]
+    one_frame = {"frames": InMemoryFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)}
+    for options in (one_frame, {"packing": True}, {}, {}):
+        with pytest.raises(ValueError, match=r"^process 1: configuration, data or packing$"):
+            train_tiny(tmp_path / "run", **options)
+    assert len(set(checksums)) == 3
+    assert checksums[2] == checksums[3]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -247,23 +260,18 @@ train_tiny(sys.argv[1], weights=weights())
 """
 
 
-def test_killed_in_a_save_and_resumed_it_ends_in_the_same_bits(finished, tmp_path):
+def test_a_run_that_is_killed_while_saving_resumes_bit_identical(finished, tmp_path):
     killed = run_python("-c", KILLED, tmp_path)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
-    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
-    assert [name[:9] for name in names] == [".00000003", "00000001", "00000002"]
+    assert [name[:9] for name in checkpoint_names(tmp_path)] == [".00000003", "00000001", "00000002"]
     assert bits(train_tiny(tmp_path, resume=True)) == bits(finished[1])
-    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["00000003", "00000004"]
+    assert checkpoint_names(tmp_path) == ["00000003", "00000004"]
 
 
-def test_killed_before_its_first_checkpoint_it_begins_with_the_given_weights(finished, begun):
+def test_a_run_that_is_killed_before_its_first_checkpoint_resumes_with_the_initial_weights(finished, begun):
     assert bits(train_tiny(begun, evaluate=2, tests=TESTS, resume=True, weights=weights())) == bits(finished[1])
-    whole, resumed = (
-        [(line["step"], "test/mAP" in line) for line in read_metrics(f)] for f in (finished[0], begun)
-    )
-    assert resumed == whole  # the given weights are not evaluated
-    whole, resumed = (sorted(p.name for p in (f / "checkpoints").iterdir()) for f in (finished[0], begun))
-    assert resumed == whole
+    assert scores(begun) == scores(finished[0])  # the initial weights are not evaluated
+    assert checkpoint_names(begun) == checkpoint_names(finished[0])
 
 
 FULL = """
@@ -277,20 +285,19 @@ sys.exit(exit_code("program", lambda: train_tiny(sys.argv[1], weights=weights(),
 """
 
 
-def test_a_full_disk_is_one_line_and_loses_no_checkpoint(finished, tmp_path):
-    """Writes beyond a file size fail, as they do where there is no room, from the third checkpoint on."""
+def test_a_full_disk_is_reported_in_one_line_and_loses_no_checkpoint(finished, tmp_path):
+    """A limit of the file size, from the third checkpoint on, fails as a full disk does."""
     done = run_python("-c", FULL, tmp_path)
     lines = [line for line in done.stderr.splitlines() if not line.startswith(("compiling ", "steps "))]
     lines = [line for line in lines if "cpu_aot_loader.cc" not in line]  # jaxlib 0.10.1 about its own cache
     refused = tmp_path / "checkpoints" / "00000003"
     assert (done.returncode, lines) == (1, [f"program: error: {refused}: cannot be written: File too large"])
-    kept = sorted(refused.parent.iterdir())
-    assert [path.name for path in kept] == ["00000001", "00000002"]
-    assert [load_checkpoint(path).step for path in kept] == [1, 2]
+    assert checkpoint_names(tmp_path) == ["00000001", "00000002"]
+    assert [load_checkpoint(path).step for path in sorted(refused.parent.iterdir())] == [1, 2]
 
 
-def test_without_a_mean_ap_a_checkpoint_is_saved_without_a_score(tmp_path, capsys):
-    """Test frames without boxes: the mean over no class is not a number."""
+def test_a_checkpoint_without_a_mean_ap_is_saved_without_a_score(tmp_path, capsys):
+    """The test frames have no boxes, so the mean over classes is NaN."""
     none = np.zeros(0, np.int32)
     bare = dataclasses.replace(TESTS.frame(0), boxes=np.zeros((0, 9), np.float32), labels=none, num_points=none)
     tests = InMemoryFrames((bare,), TESTS.sensor, NUSCENES_CLASSES)
@@ -299,16 +306,7 @@ def test_without_a_mean_ap_a_checkpoint_is_saved_without_a_score(tmp_path, capsy
     assert load_checkpoint(tmp_path / "checkpoints" / "00000001").score is None
     records = read_metrics(tmp_path)
     train_tiny(tmp_path, steps=1, evaluate=1, tests=tests, resume=True, weights=weights())
-    assert len(read_metrics(tmp_path)) == len(records)  # it is not evaluated once more
-
-
-@pytest.fixture
-def begun(finished, tmp_path) -> Path:
-    """A folder with the spec of the run alone."""
-    folder = tmp_path / "begun"
-    folder.mkdir()
-    shutil.copy(finished[0] / "run.json", folder)
-    return folder
+    assert len(read_metrics(tmp_path)) == len(records)  # it is not evaluated again
 
 
 @pytest.mark.parametrize(
@@ -323,7 +321,7 @@ def begun(finished, tmp_path) -> Path:
         (lambda spec: spec.update(data="other frames"), "data: was 'other frames', got "),
     ],
 )
-def test_another_specification_is_refused_and_the_field_is_named(begun, change, message):
+def test_a_different_specification_is_refused_and_the_field_named(begun, change, message):
     spec = json.loads((begun / "run.json").read_text())
     change(spec)
     (begun / "run.json").write_text(json.dumps(spec))
@@ -332,12 +330,10 @@ def test_another_specification_is_refused_and_the_field_is_named(begun, change, 
     assert [path.name for path in begun.iterdir()] == ["run.json"]
 
 
-def test_an_older_run_is_compared_by_what_it_has(begun):
+def test_fields_that_an_older_run_lacks_are_not_compared(begun):
     spec = json.loads((begun / "run.json").read_text())
-    older = {name: value for name, value in spec.items() if name != "ground_truth_database"}
-    older["config"] = spec["config"] | {
-        "model": {k: v for k, v in spec["config"]["model"].items() if k != "remat"}
-    }
+    older = copy.deepcopy(spec)
+    del older["ground_truth_database"], older["config"]["model"]["remat"]
     (begun / "run.json").write_text(json.dumps(older))
     spec["ground_truth_database"] = "any"
     assert runs.check_run(begun, spec, resume=True) == ["ground_truth_database"]
@@ -345,8 +341,7 @@ def test_an_older_run_is_compared_by_what_it_has(begun):
         runs.check_run(begun, spec | {"objects": "x"}, resume=True)
 
 
-def test_another_ground_truth_database_is_refused(begun, tmp_path):
-    """Cut from the same frames, and yet of other objects."""
+def test_a_different_ground_truth_database_of_the_same_frames_is_refused(begun, tmp_path):
     config = dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())
     first, other = (prepare_database(FRAMES, tmp_path / str(n), min_points=n) for n in (5, 6))
     assert first.manifest.source == other.manifest.source
@@ -358,26 +353,7 @@ def test_another_ground_truth_database_is_refused(begun, tmp_path):
         train_tiny(begun, resume=True, config=config, objects=other)
 
 
-def test_frames_whose_boxes_have_no_point_are_refused(tmp_path):
-    frames = [FRAMES.frame(index) for index in range(3)]
-    empty = tuple(dataclasses.replace(frame, num_points=0 * frame.num_points) for frame in frames)
-    with pytest.raises(ValueError, match=r"^frame 'frame 0': box 0: got 0 points, as for all boxes of 3 frames"):
-        train_tiny(tmp_path / "run", frames=InMemoryFrames(empty, FRAMES.sensor, FRAMES.classes))
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_first_frame_that_cannot_be_read_leaves_no_run(tmp_path):
-    class Broken(InMemoryFrames):
-        def frame(self, index):
-            raise ValueError("clouds/0.npy: empty file")
-
-    frames = Broken((FRAMES.frame(0),), FRAMES.sensor, FRAMES.classes)
-    with pytest.raises(ValueError, match=r"clouds/0.npy: empty file"):
-        train_tiny(tmp_path / "run", frames=frames)
-    assert not (tmp_path / "run").exists()
-
-
-def test_what_is_no_run_or_another_one_is_refused(begun, tmp_path):
+def test_a_folder_with_another_run_or_none_is_refused(begun, tmp_path):
     with pytest.raises(ValueError, match="holds a run, expected --resume or another folder"):
         train_tiny(begun)
     with pytest.raises(ValueError, match=r"run.json: found nothing, expected the run to resume"):
@@ -391,46 +367,54 @@ def test_what_is_no_run_or_another_one_is_refused(begun, tmp_path):
         train_tiny(tmp_path / "file")
 
 
-def test_what_was_done_before_an_evaluation_survives_it(finished, tmp_path, monkeypatch):
-    """Killed in the evaluation after step 2: that step is saved, and evaluated when the run is resumed."""
-    folder, evaluate = tmp_path / "run", runs._evaluate
+def test_a_run_that_is_killed_during_an_evaluation_repeats_it_on_resume(finished, tmp_path, monkeypatch):
+    folder, evaluate, evaluated = tmp_path / "run", runs._evaluate, []
 
     def killed(*_):
         raise SystemExit(137)
-
-    monkeypatch.setattr(runs, "_evaluate", killed)
-    with pytest.raises(SystemExit):
-        train_tiny(folder, evaluate=2, tests=TESTS, weights=weights())
-    saved = max((folder / "checkpoints").iterdir())
-    assert saved.name == "00000002"
-    assert load_checkpoint(saved).score is None
-    evaluated = []
 
     def noted(run, number, *rest):
         evaluated.append(number)
         return evaluate(run, number, *rest)
 
+    monkeypatch.setattr(runs, "_evaluate", killed)
+    with pytest.raises(SystemExit):
+        train_tiny(folder, evaluate=2, tests=TESTS, weights=weights())
+    assert checkpoint_names(folder)[-1] == "00000002"
+    assert load_checkpoint(folder / "checkpoints" / "00000002").score is None
     monkeypatch.setattr(runs, "_evaluate", noted)
-    state = train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
-    assert evaluated == list(range(2, STEPS + 1, 2))
-    assert bits(state) == bits(finished[1])
-    resumed, whole = ([r["test/mAP"] for r in read_metrics(f) if "test/mAP" in r] for f in (folder, finished[0]))
-    assert resumed == whole
-    last = max((folder / "checkpoints").iterdir())
-    description = json.loads((last / "checkpoint.json").read_text())
-    assert description["score"] == load_checkpoint(last).score is not None
-    train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
-    assert evaluated == list(range(2, STEPS + 1, 2))  # a finished run owes nothing
-
-
-def test_killed_before_an_evaluation_is_recorded_it_is_recorded_once(finished, tmp_path):
-    folder = shutil.copytree(finished[0], tmp_path / "run")
-    whole = read_metrics(folder)
+    assert bits(train_tiny(folder, evaluate=2, tests=TESTS, resume=True)) == bits(finished[1])
+    assert evaluated == [2, 4]
+    assert scores(folder) == scores(finished[0])
+    assert load_checkpoint(folder / "checkpoints" / "00000004").score == scores(folder)[4]
+    # Killed after the last evaluation and before its record.
+    records = read_metrics(folder)
     *kept, last = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
     assert "test/mAP" in last
     (folder / "metrics.jsonl").write_text("".join(kept))
-    train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
-    assert read_metrics(folder) == whole
+    for _ in range(2):  # the second time, nothing is left to do
+        train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+        assert evaluated == [2, 4, 4]
+        assert read_metrics(folder) == records
+
+
+def test_single_sweeps_are_reported_if_several_are_configured(tmp_path, capsys):
+    train_tiny(tmp_path / "run", config=dataclasses.replace(CONFIG, num_sweeps=3), steps=1)
+    assert "warning: num_sweeps: got 3, but the frames hold one sweep each: expected 1" in capsys.readouterr().err
+
+
+class UnreadableFrames(InMemoryFrames):
+    def frame(self, index):
+        raise ValueError("clouds/0.npy: empty file")
+
+
+def without_points(index: int) -> Frame:
+    frame = FRAMES.frame(index)
+    return dataclasses.replace(frame, num_points=0 * frame.num_points)
+
+
+UNREADABLE = UnreadableFrames((FRAMES.frame(0),), FRAMES.sensor, FRAMES.classes)
+EMPTY = InMemoryFrames(tuple(map(without_points, range(3))), FRAMES.sensor, FRAMES.classes)
 
 
 @pytest.mark.parametrize(
@@ -439,49 +423,19 @@ def test_killed_before_an_evaluation_is_recorded_it_is_recorded_once(finished, t
         ({"steps": 0}, "steps: got 0, expected an integer of at least 1"),
         ({"steps": 2.5}, "steps: got 2.5, expected an integer"),
         ({"seed": 2**32}, "seed: got 4294967296, expected an integer from 0 to 4294967295"),
-    ],
-)
-def test_numbers_that_mean_nothing_are_refused_before_there_is_a_run(tmp_path, options, message):
-    with pytest.raises(ValueError, match=message):
-        runs.train(CONFIG, FRAMES, tmp_path / "run", **{"steps": 1, **options})
-    assert not (tmp_path / "run").exists()
-    with pytest.raises(ValueError, match=r"schedule\.keep: got 0, expected an integer of at least 1"):
-        runs.Schedule(keep=0)
-
-
-def test_one_sweep_where_several_are_configured_is_told(tmp_path, capsys):
-    several = dataclasses.replace(CONFIG, num_sweeps=3)
-    train_tiny(tmp_path / "run", config=several, steps=1)
-    assert "warning: num_sweeps: got 3, but the frames hold one sweep each: expected 1" in capsys.readouterr().err
-    train_tiny(tmp_path / "one", steps=1)
-    assert "num_sweeps" not in capsys.readouterr().err
-
-
-def test_with_damaged_checkpoints_alone_the_run_is_not_begun_anew(finished, tmp_path):
-    folder = shutil.copytree(finished[0], tmp_path / "run")
-    for description in folder.glob("checkpoints/*/checkpoint.json"):
-        description.unlink()
-    with pytest.raises(CheckpointError, match=r"all \d checkpoints are damaged"):
-        train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
         ({"config": dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())}, "copy_paste: got no ground-truth"),
         ({"threads": -1}, "threads: got -1, expected at least 0"),
         ({"workers": -1}, "workers: got -1, expected at least 0"),
+        ({"frames": UNREADABLE}, "clouds/0.npy: empty file"),
+        ({"frames": EMPTY}, "frame 'frame 0': box 0: got 0 points, as for all boxes of 3 frames"),
     ],
 )
-def test_what_cannot_prepare_batches_is_refused_before_there_is_a_run(tmp_path, options, message):
-    options = {"config": CONFIG, "frames": FRAMES, "steps": 1, **options}
+def test_invalid_arguments_are_refused_before_the_run_starts(tmp_path, options, message):
     with pytest.raises(ValueError, match=message):
-        runs.train(out=tmp_path / "run", **options)
+        runs.train(out=tmp_path / "run", **{"config": CONFIG, "frames": FRAMES, "steps": 1, **options})
     assert not (tmp_path / "run").exists()
 
 
-def test_outside_the_main_thread_it_trains_as_well(finished, tmp_path):
-    """No signal can be asked for there."""
-    with ThreadPoolExecutor(1) as thread:
-        state = thread.submit(train_tiny, tmp_path / "run", weights=weights()).result()
-    assert bits(state) == bits(finished[1])
+def test_a_schedule_refuses_invalid_numbers():
+    with pytest.raises(ValueError, match=r"schedule\.keep: got 0, expected an integer of at least 1"):
+        runs.Schedule(keep=0)

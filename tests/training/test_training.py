@@ -1,4 +1,4 @@
-"""The training step: finite, compiled once, exact schedules; a short run learns a simulated frame."""
+"""The training step is finite and compiled once, its schedules are exact, and a short run learns a frame."""
 
 import dataclasses
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from tiny_run import TINY_CONFIG, bits
 
 from fcos_lidar_jax.coding import encode
 from fcos_lidar_jax.config import OptimizerConfig
@@ -37,8 +38,8 @@ SIZES = {"max_points": CONFIG.max_points, "max_boxes": CONFIG.max_boxes}
 FRAMES = SimulatedFrames(TINY, 1000)
 
 
-def fed(batch, count=STEPS):
-    """The same batch again and again, as the loop takes it."""
+def host_batches(batch, count=STEPS):
+    """The same batch several times, as input of the loop."""
     return [HostBatch(batch, {"truncated_points": 0}, ("a", "b"))] * count
 
 
@@ -47,7 +48,7 @@ def frame(seed: int):
 
 
 def counted(function):
-    """The jitted function, and a list that grows with each trace of it."""
+    """A jitted function, and a list that grows with each of its traces."""
     traces = []
 
     def call(*args):
@@ -65,13 +66,14 @@ def trainer():
     return detector, make_state(detector, optimizer, key), *counted(make_train_step(detector, optimizer))
 
 
-def test_learns_one_simulated_frame_and_compiles_once(trainer):
-    """The short form of experiments/studies/overfit_keyframe.py: a minute of training finds the large objects."""
+def test_a_short_run_learns_one_simulated_frame_and_compiles_once(trainer):
+    """Finds the large objects; experiments/studies/overfit_keyframe.py trains for longer."""
     detector, state, step, traces = trainer
     scene = next(f for f in map(frame, range(100)) if (f.num_points >= 30).sum() >= 5)
     batch = make_batch([scene], **SIZES)
     records = []
-    final = fit(step, state, fed(batch), num_steps=STEPS, report=lambda _, record: records.append(record))
+    batches = host_batches(batch)
+    final = fit(step, state, batches, num_steps=STEPS, report=lambda _, record: records.append(record))
     assert int(final.step) == STEPS
     assert len(records) == STEPS
     assert records[-1]["loss/total"] < 0.25 * records[0]["loss/total"]
@@ -86,8 +88,8 @@ def test_learns_one_simulated_frame_and_compiles_once(trainer):
     match = match_frame(boxes, labels, scores, scene.boxes, scene.labels, max_distance_m=1.0)
     assert large[match.truth].sum() >= 0.75 * large.sum()
 
-    # No recompilation over other frames, for the step and for detection.
-    for seed in range(10):
+    # Other frames need no recompilation of step or detection.
+    for seed in range(3):
         other = make_batch([frame(seed)], **SIZES)
         step(state, other)
         detect(variables, other.points[0], other.valid[0])
@@ -106,7 +108,7 @@ def empty_batch(num_points: int) -> Batch:
 
 @pytest.mark.parametrize("num_points", [0, 1])
 @pytest.mark.parametrize("with_box", [False, True])
-def test_step_is_finite_without_boxes_points_or_anything(trainer, num_points, with_box):
+def test_a_step_is_finite_without_boxes_and_points(trainer, num_points, with_box):
     _, state, step, _ = trainer
     batch = empty_batch(num_points)
     if with_box:
@@ -118,35 +120,24 @@ def test_step_is_finite_without_boxes_points_or_anything(trainer, num_points, wi
     assert (int(metrics["positives"]) > 0) == (with_box and num_points == 1)
 
 
-def assert_same_bits(found, expected):
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        a, b = (jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x for x in (a, b))
-        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
-
-
-@pytest.mark.parametrize("augmented", [False, True])
-def test_a_packed_batch_is_trained_on_to_the_same_bits(trainer, augmented):
-    """As a plain one with its valid rows in front; and where they are not, the same is owned and lost."""
-    detector, state, step, _ = trainer
-    if augmented:
-        config = dataclasses.replace(CONFIG, augment=QUICKSTART.augment)
-        optimizer = make_optimizer(config.optimizer, STEPS)
-        step = jax.jit(make_train_step(build_detector(config, TINY), optimizer))
-    assert detector.config.augment is None
+@pytest.mark.parametrize(("augmented", "packing"), [(False, Packing(0, False)), (True, Packing(1, False))])
+def test_a_step_on_a_packed_batch_is_bit_identical(augmented, packing):
+    """To a step on a plain batch with its valid rows in front; in any order, the metrics are bit-identical."""
+    config = dataclasses.replace(TINY_CONFIG, augment=QUICKSTART.augment if augmented else None)
+    detector, optimizer = build_detector(config, TINY), make_optimizer(config.optimizer, STEPS)
+    state, step = make_state(detector, optimizer, jax.random.key(0)), jax.jit(make_train_step(detector, optimizer))
     scene = frame(3)
     scattered = make_batch([scene], **SIZES)
     scattered.valid[0, np.random.default_rng(0).choice(len(scene.points), 200, replace=False)] = False
     kept = dataclasses.replace(scene, points=scene.points[scattered.valid[0, : len(scene.points)]])
     plain = make_batch([kept], **SIZES)
-    for packing in (Packing(1, byte_intensity=False), Packing(0, byte_intensity=False)):
-        packed = pack(scattered, packing)
-        found = step(state, packed)
-        assert_same_bits(found, step(state, plain))
-        assert float(found[1]["positives"]) > 0
-        assert_same_bits(found[1], step(state, scattered)[1])
+    after, metrics = step(state, pack(scattered, packing))
+    assert bits((after, metrics)) == bits(step(state, plain))
+    assert float(metrics["positives"]) > 0
+    assert bits(metrics) == bits(step(state, scattered)[1])
 
 
-def test_owner_of_a_location_is_the_owner_of_its_first_round_point():
+def test_the_owner_of_a_location_is_the_owner_of_its_first_round_point():
     scene = frame(5)
     box_valid = np.ones(len(scene.boxes), bool)
     layout = image_layout(TINY, CONFIG.model)
@@ -155,15 +146,15 @@ def test_owner_of_a_location_is_the_owner_of_its_first_round_point():
     owner = np.asarray(location_owners(image, locations, jnp.asarray(scene.boxes), jnp.asarray(box_valid)))
     index = np.asarray(image.point_index)[..., 0].reshape(-1)
     cells = location_cells(layout)
-    chosen = np.random.default_rng(0).choice(len(cells), 400, replace=False)
-    rows = np.where(cells[chosen] >= 0, index[cells[chosen]], -1)
+    sample = np.random.default_rng(0).choice(len(cells), 400, replace=False)
+    rows = np.where(cells[sample] >= 0, index[cells[sample]], -1)
     boxes = scene.boxes.astype(float)
     expected = [oracles.owner(scene.points[row, :3], boxes, box_valid) if row >= 0 else -1 for row in rows]
-    np.testing.assert_array_equal(owner[chosen], expected)
+    np.testing.assert_array_equal(owner[sample], expected)
     assert sum(box >= 0 for box in expected) > 10
 
 
-def test_state_has_no_weak_types_and_survives_a_step_in_kind(trainer):
+def test_a_step_keeps_the_types_of_the_state_and_none_is_weak(trainer):
     _, state, step, _ = trainer
     after, _ = step(state, make_batch([frame(1)], **SIZES))
 
@@ -174,17 +165,17 @@ def test_state_has_no_weak_types_and_survives_a_step_in_kind(trainer):
     assert not any(getattr(kind, "weak_type", False) for kind in kinds(state))
 
 
-def test_schedules_have_the_papers_end_points():
+def test_schedules_have_the_end_points_of_the_paper():
     rate, momentum = (f(OptimizerConfig(), 5000) for f in (learning_rate_schedule, momentum_schedule))
     np.testing.assert_allclose([rate(0), rate(2000), rate(5000)], [1e-3, 1e-2, 1e-7], rtol=1e-4)
     np.testing.assert_allclose([momentum(0), momentum(2000), momentum(5000)], [0.95, 0.85, 0.95], rtol=1e-5)
-    # Half way up, a cosine is half way.
+    # A cosine is at its mean in the middle of the warm-up.
     np.testing.assert_allclose(rate(1000), (1e-3 + 1e-2) / 2, rtol=1e-4)
     np.testing.assert_allclose(momentum(1000), 0.9, rtol=1e-5)
 
 
-def test_optimizer_clips_decays_and_reports():
-    """First step of AdamW by hand: the clipped gradient's direction, plus decay."""
+def test_the_optimizer_clips_decays_and_reports():
+    """By hand: the first step of AdamW is the sign of the clipped gradient, plus decay."""
     config = OptimizerConfig()
     optimizer = make_optimizer(config, 10)
     params = {"w": jnp.array([2.0, -1.0])}
@@ -198,23 +189,9 @@ def test_optimizer_clips_decays_and_reports():
     np.testing.assert_allclose(state[1].hyperparams["b1"], 0.95, rtol=1e-6)
 
 
-def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_step(trainer):
+def test_the_loop_reads_all_metrics_before_a_pause_and_stops_when_asked(trainer):
     _, state, _, _ = trainer
-
-    def broken(state, batch):
-        state = dataclasses.replace(state, step=state.step + 1)
-        value, one = jnp.where(state.step == 2, jnp.nan, 1.0), jnp.float32(1)
-        metrics = {"loss/total": value, "loss/l1": value, "loss/iou": one}
-        return state, {**metrics, "gradient_norm": one, "positive_iou": one}
-
-    told = r"step 2: not finite: total nan, l1 nan; samples: a, b$"
-    with pytest.raises(NonFiniteLossError, match=told):
-        fit(broken, state, fed(empty_batch(0), 5), num_steps=5)
-
-
-def test_the_loop_pauses_with_all_read_and_stops_when_asked(trainer):
-    _, state, _, _ = trainer
-    seen = []
+    calls = []
 
     def count(state, batch):
         one = jnp.float32(1)
@@ -224,18 +201,18 @@ def test_the_loop_pauses_with_all_read_and_stops_when_asked(trainer):
     final = fit(
         count,
         state,
-        fed(empty_batch(0), 9),
+        host_batches(empty_batch(0), 9),
         num_steps=9,
-        report=lambda number, record: seen.append((number, record["truncated_points"])),
+        report=lambda number, record: calls.append((number, record["truncated_points"])),
         pause_at=lambda number: number % 2 == 0,
-        pause=lambda number, state: seen.append(("pause", number, int(state.step))),
+        pause=lambda number, state: calls.append(("pause", number, int(state.step))),
         stopping=lambda number: number == 5,
     )
     assert int(final.step) == 5
-    assert seen == [(1, 0), (2, 0), ("pause", 2, 2), (3, 0), (4, 0), ("pause", 4, 4), (5, 0)]
+    assert calls == [(1, 0), (2, 0), ("pause", 2, 2), (3, 0), (4, 0), ("pause", 4, 4), (5, 0)]
 
 
-def test_augmentation_depends_on_seed_step_and_sample_alone():
+def test_augmentation_depends_only_on_seed_step_and_sample():
     detector = toy_detector(dataclasses.replace(CONFIG, augment=QUICKSTART.augment))
     optimizer = make_optimizer(CONFIG.optimizer, STEPS)
     state = make_state(detector, optimizer, jax.random.key(0))
@@ -247,8 +224,7 @@ def test_augmentation_depends_on_seed_step_and_sample_alone():
 
 
 def toy_detector(config=CONFIG) -> Detector:
-    """Predictions of one weight a location and number, moved by what the sample looks like: no batch statistics,
-    and nothing to compile."""
+    """A network with one weight per output, scaled by a mean of the sample: no batch norm, quick to compile."""
     layout = image_layout(TINY, CONFIG.model)
     kinds, rows = len(CONFIG.classes), layout.num_locations
     shapes = {"logits": (rows, kinds + 1), "regression": (rows, 10, kinds), "iou_logits": (rows, kinds)}
@@ -272,38 +248,33 @@ def with_optimizer(**changes):
 
 
 def four_frames() -> Batch:
-    """Very unequal numbers of positives, none in the second."""
+    """A batch with very different numbers of positives, and none in the second frame."""
     batch = make_batch([frame(seed) for seed in (3, 4, 5, 6)], **SIZES)
     batch.box_valid[1] = False
     batch.box_valid[2, 2:] = False
     return batch
 
 
-def test_neither_micro_batches_nor_empty_samples_change_the_gradient_or_the_box_losses():
+def test_micro_batches_and_samples_without_boxes_do_not_change_the_box_losses():
     detector, batch = toy_detector(), four_frames()
     params = detector.init(jax.random.key(0))["params"]
-    configs = [with_optimizer(batch_size=4, accumulate=accumulate) for accumulate in (1, 2)]
-    whole, in_parts = (jax.jit(make_gradient(toy_detector(config))) for config in configs)
-    (expected, _, metrics), (found, _, again) = whole(params, {}, batch), in_parts(params, {}, batch)
-    assert int(metrics["positives"]) > 10
-    for name, leaf in expected.items():
-        largest = float(jnp.abs(leaf).max())
-        assert largest > 0
-        np.testing.assert_allclose(found[name], leaf, rtol=0, atol=1e-5 * largest)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), again, metrics)
-
-    one = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 4, axis=0), batch)
-    others = dataclasses.replace(one, box_valid=one.box_valid & np.array([[True], [False], [False], [False]]))
-    four_times, once = (whole(params, {}, samples)[2] for samples in (one, others))
-    assert int(four_times["positives"]) == 4 * int(once["positives"]) > 0
+    copies = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 4, axis=0), batch)
+    one = dataclasses.replace(copies, box_valid=copies.box_valid & np.array([[True], [False], [False], [False]]))
+    metrics = []
+    for accumulate in (1, 2):
+        config = with_optimizer(batch_size=4, accumulate=accumulate)
+        gradient = jax.jit(make_gradient(toy_detector(config)))
+        metrics += [gradient(params, {}, samples)[2] for samples in (one, copies)]
+    assert [int(each["positives"]) for each in metrics] == [int(metrics[0]["positives"]) * n for n in (1, 4, 1, 4)]
     for part in ("l1", "iou", "iou_prediction"):
-        np.testing.assert_allclose(four_times[f"loss/{part}"], once[f"loss/{part}"], rtol=1e-4)
+        losses = [each[f"loss/{part}"] for each in metrics]
+        assert losses[0] > 0
+        np.testing.assert_allclose(losses, [losses[0]] * 4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("axes", ["lidar", "ray"])
-def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
-    """Cross-entropy by the positives, L1 over candidates by those: in NumPy, values and gradients of each
-    prediction, in one batch and in micro-batches."""
+def test_each_loss_is_divided_by_the_number_of_its_locations(axes):
+    """Compares with NumPy, with and without micro-batches: cross-entropy over positives, L1 over candidates."""
     choices = dataclasses.replace(
         CONFIG.loss, regress_on="candidates", l1_weight=0.5, iou_weight=0.0, iou_prediction_weight=0.0
     )
@@ -320,8 +291,8 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
         targets = targets_of(outputs, image, boxes, labels, box_valid)
         locations = locate(image, layout)
         size = 1 + 0.01 * np.asarray(image.features).mean()
-        seen = boxes[targets.owner], locations.points, locations.azimuth_rad
-        encoded = np.asarray(encode(*seen, axes=axes))
+        owned = boxes[targets.owner], locations.points, locations.azimuth_rad
+        encoded = np.asarray(encode(*owned, axes=axes))
         owner, positive, labels = (np.asarray(a) for a in (targets.owner, targets.positive, labels))
         logits, regression = (np.asarray(a, np.float64) for a in (outputs.logits, outputs.regression))
         for l in np.flatnonzero(locations.occupied):
@@ -338,7 +309,7 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
             expected["regression"][l, :, label] += 0.5 * size * weights * np.sign(np.nan_to_num(off))
             candidates += 1
     assert candidates > 2 * positives > 20
-    told = []
+    metrics_of = []
     for accumulate in (1, 2):
         model = dataclasses.replace(CONFIG.model, regression_axes=axes)
         config = dataclasses.replace(
@@ -351,12 +322,12 @@ def test_each_loss_is_divided_by_the_locations_that_it_is_summed_over(axes):
         np.testing.assert_allclose(gradient["logits"], expected["logits"] / positives, rtol=1e-3, atol=1e-6)
         regression = expected["regression"] / candidates
         np.testing.assert_allclose(gradient["regression"], regression, rtol=1e-3, atol=1e-8)
-        told.append(metrics)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), *told)
+        metrics_of.append(metrics)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), *metrics_of)
 
 
-def test_the_scores_factor_is_trained_to_be_the_iou_or_the_centreness():
-    """Predictions are the truth, half a metre too high: one centreness for all, the IoU by the heights."""
+def test_the_target_of_the_score_factor_is_the_iou_or_the_centreness():
+    """Predictions are half a metre above the truth: centreness is constant, and IoU depends on the height."""
     detector, batch = toy_detector(), jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], four_frames())
     params, layout = detector.init(jax.random.key(0))["params"], image_layout(TINY, CONFIG.model)
     image = project_points(batch.points, batch.valid, TINY, num_rounds=CONFIG.projection.num_rounds)
@@ -372,12 +343,12 @@ def test_the_scores_factor_is_trained_to_be_the_iou_or_the_centreness():
     label = np.asarray(batch.labels)[np.asarray(owner)]
     logits = np.take_along_axis(np.asarray(outputs.iou_logits, np.float64), label[:, None], axis=1)[:, 0]
     overlap = np.maximum(box[:, 5] - 0.5, 0) / (box[:, 5] + 0.5)
-    for quality, wanted in (("centreness", np.exp(-((0.5 / 0.75) ** 2))), ("iou", overlap)):
+    for quality, target in (("centreness", np.exp(-((0.5 / 0.75) ** 2))), ("iou", overlap)):
         choices = dataclasses.replace(CONFIG.loss, regress_on="candidates", quality=quality)
         sample = outputs, image, batch.boxes, batch.labels, batch.box_valid
         parts, _, _ = sample_losses(*sample, config=choices, layout=layout, axes="lidar")
         total, count = parts["iou_prediction"]
-        expected = (np.log1p(np.exp(logits)) - wanted * logits)[inside].sum()
+        expected = (np.log1p(np.exp(logits)) - target * logits)[inside].sum()
         np.testing.assert_allclose(total, expected, rtol=1e-3)
         assert int(count) == inside.sum() > 10
 
@@ -387,15 +358,14 @@ ZERO = {"params": {"w": jnp.float32(0)}, "batch_stats": {}}
 
 @pytest.fixture
 def squares():
-    """Of a detector: the squared distances of its weight from the samples' boxes. A note is taken of the rows that
-    are seen together."""
-    seen = []
+    """A detector whose loss is the squared distance of its weight from the boxes, and the rows of its batches."""
+    row_lists = []
 
     def apply(variables, images, train):
         return jnp.broadcast_to(variables["params"]["w"], images.num_dropped.shape), {}
 
     def sums(outputs, _, batch):
-        jax.debug.callback(lambda rows: seen.append(rows.tolist()), batch.boxes[:, 0, 0], ordered=True)
+        jax.debug.callback(lambda rows: row_lists.append(rows.tolist()), batch.boxes[:, 0, 0], ordered=True)
         count = batch.box_valid.sum(dtype=jnp.int32)
         total = jnp.where(batch.box_valid, jnp.square(outputs[:, None] - batch.boxes[..., 0]), 0.0).sum()
         return Sums({"positives": {"classification": total}}, {"positives": count}, {"positives": {"mean": total}})
@@ -407,24 +377,24 @@ def squares():
     batch = jax.tree.map(lambda leaf: np.repeat(leaf, 8, axis=0), batch)
     batch.boxes[:, :, 0] = np.arange(8)[:, None]
     batch.box_valid[...] = np.arange(CONFIG.max_boxes) < np.array([1, 0, 5, 2, 0, 0, 9, 3])[:, None]
-    return detector, batch, seen
+    return detector, batch, row_lists
 
 
-@pytest.mark.parametrize("pieces", [1, 2, 4, 8])
-def test_one_division_by_all_positives_and_every_row_in_one_micro_batch(squares, pieces):
-    """By hand: the mean of 2 (w - x) over all boxes. Rows are dealt out like cards: every device has its share."""
-    detector, batch, seen = squares
-    config = with_optimizer(batch_size=8, accumulate=pieces)
+@pytest.mark.parametrize("num_micro", [1, 2, 8])
+def test_gradients_are_divided_by_all_positives_and_micro_batches_are_strided(squares, num_micro):
+    """By hand: the gradient is the mean of 2 (w - x) over all boxes."""
+    detector, batch, row_lists = squares
+    config = with_optimizer(batch_size=8, accumulate=num_micro)
     gradient, _, metrics = jax.jit(make_gradient(detector(config)))({"w": jnp.float32(3.5)}, {}, batch)
     jax.effects_barrier()
     x = batch.boxes[..., 0][batch.box_valid]
     np.testing.assert_allclose(gradient["w"], np.mean(2 * (3.5 - x)), rtol=1e-6)
     assert int(metrics["positives"]) == len(x) == 20
     np.testing.assert_allclose(metrics["mean"], np.mean((3.5 - x) ** 2), rtol=1e-6)
-    assert [rows for rows in seen if rows] == [list(range(first, 8, pieces)) for first in range(pieces)]
+    assert [rows for rows in row_lists if rows] == [list(range(i, 8, num_micro)) for i in range(num_micro)]
 
 
-def test_the_running_mean_of_the_weights_is_that_of_a_loop_in_numpy(squares):
+def test_the_running_mean_of_the_weights_matches_a_loop(squares):
     decay, (make, batch, _) = 0.2, squares
     config = with_optimizer(ema_decay=decay, batch_size=8)
     detector, optimizer = make(config), make_optimizer(CONFIG.optimizer, STEPS)
@@ -435,7 +405,7 @@ def test_the_running_mean_of_the_weights_is_that_of_a_loop_in_numpy(squares):
         state, _ = step(state, batch)
         kept.append(min(decay, (1 + number) / (10 + number)))
         mean = kept[-1] * mean + (1 - kept[-1]) * float(state.params["w"])
-    assert kept[0] < kept[1] < kept[2] == decay  # the warm-up follows faster
+    assert kept[0] < kept[1] < kept[2] == decay  # EMA warm-up
     np.testing.assert_allclose(state.ema["w"], mean, rtol=1e-6)
     assert abs(mean - float(state.params["w"])) > 1e-5
     assert detection_variables(state) == {"params": state.ema, "batch_stats": {}}
@@ -444,13 +414,13 @@ def test_the_running_mean_of_the_weights_is_that_of_a_loop_in_numpy(squares):
     assert detection_variables(plain) == {"params": plain.params, "batch_stats": {}}
 
 
-def test_a_learning_rate_beyond_reason_stops_the_run_before_its_numbers_are_kept(squares):
-    """The weight explodes in the first update; the loss of the second step tells, and no pause comes after it."""
+def test_a_loss_that_is_not_finite_stops_the_run_before_a_pause(squares):
+    """The first update of a huge learning rate makes the loss of the second step infinite."""
     config = with_optimizer(peak_learning_rate=1e30, batch_size=8)
     detector, optimizer = squares[0](config), make_optimizer(config.optimizer, STEPS)
     state = make_state(detector, optimizer, jax.random.key(0), variables=ZERO)
     step, paused = jax.jit(make_train_step(detector, optimizer)), []
     options = {"pause_at": lambda number: True, "pause": lambda number, _: paused.append(number)}
     with pytest.raises(NonFiniteLossError, match=r"^step 2: not finite: .*total inf.*; samples: a, b$"):
-        fit(step, state, fed(squares[1]), num_steps=STEPS, **options)
+        fit(step, state, host_batches(squares[1]), num_steps=STEPS, **options)
     assert paused == [1]
