@@ -42,8 +42,6 @@ from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 
-FROM_SCRATCH = change(copy_paste=None, class_balanced=False)(COMPACT)
-FINE_TUNING = change(optimizer__peak_learning_rate=1e-3)(FROM_SCRATCH)
 REAL = ("scene-0523, even", "scene-0523, odd", "scene-0103", "scene-0061")
 TEST = range(3, 11)  # Keyframes of scene-0523.
 TRAIN = [i for i in range(40) if i not in TEST]
@@ -108,15 +106,24 @@ def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
 
 
 def fine_tuning(args: Args) -> dict[str, Any]:
-    """Scores on unseen keyframes of scene-0523, after training on the others from two beginnings."""
+    """Scores on unseen keyframes of scene-0523 after training on the others, with and without the checkpoint.
+
+    Both trainings use the checkpoint's network, which may differ from the preset's of today.
+    """
     street = open_frames(real_data(args.data, "nuscenes_scene0523"), split="scene0523", reading=cut_reading(1))
-    test, shown = (SelectedFrames(street, tuple(chosen)) for chosen in (TEST, TRAIN))
-    record: dict[str, Any] = {"steps": args.fine_tuning_steps, "keyframes": len(shown)}
-    beginnings = {"from the checkpoint": (FINE_TUNING, args.checkpoint), "from scratch": (FROM_SCRATCH, None)}
-    of = read_description(find_checkpoint(args.checkpoint))["hash"][:12]  # Others of the same name are others.
-    for name, (config, weights) in beginnings.items():
-        folder = args.work / of / name.replace(" ", "_")
-        detector = trained(folder, config, shown, steps=args.fine_tuning_steps, seed=0, weights=weights)
+    test, train = (SelectedFrames(street, tuple(indices)) for indices in (TEST, TRAIN))
+    record: dict[str, Any] = {"steps": args.fine_tuning_steps, "keyframes": len(train)}
+    model = load_trained(args.checkpoint).config.model
+    scratch = change(model=model, copy_paste=None, class_balanced=False)(COMPACT)
+    fine_tuned = change(optimizer__peak_learning_rate=1e-3)(scratch)
+    # The hash tells weights of the same name apart.
+    runs = args.work / read_description(find_checkpoint(args.checkpoint))["hash"][:12]
+    for name, config, weights in (
+        ("from the checkpoint", fine_tuned, args.checkpoint),
+        ("from scratch", scratch, None),
+    ):
+        options = {"steps": args.fine_tuning_steps, "seed": 0, "weights": weights}
+        detector = trained(runs / name.replace(" ", "_"), config, train, **options)
         record[name] = measured(detector, test)
     return record
 

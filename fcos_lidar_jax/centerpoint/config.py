@@ -71,12 +71,8 @@ class CenterPointConfig(Config):
     def __post_init__(self) -> None:
         super().__post_init__()
         groups, names = self.pillars.groups, self.classes
-        check(
-            len(groups) in (0, len(names)),
-            "pillars.groups",
-            groups,
-            f"{len(names)} values, one per class, or none",
-        )
+        expected = f"{len(names)} values, one per class, or none"
+        check(len(groups) in (0, len(names)), "pillars.groups", groups, expected)
         check(self.model == ModelConfig(), "model", "changes", "the default: pillars takes its place")
         for name in _RANGE_VIEW_LOSSES:
             own, default = getattr(self.loss, name), getattr(LossConfig(), name)

@@ -198,18 +198,26 @@ def test_a_card_of_other_weights_is_refused(shipped, tmp_path):
         model_card.write_card("hdl32e", tmp_path)
 
 
-def test_fine_tuning_from_other_weights_of_the_same_name_is_another_run(tmp_path, monkeypatch):
-    folders = []
+def test_fine_tuning_trains_the_network_of_its_checkpoint(tmp_path, monkeypatch):
+    """Other weights of the same name are another run."""
+    runs = []
     monkeypatch.setattr(transfer, "real_data", lambda *_: tmp_path)
     monkeypatch.setattr(transfer, "open_frames", lambda *_, **__: SimulatedFrames(TINY, 40))
-    monkeypatch.setattr(transfer, "trained", lambda folder, *_, **__: folders.append(folder))
+    monkeypatch.setattr(
+        transfer, "trained", lambda folder, config, *_, **options: runs.append((folder, config, options))
+    )
     monkeypatch.setattr(transfer, "measured", lambda *_: {})
+    weights = tmp_path / "weights"
     for value in (0.0, 1.0):
-        weights = jax.tree.map(lambda leaf, v=value: leaf + np.float32(v), untrained(CONFIG, TINY))
-        shutil.rmtree(tmp_path / "weights", ignore_errors=True)
-        save_checkpoint(tmp_path / "weights", Checkpoint(CONFIG, TINY, weights, 3))
-        transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=tmp_path / "weights", work=tmp_path))
-    assert len(set(folders)) == 4
+        variables = jax.tree.map(lambda leaf, v=value: leaf + np.float32(v), untrained(CONFIG, TINY))
+        shutil.rmtree(weights, ignore_errors=True)
+        save_checkpoint(weights, Checkpoint(CONFIG, TINY, variables, 3))
+        transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=weights, work=tmp_path))
+    assert len({folder for folder, _, _ in runs}) == 4
+    assert all(config.model == CONFIG.model for _, config, _ in runs)
+    assert [options["weights"] for _, _, options in runs] == [weights, None] * 2
+    rates = [config.optimizer.peak_learning_rate for _, config, _ in runs]
+    assert rates[0] == rates[1] / 3
 
 
 def test_a_card_counts_the_frames_of_all_trainings(shipped, tmp_path):

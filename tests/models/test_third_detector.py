@@ -13,7 +13,7 @@ from tiny_run import CONFIG, SENSOR
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
-from fcos_lidar_jax.data.frame import Frame, GivenFrames
+from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.inference import evaluate
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -69,7 +69,7 @@ TOY = ToyConfig.of(CONFIG, name="toy", classes=("car", "truck"), augment=None, o
 def frames():
     points = make_frame(0, SENSOR).points
     frame = Frame(points, BOX[None], np.zeros(1, np.int32), np.full(1, 9))
-    return GivenFrames((frame,) * 4, SENSOR, TOY.classes)
+    return InMemoryFrames((frame,) * 4, SENSOR, TOY.classes)
 
 
 @pytest.fixture(scope="module")
