@@ -141,7 +141,9 @@ def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     assert {name: scored[name] for name in names} == {name: record[name] for name in names}
     assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
     for option in ({"export": True}, {"seed": 7}, {"warm_start": tmp_path}):
-        with pytest.raises(ValueError, match=r"--(export|seed|warm-start): is of a training, expected its folder"):
+        with pytest.raises(
+            ValueError, match=r"--(export|seed|warm-start): only for a training, expected its folder"
+        ):
             shipped_weights.main(dataclasses.replace(args, **option))
     # Scores alone are no training to go on from, nor to write a card of; nothing is overwritten.
     results = tmp_path / "results"
@@ -194,7 +196,7 @@ def test_a_card_has_the_figures_of_its_own_weights_alone(shipped, tmp_path):
 def test_a_card_of_other_weights_is_refused(shipped, tmp_path):
     _, record = shipped
     (tmp_path / "hdl32e.json").write_text(json.dumps({**record, "hash": "other"}))
-    with refused(f"hdl32e.json: hash: got other, expected that of the weights: {record['hash']}"):
+    with refused(f"hdl32e.json: hash: got other, expected the hash of the weights: {record['hash']}"):
         model_card.write_card("hdl32e", tmp_path)
 
 
@@ -224,7 +226,7 @@ def test_a_card_counts_the_frames_of_all_trainings(shipped, tmp_path):
     _, record = shipped
     legs = [{**record["training"], "frames_seen": n, "curve": [[n - 1, n / 10]]} for n in (3, 5)]
     card = model_card.write_card("hdl32e", tmp_path, {**record, "earlier": legs[:1], "training": legs[1]})
-    assert "| frames seen in all | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n" in card.read_text()
+    assert "| training frames | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n" in card.read_text()
 
 
 def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
