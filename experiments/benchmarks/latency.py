@@ -1,17 +1,16 @@
-"""Table 7: where the time goes from sweep files to boxes, one sweep and ten, batch 1.
+"""Table 7: times of the stages from sweep files to boxes, for one sweep and ten, batch size 1.
 
     python -m experiments.benchmarks.latency  # on FCOS_LIDAR_REAL_DATA's cloud, else a simulated one
     python -m experiments.benchmarks.latency --precision bfloat16  # on a GPU
 
-All stages, of one sweep and of ten, run turn by turn. The paper's "Backbone" is cut here as preprocessing
-(normalise, repeat rows, pad), stem and backbone, its "Heads" as pyramid and heads, which are also timed apart. Its
-table leaves post-processing out. Reading files and composing poses is timed on a simulated data set, whose sweep
-files are as large as the real ones. The background's prior is 0.5, so that an untrained network proposes boxes
-everywhere: NMS at its busiest. On a GPU all forms of stem and NMS are timed beside them; the stages use what suits
-the platform.
+All stages of one sweep and of ten run in turns. The paper's "Backbone" is taken as preprocessing (normalise,
+repeat rows, pad), stem and backbone, its "Heads" as pyramid and heads, which are also timed separately. Its table
+omits post-processing. Reading files and composing poses is timed on a simulated data set with sweep files of the
+real size. The background prior is 0.5, so that an untrained network proposes boxes everywhere, the worst case for
+NMS. On a GPU all forms of stem and NMS are timed too; the stages use the form that suits the platform.
 
-Cost: 15 turns take about six minutes on two CPU cores. Expected: MRV well below one per cent of the path, and a
-network that is indifferent to the number of sweeps, since five rounds are five rounds.
+Cost: 15 repeats take about six minutes on two CPU cores. Expected: MRV takes well below one per cent of the time,
+and the network's time does not depend on the number of sweeps, since the number of rounds is the same.
 """
 
 import contextlib
@@ -44,14 +43,14 @@ from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 
 ROWS = {"single": NUSCENES_SINGLE.max_points, "multi": NUSCENES.max_points}
-"""Setting of table 7 -> rows its clouds are padded to."""
+"""Setting of table 7 -> rows to which clouds are padded."""
 _WHOLE = "points to boxes, one program"
 STEM_FORMS: tuple[Form, ...] = ("split", "dense", "grouped")
 
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """What to time, and how often."""
+    """Options of the measurement."""
 
     preset: Literal["nuscenes", "nuscenes_single", "quickstart"] = "nuscenes"  # Configuration preset.
     precision: Literal["float32", "bfloat16"] = "float32"  # Of the convolutions.
@@ -62,7 +61,7 @@ class Args(Options):
 
 @contextlib.contextmanager
 def simulated_sweeps(sensor: Sensor) -> Iterator[tuple[NuScenes, str]]:
-    """A simulated drive in the nuScenes layout, while it is needed, and a keyframe with nine sweeps before it."""
+    """Provide a simulated drive in the nuScenes layout and a keyframe with nine previous sweeps."""
     with tempfile.TemporaryDirectory() as folder:
         spec = DatasetSpec(1, 0, 2, sensor, False, "v1.0-synthetic")
         write_dataset(spec, Path(folder), workers=1, report=lambda _: None)
@@ -71,14 +70,14 @@ def simulated_sweeps(sensor: Sensor) -> Iterator[tuple[NuScenes, str]]:
 
 
 def real_cloud(data: Path | None) -> Path | None:
-    """File of the real ten-sweep cloud; see :func:`~experiments.script.find_real_data`."""
+    """Find the file of the real ten-sweep cloud; see :func:`~experiments.script.find_real_data`."""
     return find_real_data(data, "ten_sweep_cloud", "cloud.f16.bin")
 
 
 def fused_cloud(data: Path | None, sensor: Sensor) -> tuple[np.ndarray, str]:
-    """Ten sweeps in one cloud, f32[n, 5], the close points of the current sweep still there; and what it is.
+    """Load ten sweeps in one cloud f32[n, 5], with the close points of the current sweep, and a description.
 
-    It is simulated where no folder with ``ten_sweep_cloud/`` is named, and for other sensors than nuScenes'.
+    The cloud is simulated without a folder with ``ten_sweep_cloud/``, and for sensors other than nuScenes'.
     """
     file = real_cloud(data)
     if file is not None and sensor == NUSCENES_HDL32E:
@@ -88,7 +87,7 @@ def fused_cloud(data: Path | None, sensor: Sensor) -> tuple[np.ndarray, str]:
 
 
 def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
-    """The fused cloud, or its current sweep alone, as the detector gets it."""
+    """Prepare the fused cloud, or only its current sweep, for the detector."""
     points = cloud[cloud[:, 4] == 0] if setting == "single" else cloud
     projection = dataclasses.replace(NUSCENES.projection, remove_close="all")
     config = dataclasses.replace(NUSCENES, max_points=ROWS[setting], projection=projection)
@@ -96,7 +95,7 @@ def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
 
 
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:
-    """The stages of one cloud, each with its input at hand."""
+    """Make calls of the stages for one cloud, with precomputed inputs."""
     parts, detector = network_parts(config, sensor), build_detector(config, sensor)
     prepare, network, _, postprocess = map(jax.jit, make_stages(detector))
     detect = jax.jit(make_detect(detector))
@@ -119,7 +118,7 @@ def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Clou
 
 
 def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: str) -> np.ndarray:
-    """Host work: files to a padded cloud."""
+    """Load a padded cloud from files."""
     number = 1 if setting == "single" else 10
     points, num_close = drive.fuse_sweeps(token, CloudReading(number, "all", config.projection.close_m))
     config = dataclasses.replace(config, max_points=ROWS[setting])
@@ -127,7 +126,7 @@ def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: s
 
 
 def form_times(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, dict[str, Times]]:
-    """The times of all forms of stem and NMS; the stages take the one that suits the platform."""
+    """Time all forms of stem and NMS."""
     model, choices = config.model, config.inference
     prepare, network, candidates, _ = map(jax.jit, make_stages(build_detector(config, sensor)))
     image = prepare(*jax.device_put((cloud.points, cloud.valid)))
@@ -152,13 +151,13 @@ def form_times(config: Config, sensor: Sensor, variables: Variables, cloud: Clou
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """All figures of table 7."""
+    """Measure all figures of table 7."""
     config = change(model__precision=args.precision, model__background_prior=0.5)(PRESETS[args.preset])
     sensor = load_sensor(config.sensor)
     fused, label = fused_cloud(args.data, sensor)
     clouds = {setting: padded(fused, setting, sensor) for setting in ROWS}
     variables = jax.jit(build_detector(config, sensor).init)(jax.random.key(0))
-    on_gpu = jax.default_backend() == "gpu"  # the others take seconds on a CPU
+    on_gpu = jax.default_backend() == "gpu"  # Other forms take seconds on a CPU.
     forms = form_times(config, sensor, variables, clouds["multi"]) if on_gpu else None
     calls: dict[tuple[str, str], Call] = {}
     with simulated_sweeps(sensor) as (drive, token):
@@ -189,7 +188,7 @@ _PAPER_COLUMN = {
 
 
 def as_text(record: dict[str, Any]) -> str:
-    """The table, ours beside the paper's."""
+    """Format the table with our times beside the paper's."""
     (single, multi), paper = (record["times"][setting] for setting in ROWS), record["paper"]
     note = "" if record["comparable"] else "; other hardware or another network, not comparable"
     lines = [

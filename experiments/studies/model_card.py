@@ -70,7 +70,7 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield "## What it is for\n"
     yield f"The input is one sweep of this sensor: {_AXES}, and intensities of 0 to 255. The detected classes are"
     yield f"{', '.join(label.replace('_', ' ') for label in detector.classes)}.\n"
-    yield "The weights are a starting point for fine-tuning and for trying the program, not a usable detector: they"
+    yield "The weights are a starting point for fine-tuning and for first trials, not a usable detector: they"
     yield "were trained on simulated streets only, and miss and invent objects, as the tables show. Another sensor"
     yield "needs other weights.\n"
     yield "## Scores\n"

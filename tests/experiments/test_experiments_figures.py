@@ -13,7 +13,7 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 ROWS = {name: table["rows"] for name, table in PAPER["tables"].items()}
 BEST = ("multi, 5", "prioritized", "9 groups", "2", "(1, 3, 6)", "untied", "FCOS-LiDAR, multi")
 """The paper's detector in tables 1 to 7."""
-MARKS = {mark.name: mark.args for mark in test_projection.test_real_cloud_gives_the_papers_counts.pytestmark}
+MARKS = {mark.name: mark.args for mark in test_projection.test_real_cloud_gives_the_expected_counts.pytestmark}
 REAL_COUNTS = MARKS["parametrize"][1]
 """(close points, [in range, in view, kept by round 1, % by 1, 3, 5, 7, current with priority, without])."""
 
