@@ -4,7 +4,6 @@ import dataclasses
 import doctest
 import importlib
 import json
-import math
 import re
 import sys
 from pathlib import Path
@@ -26,7 +25,6 @@ from experiments.paper_tables.grid import run_cell
 from experiments.paper_tables.scales import smoke
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
-from experiments.statistics import interval
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -73,14 +71,6 @@ def test_the_examples_in_the_docstrings_hold(name):
     result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.attempted > 0
     assert result.failed == 0
-
-
-def test_intervals_are_students():
-    values = [3.0, 5.0, 10.0]
-    mean, low, high = interval(values)
-    error = math.sqrt(sum((v - 6) ** 2 for v in values) / 2 / 3)
-    assert (mean, low, high) == pytest.approx((6.0, 6 - 4.302653 * error, 6 + 4.302653 * error))
-    assert interval([1.0]) is None
 
 
 def test_change_replaces_fields_at_any_depth():

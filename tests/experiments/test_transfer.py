@@ -234,15 +234,3 @@ def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
     (package / "hdl32e" / "notes.md").write_text("more")
     with pytest.raises(CheckpointError, match=r"notes\.md: found a file that is not of the checkpoint"):
         load_checkpoint(package / "hdl32e")
-
-
-def test_scores_by_range_see_what_lies_there():
-    boxes = np.array([[10, 0, 0, 4, 2, 1.5, 0, 0, 0], [30, 0, 0, 4, 2, 1.5, 0, 0, 0]], np.float32)
-    frame = Frame(np.zeros((0, 5), np.float32), boxes, np.zeros(2, np.int32), np.full(2, 9, np.int32))
-    none = np.zeros(0)
-    found = Detections(boxes[:1], np.ones(1), np.zeros(1, int), np.ones(1, bool), none)
-    scores = scores_by_range([found], [frame])
-    assert scores["0-20 m"]["AP"] == {"car": pytest.approx(1, abs=1e-6)}
-    assert scores["20-40 m"]["AP"] == {"car": 0}
-    assert scores["all"]["truths"] == {"car": 2}
-    assert 0.3 < scores["all"]["AP"]["car"] < 0.6
