@@ -7,7 +7,7 @@ All stages of one sweep and of ten run in turns. The paper's "Backbone" is taken
 repeat rows, pad), stem and backbone, its "Heads" as pyramid and heads, which are also timed separately. Its table
 omits post-processing. Reading files and composing poses is timed on a simulated data set with sweep files of the
 real size. The background prior is 0.5, so that an untrained network proposes boxes everywhere, the worst case for
-NMS. On a GPU all forms of stem and NMS are timed too; the stages use the form that suits the platform.
+NMS. The stages use the forms of stem and NMS that suit the platform.
 
 Cost: 15 repeats take about six minutes on two CPU cores. Expected: MRV takes well below one per cent of the time,
 and the network's time does not depend on the number of sweeps, since the number of rounds is the same.
@@ -32,11 +32,9 @@ from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.inference import make_detect, make_stages
-from fcos_lidar_jax.inference.timing import Call, Times, interleaved
+from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.models.detector import network_parts
-from fcos_lidar_jax.models.modality import Form, Stem
-from fcos_lidar_jax.nms import rotated_nms
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, PRESETS
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
@@ -45,7 +43,6 @@ from fcos_lidar_jax.simulation.render import DatasetSpec
 ROWS = {"single": NUSCENES_SINGLE.max_points, "multi": NUSCENES.max_points}
 """Setting of table 7 -> rows to which clouds are padded."""
 _WHOLE = "points to boxes, one program"
-STEM_FORMS: tuple[Form, ...] = ("split", "dense", "grouped")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,31 +122,6 @@ def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: s
     return make_cloud(points, config, sensor=sensor, num_close=num_close).points
 
 
-def form_times(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, dict[str, Times]]:
-    """Time all forms of stem and NMS."""
-    model, choices = config.model, config.inference
-    prepare, network, candidates, _ = map(jax.jit, make_stages(build_detector(config, sensor)))
-    image = prepare(*jax.device_put((cloud.points, cloud.valid)))
-    seen = network_parts(config, sensor).preprocess(image.features[None])
-    boxes, scores, labels, valid = candidates(network(variables, image), image)
-    own = {kind: tree["stem"] for kind, tree in variables.items()}
-
-    def stem(form: Form) -> Call:
-        module = Stem(model.stem, model.circular_width, model.precision, form)
-        return functools.partial(jax.jit(functools.partial(module.apply, train=False)), own, seen)
-
-    def nms(form: Literal["rows", "matrix"]) -> Call:
-        most, threshold = choices.max_detections, choices.iou_threshold
-        suppress = functools.partial(rotated_nms, iou_threshold=threshold, max_outputs=most, form=form)
-        call = functools.partial(suppress, overlap=choices.nms_overlap)
-        return functools.partial(jax.jit(call), boxes, scores, valid, labels=labels)
-
-    return {
-        "stem": interleaved({form: stem(form) for form in STEM_FORMS}, 10),
-        "nms": interleaved({form: nms(form) for form in ("rows", "matrix")}, 10),
-    }
-
-
 def measure(args: Args) -> dict[str, Any]:
     """Measure all figures of table 7."""
     config = change(model__precision=args.precision, model__background_prior=0.5)(PRESETS[args.preset])
@@ -157,8 +129,6 @@ def measure(args: Args) -> dict[str, Any]:
     fused, label = fused_cloud(args.data, sensor)
     clouds = {setting: padded(fused, setting, sensor) for setting in ROWS}
     variables = jax.jit(build_detector(config, sensor).init)(jax.random.key(0))
-    on_gpu = jax.default_backend() == "gpu"  # Other forms take seconds on a CPU.
-    forms = form_times(config, sensor, variables, clouds["multi"]) if on_gpu else None
     calls: dict[tuple[str, str], Call] = {}
     with simulated_sweeps(sensor) as (drive, token):
         for setting, cloud in clouds.items():
@@ -172,7 +142,6 @@ def measure(args: Args) -> dict[str, Any]:
         "cloud": label,
         "loading": "simulated data set in the nuScenes layout",
         "points": {setting: cloud.num_points for setting, cloud in clouds.items()},
-        "forms": forms,
         "repeats": args.repeats,
         "times": {setting: {name: ms for (of, name), ms in found.items() if of == setting} for setting in clouds},
         "paper": {"hardware": PAPER["times"], **{s: rows[f"FCOS-LiDAR, {s}"] for s in clouds}},
@@ -213,9 +182,6 @@ def as_text(record: dict[str, Any]) -> str:
     for name, parts, column in sums:
         ours = [f"{sum(t[part]['median_ms'] for part in parts):12.2f}{'':10s}" for t in (single, multi)]
         lines.append(line(name, ours, column))
-    for part, times in (record["forms"] or {}).items():
-        listed = ", ".join(f"{form} {ms['median_ms']:.3f}" for form, ms in times.items())
-        lines.append(f"{part} by formulation, ms: {listed}")
     return "\n".join(lines)
 
 

@@ -16,7 +16,6 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from experiments.benchmarks.latency import STEM_FORMS
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, run_measurement
@@ -27,6 +26,7 @@ from fcos_lidar_jax.models.modality import Form, Stem, channel_groups
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
+STEM_FORMS: tuple[Form, ...] = ("split", "dense", "grouped")
 BASE = NUSCENES.model.stem
 _LAYOUT = image_layout(NUSCENES_HDL32E, NUSCENES.model)
 SHAPE = (1, _LAYOUT.height, _LAYOUT.width, 9 * NUSCENES.projection.num_rounds)  # Shape of the network's input.

@@ -127,8 +127,8 @@ def make_pillars(
         usable = exists & jnp.isfinite(cloud).all(axis=1)
         cloud = jnp.where(usable[:, None], cloud, 0.0)
         low, high = sensor.limit_z_m
-        usable &= (jnp.abs(cloud[:, :2]) < sensor.limit_xy_m).all(axis=1)
-        usable &= (cloud[:, 2] > low) & (cloud[:, 2] < high)
+        within_xy = (jnp.abs(cloud[:, :2]) < sensor.limit_xy_m).all(axis=1)
+        usable &= within_xy & (cloud[:, 2] > low) & (cloud[:, 2] < high)
         if sensor.azimuth_limits_rad is not None:
             _, azimuth, _ = spherical(cloud[:, :3] - np.asarray(sensor.origin_m, np.float32))
             usable &= image_columns(azimuth, sensor)[1]
