@@ -1,4 +1,4 @@
-"""Configurations as changes of others."""
+"""Changes of configurations."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,7 +10,7 @@ Change = Callable[[Config], Config]
 
 
 def change(**fields: Any) -> Change:
-    """Replace fields of a configuration; dots are double underscores.
+    """Make a function that replaces fields of a configuration; double underscores stand for dots.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> change(projection__num_rounds=3, num_sweeps=1)(QUICKSTART).projection.num_rounds

@@ -1,4 +1,4 @@
-"""Where an experiment ran, and with what: kept beside its figures."""
+"""Hardware and versions, recorded with the figures of an experiment."""
 
 import functools
 import subprocess
@@ -11,13 +11,13 @@ from fcos_lidar_jax.inference.timing import machine
 
 @functools.cache
 def hardware() -> dict[str, Any]:
-    """Device, processor, cores, versions and revision, as JSON; as they were at the process's first call."""
+    """Describe device, processor, cores, versions and revision, at the first call of a process."""
     git = ["git", "-C", str(Path(fcos_lidar_jax.__file__).parent), "describe", "--always", "--dirty"]
     described = subprocess.run(git, capture_output=True, text=True, check=False)
     return {**machine(), "git": described.stdout.strip() or "unknown"}
 
 
 def hardware_line() -> str:
-    """Device, processor and cores in a few words."""
+    """Describe device, processor and cores in one line."""
     here = hardware()
     return f"{here['device']} ({here['processor']}, {here['cores']} cores)"

@@ -1,13 +1,14 @@
-"""The ledger of the paper's claims: what it reports, what was measured here, and whether the two agree.
+"""The ledger of the paper's claims: the paper's figures, our figures, and whether they agree.
 
     python -m experiments.ledger          # print it
-    python -m experiments.ledger --write  # put it into experiments/README.md as well
+    python -m experiments.ledger --write  # also write it into experiments/README.md
 
-Nothing is trained or timed: the figures are those of the files in ``experiments/results``, so the ledger is as
-new as they are. A claim about accuracy is a row of a table of the paper. Where the 95 % interval over the seeds
-excludes zero and has the paper's sign, the claim agrees, or, if the interval excludes the paper's figure, agrees
-in direction alone; with the other sign it disagrees. Where the interval holds zero, the claim is undecided, or,
-if the interval excludes the paper's figure, disagrees.
+Nothing is trained or timed: our figures come from the files in ``experiments/results``. A claim about accuracy is
+a row of a table of the paper, and its verdict follows from the 95 % interval of the gain over the seeds:
+
+- excludes zero, with the paper's sign: agrees; agrees in direction alone if it also excludes the paper's figure
+- excludes zero, with the other sign: disagrees
+- contains zero: undecided; disagrees if it excludes the paper's figure
 """
 
 import dataclasses
@@ -28,8 +29,8 @@ from fcos_lidar_jax.files import atomic_write, read_json
 
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
-_FEWEST_SEEDS = 3  # Of a verdict.
-_MOST_SEEDS = 100  # More would not be looked for, nor trained.
+_MIN_SEEDS = 3  # Seeds needed for a verdict.
+_MAX_SEEDS = 100  # Largest number of seeds that is worth naming.
 _DIRECTION = "agrees in direction alone"
 _OUR_NDS = (
     " Simulated objects have no attributes: their error is 1 in every row, so NDS is at most 90 here, and the\n"
@@ -40,22 +41,22 @@ _MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- e
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Where the figures are, and whether the document is written."""
+    """Options of the ledger."""
 
     results: Path = RESULTS  # Folder of the figures.
-    write: bool = False  # Put the ledger into experiments/README.md.
+    write: bool = False  # Write the ledger into experiments/README.md.
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
     """A claim that needs no training."""
 
-    claim: str  # In words.
-    file: str  # Of the results, without .json.
-    value: Callable[[Any], float]  # Our figure, from what the file holds.
+    claim: str  # Text of the claim.
+    file: str  # Results file, without .json.
+    value: Callable[[Any], float]  # Computes our figure from the file's content.
     paper: float  # The paper's figure.
-    above: bool = False  # The paper gives a lower bound.
-    decides: str = ""  # What stands in the way, where they do not agree.
+    above: bool = False  # The paper states a lower bound.
+    decides: str = ""  # What would settle a disagreement.
 
 
 def _kept(rounds: int, column: str) -> Callable[[Any], float]:
@@ -113,7 +114,7 @@ FIGURES = (
 
 
 def verdict_of_figure(figure: Figure, ours: float) -> str:
-    """Agrees within a tenth, or above a lower bound; else in the direction alone, or not.
+    """Compare our figure with the paper's: agreement is within a tenth, or above a lower bound.
 
     >>> figure = Figure("", "", float, 1.2)
     >>> [verdict_of_figure(figure, ours) for ours in (1.25, 2.0, 0.9)]
@@ -127,10 +128,10 @@ def verdict_of_figure(figure: Figure, ours: float) -> str:
 
 
 def verdict(gains: list[float], paper: float) -> tuple[str, str]:
-    """Whether gains, one a seed, agree with the paper's, and what would settle or reverse it.
+    """Compare gains, one per seed, with the paper's gain; returns the verdict and what would settle or reverse it.
 
-    What would decide, in about half of the cases, is the number of seeds whose interval would tell the paper's
-    gain from none, if they scatter as those so far.
+    An undecided claim names the number of seeds with which the interval would separate the paper's gain from zero
+    in about half of the cases, if further seeds have the same deviation.
 
     >>> verdict([2.0, 2.1, 2.2], 1.9)
     ('agrees', '')
@@ -140,16 +141,16 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     ('disagrees', "a training as long as the paper's")
     >>> verdict([-1.0, 0.5, 2.0], 1.0)
     ('undecided', '12 seeds, or a longer training')
-    >>> verdict([2.0, 2.1], 1.9)  # that two agree says nothing about how far a third may be off
+    >>> verdict([2.0, 2.1], 1.9)  # two seeds say nothing about their spread
     ('undecided', 'more seeds')
     """
     bounds = interval(gains)
-    if bounds is None or len(gains) < _FEWEST_SEEDS:
+    if bounds is None or len(gains) < _MIN_SEEDS:
         return "undecided", "more seeds"
     _, low, high = bounds
     if low <= 0 <= high and low <= paper <= high:
         needed = _seeds_needed(gains, abs(paper))
-        number = str(needed) if needed <= _MOST_SEEDS else f"over {_MOST_SEEDS}"
+        number = str(needed) if needed <= _MAX_SEEDS else f"over {_MAX_SEEDS}"
         return "undecided", f"{number} seeds, or a longer training"
     if (low > 0 and paper > 0) or (high < 0 and paper < 0):
         return "agrees" if low <= paper <= high else _DIRECTION, ""
@@ -157,30 +158,32 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
 
 
 def _seeds_needed(gains: list[float], gain: float) -> int:
-    """Seeds after which the half-width of the interval falls below a gain, by the deviation of these."""
+    """Number of seeds with which the interval's half-width falls below a gain, at the deviation of these gains."""
     import numpy as np
     from scipy.stats import t
 
     deviation = float(np.std(gains, ddof=1))
     number = len(gains)
-    while t.ppf(0.975, number - 1) * deviation / math.sqrt(number) >= gain and number <= _MOST_SEEDS:
+    while t.ppf(0.975, number - 1) * deviation / math.sqrt(number) >= gain and number <= _MAX_SEEDS:
         number += 1
     return number
 
 
 def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str = "mAP") -> tuple[list[float], int]:
-    """Points of a score that a row gains over its reference, by seed, where its cells are there; samples seen."""
+    """Return a row's gains over its reference in points, one per seed with both cells, and the training
+    samples."""
     config, reference = (r.change(scale.base) for r in (row, table.reference_of(row)))
-    known, gains = read_cells(cells, scale), list[float]()
-    for seed in sorted({seed for _, seed in known}):
-        one, other = (known.get((changes_of(c, scale.base), seed), {}).get("scores") for c in (config, reference))
-        if one and other:
-            gains.append(100 * (one[score] - other[score]))
+    by_changes, gains = read_cells(cells, scale), list[float]()
+    changes = [changes_of(c, scale.base) for c in (config, reference)]
+    for seed in sorted({seed for _, seed in by_changes}):
+        own, other = (by_changes.get((names, seed), {}).get("scores") for names in changes)
+        if own and other:
+            gains.append(100 * (own[score] - other[score]))
     return gains, scale.train_frames * config.optimizer.epochs
 
 
 def figure_lines(results: Path) -> Iterator[str]:
-    """The claims that need no training, a line of Markdown each."""
+    """Yield a line of Markdown for each claim that needs no training."""
     for figure in FIGURES:
         ours = figure.value(read_json(results / f"{figure.file}.json", dict[str, Any]))
         said = verdict_of_figure(figure, ours)
@@ -191,53 +194,49 @@ def figure_lines(results: Path) -> Iterator[str]:
 
 
 def claims(score: str) -> Iterator[tuple[str, Table, Row, float]]:
-    """The rows of the paper's tables with a gain in a score: in words, table, row and the paper's gain."""
-    for table in TABLES:
+    """Yield claim, table, row and the paper's gain for each row of the paper's tables with a gain in a score."""
+    for table in TABLES.values():
         for row in table.rows:
             label, paper = table.reference_of(row).label, table.paper_difference(row).get(score)
             if row.label != label and paper is not None:
                 yield f"{table.title}: {row.label} instead of {label}", table, row, paper
 
 
-def training_lines(results: Path, score: str) -> Iterator[str]:
-    """The claims about a score whose rows were trained, a line of Markdown each."""
-    scale = quarter(Path("unused"))
+def training_lines(results: Path, score: str) -> tuple[list[str], list[str]]:
+    """Return a line of Markdown for each claim about a score, and the claims without trained cells."""
+    scale, lines, missing = quarter(Path("unused")), list[str](), list[str]()
     for claim, table, row, paper in claims(score):
         gains, samples = gains_of(table, row, scale, results / "tables" / scale.name, score)
-        if gains:
-            said, decides = verdict(gains, paper)
-            mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
-            ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
-            seeds = f"{len(gains)} seed{'s' if len(gains) > 1 else ''}"
-            what = f"{scale.name}, {seeds}, {samples:,} samples"
-            yield f"| {claim} | {paper:+.2f} | {ours} | {what} | {said} | {decides} |"
-
-
-def not_trained(results: Path) -> list[str]:
-    """The claims without a seed whose cells have scores, in words."""
-    scale = quarter(Path("unused"))
-    cells = results / "tables" / scale.name
-    return [claim for claim, table, row, _ in claims("mAP") if not gains_of(table, row, scale, cells)[0]]
+        if not gains:
+            missing.append(f"- {claim}")
+            continue
+        said, decides = verdict(gains, paper)
+        mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
+        ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
+        source = f"{scale.name}, {len(gains)} seed{'s' if len(gains) > 1 else ''}, {samples:,} samples"
+        lines.append(f"| {claim} | {paper:+.2f} | {ours} | {source} | {said} | {decides} |")
+    return lines, missing
 
 
 def as_markdown(results: Path) -> str:
-    """The whole ledger."""
+    """Format the whole ledger."""
     head = (
         "| claim | paper | here | from | verdict | what would settle or reverse it |\n|---|---|---|---|---|---|\n"
     )
     parts = [f"Without training:\n\n{head}" + "\n".join(figure_lines(results))]
-    for score, note in (("mAP", ""), ("NDS", _OUR_NDS)):
-        parts.append(f"Gains in points of {score}.{note}\n\n{head}" + "\n".join(training_lines(results, score)))
-    if missing := not_trained(results):
-        parts.append("Not run, or diverged:\n\n" + "\n".join(f"- {claim}" for claim in missing))
+    lines, missing = training_lines(results, "mAP")
+    for score, rows, note in (("mAP", lines, ""), ("NDS", training_lines(results, "NDS")[0], _OUR_NDS)):
+        parts.append(f"Gains in points of {score}.{note}\n\n{head}" + "\n".join(rows))
+    if missing:
+        parts.append("Not run, or diverged:\n\n" + "\n".join(missing))
     return "\n\n".join(parts) + "\n"
 
 
 def with_ledger(document: str, ledger: str) -> str:
-    """A document with the ledger between its two marks.
+    """Insert the ledger between its two marks in a document.
 
     Raises:
-        ValueError: the marks are not there.
+        ValueError: the marks are missing.
 
     >>> print(with_ledger(_MARKS[0] + "old" + _MARKS[1], "new"), end="")
     <!-- the ledger: python -m experiments.ledger --write -->
@@ -253,7 +252,7 @@ def with_ledger(document: str, ledger: str) -> str:
 
 
 def main(args: Args) -> None:
-    """Print the ledger, and write it."""
+    """Print the ledger, and optionally write it."""
     ledger = as_markdown(args.results)
     print(ledger, end="", flush=True)
     if args.write:

@@ -1,4 +1,4 @@
-"""The paper's own figures, with their places."""
+"""Figures of the paper, with their places in it."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The real keyframes as frame sets, and scores by class and by range."""
+"""Real keyframes as frame sets, and scores by class and range."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -26,7 +26,7 @@ SPANS_M = ((0, 20), (20, 40))
 
 @dataclasses.dataclass(frozen=True)
 class Keyframes(FrameSet):
-    """Annotated keyframes of one folder, without the points close to the sensor."""
+    """Annotated keyframes of a folder, without points close to the sensor."""
 
     folder: Path
     number: int
@@ -50,11 +50,11 @@ class Keyframes(FrameSet):
 
 
 def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]:
-    """Name -> keyframes: those of scene-0523 to choose by (even) and to report (odd), and two other scenes.
+    """Open the real keyframes by name: scene-0523 for choices (even) and reports (odd), and two other scenes.
 
     Args:
         data: folder of the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
-        reading: says which points are too close.
+        reading: determines which points are too close.
     """
     scene = open_frames(real_data(data, "nuscenes_scene0523"), split="scene0523", reading=reading, num_sweeps=1)
     sets: dict[str, FrameSet] = {
@@ -67,42 +67,45 @@ def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]
 
 
 def scores_by_range(
-    found: Iterable[Detections],
+    detections: Iterable[Detections],
     frames: Iterable[Frame],
     *,
     repeats: int = 0,
     groups: Sequence[int] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """mAP and AP by class of all boxes, and of those whose centres lie in a span of distances from the sensor.
+    """Compute mAP and AP per class, of all boxes and of boxes with centres in a range of distances from the
+    sensor.
 
-    Truth and detections are divided alike, so a hit across a border counts in neither span. With ``repeats`` sets
-    of frames drawn anew, or of groups of them, the mAPs of more than two frames have intervals.
+    Ground truth and detections are split alike, so a match across a border counts in neither range. With
+    ``repeats`` bootstrap samples of frames, or of groups of frames, the mAP of more than two frames has an
+    interval.
     """
-    found, frames = list(found), list(frames)
-    spans = {f"{low}-{high} m": within(found, frames, low, high) for low, high in SPANS_M}
-    return {name: _scores(*boxes, repeats, groups) for name, boxes in {"all": (found, frames), **spans}.items()}
+    detections, frames = list(detections), list(frames)
+    parts = {"all": (detections, frames)}
+    parts |= {f"{low}-{high} m": within(detections, frames, low, high) for low, high in SPANS_M}
+    return {name: _scores(*part, repeats, groups) for name, part in parts.items()}
 
 
 def within(
-    found: Iterable[Detections], frames: Iterable[Frame], low_m: float, high_m: float
+    detections: Iterable[Detections], frames: Iterable[Frame], low_m: float, high_m: float
 ) -> tuple[list[Detections], list[Frame]]:
-    """Detections and truth whose centres, seen from above, are that far from the sensor, ``high_m`` excluded."""
+    """Select detections and ground truth by the horizontal distance of their centres, excluding ``high_m``."""
 
     def inside(boxes: Any) -> np.ndarray:
         distance = np.hypot(*np.asarray(boxes)[:, :2].T)
         return (distance >= low_m) & (distance < high_m)
 
-    kept = [(frame, inside(frame.boxes)) for frame in frames]
-    near = [
-        dataclasses.replace(f, boxes=f.boxes[k], labels=f.labels[k], num_points=f.num_points[k]) for f, k in kept
-    ]
-    return [dataclasses.replace(d, valid=d.valid & inside(d.boxes)) for d in found], near
+    selected = []
+    for frame in frames:
+        boxes = {name: getattr(frame, name)[inside(frame.boxes)] for name in ("boxes", "labels", "num_points")}
+        selected.append(dataclasses.replace(frame, **boxes))
+    return [dataclasses.replace(d, valid=d.valid & inside(d.boxes)) for d in detections], selected
 
 
 def _scores(
-    found: list[Detections], frames: list[Frame], repeats: int, groups: Sequence[int] | None
+    detections: list[Detections], frames: list[Frame], repeats: int, groups: Sequence[int] | None
 ) -> dict[str, Any]:
-    evaluation = evaluate_frames(found, frames, metric_of(NUSCENES_CLASSES))
+    evaluation = evaluate_frames(detections, frames, metric_of(NUSCENES_CLASSES))
     pairs = zip(NUSCENES_CLASSES, evaluation.rankings, strict=True)
     truths = {name: len(ranking.truth_sample) for name, ranking in pairs}
     aps = {k: round(v, 4) for k, v in evaluation.summary["mean_dist_aps"].items() if truths[k]}
@@ -115,6 +118,6 @@ def _scores(
 def interval_of(
     evaluation: Evaluation, score: str, repeats: int, groups: Sequence[int] | None = None
 ) -> list[float]:
-    """Low and high end of a score's 95 % interval, over frames drawn anew, or over groups of them."""
+    """Compute a score's 95 % bootstrap interval over frames, or over groups of frames."""
     interval = bootstrap(evaluation, repeats=repeats, groups=groups)[score]
     return [round(interval[end], 4) for end in ("low", "high")]

@@ -1,4 +1,4 @@
-"""Training runs of tables and studies: begun or resumed, loaded, evaluated."""
+"""Training runs of tables and studies."""
 
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,10 @@ from fcos_lidar_jax.types import Detections
 def trained(
     folder: Path, config: Config, frames: FrameSet, *, steps: int, seed: int, **options: Any
 ) -> TrainedDetector:
-    """The detector at the end of a run in a folder, which is begun, resumed or found finished.
+    """Start or resume a run in a folder and load its final detector.
 
-    Options are those of :func:`fcos_lidar_jax.train`; by default one device, one thread that prepares
-    batches, and five checkpoints.
+    Options are passed to :func:`fcos_lidar_jax.train`, by default one device, one thread that prepares batches,
+    and five checkpoints.
     """
     defaults = {"threads": 1, "devices": jax.devices()[:1], "schedule": Schedule(-(-steps // 5), steps)}
     resume = (folder / RUN_SPEC).exists()
@@ -31,12 +31,14 @@ def trained(
 
 
 def detections(detector: TrainedDetector, frames: FrameSet) -> tuple[list[Detections], list[Frame]]:
-    """What a detector finds in frames, and the frames, of one process."""
+    """Detect in frames; returns detections and frames."""
     predictions = list(predict(detector, frames))
     return [p.detections for p in predictions], [p.frame for p in predictions if p.frame is not None]
 
 
-def benchmark(found: list[Detections], frames: list[Frame]) -> Evaluation:
-    """The sums of nuScenes' benchmark: a class without truth has AP 0. The ranges count from the sensor, and every
-    attribute is wrong."""
-    return evaluate(*frame_columns(found, frames))
+def benchmark(detections: list[Detections], frames: list[Frame]) -> Evaluation:
+    """Evaluate like nuScenes' benchmark: a class without ground truth has AP 0.
+
+    Ranges are relative to the sensor, and all attributes are wrong.
+    """
+    return evaluate(*frame_columns(detections, frames))

@@ -1,4 +1,4 @@
-"""What the scripts share: options, one line for a failure, the real data's folder, the record of a measurement."""
+"""Shared parts of the scripts: options, errors in one line, folder of the real data, and results files."""
 
 import dataclasses
 import json
@@ -19,18 +19,18 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of every script that measures; its own are a subclass."""
+    """Base of the options of a script that measures."""
 
-    out: Path | None = None  # JSON file of the figures; default: outputs/SCRIPT.json.
+    out: Path | None = None  # JSON file for the figures; default: outputs/SCRIPT.json.
 
 
 OptionsT = TypeVar("OptionsT", bound=Options)
 
 
 def run_script(work: Callable[[T], object], options: type[T], description: str | None) -> NoReturn:
-    """Parse the options, do the work and leave with the exit code; a foreseeable failure is one line.
+    """Parse the options, do the work and exit; an expected failure prints one line.
 
-    The description, a script's docstring, is for ``--help``.
+    The description is shown by ``--help``.
     """
     name = Path(sys.argv[0]).name
     sys.exit(exit_code(name, lambda: work(tyro.cli(options, description=description))))
@@ -42,7 +42,7 @@ def run_measurement(
     description: str | None,
     as_text: Callable[[dict[str, Any]], str] | None = None,
 ) -> NoReturn:
-    """As :func:`run_script`, for work whose result is a record, which is printed (as text, if given) and saved."""
+    """Like :func:`run_script`, for work whose record is printed, optionally as text, and saved."""
 
     def work(args: OptionsT) -> None:
         record = measure(args)
@@ -52,7 +52,7 @@ def run_measurement(
 
 
 def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> None:
-    """Write a measurement as JSON, with the machine it was made on, and print it, or a text in its place."""
+    """Write a measurement and its hardware as JSON, and print it, or a text instead."""
     written = compact_json({**record, **hardware()})
     print(text or written, flush=True)
     file = out or Path("outputs", f"{Path(sys.argv[0]).stem}.json")
@@ -60,7 +60,7 @@ def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> N
 
 
 def compact_json(value: Any, depth: int = 2) -> str:
-    """JSON text; what lies deeper than ``depth`` levels shares a line.
+    """Format JSON with one line for each value at ``depth`` levels.
 
     >>> print(compact_json({"car": {"AP": [0.1, 0.2], "truths": 3}, "seed": 0}))
     {
@@ -82,10 +82,13 @@ def compact_json(value: Any, depth: int = 2) -> str:
 
 
 def find_real_data(folder: Path | None, *parts: str) -> Path | None:
-    """A file or folder of the real data, below the folder given or the one that the environment names, if any.
+    """Find a file or folder of the real data, below the given folder or the environment's FCOS_LIDAR_REAL_DATA.
+
+    Returns:
+        the path, or None if neither folder is given.
 
     Raises:
-        ValueError: it is not there.
+        ValueError: the path does not exist.
     """
     root = folder or os.environ.get("FCOS_LIDAR_REAL_DATA")
     if not root:
@@ -98,7 +101,7 @@ def find_real_data(folder: Path | None, *parts: str) -> Path | None:
 
 
 def real_data(folder: Path | None, part: str) -> Path:
-    """As :func:`find_real_data`, for scripts that cannot do without: ValueError where no folder is named."""
+    """Like :func:`find_real_data`, with a ValueError if no folder is given."""
     path = find_real_data(folder, part)
     if path is None:
         raise ValueError(f"--data: missing, expected the folder that holds {part}/")

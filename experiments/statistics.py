@@ -1,4 +1,4 @@
-"""Intervals over seeds, and over frames."""
+"""Confidence intervals over seeds and over frames."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from fcos_lidar_jax.evaluation.metrics import Evaluation
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float] | None:
-    """Mean and 95 % interval of Student's t over seeds; None for fewer than two.
+    """Compute mean and 95 % interval of Student's t over seeds; None for fewer than two.
 
     >>> [round(v, 3) for v in interval([1.0, 2.0, 3.0])]
     [2.0, -0.484, 4.484]
@@ -24,12 +24,12 @@ def interval(values: Sequence[float]) -> tuple[float, float, float] | None:
 
 
 def paired_difference(one: Evaluation, other: Evaluation, *, repeats: int = 1000) -> tuple[float, float]:
-    """95 % interval of the other's mAP minus the one's, over frames of both drawn anew, the same for both."""
-    rng, number, drawn = np.random.default_rng(0), len(one.tokens), []
-
+    """Compute the 95 % bootstrap interval of ``other``'s mAP minus ``one``'s, resampling the same frames for
+    both."""
+    rng, number, differences = np.random.default_rng(0), len(one.tokens), []
     for _ in range(repeats):
         copies = np.bincount(rng.integers(0, number, number), minlength=number)
-        ours, theirs = (scores_of_draw(evaluation, copies)["mean_ap"] for evaluation in (one, other))
-        drawn.append(theirs - ours)
-    low, high = np.quantile(drawn, [0.025, 0.975])
+        before, after = (scores_of_draw(evaluation, copies)["mean_ap"] for evaluation in (one, other))
+        differences.append(after - before)
+    low, high = np.quantile(differences, [0.025, 0.975])
     return float(low), float(high)

@@ -1,4 +1,4 @@
-"""FCOS-LiDAR in JAX: 3D object detection on LiDAR range images, from pure functions.
+"""FCOS-LiDAR in JAX: 3D object detection on LiDAR range images with pure functions.
 
 >>> import numpy as np
 >>> import fcos_lidar_jax as fcos
@@ -38,7 +38,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    # Imported when first used: importing the package alone must not load JAX.
+    # Imported on first use, because importing the package must not load JAX.
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

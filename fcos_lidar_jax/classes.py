@@ -1,4 +1,4 @@
-"""Class names of the data sets that are known, and what follows from a name."""
+"""Class names of the supported data sets, and defaults per class."""
 
 NUSCENES_CLASSES = (
     *("car", "truck", "bus", "trailer", "construction_vehicle"),
@@ -23,12 +23,12 @@ RANGES_M = {
     **dict.fromkeys(KITTI_CLASSES, 70.0),
     **dict.fromkeys(ARGOVERSE2_CLASSES, 100.0),
 }
-"""Class -> greatest distance at which it is evaluated, in metres: nuScenes' are the benchmark's."""
-DEFAULT_RANGE_M = 50.0  # For every other class.
+"""Class -> evaluation range, metres; nuScenes' ranges are the benchmark's."""
+DEFAULT_RANGE_M = 50.0  # Evaluation range of other classes.
 
 PASTE_TARGETS = {
     **dict(zip(NUSCENES_CLASSES, (2, 3, 4, 6, 7, 2, 6, 6, 2, 2), strict=True)),
     **dict(zip(KITTI_CLASSES, (15, 10, 10), strict=True)),
 }
-"""Reading: class -> boxes that copy-paste fills a frame up to."""
-DEFAULT_PASTE_TARGET = 2  # For every other class.
+"""Reading: class -> number of boxes up to which copy-paste fills a frame."""
+DEFAULT_PASTE_TARGET = 2  # Paste target of other classes.

@@ -1,4 +1,4 @@
-"""The named configurations: the paper's detectors and small ones for first contact and tests."""
+"""Named configurations: the paper's detectors, and small ones for first steps and tests."""
 
 import dataclasses
 import math
@@ -20,7 +20,7 @@ NUSCENES = Config()
 """The paper's detector: ten sweeps, five rounds."""
 
 NUSCENES_SINGLE = dataclasses.replace(NUSCENES, name="nuscenes_single", num_sweeps=1, max_points=40_000)
-"""The paper's single-frame detector: the same network on one sweep, five rounds too."""
+"""The paper's single-frame detector: the same network and five rounds on one sweep."""
 
 NUSCENES_TEST = dataclasses.replace(
     NUSCENES, name="nuscenes_test", fade_epochs=5, model=dataclasses.replace(NUSCENES.model, head_channels=128)
@@ -35,18 +35,18 @@ KITTI = dataclasses.replace(
     max_points=131_072,
     max_boxes=64,
     class_balanced=False,
-    # 64 beams need no doubling.
+    # With 64 beams the rows need no doubling.
     model=dataclasses.replace(
         NUSCENES.model,
         row_upscale=1,
         channel_mean=(10.9, 0.0, -1.04, 12.1, 0.0, -0.15, 53.6, 0.0, 0.0),
         channel_scale=(11.5, 6.9, 0.86, 12.3, 0.4, 0.13, 40.8, 1.0, 0.144),
     ),
-    # Labels and points lie within the camera's view, ahead: no turns that leave it, no driving backwards.
+    # Labels and points are limited to the camera's view ahead: rotations must not leave it.
     augment=AugmentConfig(flip_x_probability=0.0, max_rotation_rad=math.pi / 4),
 )
-"""KITTI's benchmark: one sweep, the camera's view, three classes. The channels' means and scales are those
-commonly used for this view; those of the angles are nominal."""
+"""KITTI: one sweep, the camera's view, three classes. The means and scales of the channels are the usual ones for
+this view; the angles' are nominal."""
 
 ARGOVERSE2 = dataclasses.replace(
     NUSCENES_SINGLE,
@@ -61,8 +61,8 @@ ARGOVERSE2 = dataclasses.replace(
         channel_scale=(14.0, 14.0, 1.3, 13.0, 1.8, 0.17, 17.6, 1.0, 0.144),
     ),
 )
-"""Argoverse 2's sensor data set: one sweep of both LiDARs, 26 classes. The channels' means and scales are nominal,
-those of simulated frames."""
+"""Argoverse 2's sensor data set: one sweep of both LiDARs, 26 classes. The means and scales of the channels were
+measured on simulated frames."""
 
 QUICKSTART = dataclasses.replace(
     NUSCENES,
@@ -85,7 +85,7 @@ QUICKSTART = dataclasses.replace(
     ),
     optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=2),
 )
-"""Small enough to train on two CPU cores: the same code, other numbers."""
+"""The same code with smaller numbers, to train on two CPU cores."""
 
 COMPACT = dataclasses.replace(
     NUSCENES_SINGLE,
@@ -105,25 +105,25 @@ COMPACT = dataclasses.replace(
         head_channels=32,
         head_convs=2,
     ),
-    # At the paper's 0.25 a nearly square object can settle a quarter turn off with its sides exchanged: there the
-    # IoU is perfect and only the L1 loss objects.
+    # With the paper's 0.25, a nearly square object can stay rotated by 90 degrees with its sides swapped: its IoU
+    # is perfect, and only the L1 loss penalises it.
     loss=LossConfig(l1_weight=1.0),
-    # Objects do not overlap on the ground, so a box that does is mostly another estimate of the same object.
+    # Objects do not overlap on the ground, so overlapping boxes mostly estimate the same object.
     inference=InferenceConfig(iou_threshold=0.1, iou_exponent=0.5, merge_iou=0.1),
-    # The street's direction stays near that of the drive, as it is in what will be seen.
+    # Streets mostly run in the driving direction, in training as in detection.
     augment=AugmentConfig(max_rotation_rad=math.pi / 8),
     optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=1, ema_decay=0.998),
 )
 """One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with an eighth of its parameters.
 
-Where the time goes decides the numbers (``experiments/LOG.md``, 2026-11-22; figures are times from
-file to boxes, relative to this preset). What works at stride 1 costs most, so it is narrow: heads of 48 channels
-1.23, of four convolutions 1.17, a stem of 8 channels a type 1.30, a first stage of 32 1.17. The backbone's later
-stages cost least, so there it is deep: the quickstart's blocks 0.92, its whole network 0.83. Doubled rows hold
-the same points for 1.95 times the time. Tied heads save parameters alone: 1.02. The image wraps around: no seam
-behind the vehicle. NMS at 0.1, weighted NMS and the IoU's exponent are not in the paper:
-``python -m experiments.studies.post_processing`` measures what each adds. Neither are the axes of the regression;
-``experiments/LOG.md`` compares them with the paper's.
+The sizes follow from measured times (``experiments/LOG.md``, 2026-11-22; numbers are times from file to boxes,
+relative to this preset). Layers at stride 1 cost most, so they are narrow: heads with 48 channels take 1.23, heads
+with four convolutions 1.17, a stem with 8 channels per type 1.30, a first stage of width 32 1.17. The later stages
+of the backbone cost least, so they are deep: the quickstart's blocks take 0.92, its whole network 0.83. Doubled
+rows take 1.95 and contain the same points. Tied heads only save parameters: 1.02. The image wraps around, so there
+is no seam behind the vehicle. NMS at 0.1, weighted NMS and the IoU exponent are not in the paper;
+``python -m experiments.studies.post_processing`` measures what each adds. The regression axes are not in the paper
+either; ``experiments/LOG.md`` compares them with the paper's.
 """
 
 CENTERPOINT_PILLARS = CenterPointConfig.of(
@@ -136,7 +136,7 @@ CENTERPOINT_PILLARS = CenterPointConfig.of(
     augment=AugmentConfig(max_rotation_rad=math.pi / 8),
     optimizer=OptimizerConfig(peak_learning_rate=1e-3, epochs=20),
 )
-"""CenterPoint on pillars with the numbers of its authors for nuScenes: ten sweeps, pillars of 0.2 m."""
+"""CenterPoint on pillars with its authors' values for nuScenes: ten sweeps, pillars of 0.2 m."""
 
 CENTERPOINT_COMPACT = CenterPointConfig.of(
     COMPACT,
@@ -154,8 +154,9 @@ CENTERPOINT_COMPACT = CenterPointConfig.of(
         head_channels=32,
     ),
 )
-"""CenterPoint for comparison with ``compact``: its sweep, augmentation, optimizer and post-processing, pillars of
-0.4 m, and half the parameters. One group of all classes: rare ones share their features with frequent ones."""
+"""CenterPoint for comparison with ``compact``: the same sweep, augmentation, optimizer and post-processing, with
+pillars of 0.4 m and half the parameters. All classes are one group: rare classes share features with frequent
+ones."""
 
 PRESETS: dict[str, Config] = {
     c.name: c
@@ -164,4 +165,4 @@ PRESETS: dict[str, Config] = {
         *(CENTERPOINT_PILLARS, CENTERPOINT_COMPACT),
     )
 }
-"""Name -> configuration."""
+"""Configurations by name."""

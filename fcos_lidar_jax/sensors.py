@@ -8,6 +8,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fcos_lidar_jax.fields import check, check_choices, check_hashable, from_json
+
+_MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
+_MAX_ROWS = 4096  # Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.
+
+
+def _finite(*values: float) -> bool:
+    return all(abs(value) <= _MAX_NUMBER for value in values)
+
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
@@ -46,9 +55,7 @@ class Sensor:
     azimuth_limits_rad: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if isinstance(value := getattr(self, field.name), list | np.ndarray):
-                raise ValueError(f"{field.name}: got {value!r}, expected a tuple")
+        check_hashable(self)
         table = np.asarray(self.inclinations_rad, np.float64)
         if table.ndim != 1 or table.size < 2:
             raise ValueError(f"inclinations_rad: got {table.size} beams, expected at least 2")
@@ -56,23 +63,19 @@ class Sensor:
             raise ValueError("inclinations_rad: expected finite radians within [-pi/2, pi/2]")
         if not (np.diff(table) < 0).all():
             raise ValueError("inclinations_rad: expected strictly decreasing values, the highest beam first")
-        if not isinstance(self.num_columns, int) or self.num_columns < 2:
-            raise ValueError(f"num_columns: got {self.num_columns!r}, expected an integer of at least 2")
-        if len(self.origin_m) != 3 or not np.isfinite(self.origin_m).all():
-            raise ValueError(f"origin_m: got {self.origin_m!r}, expected three finite numbers")
-        if not self.limit_xy_m > 0:
-            raise ValueError(f"limit_xy_m: got {self.limit_xy_m!r}, expected a positive number")
-        if len(self.limit_z_m) != 2 or not self.limit_z_m[0] < self.limit_z_m[1]:
-            raise ValueError(f"limit_z_m: got {self.limit_z_m!r}, expected (low, high) with low < high")
-        if not (math.isfinite(self.intensity_scale) and self.intensity_scale > 0):
-            raise ValueError(f"intensity_scale: got {self.intensity_scale!r}, expected a positive number")
-        if self.row_source not in ("inclination", "laser"):
-            raise ValueError(f"row_source: got {self.row_source!r}, expected 'inclination' or 'laser'")
-        if self.azimuth_limits_rad is not None:
-            ends = self.azimuth_limits_rad
-            if len(ends) != 2 or not (abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi):
-                expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
-                raise ValueError(f"azimuth_limits_rad: got {ends!r}, expected {expected}")
+        columns, origin, limits_z = self.num_columns, self.origin_m, self.limit_z_m
+        check(isinstance(columns, int) and columns >= 2, "num_columns", columns, "an integer of at least 2")
+        check(len(origin) == 3 and _finite(*origin), "origin_m", origin, "three finite numbers")
+        ordered = len(limits_z) == 2 and _finite(*limits_z) and limits_z[0] < limits_z[1]
+        check(ordered, "limit_z_m", limits_z, "finite (low, high) with low < high")
+        for name in ("limit_xy_m", "intensity_scale"):
+            value = getattr(self, name)
+            check(_finite(value) and value > 0, name, value, "a positive number")
+        check_choices(self)
+        if (ends := self.azimuth_limits_rad) is not None:
+            within = len(ends) == 2 and abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
+            expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
+            check(within, "azimuth_limits_rad", ends, expected)
 
     @property
     def first_azimuth_rad(self) -> float:
@@ -199,7 +202,18 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     return record
 
 
-_MAX_ROWS = 4096  # far more than any LiDAR has, so that a corrupt number cannot exhaust the memory
+@dataclasses.dataclass(frozen=True)
+class _EvenBeams:
+    """Evenly spaced beams, in degrees, of a sensor file."""
+
+    lowest: float
+    highest: float
+    rows: int
+
+    def __post_init__(self) -> None:
+        for name in ("lowest", "highest"):
+            check(_finite(getattr(self, name)), name, getattr(self, name), "a finite number")
+        check(2 <= self.rows <= _MAX_ROWS, "rows", self.rows, f"an integer from 2 to {_MAX_ROWS}")
 
 
 def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
@@ -218,43 +232,12 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     >>> sensor_from_json({"name": "mine", "num_columns": 1024, "inclinations_deg": beams}).num_rows
     64
     """
-    if not isinstance(record, dict):
-        raise ValueError(f"{where}: got {type(record).__name__}, expected a JSON object")
-    record = dict(record)
-    if "inclinations_deg" in record:
-        beams = record.pop("inclinations_deg")
-        if not isinstance(beams, dict) or set(beams) != {"lowest", "highest", "rows"}:
-            expected = "an object with lowest, highest and rows"
-            raise ValueError(f"{where}: inclinations_deg: got {beams!r}, expected {expected}")
-        low, high = (_number(beams[end], f"{where}: inclinations_deg.{end}") for end in ("lowest", "highest"))
-        if not isinstance(beams["rows"], int) or not 2 <= beams["rows"] <= _MAX_ROWS:
-            expected = f"an integer from 2 to {_MAX_ROWS}"
-            raise ValueError(f"{where}: inclinations_deg.rows: got {beams['rows']!r}, expected {expected}")
-        record["inclinations_rad"] = even_inclinations(low, high, beams["rows"])
-    fields = {f.name: f for f in dataclasses.fields(Sensor)}
-    unknown = sorted(set(record) - set(fields))
-    if unknown:
-        raise ValueError(f"{where}: {unknown[0]}: unknown field, expected one of {', '.join(sorted(fields))}")
-    for name, field in fields.items():
-        if name not in record:
-            if field.default is dataclasses.MISSING:
-                raise ValueError(f"{where}: {name}: missing")
-            continue
-        value = record[name]
-        if name == "azimuth_limits_rad" and value is None:
-            continue
-        if name in ("inclinations_rad", "origin_m", "limit_z_m", "azimuth_limits_rad"):
-            if not isinstance(value, list | tuple):
-                raise ValueError(f"{where}: {name}: got {value!r}, expected a list of numbers")
-            record[name] = tuple(_number(v, f"{where}: {name}") for v in value)
-        elif name in ("limit_xy_m", "intensity_scale"):
-            record[name] = _number(value, f"{where}: {name}")
-        elif name == "name" and not isinstance(value, str):
-            raise ValueError(f"{where}: {name}: got {value!r}, expected a string")
-    try:
-        return Sensor(**record)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+    if isinstance(record, dict) and "inclinations_deg" in record:
+        beams = from_json(_EvenBeams, record["inclinations_deg"], f"{where}.inclinations_deg")
+        table = even_inclinations(beams.lowest, beams.highest, beams.rows)
+        others = {name: value for name, value in record.items() if name != "inclinations_deg"}
+        record = {**others, "inclinations_rad": table}
+    return from_json(Sensor, record, where, defaults=True)
 
 
 def load_sensor(path: str | Path) -> Sensor:
@@ -279,12 +262,3 @@ def load_sensor(path: str | Path) -> Sensor:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not JSON: {error}") from None
     return sensor_from_json(record, str(path))
-
-
-_MAX_NUMBER = 1e30  # comparing with it also rejects NaN and integers beyond float range
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MAX_NUMBER:
-        raise ValueError(f"{where}: got {value!r}, expected a finite number")
-    return float(value)

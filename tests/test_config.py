@@ -98,6 +98,7 @@ def test_json_gives_back_the_configuration(name):
         (("num_sweeps",), True, "run.num_sweeps: got True, expected int"),
         (("augment", "scale_range"), [1.05, 0.95], "run.augment.scale_range"),
         (("loss",), MISSING, r"run\.loss: missing"),
+        (("loss", "l1_weight"), 10**400, r"run\.loss\.l1_weight: got 1000"),
     ],
 )
 def test_bad_json_gets_one_line_with_the_field(path, value, message):

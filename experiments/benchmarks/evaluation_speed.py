@@ -1,13 +1,13 @@
-"""How fast is the evaluation beside the official devkit's, on the same files, and how much memory does it take?
+"""Speed and memory of the evaluation beside the official devkit, on the same files.
 
     pip install --no-deps nuscenes-devkit==1.2.0
     pip install opencv-python-headless scikit-learn cachetools pyquaternion tqdm
     python -m experiments.benchmarks.evaluation_speed
 
-Generates a data set and a results file of the size of nuScenes val (6,019 keyframes in 150 scenes, 30 annotations
-and 200 predictions each), evaluates it with both in processes of their own, and expects the same numbers. Compared
-are the time from the tables in memory to the summary (the devkit's ``DetectionEval`` without curves) and that of
-the whole process. The command ``fcos-lidar evaluate --results FILE`` is measured too.
+Generates a data set and a results file of the size of nuScenes val (6,019 keyframes in 150 scenes, with 30
+annotations and 200 predictions each), evaluates it with both in separate processes, and expects the same numbers.
+Compares the time from tables in memory to the summary (the devkit's ``DetectionEval`` without curves) and the time
+of the whole process. Also measures the command ``fcos-lidar evaluate --results FILE``.
 
 Cost: five minutes, 1.5 GB of disk, 3 GB of memory. Expected: 20 times as fast from the tables on, below 2 GiB.
 """
@@ -38,10 +38,10 @@ TRUTHS, PREDICTIONS = 30, 200  # of every keyframe
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """How large, and how often."""
+    """Options of the comparison."""
 
     samples: int = 6019  # Keyframes, spread over the split's scenes.
-    repeats: int = 3  # Runs of ours, of which the median counts; the devkit runs once.
+    repeats: int = 3  # Runs of our evaluation, for the median; the devkit runs once.
 
 
 def _make_files(root: Path, samples: int) -> None:
@@ -62,7 +62,7 @@ def _make_files(root: Path, samples: int) -> None:
 
 
 def make_predictions(rng: np.random.Generator, truths: list[tuple[str, Row]]) -> Iterator[Row]:
-    """Boxes about the truths of a keyframe, near and far, the nearer the likelier to score high."""
+    """Make boxes around the annotations of a keyframe; nearer boxes tend to have higher scores."""
     away = rng.exponential(2.0, (PREDICTIONS, 1)) * rng.normal(0, [1, 1, 0.1], (PREDICTIONS, 3))
     score = np.clip(np.exp(-np.linalg.norm(away, axis=1)) * rng.beta(4, 2, PREDICTIONS), 1e-3, None)
     scale, velocity = rng.uniform(0.8, 1.25, (PREDICTIONS, 3)), rng.normal(0, 2, (PREDICTIONS, 2))
@@ -115,11 +115,11 @@ def now(stage):
     stages[f"{stage}_s"], stages[f"{stage}_cpu_s"] = wall - last[0], cpu - last[1]
     last[:] = wall, cpu
 """
-"""Before either: wall and processor time of its stages; importing the packages counts as reading the tables."""
+"""Start of both programs: measures wall and processor time of the stages, with imports as part of ``tables``."""
 
 
 def run(command: list[str]) -> tuple[str, dict[str, float]]:
-    """Last line of the output, wall time and peak memory of a process."""
+    """Run a process; returns its last output line, wall time and peak memory."""
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -132,7 +132,7 @@ def run(command: list[str]) -> tuple[str, dict[str, float]]:
 
 
 def staged(name: str, code: str, arguments: list[str]) -> dict[str, float]:
-    """The times that a program reports, its wall time and its memory."""
+    """Run a program; returns its reported times, wall time and memory."""
     line, figures = run([sys.executable, "-c", f"{STAGED}{code}print(json.dumps(stages))", *arguments])
     figures |= json.loads(line)
     for unit in ("s", "cpu_s"):
@@ -142,7 +142,7 @@ def staged(name: str, code: str, arguments: list[str]) -> dict[str, float]:
 
 
 def differences(ours: Any, theirs: Any, path: str = "") -> list[str]:
-    """Where two summaries are not the same to 1e-9."""
+    """List the places where two summaries differ by more than 1e-9."""
     if isinstance(theirs, dict):
         if list(ours) != list(theirs):
             return [f"{path}: keys"]
@@ -154,7 +154,7 @@ def differences(ours: Any, theirs: Any, path: str = "") -> list[str]:
 
 
 def main(args: Args) -> None:
-    """Generate, run both, compare, write the figures."""
+    """Generate the files, run both, compare, and save the figures."""
     with tempfile.TemporaryDirectory() as folder:
         root, began = Path(folder), time.perf_counter()
         _make_files(root, args.samples)

@@ -1,10 +1,11 @@
-"""What the paper's preset costs here: parameters, memory, the time of every stage, and of one training step.
+"""Cost of the paper's preset: parameters, memory, and times of all stages and of one training step.
 
     python -m experiments.benchmarks.full_size --data FOLDER  # on the real keyframe of scene-0061
     python -m experiments.benchmarks.full_size  # on a simulated frame
     python -m experiments.benchmarks.full_size --memory-only --out experiments/results/training_memory.json
 
-Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameters; the network is 99 % of the path.
+Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameters; the network takes 99 % of the
+time.
 """
 
 import dataclasses
@@ -42,19 +43,22 @@ from fcos_lidar_jax.types import Batch
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """What to measure."""
+    """Options of the measurement."""
 
     preset: Literal["nuscenes", "nuscenes_single", "quickstart"] = "nuscenes"  # Configuration preset.
     data: Path | None = None
     """Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated frame."""
-    repeats: int = 15  # Turns, of which the median counts.
+    repeats: int = 15  # Timed calls, for the median.
     memory_only: bool = False
-    """Nothing is run: only the memory of a training step is measured, without and with ``model.remat``."""
+    """Only compute the memory of a training step, without and with ``model.remat``, and run nothing."""
 
 
 def training_memory(config: Config) -> dict[str, dict[str, float]]:
-    """GiB of a training step of one frame, without and with ``model.remat``: what is kept for the backward pass
-    (by both forms of the stem), and what the compiled program needs beside state and batch."""
+    """Compute the memory of a training step of one frame, without and with ``model.remat``, in GiB.
+
+    ``kept`` is the memory kept for the backward pass, ``temporary`` the compiled program's in addition to state
+    and batch.
+    """
     sensor, found = load_sensor(config.sensor), {}
     points, boxes = (1, config.max_points), (1, config.max_boxes)
     shapes = (*points, sensor.point_columns), points, (*boxes, 9), boxes, boxes
@@ -80,7 +84,7 @@ def training_memory(config: Config) -> dict[str, dict[str, float]]:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """All figures of the preset on one frame."""
+    """Measure all figures of the preset on one frame."""
     config = PRESETS[args.preset]
     if args.memory_only:
         return {"preset": config.name, "training_gib": training_memory(config)}
@@ -109,7 +113,7 @@ def measure(args: Args) -> dict[str, Any]:
     axes = config.model.regression_axes
     objective = functools.partial(sample_losses, config=config.loss, layout=layout, axes=axes)
     losses, assignment = (jax.jit(lambda o, i, part=part: objective(o, i, *truth)[part]) for part in (0, 1))
-    # A trained detector is sure of little: as many candidates as the threshold lets through is the worst case.
+    # The worst case for NMS: unlike a trained detector, many candidates above the threshold.
     eager = dataclasses.replace(outputs, logits=outputs.logits.at[:, -1].add(-4.0))
     detect = jax.jit(make_detect(detector))
     forward, images = jax.jit(lambda v, i: detector.apply(v, i)[0]), jax.tree.map(lambda leaf: leaf[None], image)

@@ -1,18 +1,18 @@
-"""What does XLA make of the programs for a GPU that is not there? Compiled by its whole pipeline, never run.
+"""Compilation of the programs for GPUs by XLA's whole pipeline, without a GPU and without running them.
 
     bash .ci/gpu  # fetches XLA's plugin (0.6 GB) into build/gpu/plugin, then runs this script with its arguments
     bash .ci/gpu --programs train-nuscenes detect-compact
-    bash .ci/gpu --all  # every preset
-    python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin  # once the plugin is there
+    bash .ci/gpu --all  # all presets
+    python -m experiments.benchmarks.gpu_programs --plugin build/gpu/plugin  # with the plugin fetched
 
-Every program is compiled in a process of its own, so that an abort of XLA costs a line and not the check. A line
-per program: seconds, GFLOP per frame, temporary memory, kernels outside of loops, and the loops with their number
-of iterations (``?`` where the data decide) and the kernels of one. ``slow`` counts weight gradients that became a
-convolution with a kernel as large as the image, for which cuDNN has no good algorithm. Exit code 1 where a program
-does not compile, or exchanges anything between devices but sums.
+Each program is compiled in a separate process, so that an abort of XLA does not end the check. Prints one line per
+program: seconds, GFLOP per frame, temporary memory, kernels outside loops, and for each loop its iterations (``?``
+if they depend on data) and kernels per iteration. ``slow`` counts weight gradients that became a convolution with
+a kernel as large as the image, for which cuDNN has no good algorithm. The exit code is 1 if a program does not
+compile, or if devices exchange anything but sums.
 
-There are no times: nothing is run, and the kernels are chosen without measuring them. Cost: about a minute per
-training step and 15 seconds per detection on one core.
+Nothing is run, so there are no times, and kernels are chosen without measuring them. Cost: one minute per training
+step and 15 seconds per detection on one core.
 """
 
 import collections
@@ -61,7 +61,7 @@ dnn_version_info {{ major: 9 minor: 10 }}
 runtime_version {{ major: 12 minor: 9 patch: 0 }}
 device_description_str: "{name}"
 """
-_NUM_LAGS = 410  # Of ten sweeps and what is pasted, by preset ``nuscenes``.
+_NUM_LAGS = 410  # Distinct time lags of ten sweeps and pasted objects, with the preset ``nuscenes``.
 _NO_KERNEL = {
     "parameter",
     "constant",
@@ -78,7 +78,7 @@ _EXCHANGES = ("all-gather", "all-to-all", "collective-permute", "reduce-scatter"
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """One program to compile."""
+    """A program to compile."""
 
     kind: Literal["train", "detect", "export"]
     preset: str
@@ -104,11 +104,11 @@ PROGRAMS = {
     "detect-compact": Program("detect", "compact"),
     "export-quickstart": Program("export", "quickstart"),
 }
-"""The check: what is compiled without ``--all``."""
+"""Programs that are compiled without ``--all``."""
 
 
 def all_programs() -> dict[str, Program]:
-    """The check's programs, and the training and detection of every preset in both precisions."""
+    """List the default programs, and training and detection of all presets in both precisions."""
     from fcos_lidar_jax.presets import PRESETS
 
     programs = dict(PROGRAMS)
@@ -122,13 +122,13 @@ def all_programs() -> dict[str, Program]:
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """What to compile."""
+    """Options of the check."""
 
-    plugin: Path  # Folder with XLA's plugin for CUDA, as `.ci/gpu` fetches it.
-    programs: tuple[str, ...] = ()  # Names of programs; default: those of the check.
-    all: bool = False  # Every preset too.
-    limit_s: int = 900  # Longest time for one program, seconds.
-    one: str | None = None  # Compile this one in this process and print its record; for the script itself.
+    plugin: Path  # Folder with XLA's plugin for CUDA, as fetched by `.ci/gpu`.
+    programs: tuple[str, ...] = ()  # Names of programs; default: the check's.
+    all: bool = False  # Also compile all presets.
+    limit_s: int = 900  # Time limit per program, seconds.
+    one: str | None = None  # Compile one program in this process and print its record (internal).
     text: Path | None = None  # With --one: write the compiled program here.
 
 
@@ -157,7 +157,7 @@ def measure(args: Args) -> dict[str, Any]:
 
 
 def check(args: Args) -> None:
-    """Measure, save, and fail where a program is not as it should be."""
+    """Compile all programs, save the record, and fail if a program fails the check."""
     record = measure(args)
     programs = record["programs"]
     failed = [name for name, found in programs.items() if found.get("failed") or found.get("exchanges")]
@@ -167,7 +167,7 @@ def check(args: Args) -> None:
 
 
 def _compiled(name: str, args: Args, environment: dict[str, str]) -> dict[str, Any]:
-    """The record of one program, compiled in a process of its own."""
+    """Compile one program in a separate process."""
     command = [sys.executable, "-m", "experiments.benchmarks.gpu_programs", "--plugin", str(args.plugin)]
     try:
         done = subprocess.run(
@@ -202,7 +202,7 @@ def _line(name: str, record: dict[str, Any]) -> str:
 
 
 def compile_program(program: Program, text: Path | None = None) -> dict[str, Any]:
-    """Compile in this process, whose environment :func:`measure` has made."""
+    """Compile in this process, in the environment set by :func:`measure`."""
     import jax
     from jax.experimental import topologies
     from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
@@ -249,7 +249,7 @@ def compile_program(program: Program, text: Path | None = None) -> dict[str, Any
 
 
 def gflop(lowered: Any) -> float:
-    """Operations of a program before XLA optimises it, in the form of the platform it was lowered for, by 1e9."""
+    """Count the operations of a lowered program before optimisation, in 10^9."""
     import jax
     from jaxlib import _jax  # type: ignore[attr-defined]
 
@@ -269,7 +269,7 @@ def _configured(program: Program) -> Any:
 
 
 def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...], tuple[int, ...]]:
-    """A function, shapes of its arguments, which of them are split over the devices, and which are donated."""
+    """Return a function, its arguments' shapes, which of them are split over devices, and which are donated."""
     import jax
     import jax.numpy as jnp
 
@@ -300,7 +300,7 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
     if program.kind == "detect":
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         return make_detect(detector), (variables, spec(n, c), spec(n, dtype=jnp.bool_)), (False,) * 3, ()
-    # As the data sets' own clouds reach a GPU: KITTI's intensities are no whole numbers.
+    # The packing of the data sets' clouds: KITTI's intensities are not integers.
     packing = Packing(1 if config.num_sweeps == 1 else _NUM_LAGS, byte_intensity=config.sensor != "kitti_hdl64e")
     packed = empty_packed(b, packing, max_points=n, max_boxes=m, columns=c)
     batch = jax.tree.map(lambda leaf: spec(*leaf.shape, dtype=leaf.dtype), packed)
@@ -308,7 +308,7 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
 
 
 def _stage_gflop(program: Program, sharding: Any) -> dict[str, float]:
-    """GFLOP of each stage of the range view's network, forward, for one frame."""
+    """Count the GFLOP of each stage of the range view's network for one frame."""
     import jax
 
     from fcos_lidar_jax.models import build_detector
@@ -339,9 +339,9 @@ def _stage_gflop(program: Program, sharding: Any) -> dict[str, float]:
 
 
 def count_kernels(module: str) -> tuple[int, list[tuple[int | None, int]]]:
-    """Kernels of a compiled program outside of its loops, and (iterations, kernels of one) of every loop.
+    """Count the kernels of a compiled program outside loops, and list (iterations, kernels each) of all loops.
 
-    Iterations are None where the data decide. A loop within a loop is one of the list; its own iterations count.
+    Iterations are None if they depend on data. Nested loops are separate entries.
 
     >>> text = '''%body (p: s32[]) -> s32[] {
     ...   %a = s32[] fusion(%p), kind=kLoop
@@ -384,7 +384,7 @@ def count_kernels(module: str) -> tuple[int, list[tuple[int | None, int]]]:
 
 
 def _computations(module: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-    """Name and (operation, line) of every computation of a module's text."""
+    """Yield name and (operation, line) pairs of each computation in a module's text."""
     name, operations = None, []
     for line in module.splitlines():
         head = re.match(r"(ENTRY )?(%[\w.\-]+) \(.*\{$", line)

@@ -1,17 +1,16 @@
-"""Table 7: where the time goes from sweep files to boxes, one sweep and ten, batch 1.
+"""Table 7: times of the stages from sweep files to boxes, for one sweep and ten, batch size 1.
 
     python -m experiments.benchmarks.latency  # on FCOS_LIDAR_REAL_DATA's cloud, else a simulated one
     python -m experiments.benchmarks.latency --precision bfloat16  # on a GPU
 
-All stages, of one sweep and of ten, run turn by turn. The paper's "Backbone" is cut here as preprocessing
-(normalise, repeat rows, pad), stem and backbone, its "Heads" as pyramid and heads, which are also timed apart. Its
-table leaves post-processing out. Reading files and composing poses is timed on a simulated data set, whose sweep
-files are as large as the real ones. The background's prior is 0.5, so that an untrained network proposes boxes
-everywhere: NMS at its busiest. On a GPU all forms of stem and NMS are timed beside them; the stages use what suits
-the platform.
+All stages of one sweep and of ten run in turns. The paper's "Backbone" is taken as preprocessing (normalise,
+repeat rows, pad), stem and backbone, its "Heads" as pyramid and heads, which are also timed separately. Its table
+omits post-processing. Reading files and composing poses is timed on a simulated data set with sweep files of the
+real size. The background prior is 0.5, so that an untrained network proposes boxes everywhere, the worst case for
+NMS. The stages use the forms of stem and NMS that suit the platform.
 
-Cost: 15 turns take about six minutes on two CPU cores. Expected: MRV well below one per cent of the path, and a
-network that is indifferent to the number of sweeps, since five rounds are five rounds.
+Cost: 15 repeats take about six minutes on two CPU cores. Expected: MRV takes well below one per cent of the time,
+and the network's time does not depend on the number of sweeps, since the number of rounds is the same.
 """
 
 import contextlib
@@ -33,25 +32,22 @@ from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.inference import make_detect, make_stages
-from fcos_lidar_jax.inference.timing import Call, Times, interleaved
+from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.models.detector import network_parts
-from fcos_lidar_jax.models.modality import Form, Stem
-from fcos_lidar_jax.nms import rotated_nms
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, PRESETS
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 
 ROWS = {"single": NUSCENES_SINGLE.max_points, "multi": NUSCENES.max_points}
-"""Setting of table 7 -> rows its clouds are padded to."""
+"""Setting of table 7 -> rows to which clouds are padded."""
 _WHOLE = "points to boxes, one program"
-STEM_FORMS: tuple[Form, ...] = ("split", "dense", "grouped")
 
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """What to time, and how often."""
+    """Options of the measurement."""
 
     preset: Literal["nuscenes", "nuscenes_single", "quickstart"] = "nuscenes"  # Configuration preset.
     precision: Literal["float32", "bfloat16"] = "float32"  # Of the convolutions.
@@ -62,7 +58,7 @@ class Args(Options):
 
 @contextlib.contextmanager
 def simulated_sweeps(sensor: Sensor) -> Iterator[tuple[NuScenes, str]]:
-    """A simulated drive in the nuScenes layout, while it is needed, and a keyframe with nine sweeps before it."""
+    """Provide a simulated drive in the nuScenes layout and a keyframe with nine previous sweeps."""
     with tempfile.TemporaryDirectory() as folder:
         spec = DatasetSpec(1, 0, 2, sensor, False, "v1.0-synthetic")
         write_dataset(spec, Path(folder), workers=1, report=lambda _: None)
@@ -71,14 +67,14 @@ def simulated_sweeps(sensor: Sensor) -> Iterator[tuple[NuScenes, str]]:
 
 
 def real_cloud(data: Path | None) -> Path | None:
-    """File of the real ten-sweep cloud; see :func:`~experiments.script.find_real_data`."""
+    """Find the file of the real ten-sweep cloud; see :func:`~experiments.script.find_real_data`."""
     return find_real_data(data, "ten_sweep_cloud", "cloud.f16.bin")
 
 
 def fused_cloud(data: Path | None, sensor: Sensor) -> tuple[np.ndarray, str]:
-    """Ten sweeps in one cloud, f32[n, 5], the close points of the current sweep still there; and what it is.
+    """Load ten sweeps in one cloud f32[n, 5], with the close points of the current sweep, and a description.
 
-    It is simulated where no folder with ``ten_sweep_cloud/`` is named, and for other sensors than nuScenes'.
+    The cloud is simulated without a folder with ``ten_sweep_cloud/``, and for sensors other than nuScenes'.
     """
     file = real_cloud(data)
     if file is not None and sensor == NUSCENES_HDL32E:
@@ -88,7 +84,7 @@ def fused_cloud(data: Path | None, sensor: Sensor) -> tuple[np.ndarray, str]:
 
 
 def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
-    """The fused cloud, or its current sweep alone, as the detector gets it."""
+    """Prepare the fused cloud, or only its current sweep, for the detector."""
     points = cloud[cloud[:, 4] == 0] if setting == "single" else cloud
     projection = dataclasses.replace(NUSCENES.projection, remove_close="all")
     config = dataclasses.replace(NUSCENES, max_points=ROWS[setting], projection=projection)
@@ -96,7 +92,7 @@ def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
 
 
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:
-    """The stages of one cloud, each with its input at hand."""
+    """Make calls of the stages for one cloud, with precomputed inputs."""
     parts, detector = network_parts(config, sensor), build_detector(config, sensor)
     prepare, network, _, postprocess = map(jax.jit, make_stages(detector))
     detect = jax.jit(make_detect(detector))
@@ -119,47 +115,20 @@ def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Clou
 
 
 def load(drive: NuScenes, token: str, config: Config, sensor: Sensor, setting: str) -> np.ndarray:
-    """Host work: files to a padded cloud."""
+    """Load a padded cloud from files."""
     number = 1 if setting == "single" else 10
     points, num_close = drive.fuse_sweeps(token, CloudReading(number, "all", config.projection.close_m))
     config = dataclasses.replace(config, max_points=ROWS[setting])
     return make_cloud(points, config, sensor=sensor, num_close=num_close).points
 
 
-def form_times(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, dict[str, Times]]:
-    """The times of all forms of stem and NMS; the stages take the one that suits the platform."""
-    model, choices = config.model, config.inference
-    prepare, network, candidates, _ = map(jax.jit, make_stages(build_detector(config, sensor)))
-    image = prepare(*jax.device_put((cloud.points, cloud.valid)))
-    seen = network_parts(config, sensor).preprocess(image.features[None])
-    boxes, scores, labels, valid = candidates(network(variables, image), image)
-    own = {kind: tree["stem"] for kind, tree in variables.items()}
-
-    def stem(form: Form) -> Call:
-        module = Stem(model.stem, model.circular_width, model.precision, form)
-        return functools.partial(jax.jit(functools.partial(module.apply, train=False)), own, seen)
-
-    def nms(form: Literal["rows", "matrix"]) -> Call:
-        most, threshold = choices.max_detections, choices.iou_threshold
-        suppress = functools.partial(rotated_nms, iou_threshold=threshold, max_outputs=most, form=form)
-        call = functools.partial(suppress, overlap=choices.nms_overlap)
-        return functools.partial(jax.jit(call), boxes, scores, valid, labels=labels)
-
-    return {
-        "stem": interleaved({form: stem(form) for form in STEM_FORMS}, 10),
-        "nms": interleaved({form: nms(form) for form in ("rows", "matrix")}, 10),
-    }
-
-
 def measure(args: Args) -> dict[str, Any]:
-    """All figures of table 7."""
+    """Measure all figures of table 7."""
     config = change(model__precision=args.precision, model__background_prior=0.5)(PRESETS[args.preset])
     sensor = load_sensor(config.sensor)
     fused, label = fused_cloud(args.data, sensor)
     clouds = {setting: padded(fused, setting, sensor) for setting in ROWS}
     variables = jax.jit(build_detector(config, sensor).init)(jax.random.key(0))
-    on_gpu = jax.default_backend() == "gpu"  # the others take seconds on a CPU
-    forms = form_times(config, sensor, variables, clouds["multi"]) if on_gpu else None
     calls: dict[tuple[str, str], Call] = {}
     with simulated_sweeps(sensor) as (drive, token):
         for setting, cloud in clouds.items():
@@ -173,7 +142,6 @@ def measure(args: Args) -> dict[str, Any]:
         "cloud": label,
         "loading": "simulated data set in the nuScenes layout",
         "points": {setting: cloud.num_points for setting, cloud in clouds.items()},
-        "forms": forms,
         "repeats": args.repeats,
         "times": {setting: {name: ms for (of, name), ms in found.items() if of == setting} for setting in clouds},
         "paper": {"hardware": PAPER["times"], **{s: rows[f"FCOS-LiDAR, {s}"] for s in clouds}},
@@ -189,7 +157,7 @@ _PAPER_COLUMN = {
 
 
 def as_text(record: dict[str, Any]) -> str:
-    """The table, ours beside the paper's."""
+    """Format the table with our times beside the paper's."""
     (single, multi), paper = (record["times"][setting] for setting in ROWS), record["paper"]
     note = "" if record["comparable"] else "; other hardware or another network, not comparable"
     lines = [
@@ -214,9 +182,6 @@ def as_text(record: dict[str, Any]) -> str:
     for name, parts, column in sums:
         ours = [f"{sum(t[part]['median_ms'] for part in parts):12.2f}{'':10s}" for t in (single, multi)]
         lines.append(line(name, ours, column))
-    for part, times in (record["forms"] or {}).items():
-        listed = ", ".join(f"{form} {ms['median_ms']:.3f}" for form, ms in times.items())
-        lines.append(f"{part} by formulation, ms: {listed}")
     return "\n".join(lines)
 
 

@@ -1,16 +1,16 @@
-"""How fast is the loader? Ten-sweep samples with copy-paste.
+"""Speed of the loader for ten-sweep samples with copy-paste.
 
     python -m experiments.benchmarks.loader_speed --data-root ROOT --version V --split S
 
-Reads a data set in nuScenes' layout (``fcos-lidar synthesize`` makes one; by default the real scene-0523 below the
-environment's ``FCOS_LIDAR_REAL_DATA``), cuts a ground-truth database from it, and times whole batches, prepared on
-demand, by two threads, by two processes, and packed for a device, which a CPU stands in for, by two threads in the
-background; and a training step of the quickstart preset, to be compared with. Files come from the page cache.
-Other programs lengthen the wall clock, not the processor time: with the cores to itself a loader makes about cores
-/ (processor time per sample) samples a second.
+Reads a data set in nuScenes' layout (such as one written by ``fcos-lidar synthesize``; default: the real
+scene-0523 below the environment's ``FCOS_LIDAR_REAL_DATA``), cuts a ground-truth database from it, and times
+batches prepared on demand, by two threads, by two processes, and packed for a device (a CPU here) by two threads.
+A training step of the quickstart preset is timed for comparison. Files come from the page cache. Other programs
+increase the wall time but not the processor time: an undisturbed loader prepares about cores / (processor time per
+sample) samples per second.
 
-Cost: two minutes. Expected on two cores: at least 40 samples a second. The paper's eight
-GPUs need 52.8: 40 epochs of 123,580 samples, class-balanced resampling counted, in 26 hours.
+Cost: two minutes. Expected on two cores: at least 40 samples per second. The paper's eight GPUs need 52.8: 40
+epochs of 123,580 samples after class-balanced resampling in 26 hours.
 """
 
 import contextlib
@@ -49,25 +49,25 @@ EPOCHS, EPOCH_SAMPLES, HOURS = 40, 123_580, 26
 """The paper's training on 8 A100: an epoch of nuScenes' 28,130 training frames after class-balanced resampling."""
 FULL_SIZE = Path("experiments/results/full_size.json")  # Has the time of a training step of the paper's preset.
 WAYS = {"on demand": (0, 0), "2 threads": (2, 0), "2 processes": (0, 2)}
-"""Of preparing batches: threads, worker processes."""
+"""Ways of preparing batches: threads and worker processes."""
 Batches = Iterator[HostBatch]
 
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """What to load."""
+    """Options of the measurement."""
 
     data_root: Path | None = None
     """Data set in nuScenes' layout; default: nuscenes_scene0523 below FCOS_LIDAR_REAL_DATA."""
     version: str = "v1.0-scene0523"  # Folder of the tables.
     split: str = "scene0523"  # Keyframes to load.
-    batch_size: int = 8  # Samples a batch.
-    samples: int = 160  # To load in each way of preparing batches.
-    train_step: bool = True  # Time a training step of the quickstart preset too.
+    batch_size: int = 8  # Samples per batch.
+    samples: int = 160  # Samples per way of preparing batches.
+    train_step: bool = True  # Also time a training step of the quickstart preset.
 
 
 def cpu_s() -> float:
-    """Processor time of this process and its living children."""
+    """Sum the processor time of this process and its running children."""
     total = time.process_time()
     for child in multiprocessing.active_children():
         fields = Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()
@@ -84,7 +84,7 @@ def throughput(
     delivery: Callable[[Batches], AbstractContextManager[Batches]] = contextlib.nullcontext,
     **how: Any,
 ) -> dict[str, float]:
-    """Samples a second, once it runs; as much waits ready at the end as at the beginning."""
+    """Measure samples per second in a steady state, with as many prepared samples at the end as at the start."""
     size, warm = config.optimizer.batch_size, 6
     steps = -(-samples // size)
     truncated: Counter[str] = Counter(truncated_points=0, truncated_boxes=0)
@@ -116,7 +116,7 @@ def _needs(train_step: bool) -> dict[str, float]:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """Time the loader in all ways, and the steps that it has to feed."""
+    """Time the loader in all ways, and the training steps that it serves."""
     root = args.data_root or find_real_data(None, "nuscenes_scene0523")
     if root is None:
         raise ValueError("--data-root: missing, expected a data set in nuScenes' layout")

@@ -1,4 +1,4 @@
-"""Tables in the official nuScenes layout, of any size, without files of points."""
+"""Generated tables in the official nuScenes layout, of any size, without point files."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -14,17 +14,17 @@ from fcos_lidar_jax.simulation.nuscenes_tables import fixed_tables
 from fcos_lidar_jax.simulation.nuscenes_tables import token as name_token
 
 Row = dict[str, Any]
-SHARES = (0.43, 0.08, 0.02, 0.02, 0.02, 0.2, 0.02, 0.02, 0.09, 0.1)  # Of the classes, about as in nuScenes.
+SHARES = (0.43, 0.08, 0.02, 0.02, 0.02, 0.2, 0.02, 0.02, 0.09, 0.1)  # Class frequencies, similar to nuScenes.
 EGO = {"translation": [411.3039349319818, 1180.8903791765097, 0.0], "rotation": [0.9831, 0.0, 0.0, -0.18307]}
 MOUNT = {"translation": [0.9, 0.0, 1.8], "rotation": [1.0, 0.0, 0.0, 0.0]}
 _CATEGORIES = {name: category for category, name in reversed(CATEGORY_TO_CLASS.items())}
 
 
 def write_tables(folder: Path, scenes: Mapping[str, int], files: Mapping[str, int], *, objects: int) -> None:
-    """Write all tables into a new folder, that of the version.
+    """Write all tables into a new version folder.
 
-    ``scenes`` maps names to numbers of keyframes, ``files`` channels to files a keyframe, the first of them its
-    own. Each of a scene's ``objects`` is there in all of its keyframes.
+    ``scenes`` maps names to numbers of keyframes, ``files`` maps channels to files per keyframe, of which the
+    first is the keyframe's. All of a scene's ``objects`` occur in all of its keyframes.
     """
     folder.mkdir(parents=True)
     channels, numbers = list(files), list(scenes.values())
@@ -63,19 +63,19 @@ def write_tables(folder: Path, scenes: Mapping[str, int], files: Mapping[str, in
     for name, rows in tables.items():
         with (folder / f"{name}.json").open("w") as stream:
             stream.write("[")
-            for i, row in enumerate(rows):  # one field a line, as in the official tables
+            for i, row in enumerate(rows):  # One field per line, like the official tables.
                 stream.write(("," if i else "") + "\n" + json.dumps(row, indent=0))
             stream.write("\n]")
     (folder.parent / "map.png").touch()
 
 
 def class_of(scene: int, number: int) -> str:
-    """Class of an object of a scene."""
+    """Choose the class of an object of a scene."""
     return str(np.random.default_rng([scene, number]).choice(NUSCENES_CLASSES, p=SHARES))
 
 
 def annotations(scene: int, number: int, keyframes: int) -> Iterator[Row]:
-    """Rows of an object in its keyframes; it stands still or moves on a straight line."""
+    """Yield the rows of an object in its keyframes; it stands still or moves in a straight line."""
     rng, known = np.random.default_rng([1, scene, number]), CLASS_ATTRIBUTES[class_of(scene, number)]
     start = EGO["translation"] + np.append(rng.normal(0, 22, 2), 0)
     step = rng.choice([0, 2]) * np.append(rng.normal(0, 1, 2), 0)
@@ -115,12 +115,12 @@ def _sample_data(keyframes: list[int], files: Mapping[str, int]) -> Iterator[Row
 
 
 def _token(kind: str, *numbers: int) -> str:
-    """32 characters, as real tokens have."""
+    """Token of 32 characters, like real tokens."""
     return (kind.encode().hex() + "".join(f"{n:06x}" for n in numbers)).ljust(32, "0")
 
 
 def _link(kind: str, *numbers: int, of: int) -> Row:
-    """Token of a row, and of those before and after it among so many that the last number counts."""
+    """Tokens of a row and its neighbours; the last number is the row's index in a chain of length ``of``."""
     *chain, i = numbers
     return {
         "token": _token(kind, *numbers),

@@ -1,12 +1,12 @@
-"""How long do the modality-wise convolutions take, by the variants of tables 3, 4 and 5?
+"""Times of the modality-wise convolutions in the variants of tables 3, 4 and 5.
 
     python -m experiments.benchmarks.module_latency  # the stem alone, at full size: 64x1088x45
     python -m experiments.benchmarks.module_latency --include-grouped  # feature_group_count too, slow on a CPU
 
-Every variant is computed in the fastest of its formulations (see ``Stem``), found by a short run of all of them;
-then all variants run turn by turn. ``needed`` are the operations of the mathematics, ``executed`` what XLA counts
-in the compiled program: without those on the zero padding, with those on the zeros of a block-diagonal kernel.
-Cost: 15 turns take some minutes on two CPU cores. The result is in README.md.
+Each variant uses the fastest of its formulations (see ``Stem``), found by a short run of all of them; then all
+variants run in turns. ``needed`` counts the operations of the definition, ``executed`` the operations that XLA
+counts in the compiled program: without the zero padding, but with the zeros of block-diagonal kernels. Cost: 15
+repeats take some minutes on two CPU cores. README.md has the result.
 """
 
 import dataclasses
@@ -16,7 +16,6 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from experiments.benchmarks.latency import STEM_FORMS
 from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, run_measurement
@@ -27,13 +26,14 @@ from fcos_lidar_jax.models.modality import Form, Stem, channel_groups
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
+STEM_FORMS: tuple[Form, ...] = ("split", "dense", "grouped")
 BASE = NUSCENES.model.stem
 _LAYOUT = image_layout(NUSCENES_HDL32E, NUSCENES.model)
-SHAPE = (1, _LAYOUT.height, _LAYOUT.width, 9 * NUSCENES.projection.num_rounds)  # Of the network's input.
+SHAPE = (1, _LAYOUT.height, _LAYOUT.width, 9 * NUSCENES.projection.num_rounds)  # Shape of the network's input.
 
 
 class Variant(NamedTuple):
-    """What is timed, and the rows of the paper that it is: table -> row."""
+    """A timed stem, and the paper's rows with this stem: table -> row."""
 
     stem: StemConfig
     rows: dict[str, str]
@@ -54,21 +54,21 @@ VARIANTS = {
     "dilations (1, 3)": _variant({"table5": "(1, 3)"}, dilations=(1, 3)),
     "dilations (1, 1, 1)": _variant({"table5": "(1, 1, 1)"}, dilations=(1, 1, 1)),
 }
-REFERENCE = "9 types"  # The paper's stem: ratios are to it.
+REFERENCE = "9 types"  # The paper's stem, to which ratios are relative.
 
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """What to time, and how often."""
+    """Options of the measurement."""
 
-    only: tuple[str, ...] = ()  # Of the variants, by name, beside "9 types"; default: all.
-    include_grouped: bool | None = None  # Try feature_group_count as well; default: not on a CPU.
-    precision: Literal["float32", "bfloat16"] = "float32"  # Of the convolutions behind the first.
-    repeats: int = 15  # Turns.
+    only: tuple[str, ...] = ()  # Names of variants, in addition to "9 types"; default: all.
+    include_grouped: bool | None = None  # Also try feature_group_count; default: not on a CPU.
+    precision: Literal["float32", "bfloat16"] = "float32"  # Precision of the convolutions after the first.
+    repeats: int = 15  # Timed calls per variant.
 
 
 def needed_gflop(stem: StemConfig) -> float:
-    """Multiplications and additions of a stem's convolutions, each counted as one, in 10^9.
+    """Count the multiplications and additions of a stem's convolutions, in 10^9.
 
     >>> round(needed_gflop(StemConfig(num_convs=1, dilations=(1,))), 2)
     4.37
@@ -82,7 +82,7 @@ def needed_gflop(stem: StemConfig) -> float:
 
 
 def forms_of(stem: StemConfig, include_grouped: bool) -> tuple[Form, ...]:
-    """Formulations that differ: one group has one, groups of different sizes have no feature_group_count."""
+    """List the distinct formulations: one for one group; feature_group_count needs groups of equal size."""
     sizes = channel_groups(stem, SHAPE[-1] // 9)
     if len(sizes) == 1:
         return ("split",)
@@ -90,7 +90,7 @@ def forms_of(stem: StemConfig, include_grouped: bool) -> tuple[Form, ...]:
 
 
 def compiled(stem: StemConfig, precision: str, form: Form) -> tuple[Call, float]:
-    """One formulation of a variant, with random weights and input, and the 10^9 operations that it executes."""
+    """Compile a formulation with random weights and input; returns a call and its executed 10^9 operations."""
     module = Stem(stem, precision=precision, form=form)
     image = jax.random.normal(jax.random.key(0), SHAPE, jnp.float32)
     variables = jax.jit(lambda: module.init(jax.random.key(1), jnp.zeros((1, 8, 8, SHAPE[-1])), train=False))()
@@ -110,7 +110,7 @@ def _paper_times(variant: Variant) -> dict[str, dict[str, float]]:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """The variants' times.
+    """Time the variants.
 
     Returns:
         ``variants``, for each: ``form`` (the fastest), ``forms_ms`` (the short run of all), ``median_ms``,
@@ -118,7 +118,7 @@ def measure(args: Args) -> dict[str, Any]:
         ``paper``, ``{"table, row": {"time_ms", "ratio"}}`` if it has any. Beside them the options.
 
     Raises:
-        ValueError: there is no variant of a name that is asked for.
+        ValueError: an unknown variant in ``only``.
     """
     for name in args.only:
         if name not in VARIANTS:
@@ -151,7 +151,7 @@ def measure(args: Args) -> dict[str, Any]:
 
 
 def as_text(record: dict[str, Any]) -> str:
-    """The table, ours beside the paper's."""
+    """Format the table with our times beside the paper's."""
     lines = [
         f"stem alone, {'x'.join(map(str, SHAPE[1:]))}, {record['precision']}, {record['repeats']} turns, "
         f"{hardware_line()}",
@@ -171,7 +171,7 @@ def as_text(record: dict[str, Any]) -> str:
 
 
 def figures(names: Mapping[str, str], args: Args) -> dict[str, Any]:
-    """For a table of the paper, from its rows' labels with their variants, whatever ``args.only`` says."""
+    """Measure figures for a table of the paper; ``names`` maps the labels of its rows to variants."""
     measured = measure(dataclasses.replace(args, only=tuple(names.values())))
     columns: dict[str, dict[str, float]] = {}
     for label, name in names.items():

@@ -1,13 +1,13 @@
-"""What does multi-round projection keep, and what does it cost? The paper's figures that need no training.
+"""Points kept by the multi-round projection, and its time: the paper's figures that need no training.
 
     python -m experiments.benchmarks.mrv_figures  # the cloud of FCOS_LIDAR_REAL_DATA, else a simulated one
     python -m experiments.benchmarks.mrv_figures --data FOLDER  # FOLDER/ten_sweep_cloud/cloud.f16.bin
 
-Counts: points kept by 1, 3, 5 and 7 rounds with and without priority of the current sweep, and how many cells of
-round 1 the current sweep holds; with the points on the vehicle, and without. Times: one sweep and ten, all rounds
-in turns, beside table 1's, as ratios to one round. Cost: half a minute on two CPU cores. Expected of the paper
-(section 3.2): ~240K points, ~28K of them kept by one round, more than 50 % by five; seven rounds hardly slower
-than one (0.76 and 0.66 ms on its GPU).
+Counts the points kept by 1, 3, 5 and 7 rounds with and without priority of the current sweep, and the points of
+the current sweep among them, with and without the points on the vehicle. Times one sweep and ten in turns, as
+ratios to one round, beside table 1. Cost: half a minute on two CPU cores. The paper (section 3.2): about 240K
+points, of which one round keeps about 28K and five rounds more than 50 %; seven rounds are hardly slower than one
+(0.76 and 0.66 ms).
 """
 
 import dataclasses
@@ -33,11 +33,11 @@ ROUNDS = (1, 3, 5, 7)
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """On which cloud, and how often."""
+    """Options of the measurement."""
 
     data: Path | None = None
     """Folder with ten_sweep_cloud/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated cloud."""
-    repeats: int = 100  # Turns of the times.
+    repeats: int = 100  # Timed calls.
 
 
 Close = Literal["all", "none"]
@@ -47,7 +47,7 @@ _CLOSE: dict[str, Close] = {"with": "none", "without": "all"}
 def kept_by_rounds(
     points: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, close: Close = "all"
 ) -> dict[str, Any]:
-    """Points of a fused cloud f32[n, c] that so many rounds keep, with and without priority of the current sweep.
+    """Count the kept points of a fused cloud f32[n, c] by rounds, with and without priority of the current sweep.
 
     A point is current if its time lag is 0; ``close`` is ``"none"`` to keep the points on the vehicle, or
     ``"all"``.
@@ -83,7 +83,7 @@ def kept_by_rounds(
 
 
 def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[str, dict[str, float]]]:
-    """Means of :func:`kept_by_rounds` over clouds.
+    """Average :func:`kept_by_rounds` over clouds.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0.1]], np.float32)
@@ -103,7 +103,7 @@ def mean_kept(clouds: Sequence[np.ndarray], sensor: Sensor) -> dict[str, dict[st
 def mrv_times(
     cloud: np.ndarray, sensor: Sensor, *, rounds: Sequence[int] = ROUNDS, repeats: int = 100
 ) -> dict[str, Any]:
-    """Times of the projection of ten fused sweeps f32[n, 5], and of the current one, padded as by the presets.
+    """Time the projection of ten fused sweeps f32[n, 5] and of the current sweep, padded like the presets.
 
     Returns:
         ``{"single" | "multi": {rounds: {"median_ms", "p99_ms", "ratio"}}}``, the ratio to the first of ``rounds``.
@@ -122,7 +122,7 @@ def mrv_times(
 
 
 def as_text(record: dict[str, Any]) -> str:
-    """All figures as tables."""
+    """Format all figures as tables."""
     text = PAPER["text"]
     lines = [f"{record['cloud']}, {record['points']} points; paper: {text['fused_points']['printed']}"]
     for name, found in record["kept"].items():
@@ -151,7 +151,7 @@ def as_text(record: dict[str, Any]) -> str:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """Counts and times, and the times of table 1."""
+    """Measure counts and times, beside the times of table 1."""
     rows, sensor = PAPER["tables"]["table1"]["rows"], NUSCENES_HDL32E
     paper = {str(r): rows[f"multi, {r}"]["time_ms"] for r in ROUNDS}
     cloud, label = fused_cloud(args.data, sensor)

@@ -1,4 +1,4 @@
-"""Other programs, timed in processes of their own, turn by turn with ours: the speed of a machine drifts.
+"""Timing of other programs in turns with ours, because the speed of a machine drifts.
 
 A peer is a Python file that defines ``FNS``, name -> function that runs once and waits.
 """
@@ -38,9 +38,9 @@ def turn_by_turn(
     environment: Mapping[str, object],
     python: str | Path = sys.executable,
 ) -> dict[str, float]:
-    """Medians of our call and a peer's, in seconds, and their ratio, after one run of each.
+    """Time our call and a peer's function in turns, after one run of each: medians in seconds and their ratio.
 
-    The peer's function of a name runs in an interpreter and environment of its own.
+    The peer runs in a separate process with its own interpreter and environment.
     """
     command = [python, "-c", _WORKER, peer.absolute(), name]
     variables = {**os.environ, **{key: str(value) for key, value in environment.items()}}

@@ -1,14 +1,14 @@
-"""How long does a training step take beside PyTorch's forward and backward pass on the same CPU?
+"""Time of a training step beside PyTorch's forward and backward pass on the same CPU.
 
     python -m experiments.benchmarks.train_speed --torch-python PYTHON  # an interpreter that has torch
     python -m experiments.benchmarks.train_speed --torch-python PYTHON --peer FILE
 
 Ours is the whole step: augmentation, projection, network, assignment, losses, gradients, AdamW. The peer's is
-the network alone with a plain loss (``torch_net.py``, or any file with ``FNS["train"]``). Both run turn by
-turn, batch 1, float32: ``reduced`` (32x288, five rounds, a quarter of the channels), ``slim`` (32x1088, one
-round, 0.9 M parameters), ``full`` (64x1088, five rounds, the paper's channels) and ``full_64``, whose pyramid
-has 64 channels. Cost: about half an hour on two CPU cores and 12 GB. Expected: at most 1.4 of the peer's time when
-slim, 1.25 at full size, 2 when reduced.
+only the network with a plain loss (``torch_net.py``, or any file with ``FNS["train"]``). Both run in
+turns with batch size 1 in float32: ``reduced`` (32x288, five rounds, a quarter of the channels), ``slim``
+(32x1088, one round, 0.9 M parameters), ``full`` (64x1088, five rounds, the paper's channels) and ``full_64``,
+whose pyramid has 64 channels. Cost: about half an hour on two CPU cores and 12 GB. Expected: at most 1.4 of the
+peer's time when slim, 1.25 at full size, 2 when reduced.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ _PEER = Path(__file__).with_name("torch_net.py")
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """Whom to run against, and how often."""
+    """Options of the comparison."""
 
     torch_python: Path  # Interpreter that has torch.
     peer: Path = _PEER  # Program with FNS["train"].
@@ -53,7 +53,7 @@ _SIZES: dict[Size, dict[str, Any]] = {
 
 
 def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
-    """The paper's detector on one sweep, with these numbers."""
+    """Configure the paper's detector for one sweep with given sizes."""
     config = change(
         num_sweeps=1,
         max_points=40_000,
@@ -69,7 +69,7 @@ def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """Compare at all sizes."""
+    """Compare at the selected sizes."""
     record: dict[str, Any] = {"peer": args.peer.name}
     for name in args.sizes:
         size = _SIZES[name]
@@ -77,7 +77,7 @@ def measure(args: Args) -> dict[str, Any]:
         frames = [without_close(make_frame(0, sensor, num_objects=30), sensor, cut_reading(1))]
         over = 64 // size["STEM"]
         others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
-        sizes = {**size, **others, "TRAIN": 1, "CL": 1}  # and what other peers call them
+        sizes = {**size, **others, "TRAIN": 1, "CL": 1}  # Other peers use other names.
         peer = {"peer": args.peer, "name": "train", "environment": sizes, "python": args.torch_python}
         repeats = args.repeats * (10 if name == "reduced" else 1)
         record[name] = turn_by_turn(training_steps(config, sensor, frames), repeats, **peer)

@@ -1,4 +1,4 @@
-"""Whole training steps, to be timed."""
+"""Training steps to be timed."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 
 
 def training_steps(config: Config, sensor: Sensor, frames: Sequence[Frame]) -> Callable[[], dict[str, Any]]:
-    """Whole training steps on one batch of the frames, one a call, which returns the metrics."""
+    """Make a function that runs one training step on a batch of the frames and returns its metrics."""
     detector, optimizer = build_detector(config, sensor), make_optimizer(config.optimizer, 1000)
     step = jax.jit(make_train_step(detector, optimizer), donate_argnums=0)
     state = make_state(detector, optimizer, jax.random.key(0))

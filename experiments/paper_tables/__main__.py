@@ -1,31 +1,40 @@
-"""All tables of the paper, one after the other: ``python -m experiments.paper_tables --scale smoke``.
+"""Train and measure the tables of the paper.
 
-Every table prints our figure beside the paper's, and writes Markdown, JSON and a picture below ``--out``.
-README.md says what the scales cost, and how several processes share the cells. Times want a machine that does
-nothing else: once all cells are there, the command again measures them anew.
+    python -m experiments.paper_tables --scale smoke  # all tables on a toy
+    python -m experiments.paper_tables --tables table1 table6 --scale sector
+    python -m experiments.paper_tables --tables table8 --scale nuscenes --data-root DIR --test-version V
+
+Each table prints our figures beside the paper's and writes Markdown, JSON and pictures below ``--out``. README.md
+explains the scales, their cost, and how several processes share the cells. Measure times on an idle machine: once
+all cells are there, the same command only measures again.
 """
 
-from experiments.paper_tables.table1_mrv_rounds import TABLE as TABLE_1
-from experiments.paper_tables.table2_priority import TABLE as TABLE_2
-from experiments.paper_tables.table3_modality_groups import TABLE as TABLE_3
-from experiments.paper_tables.table4_num_convs import TABLE as TABLE_4
-from experiments.paper_tables.table5_dilations import TABLE as TABLE_5
-from experiments.paper_tables.table6_untied_heads import TABLE as TABLE_6
-from experiments.paper_tables.table7_latency import TABLE as TABLE_7
-from experiments.paper_tables.table8_test_submission import TABLE as TABLE_8
+import dataclasses
+
+from experiments.paper_tables import submission
+from experiments.paper_tables.paper_rows import PAPER_TABLES
 from experiments.paper_tables.tables import Args, run_table
 from experiments.script import run_script
 
-TABLES = (TABLE_1, TABLE_2, TABLE_3, TABLE_4, TABLE_5, TABLE_6, TABLE_7, TABLE_8)
+TABLES = {table.name: table for table in (*PAPER_TABLES, submission.TABLE)}
 
 
-def main(args: Args) -> None:
-    """All tables, with all of their rows."""
-    if args.rows:
-        raise ValueError(f"--rows: got {list(args.rows)}, expected none: a table's own script takes them")
-    for table in TABLES:
-        run_table(table, args)
+@dataclasses.dataclass(frozen=True)
+class TablesArgs(Args):
+    """Options of the tables."""
+
+    tables: tuple[str, ...] = ()  # Tables to train, such as table1; default: all.
+
+
+def main(args: TablesArgs) -> None:
+    """Run the tables one after the other."""
+    if unknown := [name for name in args.tables if name not in TABLES]:
+        raise ValueError(f"--tables: got {unknown[0]!r}, expected some of {', '.join(TABLES)}")
+    if args.rows and len(args.tables) != 1:
+        raise ValueError(f"--rows: got {list(args.rows)}, expected none unless --tables names one table")
+    for name in args.tables or TABLES:
+        run_table(TABLES[name], args)
 
 
 if __name__ == "__main__":
-    run_script(main, Args, __doc__)
+    run_script(main, TablesArgs, __doc__)

@@ -1,8 +1,8 @@
-"""Result cells: ``cells.csv`` of a scale has a row per training, ``scale.json`` what all of them share.
+"""Result cells: ``cells.csv`` has one row per training, and ``scale.json`` their common data and base.
 
-A cell is a seed and what its configuration changes in the scale's base, in words such as
-``num_sweeps=1, projection.num_rounds=3``. So a new field of the configuration renames no cell. Cells whose data or
-base differ from those of today are refused.
+A cell is identified by its seed and by its changes to the base configuration, such as
+``num_sweeps=1, projection.num_rounds=3``, so that a new configuration field renames no cell. Cells with other data
+or another base are refused.
 """
 
 import csv
@@ -21,14 +21,14 @@ from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock, read_json
 
-Cell = dict[str, Any]  # ``changes``, ``seed``, ``scores`` or ``diverged``, and who trained it.
+Cell = dict[str, Any]  # ``changes``, ``seed``, ``scores`` or ``diverged``, and hardware.
 _CELLS, _SCALE, _LOCK = "cells.csv", "scale.json", "cells.lock"
 _TEXT = {"changes", "diverged", "git", "device", "processor", "jax", "python", "fcos_lidar_jax"}
-_LONGEST = 80  # Characters of a folder's name.
+_MAX_NAME = 80  # Characters of a folder's name.
 
 
 def changes_of(config: Config, base: Config) -> str:
-    """What a configuration changes in another one, its name aside.
+    """Describe the differences between a configuration and its base, except the name.
 
     >>> from experiments.changes import change
     >>> from fcos_lidar_jax.presets import QUICKSTART
@@ -43,22 +43,22 @@ def changes_of(config: Config, base: Config) -> str:
 
 
 def run_name(changes: str, seed: int) -> str:
-    """The folder's name of a cell's training.
+    """Name the folder of a cell's training.
 
     >>> run_name("num_sweeps=1, projection.num_rounds=3", 0)
     'num_sweeps=1_projection.num_rounds=3_seed=0'
     """
     name = re.sub(r"[^\w.=-]+", "_", changes)
-    if len(name) > _LONGEST:
-        name = f"{name[:_LONGEST]}_{hashlib.blake2b(changes.encode(), digest_size=4).hexdigest()}"
+    if len(name) > _MAX_NAME:
+        name = f"{name[:_MAX_NAME]}_{hashlib.blake2b(changes.encode(), digest_size=4).hexdigest()}"
     return f"{name}_seed={seed}"
 
 
 def read_cells(folder: Path, scale: Scale) -> dict[tuple[str, int], Cell]:
-    """The finished cells of a scale, by their changes and seeds.
+    """Read the finished cells of a scale, by changes and seed.
 
     Raises:
-        ValueError: they are of other data or of another base; the message names the first field that differs.
+        ValueError: data or base differ; the message names the first field.
     """
     if not (folder / _CELLS).is_file():
         return {}
@@ -69,7 +69,7 @@ def read_cells(folder: Path, scale: Scale) -> dict[tuple[str, int], Cell]:
 
 
 def add_cell(folder: Path, scale: Scale, cell: Cell, *, locks: Path) -> Cell:
-    """Write a finished cell beside the others of its scale, and read it."""
+    """Add a finished cell to its scale's file."""
     with file_lock(locks / _LOCK, wait=True):
         cells = read_cells(folder, scale) | {(cell["changes"], cell["seed"]): cell}
         rows = [_row(cells[key]) for key in sorted(cells)]
@@ -104,14 +104,14 @@ def _shared(scale: Scale) -> dict[str, Any]:
 
 
 def _flat(record: dict[str, Any]) -> dict[str, Any]:
-    """Values by dotted names, as JSON gives them back."""
     return flatten_dict(json.loads(json.dumps(record)), sep=".")
 
 
 def _check(file: Path, shared: dict[str, Any]) -> None:
-    """Compare what the cells of a file share with today's; later fields had the values that checkpoints say."""
-    found = _flat({"base": LATER_FIELDS}) | _flat(read_json(file, dict[str, Any]))
+    """Compare data and base of the cells with the scale's; fields that the file lacks have their later
+    defaults."""
+    recorded = _flat({"base": LATER_FIELDS}) | _flat(read_json(file, dict[str, Any]))
     for field, value in _flat(shared).items():
-        if field in found and field != "base.name" and found[field] != value:
-            line = f"{file}: {field}: got {found[field]!r}, expected {value!r}"
+        if field != "base.name" and recorded.get(field, value) != value:
+            line = f"{file}: {field}: got {recorded[field]!r}, expected {value!r}"
             raise ValueError(f"{line}: its cells are of another scale, choose another --out and --runs")

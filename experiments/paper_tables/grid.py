@@ -1,9 +1,9 @@
-"""A grid of configurations, trained and scored: what the paper's tables are made of.
+"""Training and scoring of cells, which the paper's tables consist of.
 
-A cell is a configuration, a scale and a seed. Its result is a row of the scale's file (``cells.py``), so that a
-finished cell is never run again, a cell that several tables share is run once, a stopped one resumed. Processes
-that share the folders, one per GPU or core, share the cells. The code's revision does not name a cell; its row has
-it.
+A cell is a configuration, a scale and a seed. Its result is a row of the scale's file (``cells.py``), so a
+finished cell is never trained again, tables share cells, and an interrupted cell is resumed. Processes with the
+same folders, one per GPU or core, share the cells. The revision of the code is recorded but does not identify a
+cell.
 """
 
 import sys
@@ -19,50 +19,48 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.files import atomic_write, file_lock
 from fcos_lidar_jax.training import NonFiniteLossError
 
-_PATIENCE_S = 5.0  # Between looks at what other processes train.
+_POLL_S = 5.0  # Interval of looking for the results of other processes, seconds.
 
 
 def run_cells(
     cells: Sequence[tuple[Config, int]], scale: Scale, *, results: Path, runs: Path, labels: Sequence[str] = ()
 ) -> list[Cell]:
-    """The records of configurations with seeds, in their order, each from the file or by training it.
+    """Return the records of cells in the given order, from the file or by training.
 
-    A label is printed when its cell's training begins. A cell that another process trains is left to it and
-    looked at again when the others are done.
+    A label is printed when the training of its cell begins. Cells that other processes train are left to them and
+    read when all others are done.
     """
-    found: dict[int, Cell] = {}
-    while len(found) < len(cells):
-        known = len(found)
+    records: dict[int, Cell] = {}
+    while len(records) < len(cells):
+        before = len(records)
         for i, (config, seed) in enumerate(cells):
-            title = f"cell {i + 1} of {len(cells)}: {labels[i]}" if labels else ""
-            record = None
-            if i not in found:
-                record = run_cell(config, scale, seed, results=results, runs=runs, title=title)
-            if record is not None:
-                found[i] = record
-        if len(found) == known:
-            time.sleep(_PATIENCE_S)
-    return [found[i] for i in range(len(cells))]
+            if i not in records:
+                title = f"cell {i + 1} of {len(cells)}: {labels[i]}" if labels else ""
+                if cell := run_cell(config, scale, seed, results=results, runs=runs, title=title):
+                    records[i] = cell
+        if len(records) == before:
+            time.sleep(_POLL_S)
+    return [records[i] for i in range(len(cells))]
 
 
 def run_cell(
     config: Config, scale: Scale, seed: int, *, results: Path, runs: Path, title: str = ""
 ) -> Cell | None:
-    """A cell of the folder ``results``, trained if need be; None while another process trains it.
+    """Return a cell of the folder ``results``, trained if necessary; None while another process trains it.
 
-    A run whose loss or state stopped being finite is a result too: ``diverged`` in place of ``scores``, and what
-    was said. ``git`` names the revisions of all processes that took part, in their order.
+    A loss or state that is not finite is a result too: ``diverged`` replaces ``scores`` and contains the error.
+    ``git`` lists the revisions of all processes that trained it.
     """
     changes = changes_of(config, scale.base)
     name = run_name(changes, seed)
-    with file_lock(runs / f"{name}.lock") as mine:
+    with file_lock(runs / f"{name}.lock") as held:
         if known := read_cells(results, scale).get((changes, seed)):
             return known
-        if not mine:
+        if not held:
             return None
         if title:
             print(title, file=sys.stderr, flush=True)
-        revisions = _join(runs / name, hardware()["git"])
+        revisions = _add_revision(runs / name, hardware()["git"])
         try:
             outcome: Cell = {"scores": scale.score(config, seed, runs / name)}
         except (NonFiniteLossError, NonFiniteStateError) as error:
@@ -71,8 +69,8 @@ def run_cell(
         return add_cell(results, scale, cell, locks=runs)
 
 
-def _join(folder: Path, revision: str) -> list[str]:
-    """Record in a run's folder the revision that works on it now; all that did."""
+def _add_revision(folder: Path, revision: str) -> list[str]:
+    """Record the current revision in a run's folder; returns all recorded revisions."""
     file = folder / "revisions.txt"
     before = file.read_text(encoding="utf-8").split() if file.is_file() else []
     revisions = before if before[-1:] == [revision] else [*before, revision]

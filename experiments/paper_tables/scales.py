@@ -1,10 +1,10 @@
-"""Where and how long the cells of a table are trained.
+"""Data and length of the training of a table's cells.
 
-- ``smoke``: a toy network and a few steps on a few simulated frames: that everything runs, in minutes, on two
-  cores. Its scores mean nothing.
-- ``sector``: the compact network on ten sweeps of a quarter of nuScenes' sensor's turn, at its own resolution and
-  reach, of varied streets in ordinary traffic. Half an hour of one CPU core a cell.
-- ``nuscenes``: the paper's detector on a data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
+- ``smoke``: a toy network and a few steps on a few simulated frames, to check in minutes that everything runs. Its
+  scores mean nothing.
+- ``sector``: the compact network on ten sweeps in a quarter of the view of nuScenes' sensor, at full resolution
+  and range, of varied simulated streets. Half an hour of one CPU core per cell.
+- ``nuscenes``: the paper's detector on a data set in the nuScenes layout, prepared by ``fcos-lidar prepare``.
 """
 
 import dataclasses
@@ -43,13 +43,13 @@ from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
 from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
-_CURVE_FRAMES = 100  # Test frames of the evaluations during a training.
-_BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, which would leave a trail when sweeps are fused.
+_CURVE_FRAMES = 100  # Test frames of evaluations during training.
+_BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, which leaves a trail in fused sweeps.
 
 
 @dataclasses.dataclass(frozen=True)
 class NewestSweeps(WrappedFrames):
-    """Simulated frames of which only the newest sweeps are kept; what is annotated, the current sweep decides."""
+    """Frames reduced to their newest sweeps; their annotations depend on the current sweep only."""
 
     num_sweeps: int
 
@@ -64,22 +64,22 @@ class NewestSweeps(WrappedFrames):
 
 @dataclasses.dataclass(frozen=True)
 class Simulated:
-    """Simulated streets, ten sweeps a frame, the same frames for every cell."""
+    """Simulated streets with ten sweeps per frame, the same for each cell."""
 
     name: str
-    base: Config  # What the rows of the tables are changes of.
+    base: Config  # Configuration that the rows of tables change.
     sensor: Sensor
     train_frames: int
     test_frames: int
-    cache: Path  # Frames are simulated once and kept here.
+    cache: Path  # Folder of the frames, which are simulated once.
     streets: Streets = PLAIN
-    num_objects: int = 14  # This and the others as of make_frame.
+    num_objects: int = 14  # See make_frame, also for the next two.
     reach_m: float = 10.0
     min_points: int = 5
-    looks: int = 0  # Evaluations during a cell's training, on the first test frames: its curve.
+    evaluations: int = 0  # Evaluations on the first test frames during training.
 
     def describe(self) -> dict[str, Any]:
-        """What of the scale decides a cell's result, as JSON."""
+        """Describe all that determines the result of a cell, as JSON."""
         return {
             "scale": self.name,
             "streets": dataclasses.asdict(self.streets),
@@ -94,7 +94,7 @@ class Simulated:
         }
 
     def check(self, config: Config) -> None:
-        """Refuse a row that cannot be trained here, or that would change nothing: ValueError."""
+        """Raise a ValueError for a row that cannot be trained here or would change nothing."""
         sweeps = self.base.num_sweeps
         if not 1 <= config.num_sweeps <= sweeps:
             raise ValueError(f"num_sweeps: got {config.num_sweeps}, expected 1 to {sweeps} at scale {self.name}")
@@ -104,7 +104,7 @@ class Simulated:
                 raise ValueError(f"{field}: got {value!r}, expected {base!r} at scale {self.name}")
 
     def frames(self, split: str, num_sweeps: int) -> NewestSweeps:
-        """Training or test streets; the same, and the same sweeps, however many of them are fused."""
+        """Training or test frames, with the same streets and sweeps for each number of sweeps."""
         number, first = {"train": (self.train_frames, 0), "test": (self.test_frames, UNSEEN_SEED)}[split]
         sweeps = self.base.num_sweeps
         made = SimulatedFrames(
@@ -119,40 +119,41 @@ class Simulated:
         )
         return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
 
-    def _folder(self, what: str, num_sweeps: int) -> Path:
-        return self.cache / f"{self.sensor.name}_{what}_{num_sweeps}_sweeps"
+    def _folder(self, content: str, num_sweeps: int) -> Path:
+        return self.cache / f"{self.sensor.name}_{content}_{num_sweeps}_sweeps"
 
     def clouds(self, num_sweeps: int) -> list[np.ndarray]:
-        """The first twenty test clouds, f32[n, 5], for figures that need no training."""
+        """Points of the first twenty test frames, f32[n, 5], for figures that need no training."""
         frames = self.frames("test", num_sweeps)
         return [frames.frame(i).points for i in range(min(20, len(frames)))]
 
     def objects(self, num_sweeps: int) -> GroundTruthDatabase:
         folder = self._folder(f"objects_{self.train_frames}", num_sweeps)
-        # Two builders would sweep away each other's files.
+        # Concurrent builders would delete each other's files.
         with file_lock(folder.with_suffix(".lock"), wait=True):
             return database.prepare_database(self.frames("train", num_sweeps), folder)
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train in the folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``.
+        """Train in a folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``.
 
-        With looks also ``curve``, [[samples, mAP]], ``ranges``, mAP and AP by distance, and ``seconds_of_steps``.
+        With ``evaluations`` also ``curve``, [[samples, mAP]], ``ranges``, scores by distance, and
+        ``seconds_of_steps``.
         """
         frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
         steps, options = config.optimizer.epochs * steps_per_epoch(frames, config), dict[str, Any]()
-        if self.looks:
-            along = SelectedFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
-            options = {"tests": along, "schedule": Schedule(-(-steps // 20), -(-steps // self.looks))}
+        if self.evaluations:
+            first = SelectedFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
+            options = {"tests": first, "schedule": Schedule(-(-steps // 20), -(-steps // self.evaluations))}
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
-        found, seen = detections(detector, tests)
-        scores = _scores(benchmark(found, seen).summary)
-        if not self.looks:
+        boxes, test_frames = detections(detector, tests)
+        scores = _scores(benchmark(boxes, test_frames).summary)
+        if not self.evaluations:
             return scores
         batch, records = config.optimizer.batch_size, read_metrics(folder)
         return scores | {
             "curve": [[r["step"] * batch, round(r["test/mAP"], 5)] for r in records if "test/mAP" in r],
-            "ranges": scores_by_range(found, seen),
+            "ranges": scores_by_range(boxes, test_frames),
             "seconds_of_steps": round(sum(r.get("seconds", 0.0) for r in records)),
         }
 
@@ -161,31 +162,29 @@ class Simulated:
 class Layout:
     """Options of --scale nuscenes."""
 
-    data_root: Path | None = None  # Folder of a data set in the nuScenes layout that fcos-lidar prepare has seen.
+    data_root: Path | None = None  # Folder of a data set in the nuScenes layout, after fcos-lidar prepare.
     version: str = "v1.0-trainval"  # Folder of its tables.
     index: Path | None = None
-    """Where fcos-lidar prepare has put the index; default: DATA_ROOT/.fcos_lidar/VERSION."""
-    splits: Path | None = None  # File {name: [scene, ...]} with own splits.
-    train_split: str | None = None  # Default: mini_train for a version that ends in mini, else train.
+    """Index written by fcos-lidar prepare; default: DATA_ROOT/.fcos_lidar/VERSION."""
+    splits: Path | None = None  # File {name: [scene, ...]} with your own splits.
+    train_split: str | None = None  # Default: mini_train for a version that ends in mini, otherwise train.
     val_split: str | None = None  # Default: mini_val or val.
     test_version: str | None = None
-    """Version whose split test table 8 writes a results file for, such as v1.0-test."""
-    allow_missing_sweeps: bool = False  # Go on with fewer sweeps where files of older sweeps are missing.
-    steps: int | None = None  # Updates of every cell, instead of the preset's epochs.
-    accumulate: int = 1  # Parts that a batch is cut into where it does not fit; changes batch norm alone.
-    precision: Literal["float32", "bfloat16"] = "float32"  # Of the convolutions behind the first.
-    threads: int = 2  # That prepare batches.
-    workers: int = 0  # Processes that prepare batches, beside the threads.
+    """Version, such as v1.0-test, for whose split test table 8 writes a results file."""
+    allow_missing_sweeps: bool = False  # Use fewer sweeps if files of older sweeps are missing.
+    steps: int | None = None  # Updates of each cell, instead of the preset's epochs.
+    accumulate: int = 1  # Micro-batches per step, if a batch does not fit; only batch norm changes.
+    precision: Literal["float32", "bfloat16"] = "float32"  # Precision of the convolutions after the first.
+    threads: int = 2  # Threads that prepare batches.
+    workers: int = 0  # Additional processes that prepare batches.
 
 
 @dataclasses.dataclass(frozen=True)
 class NuScenesLayout:
-    """A data set in the nuScenes layout that ``fcos-lidar prepare`` has seen.
-
-    ``describe`` and ``score`` are as of :class:`Simulated`.
+    """A data set in the nuScenes layout, prepared by ``fcos-lidar prepare``; used like :class:`Simulated`.
 
     Raises:
-        ValueError: at construction, where data, index or splits are not there.
+        ValueError: at construction, if data, index or splits are missing.
     """
 
     layout: Layout
@@ -209,7 +208,7 @@ class NuScenesLayout:
 
     @property
     def splits(self) -> tuple[str, str]:
-        """To train and to evaluate on."""
+        """Splits for training and evaluation."""
         layout = self.layout
         train, val = ("mini_train", "mini_val") if layout.version.endswith("mini") else ("train", "val")
         return layout.train_split or train, layout.val_split or val
@@ -221,17 +220,17 @@ class NuScenesLayout:
 
     @property
     def index(self) -> Path:
-        """Where fcos-lidar prepare writes."""
+        """Folder of the index that fcos-lidar prepare writes."""
         return self.layout.index or default_index(self.data_root, self.layout.version)
 
-    @functools.cache  # noqa: B019 - a handful of scales a process
+    @functools.cache  # noqa: B019 - few scales per process
     def _data(self, version: str) -> NuScenes:
         index = self.index if version == self.layout.version else None
         missing = self.layout.allow_missing_sweeps
         return NuScenes(self.data_root, version, index=index, allow_missing_sweeps=missing)
 
     def frames(self, split: str, config: Config, version: str | None = None) -> NuScenesFrames:
-        """Keyframes of a split, of the layout's version or another, fused as a configuration wants it."""
+        """Keyframes of a split, of the layout's version or another, read according to a configuration."""
         data = self._data(version or self.layout.version)
         return NuScenesFrames(data, tuple(data.split(split, file=self.layout.splits)), config.reading)
 
@@ -248,7 +247,7 @@ class NuScenesLayout:
         }
 
     def objects(self, frames: NuScenesFrames) -> GroundTruthDatabase:
-        """What fcos-lidar prepare has cut from the training frames, or from more sweeps of them.
+        """Open the database that fcos-lidar prepare has cut from the training frames, of at least as many sweeps.
 
         Raises:
             ValueError: there is no such database.
@@ -258,14 +257,14 @@ class NuScenesLayout:
             raise ValueError(f"{folder}: no objects here, expected some: run fcos-lidar prepare")
         objects = database.open_database(folder)
         sweeps = range(frames.reading.num_sweeps, NUSCENES.num_sweeps + 1)
-        known = [dataclasses.replace(frames, reading=database.cut_reading(n)).fingerprint() for n in sweeps]
-        if objects.manifest.source not in known:
+        sources = [dataclasses.replace(frames, reading=database.cut_reading(n)).fingerprint() for n in sweeps]
+        if objects.manifest.source not in sources:
             origin = f"cut from other frames than {self.splits[0]}"
             raise ValueError(f"{folder}: {origin}: run fcos-lidar prepare again")
         return objects
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train and evaluate as the benchmark does; the results file stays in the folder."""
+        """Train and evaluate like the benchmark; the results file stays in the folder."""
         layout, (train_split, val_split) = self.layout, self.splits
         frames, tests = self.frames(train_split, config), self.frames(val_split, config)
         steps = layout.steps or config.optimizer.epochs * steps_per_epoch(frames, config)
@@ -278,11 +277,11 @@ class NuScenesLayout:
         return _scores(evaluate(read_results(file, truth.tokens).boxes, truth).summary)
 
 
-Scale = Simulated | NuScenesLayout  # Where and how long cells are trained.
+Scale = Simulated | NuScenesLayout
 
 
 def write_submission(detector: CloudDetector, frames: NuScenesFrames, file: Path) -> None:
-    """Detect in keyframes and write the benchmark's results file; an interrupted call resumes."""
+    """Detect in keyframes and write the benchmark's results file; resumes after an interruption."""
     data, tokens = frames.nuscenes, frames.tokens
     file.parent.mkdir(parents=True, exist_ok=True)
 
@@ -312,7 +311,7 @@ _TOY = change(
     class_balanced=False,
     augment=None,
     projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
-    # As many channels a type as there are rounds, or table 3 could not leave them ungrouped.
+    # Table 3 needs at least as many channels per type as rounds.
     model__stem=StemConfig(channels_per_type=5, out_channels=8),
     inference=InferenceConfig(max_detections=50, candidates_per_level=100),
     optimizer__epochs=2,
@@ -320,7 +319,7 @@ _TOY = change(
 
 
 def smoke(cache: Path) -> Simulated:
-    """A toy that runs in seconds; its scores mean nothing."""
+    """Create the scale ``smoke``."""
     sensor = dataclasses.replace(TINY, name="toy", num_columns=64)
     return Simulated("smoke", _TOY, sensor, train_frames=16, test_frames=6, cache=cache)
 
@@ -335,10 +334,10 @@ _SECTOR = change(
     projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
     model__circular_width=False,
     model__local_geometry=False,
-    # Wide enough for the 45 inputs of five rounds.
+    # Wider than compact, for the 45 inputs of five rounds.
     model__stem__channels_per_type=8,
     model__stem__out_channels=24,
-    # What is turned leaves the sector, and a mirrored street would look down behind.
+    # Larger rotations leave the sector, and a mirrored street would face backwards.
     augment__flip_y_probability=0.0,
     augment__max_rotation_rad=math.radians(5),
     optimizer__ema_decay=0.998,
@@ -347,8 +346,8 @@ _SECTOR = change(
 
 
 def quarter(cache: Path) -> Simulated:
-    """The compact network on ten sweeps of the quarter of a turn ahead: what the paper's claims are about."""
+    """Create the scale ``sector``, which the ledger's verdicts rest on."""
     extent = {"num_objects": 60, "reach_m": NUSCENES_HDL32E.limit_xy_m, "min_points": 1}
     ahead = sector(NUSCENES_HDL32E, math.pi / 2, 272)
-    sizes = {"train_frames": 4000, "test_frames": 400, "cache": cache, "looks": 8}
+    sizes = {"train_frames": 4000, "test_frames": 400, "cache": cache, "evaluations": 8}
     return Simulated("sector", _SECTOR, ahead, **sizes, streets=CITY, **extent)

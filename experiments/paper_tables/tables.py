@@ -1,4 +1,4 @@
-"""What all tables of the paper share: rows, the record, Markdown and the picture."""
+"""Tables: rows, training of their cells, record, Markdown and pictures."""
 
 import dataclasses
 import functools
@@ -16,14 +16,7 @@ from experiments.hardware import hardware
 from experiments.paper import PAPER
 from experiments.paper_tables.cells import Cell
 from experiments.paper_tables.grid import run_cells
-from experiments.paper_tables.scales import (
-    Layout,
-    NuScenesLayout,
-    Scale,
-    Simulated,
-    quarter,
-    smoke,
-)
+from experiments.paper_tables.scales import Layout, NuScenesLayout, Scale, Simulated, quarter, smoke
 from experiments.script import compact_json
 from experiments.statistics import interval
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -31,66 +24,64 @@ from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import atomic_write, file_lock
 
 SCORES = ("mAP", "NDS")
-_NOTHING = "the scores mean nothing"
+_SMOKE_NOTE = "the scores mean nothing"
 
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """At which scale, and where the results go."""
+    """Options of a table."""
 
     scale: Literal["smoke", "sector", "nuscenes"] = "smoke"
-    """Minutes on a toy; the compact network on simulated streets, a quarter of nuScenes' sensor's turn; the
-    paper's detector on nuScenes."""
-    rows: tuple[str, ...] = ()  # Labels of the rows to train, beside the reference; default: all.
-    seeds: tuple[int, ...] = ()  # Of every cell; default: 0 for smoke, else 0, 1 and 2.
-    out: Path = Path("outputs/tables")  # Folder of tables and cells; a folder of the scale's name below it.
-    runs: Path = Path("outputs/runs")  # Folder of the training runs and of the simulated frames.
+    """A toy, in minutes; the compact network on simulated streets in a quarter of the view of nuScenes' sensor; or
+    the paper's detector on nuScenes."""
+    rows: tuple[str, ...] = ()  # Labels of the rows to train, in addition to the reference; default: all.
+    seeds: tuple[int, ...] = ()  # Seeds of each row; default: 0 for smoke, otherwise 0, 1 and 2.
+    out: Path = Path("outputs/tables")  # Folder of tables and cells, with one subfolder per scale.
+    runs: Path = Path("outputs/runs")  # Folder of training runs and simulated frames.
     data: Path | None = None
-    """Folder with ten_sweep_cloud/ for the figures of a real cloud (not those of table 7 at scale smoke, which has
-    another sensor); default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated one."""
-    only_figures: bool = False  # What needs no training alone, in files of its own.
+    """Folder with ten_sweep_cloud/ for figures of a real cloud; default: the environment's FCOS_LIDAR_REAL_DATA,
+    otherwise a simulated cloud."""
+    only_figures: bool = False  # Only measure what needs no training, into separate files.
     nuscenes: tyro.conf.OmitArgPrefixes[Layout] = dataclasses.field(default_factory=Layout)
-    """Data set and training of --scale nuscenes."""
+    """Options of --scale nuscenes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
     """A row of a table."""
 
-    label: str  # As it is printed.
-    change: Change  # What it changes in the scale's base.
+    label: str  # Printed label.
+    change: Change  # Change of the scale's base configuration.
     paper: str | None = None  # Key of the paper's row.
-    gain: str | None = None  # Key among the paper's texts of a gain in mAP that it states without a row.
-    reference: str | None = None  # Label of the row that its differences are taken from; default: the table's.
+    gain: str | None = None  # Key in the paper's texts of a gain in mAP that is stated without a row.
+    reference: str | None = None  # Label of the row that differences are relative to; default: the table's.
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table of the paper, as an experiment."""
+    """A table whose rows are trained and measured."""
 
-    name: str  # Key in ``paper.json``, if it is one of the paper's.
-    title: str  # What it asks.
-    rows: tuple[Row, ...]  # In the paper's order.
-    reference: str  # Label of the row that differences are taken from, unless a row names its own.
+    name: str  # Key in ``paper.json``, for a table of the paper.
+    title: str  # Printed title.
+    rows: tuple[Row, ...]  # Rows in the paper's order.
+    reference: str  # Label of the row that differences are relative to, unless a row names its own.
     figures: Callable[[Args], dict[str, Any]] | None = None
-    """Measured without training: ``{"columns": {label: {column: value}}, "lines": [text], ...}``."""
+    """Measures what needs no training: ``{"columns": {label: {column: value}}, "lines": [text], ...}``."""
 
     def __post_init__(self) -> None:
-        """Refuse names that would be missed after hours of training."""
-        labels = [row.label for row in self.rows]
-        theirs, gains = self.paper_rows, PAPER["text"]
+        labels, gains = [row.label for row in self.rows], PAPER["text"]
         if self.reference not in labels:
             raise ValueError(f"table {self.name}: reference: got {self.reference!r}, expected one of {labels}")
         for row in self.rows:
             if labels.count(row.label) > 1:
                 raise ValueError(f"table {self.name}: got two rows {row.label!r}, expected different labels")
-            for field, known in (("reference", labels), ("paper", theirs), ("gain", gains)):
+            for field, known in (("reference", labels), ("paper", self.paper_rows), ("gain", gains)):
                 key = getattr(row, field)
                 if key is not None and key not in known:
                     raise ValueError(f"row {row.label!r}: {field}: got {key!r}, expected one of {list(known)}")
 
     def only(self, labels: tuple[str, ...]) -> "Table":
-        """The table with the rows of these labels and their references; with all where there are none."""
+        """Select the rows with these labels and their references; all rows without labels."""
         if unknown := [label for label in labels if label not in [row.label for row in self.rows]]:
             known = ", ".join(row.label for row in self.rows)
             raise ValueError(f"--rows: got {unknown[0]!r}, expected some of: {known}")
@@ -100,35 +91,35 @@ class Table:
         return dataclasses.replace(self, rows=tuple(row for row in self.rows if row.label in needed))
 
     def reference_of(self, row: Row) -> Row:
-        """The row that a row's differences are taken from."""
+        """Return the row that a row's differences are relative to."""
         return next(r for r in self.rows if r.label == (row.reference or self.reference))
 
     def paper_difference(self, row: Row) -> dict[str, float]:
-        """Score -> what the row gains over its reference in the paper, where the paper tells."""
+        """Score -> gain over the reference in the paper, if stated there."""
         if row.gain is not None:
             return {"mAP": PAPER["text"][row.gain]["value"]}
-        theirs, base = (self.paper_rows.get(r.paper, {}) for r in (row, self.reference_of(row)))
-        return {s: round(theirs[s] - base[s], 2) for s in SCORES if s in theirs and s in base}
+        own, base = (self.paper_rows.get(r.paper, {}) for r in (row, self.reference_of(row)))
+        return {s: round(own[s] - base[s], 2) for s in SCORES if s in own and s in base}
 
     @property
     def paper_rows(self) -> dict[Any, Any]:
-        """The paper's rows, none where the table is not the paper's."""
+        """Rows of the paper's table; empty for other tables."""
         return PAPER["tables"].get(self.name, {"rows": {}})["rows"]
 
 
 def simulated_scale(args: Args) -> Simulated | None:
-    """The scale that is asked for, if its frames are simulated."""
+    """Create the selected scale if its frames are simulated."""
     make = {"smoke": smoke, "sector": quarter}.get(args.scale)
     return make(args.runs / "frames") if make else None
 
 
 def make_scale(args: Args) -> Simulated | NuScenesLayout:
-    """The scale that is asked for."""
+    """Create the selected scale."""
     return simulated_scale(args) or NuScenesLayout(args.nuscenes)
 
 
 def stem_times(variants: dict[str, str], args: Args) -> dict[str, Any]:
-    """Figures of a table about the stem, from its rows' labels with their variants in ``module_latency.py``."""
+    """Measure the stem for a table; ``variants`` maps labels to variants of ``module_latency.py``."""
     repeats = 2 if args.scale == "smoke" else 15
     return module_latency.figures(
         variants, module_latency.Args(repeats=repeats, precision=args.nuscenes.precision)
@@ -136,7 +127,7 @@ def stem_times(variants: dict[str, str], args: Args) -> dict[str, Any]:
 
 
 def run_table(table: Table, args: Args) -> dict[str, Any]:
-    """Train what is missing, measure, print, write; the record."""
+    """Train missing cells, measure, print and write a table; returns its record."""
     _check(args)
     table = table.only(args.rows)
     here, folder = hardware(), args.out / args.scale
@@ -144,12 +135,12 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
     scale = None if args.only_figures else make_scale(args)
     cells = {} if scale is None else _cells(table, scale, seeds, folder, args)
     file = folder / f"{table.name}{'_figures' if args.only_figures else ''}"
-    # One process at a time: what is timed is not to be disturbed by the others of the same table.
+    # One process at a time, so that processes of the same table do not disturb each other's times.
     with file_lock(args.runs / args.scale / f"{file.name}.lock", wait=True):
         record = make_record(table, args.scale, scale, cells, table.figures(args) if table.figures else {})
         text = as_markdown(table, record)
         print(text, flush=True)
-        # Scores and what was trained on are in the files of the cells.
+        # Scores and training data are in the files of the cells.
         rows = [{name: value for name, value in row.items() if name != "scores"} for row in record["rows"]]
         written = {**{name: value for name, value in record.items() if name != "trained_on"}, "rows": rows, **here}
         for suffix, content in ((".json", compact_json(written, 3) + "\n"), (".md", text)):
@@ -159,7 +150,7 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
         if len(seeds) > 1 and cells:
             draw(table, record, picture)
         else:
-            picture.unlink(missing_ok=True)  # of other seeds
+            picture.unlink(missing_ok=True)  # A picture of other seeds.
         if any(cell and "curve" in cell for row in record["rows"] for cell in row.get("scores", ())):
             draw_learning(table, record, file.with_name(f"{file.name}_curves.png"))
     return record
@@ -168,7 +159,7 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
 def make_record(
     table: Table, scale_name: str, scale: Scale | None, cells: dict[str, list[Cell]], figures: dict[str, Any]
 ) -> dict[str, Any]:
-    """What a table says, from the cells of its rows and from figures that need no training."""
+    """Combine the cells of a table's rows with the figures that need no training."""
     return {
         "table": table.name,
         "scale": scale_name,
@@ -183,39 +174,39 @@ def make_record(
 def _check(args: Args) -> None:
     for seed in args.seeds:
         if seed < 0 or args.seeds.count(seed) > 1:
-            raise ValueError(f"--seeds: got {args.seeds}, expected different ones, none below 0")
+            raise ValueError(f"--seeds: got {args.seeds}, expected different seeds of at least 0")
     real_cloud(args.data)
     if args.scale != "nuscenes":
         for field in dataclasses.fields(Layout):
             if getattr(args.nuscenes, field.name) != getattr(Layout(), field.name):
                 option = field.name.replace("_", "-")
-                raise ValueError(f"--{option}: is of --scale nuscenes, got --scale {args.scale}")
+                raise ValueError(f"--{option}: only for --scale nuscenes, got --scale {args.scale}")
 
 
 def _cells(table: Table, scale: Scale, seeds: tuple[int, ...], results: Path, args: Args) -> dict[str, list[Cell]]:
-    """The records of every row's cells, by seed."""
+    """Train or read the cells of each row, by label and in the order of the seeds."""
     configs = {row.label: row.change(scale.base) for row in table.rows}
     if isinstance(scale, Simulated):
         for config in configs.values():
             scale.check(config)
-    wanted = [(config, seed) for config in configs.values() for seed in seeds]
+    pairs = [(config, seed) for config in configs.values() for seed in seeds]
     labels = [f"{label}, seed {seed}" for label in configs for seed in seeds]
-    found = iter(run_cells(wanted, scale, results=results, runs=args.runs / args.scale, labels=labels))
-    return {label: [next(found) for _ in seeds] for label in configs}
+    cells = iter(run_cells(pairs, scale, results=results, runs=args.runs / args.scale, labels=labels))
+    return {label: [next(cells) for _ in seeds] for label in configs}
 
 
 def _row_record(table: Table, row: Row, cells: dict[str, list[Cell]]) -> dict[str, Any]:
-    """Scores of a row, their difference to the reference, seed by seed, and the paper's."""
+    """Scores of a row, differences to its reference per seed, and the paper's scores."""
     reference = table.reference_of(row)
     record: dict[str, Any] = {"label": row.label, "reference": reference.label}
     record |= {"paper": table.paper_rows.get(row.paper, {}), "paper_difference": table.paper_difference(row)}
     if row.label in cells:
         own, base = cells[row.label], [cell.get("scores") for cell in cells[reference.label]]
-        record["scores"] = mine = [cell.get("scores") for cell in own]
+        record["scores"] = scores = [cell.get("scores") for cell in own]
         record["diverged"] = [f"seed {cell['seed']}: {cell['diverged']}" for cell in own if "diverged" in cell]
         for s in SCORES:
-            record[s] = _summary([100 * cell[s] for cell in mine if cell])
-            pairs = [(cell, other) for cell, other in zip(mine, base, strict=True) if cell and other]
+            record[s] = _summary([100 * cell[s] for cell in scores if cell])
+            pairs = [(cell, other) for cell, other in zip(scores, base, strict=True) if cell and other]
             record[f"{s}_difference"] = _summary([100 * (cell[s] - other[s]) for cell, other in pairs])
     return record
 
@@ -225,14 +216,14 @@ def _summary(values: list[float]) -> dict[str, Any] | None:
 
 
 def as_markdown(table: Table, record: dict[str, Any]) -> str:
-    """The table, ours beside the paper's."""
+    """Format a table with our scores beside the paper's."""
     columns = record["figures"].get("columns", {})
     extra = list(dict.fromkeys(name for values in columns.values() for name in values))
-    trained, theirs = bool(record["seeds"]), any(row["paper_difference"] for row in record["rows"])
+    trained, of_paper = bool(record["seeds"]), any(row["paper_difference"] for row in record["rows"])
     header = [""]
     for s in SCORES:
         header += [f"{s}, ours", "difference, ours"] if trained else []
-        header += [f"{s}, paper", "difference, paper"] if theirs else []
+        header += [f"{s}, paper", "difference, paper"] if of_paper else []
     note = f"; {_training_text(record['trained_on'])}" if trained else ""
     lines = [f"### {table.title}", "", f"Scale `{record['scale']}`, seeds {record['seeds'] or 'none'}{note}.", ""]
     lines += ["| " + " | ".join([*header, *extra]) + " |", "|---" * (len(header) + len(extra)) + "|"]
@@ -241,7 +232,7 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
         for s in SCORES:
             if trained:
                 cells += [_text(row.get(s)), "-" if itself else _text(row.get(f"{s}_difference"), sign=True)]
-            if theirs:
+            if of_paper:
                 gain = row["paper_difference"].get(s)
                 cells += [_number(row["paper"].get(s)), "-" if itself else _number(gain, sign=True)]
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
@@ -256,7 +247,7 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
 
 
 def by_distance(rows: list[dict[str, Any]]) -> list[str]:
-    """mAP and AP by distance and by class, for the rows whose cells hold them, and how long their steps took."""
+    """Format mAP and AP by distance and class, and the time of the training steps, for rows that have them."""
     table, seconds = list[str](), list[str]()
     for row in rows:
         cells = [cell for cell in row.get("scores", ()) if cell and "ranges" in cell]
@@ -279,15 +270,17 @@ def by_distance(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _warnings(record: dict[str, Any]) -> list[str]:
-    """What a reader of a table must not overlook."""
-    said = [f"At this scale {_NOTHING}: that the rows run is all they say."] if record["scale"] == "smoke" else []
+    """Warnings for the reader of a table."""
+    lines = list[str]()
+    if record["scale"] == "smoke":
+        lines.append(f"At this scale {_SMOKE_NOTE}: they only show that the rows run.")
     if len(record["seeds"]) == 2:
-        said.append("Two seeds can agree by chance: an interval of two says nothing about their spread.")
-    return said
+        lines.append("Two seeds can agree by chance: an interval of two says nothing about their spread.")
+    return lines
 
 
 def _training_text(trained_on: dict[str, Any]) -> str:
-    """What a row that changes nothing is trained on, and how long."""
+    """Describe the training of the base configuration."""
     optimizer, precision = trained_on["base"]["optimizer"], trained_on["base"]["model"]["precision"]
     shown = {name: value for name, value in trained_on.items() if isinstance(value, int | float | str)}
     shown |= {
@@ -318,26 +311,26 @@ def _text(value: dict[str, Any] | None, sign: bool = False) -> str:
 
 
 def draw(table: Table, record: dict[str, Any], path: Path) -> None:
-    """Our differences in mAP with their intervals, and the paper's."""
+    """Draw our differences in mAP with intervals, and the paper's differences."""
     from fcos_lidar_jax.visualization.figure import new_figure, save_png
 
     rows = record["rows"]
     figure = new_figure(7.5, 1.2 + 0.45 * len(rows))
     axis = figure.add_subplot()
     for i, row in enumerate(rows):
-        ours, theirs = row["mAP_difference"], row["paper_difference"].get("mAP")
+        ours, paper = row["mAP_difference"], row["paper_difference"].get("mAP")
         if ours is not None:
             mean, low, high = ours["interval"] or [ours["mean"]] * 3
             bars = {"xerr": [[mean - low], [high - mean]], "fmt": "o", "color": "#0072b2"}
             axis.errorbar(mean, i, **bars, label="ours, 95 % interval")
-        if theirs is not None:
-            axis.plot(theirs, i, "D", color="#d55e00", markersize=5, label="paper")
+        if paper is not None:
+            axis.plot(paper, i, "D", color="#d55e00", markersize=5, label="paper")
     axis.axvline(0, color="#888888", linewidth=0.8)
     axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
     axis.set_ylim(len(rows) - 0.5, -0.5)
     axis.set_xlabel(f"mAP, points more than {_references(record)}")
-    said = f", {_NOTHING}" if record["scale"] == "smoke" else ""
-    axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds{said})", fontsize=11)
+    note = f", {_SMOKE_NOTE}" if record["scale"] == "smoke" else ""
+    axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds{note})", fontsize=11)
     handles, labels = axis.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
     axis.legend(kinds.values(), kinds.keys(), fontsize=9, frameon=False)
@@ -346,14 +339,14 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
 
 
 def draw_learning(table: Table, record: dict[str, Any], path: Path) -> None:
-    """The mAP of each row over the samples that its training had seen: thin by seed, thick their mean."""
+    """Draw the mAP of each row over the training samples: thin lines per seed, thick lines for the mean."""
     from fcos_lidar_jax.visualization.figure import new_figure, save_png
 
     figure = new_figure(7.5, 4)
     axis = figure.add_subplot()
     for i, row in enumerate(record["rows"]):
         curves = [np.array(cell["curve"]) for cell in row["scores"] if cell]
-        if not curves:  # all diverged
+        if not curves:  # All seeds diverged.
             continue
         for curve in curves:
             axis.plot(curve[:, 0], 100 * curve[:, 1], color=f"C{i}", linewidth=0.5)

@@ -1,20 +1,18 @@
-"""CenterPoint beside the range view: what both find after the same samples and after the same time.
+"""CenterPoint and the range view after equal samples and after equal time.
 
     python -m experiments.studies.centerpoint  # smoke: minutes, a toy
     python -m experiments.studies.centerpoint --scale sector  # 3 rows, 9 cells
 
-Both see the points of the same ten sweeps that lie in the sector, and share trainer, augmentation, optimizer,
-post-processing and evaluation; both may send as many candidates to NMS. CenterPoint has the pillars of its
-compact preset, and predicts no IoU. What favours the range view here: learning rate and NMS were chosen for
-``compact``, which has more parameters (the table says how many), and CenterPoint computes a whole square, of
-which a sector sees a quarter. Its steps take longer for that, and the range view is trained for half as many
-epochs again in a row of its own. The minutes that the steps took stand below the table, beside the scores by
-class and by range; other work may have shared the machine, so what a step costs is timed as well, turn by turn.
-That, and the times from a cloud to boxes in the form of the paper's table 7, need no training
-(``--only-figures``): they are those of random weights, whose candidates are not as many as a trained detector's,
-so the stage of the boxes is not to be compared.
+Both use the points of the same ten sweeps in the sector, the same training, augmentation, optimizer,
+post-processing and evaluation, and the same number of NMS candidates. CenterPoint has the pillars of its compact
+preset and predicts no IoU. The comparison favours the range view: learning rate and NMS were chosen for
+``compact``, which has more parameters, and CenterPoint computes a whole square although the sector covers a
+quarter of it. As its steps therefore take longer, one row trains the range view for half as many epochs again.
 
-The paper compares itself with CenterPoint in table 7 and has no table of both after equal training.
+The minutes of the training steps are printed below the table; other work may have shared the machine, so the steps
+are also timed in turns. These times, and the times of the stages from cloud to boxes, need no training
+(``--only-figures``). They are of random weights, which have fewer candidates than trained ones, so the times of
+the stage ``boxes`` cannot be compared. The paper compares both in table 7, but not after equal training.
 """
 
 from typing import Any
@@ -33,14 +31,12 @@ from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
 
-_AS_LONG = 1.5  # Times the epochs of the scale, in which CenterPoint takes about as long.
-_CANDIDATES = (
-    4450  # As many as the range view has on all of its levels, of which the coarsest hold less than 1000.
-)
+_MORE_EPOCHS = 1.5  # Factor with which the range view takes about as long as CenterPoint.
+_CANDIDATES = 4450  # Candidates of the range view on all levels; the coarsest have less than 1000 each.
 
 
-def _as_long(config: Config) -> Config:
-    return change(optimizer__epochs=round(_AS_LONG * config.optimizer.epochs))(config)
+def _trained_longer(config: Config) -> Config:
+    return change(optimizer__epochs=round(_MORE_EPOCHS * config.optimizer.epochs))(config)
 
 
 def _peer(config: Config) -> Config:
@@ -51,11 +47,11 @@ def _peer(config: Config) -> Config:
 
 OURS = Row("FCOS-LiDAR", change())
 PEER = Row("CenterPoint", _peer)
-ROWS = (PEER, OURS, Row(f"FCOS-LiDAR, {_AS_LONG} x epochs", _as_long))
+ROWS = (PEER, OURS, Row(f"FCOS-LiDAR, {_MORE_EPOCHS} x epochs", _trained_longer))
 
 
 def stage_calls(config: Config, points: Any, sensor: Any) -> tuple[dict[str, Call], int]:
-    """The stages of a detector with random weights on one cloud, each to be timed alone, and its parameters."""
+    """Make timed calls of a detector's stages on one cloud with random weights; also returns its parameters."""
     detector = build_detector(config, sensor)
     stages, variables = make_stages(detector), detector.init(jax.random.key(0))
     cloud = make_cloud(points, config, sensor=sensor, num_close=0)
@@ -71,7 +67,7 @@ def stage_calls(config: Config, points: Any, sensor: Any) -> tuple[dict[str, Cal
 
 
 def figures(args: Args) -> dict[str, Any]:
-    """Times of the stages and of a training step, and parameters, by row."""
+    """Measure times of the stages and of a training step, and count parameters, by row."""
     scale = simulated_scale(args)
     assert scale is not None
     frame, calls, columns = scale.frames("test", scale.base.num_sweeps).frame(0), dict[tuple[str, str], Call](), {}
@@ -91,7 +87,7 @@ TABLE = Table("centerpoint", "CenterPoint and the range view", ROWS, reference=P
 
 
 def main(args: Args) -> None:
-    """The table."""
+    """Train and print the table."""
     if args.scale == "nuscenes":
         raise ValueError("--scale: got nuscenes, expected smoke or sector")
     run_table(TABLE, args)

@@ -1,13 +1,14 @@
-"""Does a training step depend on the number of devices or processes?
+"""Equivalence of training steps on different numbers of devices and processes.
 
     python -m experiments.studies.device_equivalence
 
-One gradient and five steps in float32 and float64, from the same state, on meshes of 1, 2, 4 and 8 virtual CPU
-devices in one process, and of 8 in two, on very unequal samples. Differences are those of the worst leaf, relative
-to its largest value. Expected: owners, labels and K identical; gradient and five steps within 1e-9 in float64; in
-float32 a gradient that differs by less than twice ``rounding``, by which one device's gradient differs from that
-in float64. In float32 the five steps are only reported: AdamW turns a rounding difference of a gradient near zero
-into a full step. Eight minutes on two cores, nearly all of it compilation.
+Computes one gradient and five steps in float32 and float64 from the same state, on meshes of 1, 2, 4 and 8 virtual
+CPU devices in one process, and of 8 devices in two processes, on very unequal samples. A difference is the largest
+over all leaves, relative to the leaf's largest value. Expected: identical owners, labels and K; differences of
+gradient and five steps below 1e-9 in float64; in float32 a gradient that differs by less than twice ``rounding``,
+the difference between float32 and float64 on one device. In float32 the five steps are only reported, because
+AdamW turns rounding noise of a gradient near zero into a full-size step. Cost: eight minutes on two cores, mostly
+compilation.
 """
 
 import dataclasses
@@ -42,7 +43,7 @@ from fcos_lidar_jax.types import Batch, TrainState
 
 SIZE, STEPS, POINTS = 8, 5, 2048
 WEIGHTS = 1
-"""Seed of weights that put no activation near ReLU's kink, where rounding changes more than the last bits."""
+"""Seed of weights without activations near the kink of ReLU, where rounding changes more than the last bits."""
 SENSOR = dataclasses.replace(TINY, num_columns=64)
 CONFIG = change(
     max_points=POINTS,
@@ -55,13 +56,13 @@ CONFIG = change(
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """How much."""
+    """Options of the comparison."""
 
-    quick: bool = False  # Five steps in float64 alone, on one device and on eight in two processes.
+    quick: bool = False  # Only five steps in float64, on one device and on eight devices in two processes.
 
 
 def batch_of(step: int) -> Batch:
-    """Very unequal samples: the first without boxes, the second without points, the third with a single box."""
+    """Make very unequal samples: the first without boxes, the second without points, the third with one box."""
     frames = []
     for i in range(SIZE):
         frame = make_frame(100 * step + i, SENSOR, num_objects=2 + 3 * i)
@@ -83,7 +84,7 @@ def _targets_of(detector: Detector, state: TrainState, batch: Batch) -> tuple[ja
 
 
 def draw_variables(detector: Detector, dtype: str) -> Any:
-    """Weights as they might be, drawn by NumPy: Flax's own take longer to compile than the rest of a run."""
+    """Draw realistic weights with NumPy, because Flax's initialisation takes long to compile."""
     rng = np.random.default_rng(WEIGHTS)
 
     def draw(path: Any, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
@@ -91,31 +92,31 @@ def draw_variables(detector: Detector, dtype: str) -> Any:
             predicts = path[-1].key.endswith("_kernel")
             scale = 0.01 if predicts else (2 / np.prod(leaf.shape[:-1])) ** 0.5
             return (scale * rng.normal(size=leaf.shape)).astype(dtype)
-        # Headings far from zero, where their direction is well defined.
+        # Headings away from zero, where their direction is well defined.
         return np.full(leaf.shape, path[-1].key in ("scale", "var", "heading_bias"), dtype)
 
     return jax.tree_util.tree_map_with_path(draw, jax.eval_shape(detector.init, jax.random.key(0)))
 
 
 def measure(out: Path, mesh: Mesh, dtype: str, *, gradient: bool) -> None:
-    """On one mesh, five steps, and one gradient where it is wanted."""
+    """Compute five steps on one mesh, and optionally one gradient."""
     detector, optimizer = build_detector(CONFIG, SENSOR), make_optimizer(CONFIG.optimizer, STEPS)
     start = make_state(detector, optimizer, jax.random.key(1), variables=draw_variables(detector, dtype))
     state, process, processes = replicate(start, mesh), jax.process_index(), jax.process_count()
     rows = slice(process * SIZE // processes, (process + 1) * SIZE // processes)
     batches = [shard_batch(jax.tree.map(lambda leaf: leaf[rows], batch_of(i)), mesh) for i in range(STEPS)]
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     if gradient:
         on_all = functools.partial(jax.jit, out_shardings=NamedSharding(mesh, PartitionSpec()))
         of_batch = on_all(make_gradient(detector))(state.params, state.batch_stats, batches[0])
-        found |= zip(("gradient", "statistics", "metrics"), of_batch, strict=True)
-        found["targets"] = on_all(functools.partial(_targets_of, detector))(state, batches[0])
+        results |= zip(("gradient", "statistics", "metrics"), of_batch, strict=True)
+        results["targets"] = on_all(functools.partial(_targets_of, detector))(state, batches[0])
     step = jit_step(make_train_step(detector, optimizer), mesh)
     metrics = {}
     for batch in batches:
         state, metrics = step(state, batch)
-    found["after"] = state.params, state.batch_stats, state.ema, metrics["loss/total"]
-    leaves = jax.tree_util.tree_flatten_with_path(found)[0]
+    results["after"] = state.params, state.batch_stats, state.ema, metrics["loss/total"]
+    leaves = jax.tree_util.tree_flatten_with_path(results)[0]
     arrays = {jax.tree_util.keystr(path): np.asarray(leaf.addressable_data(0)) for path, leaf in leaves}
     if process == 0:
         np.savez(out, **arrays)  # type: ignore[arg-type]
@@ -124,7 +125,7 @@ def measure(out: Path, mesh: Mesh, dtype: str, *, gradient: bool) -> None:
 def work(
     folder: Path, sizes: list[int], processes: int, process: int, port: int, dtype: str, gradient: bool
 ) -> None:
-    """Measure on all meshes, in one process of several."""
+    """Measure on all meshes, as one of several processes."""
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_num_cpu_devices", max(sizes) // processes)
     jax.config.update("jax_enable_x64", dtype == "float64")
@@ -137,7 +138,7 @@ def work(
 
 
 def launch(folder: Path, sizes: list[int], processes: int, dtype: str, *, gradient: bool) -> None:
-    """Measure in processes of their own, which write NPZ files into a folder."""
+    """Measure in new processes, which write NPZ files into a folder."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
@@ -148,7 +149,7 @@ def launch(folder: Path, sizes: list[int], processes: int, dtype: str, *, gradie
 
 
 def _difference(one: dict[str, np.ndarray], many: dict[str, np.ndarray], part: str) -> float:
-    """Of all leaves of a part, each relative to its largest value."""
+    """Largest difference over the leaves of a part, relative to the leaf's largest value."""
     leaves = [(one[name], many[name]) for name in one if name.startswith(f"['{part}']")]
     return max(float(np.abs(a - b).max() / max(float(np.abs(a).max()), 1e-12)) for a, b in leaves)
 

@@ -1,14 +1,14 @@
-"""How much does a change of the network or of its losses learn in a few minutes? One number per trial.
+"""The learning ladder: the score of a changed network or loss after a short, fixed training.
 
     python -m experiments.studies.ladder --trials base CenterPoint
     python -m experiments.studies.ladder --trials base "local geometry" --seeds 0 1 2
 
-Every trial is ``compact`` with changes, on a quarter of the turn of nuScenes' HDL-32E (32 x 272 pixels), one sweep
-and one round, 4,000 frames of varied streets that are simulated once and kept, 3,000 steps of one frame in a
-single one-cycle. The score is the mAP of nuScenes' form on 200 unseen frames, and on 60 of them at each quarter.
-The same command resumes a trial that was stopped. Trials that the file of ``--out`` has are not repeated: with
-``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has a
-line per trial. Cost: about half an hour of one core per trial, and some minutes once for the frames.
+Each trial is a change of ``compact``, trained on a quarter of the view of nuScenes' HDL-32E (32 x 272 pixels) with
+one sweep and one round: 4,000 frames of varied simulated streets, 3,000 steps of one frame, one one-cycle
+schedule. The score is nuScenes' mAP on 200 unseen frames, and on 60 of them after each quarter of the training.
+The same command resumes a trial. Trials that the file of ``--out`` has are not repeated: with
+``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has
+one line per trial. Cost: half an hour of one core per trial, and some minutes once for the frames.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
-_BONNET_M = 2.1  # Nearer points are on the ego vehicle's bonnet, as in the scale ``sector``.
+_BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
 
 BASE: Change = change(
     name="ladder",
@@ -47,7 +47,7 @@ BASE: Change = change(
     class_balanced=False,
     projection=dataclasses.replace(NUSCENES.projection, num_rounds=1, remove_close="all", close_m=_BONNET_M),
     model__circular_width=False,
-    # A turn leaves the sector, and a mirrored street would look down behind.
+    # Larger rotations leave the sector, and a mirrored street would face backwards.
     augment__flip_y_probability=0.0,
     augment__max_rotation_rad=math.radians(5),
 )
@@ -60,16 +60,16 @@ TRIALS: dict[str, Change] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Args(Options):
-    """Which trials."""
+    """Options of the trials."""
 
     trials: tuple[str, ...] = ("base",)  # Names of trials.
-    seeds: tuple[int, ...] = (0,)  # Of weights, order and augmentation.
-    steps: int = STEPS  # Updates of each.
+    seeds: tuple[int, ...] = (0,)  # Seeds of weights, order and augmentation.
+    steps: int = STEPS  # Updates per trial.
     work: Path = Path("outputs/ladder")  # Folder of frames and runs.
 
 
 def frames(work: Path, split: str) -> FrameSet:
-    """Frames of a split, simulated once."""
+    """Open the frames of a split, which are simulated once."""
     number, first = {"train": (TRAIN_FRAMES, 0), "test": (TEST_FRAMES, UNSEEN_SEED)}[split]
     reading, reach_m = CloudReading(1, "all", _BONNET_M), NUSCENES_HDL32E.limit_xy_m
     made = SimulatedFrames(SENSOR, number, first, 60, reach_m, 1, reading, streets=CITY)
@@ -77,16 +77,14 @@ def frames(work: Path, split: str) -> FrameSet:
 
 
 def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
-    """Scores of a training."""
+    """Train a trial and score it."""
     tests = frames(args.work, "test")
-    along = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
+    curve_frames = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
     folder = args.work / f"{name.replace(' ', '_').replace(',', '')}_{args.steps}_{seed}"
     schedule = Schedule(-(-args.steps // 10), -(-args.steps // 4), 1)
-    detector = trained(
-        folder, config, frames(args.work, "train"), steps=args.steps, seed=seed, tests=along, schedule=schedule
-    )
-    found, seen = detections(detector, tests)
-    summary, records = benchmark(found, seen).summary, read_metrics(folder)
+    options = {"steps": args.steps, "seed": seed, "tests": curve_frames, "schedule": schedule}
+    detector = trained(folder, config, frames(args.work, "train"), **options)
+    summary, records = benchmark(*detections(detector, tests)).summary, read_metrics(folder)
     seconds = [r["seconds"] for r in records if "seconds" in r]
     return {
         "trial": name,

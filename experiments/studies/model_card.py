@@ -1,9 +1,9 @@
-"""The model card of shipped weights, from the measured figures alone.
+"""Model card of shipped weights, generated from measured figures.
 
     python -m experiments.studies.model_card --name hdl32e
 
-Writes ``fcos_lidar_jax/weights/NAME/README.md`` from ``NAME.json``, as ``shipped_weights --export`` measured it,
-and ``transfer.json`` of the same folder; figures of other weights than those in the package are left out.
+Writes ``fcos_lidar_jax/weights/NAME/README.md`` from ``NAME.json``, written by ``shipped_weights --export``, and
+``transfer.json`` of the same folder. Figures of weights other than those in the package are left out.
 """
 
 import dataclasses
@@ -24,40 +24,37 @@ RESULTS = Path("experiments/results")
 SHIPPED = Path(fcos_lidar_jax.__file__).parent / "weights"
 _BANDS = ("all", "0-20 m", "20-40 m")
 _UNSEEN = {
-    "hdl32e": "with classes as frequent as in cities and half the objects of the training's",
-    "quickstart": "streets of the same kind",
+    "hdl32e": "with class frequencies of cities and half as many objects as in training",
+    "quickstart": "of the same kind of streets",
 }
 _AXES = "x right, y ahead, z up from the sensor, in metres"
 _WEAK_AP, _WEAK_BOXES = 0.05, 10
-"""Classes with fewer boxes say nothing; those with less AP are listed as hardly found."""
+"""Classes with less AP are listed as hardly detected, if they have at least this many boxes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Whose card."""
+    """Options of the model card."""
 
-    name: Literal["quickstart", "hdl32e"]  # Weights.
+    name: Literal["quickstart", "hdl32e"]  # Name of the weights.
     results: Path = RESULTS  # Folder of the figures.
 
 
 def write_card(name: str, results: Path, training: Mapping[str, Any] | None = None) -> Path:
-    """Write the card of shipped weights beside them.
+    """Write the model card of shipped weights beside them; returns the file.
 
     Args:
-        name: of the weights.
-        results: folder of ``NAME.json`` and, where it was measured, ``transfer.json``.
-        training: what ``NAME.json`` will hold; default: what it holds.
-
-    Returns:
-        the file.
+        name: name of the weights.
+        results: folder of ``NAME.json`` and, if measured, ``transfer.json``.
+        training: content of ``NAME.json``; default: read from the file.
     """
     folder = SHIPPED / name
     file, weights = results / f"{name}.json", read_description(folder)["hash"]
     record = training or read_json(file, dict[str, Any])
     if "training" not in record:
-        raise ValueError(f"{file}: training: missing, expected what shipped_weights --export wrote of it")
+        raise ValueError(f"{file}: training: missing, expected the training that shipped_weights --export records")
     if record.get("hash", weights) != weights:
-        raise ValueError(f"{file}: hash: got {record['hash']}, expected that of the weights: {weights}")
+        raise ValueError(f"{file}: hash: got {record['hash']}, expected the hash of the weights: {weights}")
     lines = [*_about(name, record), *_figures(results / "transfer.json", weights), *_training(name, record)]
     path = folder / "README.md"
     atomic_write(path, lambda file: file.write_text("\n".join(lines) + "\n", encoding="utf-8"))
@@ -71,11 +68,12 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield f"Preset `{trained['preset']}` for the sensor `{detector.sensor.name}`: {parameters:,} parameters,"
     yield f"{record['bytes'] / 2**20:.1f} MiB as float16, under the licence of the package.\n"
     yield "## What it is for\n"
-    yield f"It takes one sweep of that sensor: {_AXES}, and intensities of 0 to 255. It finds boxes of"
+    yield f"The input is one sweep of this sensor: {_AXES}, and intensities of 0 to 255. The detected classes are"
     yield f"{', '.join(label.replace('_', ' ') for label in detector.classes)}.\n"
-    yield "It is a start for a training and a means to try the program, not a product: trained on simulated"
-    yield "streets alone, it misses and invents objects, as the tables show. Another sensor needs other weights.\n"
-    yield "## What it finds\n"
+    yield "The weights are a starting point for fine-tuning and for first trials, not a usable detector: they"
+    yield "were trained on simulated streets only, and miss and invent objects, as the tables show. Another sensor"
+    yield "needs other weights.\n"
+    yield "## Scores\n"
     low, high = record["interval"]["low"], record["interval"]["high"]
     scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
     yield f"On {record['unseen_frames']} unseen simulated frames, {_UNSEEN[name]}: {scored}.\n"
@@ -84,27 +82,27 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
 def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     trained = record["training"]
     yield "\n## Trained on\n"
-    yield "Simulated streets alone, never real ones, each frame another street:\n"
+    yield "Only simulated streets, each frame on another street:\n"
     for leg in (*record["earlier"], trained):
         done = f"{leg['frames_seen']:,} frames, step {leg['steps']:,} of {leg['steps_planned']:,}"
         hours = f"{leg['seconds_of_steps'] / 3600:.1f} hours of steps"
         yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {hours}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
-        yield f"\nA training from {name} began with the weights of the one before."
-    yield f"\nMade by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
+        yield f"\nA training from {name} started from the weights of the training before it."
+    yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
 
 
 def _curve(legs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """The mAP over the frames seen in all trainings together."""
+    """Table of the mAP over the frames of all trainings."""
     ends = np.cumsum([leg["frames_seen"] for leg in legs]).tolist()
     begins = [0, *ends[:-1]]
     points = [(n + seen, score) for n, leg in zip(begins, legs, strict=True) for seen, score in leg["curve"]]
     if not points:
         return
-    yield "\nDuring the training, on a few unseen frames, the same each time; where the learning rate rises again,"
-    yield "the score may fall at first:\n"
-    yield "| frames seen in all | mAP |\n|---|---|"
+    yield "\nScores during training, on the same few unseen frames. When the learning rate rises again, the score"
+    yield "may fall at first:\n"
+    yield "| training frames | mAP |\n|---|---|"
     yield from (f"| {seen:,} | {score:.3f} |" for seen, score in points)
 
 
@@ -112,11 +110,11 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
     command = "`python -m experiments.studies.transfer --data FOLDER`"
     record = read_json(file, dict[str, Any]) if file.exists() else {}
     if record.get("checkpoint", {}).get("hash") != weights:
-        yield f"Not measured yet with these weights: {command} does."
+        yield f"Not measured yet with these weights; {command} does."
         return
-    yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, as {command} measured it; boxes in"
-    yield "brackets. The intervals are of simulated drives and of real keyframes drawn again; the latter are too"
-    yield "narrow, for keyframes of a scene are alike."
+    yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, measured by {command}."
+    yield "Numbers of boxes are in brackets. Bootstrap intervals resample simulated drives or real keyframes; the"
+    yield "latter are too narrow, because keyframes of a scene are similar."
     for name, part in record.items():
         if isinstance(part, dict) and "all" in part:
             yield from _part(name, part)
@@ -144,10 +142,7 @@ def _part(name: str, part: Mapping[str, Any]) -> Iterator[str]:
         yield f"| {label.replace('_', ' ')} | {' | '.join(shown)} |"
     often = [label for label, boxes in truths.items() if boxes >= _WEAK_BOXES]
     if weak := [label.replace("_", " ") for label in often if aps[label] < _WEAK_AP]:
-        yield (
-            f"\nHardly found here (AP below {_WEAK_AP:g}), of the classes with at least {_WEAK_BOXES} boxes: "
-            f"{', '.join(weak)}."
-        )
+        yield f"\nHardly detected (AP below {_WEAK_AP:g} with at least {_WEAK_BOXES} boxes): {', '.join(weak)}."
 
 
 def _text(interval: Any) -> str:
@@ -155,7 +150,7 @@ def _text(interval: Any) -> str:
 
 
 def main(args: Args) -> None:
-    """Write the card and say where it is."""
+    """Write the card and print its path."""
     print(write_card(args.name, args.results))
 
 

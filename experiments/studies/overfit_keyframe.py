@@ -1,16 +1,15 @@
-"""Can it learn? Train from random weights on one annotated frame, then detect on it.
+"""Overfitting: train from random weights on one annotated frame, then detect in it.
 
     python -m experiments.studies.overfit_keyframe --data FOLDER  # the real keyframe of scene-0061
     python -m experiments.studies.overfit_keyframe --source synthetic  # one simulated frame, no data needed
-    python -m experiments.studies.overfit_keyframe --detector centerpoint --data FOLDER  # and the peer?
+    python -m experiments.studies.overfit_keyframe --detector centerpoint --data FOLDER
 
-The data folder holds ``nuscenes_scene0061/`` (a ``.pcd.bin`` and ``boxes.json``). A box counts when it owns at
-least five cells of the single-sweep image; it is hit, one to one, by a detection of score >= 0.3 of its class
-within 0.5 m in the plane and 10 degrees in yaw (modulo pi for barriers, ignored for cones).
+The data folder contains ``nuscenes_scene0061/`` (a ``.pcd.bin`` and ``boxes.json``). Only boxes that own at least
+five cells of the single-sweep image count. A box is found if a detection of its class with a score of at least 0.3
+is matched one to one within 0.5 m in the plane and 10 degrees in yaw (modulo pi for barriers, ignored for cones).
 
-Cost: about five minutes a seed on two CPU cores, two for CenterPoint. Expected: at least 26 of 27 boxes on the
-real frame, at most 5 % of the detections far from every box of their class, a mean centre error of a few
-centimetres.
+Cost: five minutes per seed on two CPU cores, two for CenterPoint. Expected: at least 26 of 27 boxes on the real
+frame, at most 5 % of the detections far from all boxes of their class, a mean centre error of a few centimetres.
 """
 
 import dataclasses
@@ -45,7 +44,6 @@ from fcos_lidar_jax.visualization.bev import draw_bev
 
 MIN_CELLS, MIN_SCORE, MAX_DISTANCE_M, MAX_HEADING_RAD = 5, 0.3, 0.5, np.radians(10)
 
-_OF_THE_PEER = ("model", "pillars", "loss")
 CONFIG = change(
     name="overfit_keyframe",
     sensor=SENSOR.name,
@@ -54,8 +52,7 @@ CONFIG = change(
     copy_paste=None,
     class_balanced=False,
     augment=None,
-    # At the default 0.25 a nearly square object can settle a quarter turn off with its sides exchanged: there the
-    # IoU is perfect and only the L1 loss objects.
+    # With the default, nearly square objects can stay rotated by 90 degrees, see presets.COMPACT.
     loss__l1_weight=1.0,
     optimizer__batch_size=1,
     model__row_upscale=1,
@@ -63,30 +60,31 @@ CONFIG = change(
     model__backbone_blocks=(4, 4, 1, 1),
     model__head_convs=4,
 )(QUICKSTART)
-"""The paper's depth at the quickstart's widths, on the full-size image of one sweep, rows not doubled."""
+"""The paper's depth with the quickstart's widths, on the full-size image of one sweep without doubled rows."""
 CONFIGS = {
     "fcos": CONFIG,
     "centerpoint": CenterPointConfig.of(
-        CONFIG, name="overfit_centerpoint", **{part: getattr(CENTERPOINT_COMPACT, part) for part in _OF_THE_PEER}
+        CONFIG,
+        name="overfit_centerpoint",
+        **{part: getattr(CENTERPOINT_COMPACT, part) for part in ("model", "pillars", "loss")},
     ),
 }
-"""Detector -> configuration: CenterPoint is that of its compact preset, the rest is the same."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """What to train on, and how long."""
+    """Options of the trainings."""
 
-    detector: Literal["fcos", "centerpoint"] = "fcos"  # What to train: ours, or CenterPoint on pillars.
-    source: Literal["real", "synthetic"] = "real"  # The real keyframe, or a simulated frame of the same sensor.
+    detector: Literal["fcos", "centerpoint"] = "fcos"  # FCOS-LiDAR, or CenterPoint on pillars.
+    source: Literal["real", "synthetic"] = "real"  # The real keyframe or a simulated frame.
     data: Path | None = None  # Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA.
-    seeds: tuple[int, ...] = (0, 1, 2)  # One run each.
-    steps: int = 300  # Updates a run.
-    runs: Path = Path("outputs/overfit_keyframe")  # Folder of the runs, with a picture of each.
+    seeds: tuple[int, ...] = (0, 1, 2)  # Seeds, one per run.
+    steps: int = 300  # Updates per run.
+    runs: Path = Path("outputs/overfit_keyframe")  # Folder of the runs and their pictures.
 
 
 def owned_cells(frame: Frame) -> np.ndarray:
-    """Cells of the single-sweep image whose point each box owns."""
+    """Count the cells of the single-sweep image that each box owns."""
     image = project_points(frame.points, np.ones(len(frame.points), bool), SENSOR, num_rounds=1)
     first = np.asarray(image.features[..., 0]).reshape(-1, 9)
     owner = owners(first[:, :3], first[:, 7] > 0, frame.boxes, np.ones(len(frame.boxes), bool))
@@ -95,14 +93,17 @@ def owned_cells(frame: Frame) -> np.ndarray:
 
 def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:
     started = time.monotonic()
-    peer = "" if args.detector == "fcos" else f"{args.detector}_"
-    folder, frames = args.runs / f"{peer}{args.source}_{seed}", InMemoryFrames((frame,), SENSOR, NUSCENES_CLASSES)
+    prefix = "" if args.detector == "fcos" else f"{args.detector}_"
+    folder, frames = (
+        args.runs / f"{prefix}{args.source}_{seed}",
+        InMemoryFrames((frame,), SENSOR, NUSCENES_CLASSES),
+    )
     detector = trained(folder, CONFIGS[args.detector], frames, steps=args.steps, seed=seed)
     (found,), _ = detections(detector, frames)
     minutes = (time.monotonic() - started) / 60
     predicted, cells = confident(found, MIN_SCORE), owned_cells(frame)
     (boxes, labels, _), counted = predicted, cells >= MIN_CELLS
-    # All boxes may be hit, so that a detection of a small box never takes a counted one.
+    # Matched with all boxes, so that the detection of a small box is never matched with a counted one.
     errors = {"max_distance_m": MAX_DISTANCE_M, "max_heading_error_rad": MAX_HEADING_RAD}
     period = NUSCENES_METRIC.heading_period_rad
     match = match_frame(*predicted, frame.boxes, frame.labels, heading_period_rad=period, **errors)
@@ -136,12 +137,12 @@ def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """Run all seeds, a line each."""
+    """Run all seeds and print a line for each."""
     real = args.source == "real"
     frame = read_keyframe(real_data(args.data, "nuscenes_scene0061"), SENSOR) if real else make_frame(0, SENSOR)
     frame = without_close(frame, SENSOR, cut_reading(1))
     names = Counter(NUSCENES_CLASSES[i] for i in sorted(frame.labels[owned_cells(frame) >= MIN_CELLS]))
-    print("boxes that count:", ", ".join(f"{number} {name}" for name, number in names.items()))
+    print("counted boxes:", ", ".join(f"{number} {name}" for name, number in names.items()))
     shapes = jax.eval_shape(build_detector(CONFIGS[args.detector], SENSOR).init, jax.random.key(0))
     print("parameters:", count_parameters(shapes["params"])["total"])
     results = []

@@ -1,12 +1,12 @@
-"""What does post-processing that is not in the paper add to a trained detector, and what does it cost?
+"""Gain and cost of post-processing that is not in the paper.
 
     python -m experiments.studies.post_processing --out experiments/results/post_processing.json
 
-NMS at a lower threshold, weighted NMS (also known as box voting), the predicted IoU's exponent and mirrored views
-are fields of ``Config.inference``, which no training depends on. The shipped weights find boxes with each in the
-same unseen simulated frames, and in the real keyframes where the environment's ``FCOS_LIDAR_REAL_DATA`` has them;
-the intervals are of the paired difference of the mAP over frames drawn anew. Thresholds and exponent of
-``compact`` were chosen on 60 other simulated frames. Cost: a second a frame on two CPU cores.
+A lower NMS threshold, weighted NMS (box voting), the exponent of the predicted IoU and mirrored views are fields
+of ``Config.inference``, which training does not depend on. Each is applied with the shipped weights to the same
+unseen simulated frames, and to the real keyframes if the environment's ``FCOS_LIDAR_REAL_DATA`` has them. The
+intervals are bootstrap intervals of the paired difference in mAP. The values of ``compact`` were chosen on 60
+other simulated frames. Cost: one second per frame on two CPU cores.
 """
 
 import dataclasses
@@ -44,44 +44,44 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "mirrored view": {"flips": "x"},
     "as in compact, mirrored view": {**_COMPACT, "flips": "x"},
 }
-"""What differs from the paper's post-processing."""
+"""Changes of the paper's post-processing."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Args(Options):
-    """Which weights, and on how much."""
+    """Options of the comparison."""
 
-    weights: Path = Path("hdl32e")  # Trained with flips of x.
+    weights: Path = Path("hdl32e")  # Weights that were trained with flips of x.
     frames: int = 400  # Unseen simulated frames.
-    data: Path | None = None  # Folder with the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
-    repeats: int = 15  # Turns of the timing.
+    data: Path | None = None  # Folder of the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
+    repeats: int = 15  # Timed calls per variant.
 
 
 def programs(trained: TrainedDetector) -> dict[str, Any]:
-    """Pure detection of one cloud, by variant."""
+    """Make the pure detection function of each variant."""
     paper = dataclasses.asdict(InferenceConfig())
     return {n: make_detect(trained.with_inference(**{**paper, **own}).model) for n, own in VARIANTS.items()}
 
 
 def find(trained: TrainedDetector, sets: Sequence[FrameSet]) -> tuple[dict[str, list[Detections]], list[Frame]]:
-    """What every variant finds, and the frames."""
-    # One program, in which the variants share what they have in common.
+    """Detect with all variants; returns their detections and the frames."""
+    # One program, so that the variants share the network.
     each = programs(trained)
     together = jax.jit(lambda *given: {name: detect(*given) for name, detect in each.items()})
-    variables, found, read = jax.device_put(trained.variables), {name: [] for name in VARIANTS}, []
+    variables, found, visited = jax.device_put(trained.variables), {name: [] for name in VARIANTS}, []
     progress = Progress("frames", sum(map(len, sets)))
     for frames in sets:
         for index in range(len(frames)):
-            read.append(frames.frame(index))
-            cloud = make_cloud(read[-1].points, trained.config, sensor=trained.sensor, num_close=0)
+            visited.append(frames.frame(index))
+            cloud = make_cloud(visited[-1].points, trained.config, sensor=trained.sensor, num_close=0)
             for name, detections in jax.device_get(together(variables, cloud.points, cloud.valid)).items():
                 found[name].append(detections)
-            progress.show(len(read))
-    return found, read
+            progress.show(len(visited))
+    return found, visited
 
 
 def compare(found: dict[str, list[Detections]], frames: list[Frame], classes: Sequence[str]) -> dict[str, Any]:
-    """mAP of every variant, and its difference from that of the paper's."""
+    """Compute the mAP of each variant and its difference from the paper's post-processing."""
     metric = metric_of(classes)
     evaluations = {name: evaluate_frames(boxes, frames, metric) for name, boxes in found.items()}
     record: dict[str, Any] = {"frames": len(frames)}
@@ -95,19 +95,19 @@ def compare(found: dict[str, list[Detections]], frames: list[Frame], classes: Se
 
 
 def times(trained: TrainedDetector, repeats: int) -> dict[str, Any]:
-    """Milliseconds from points to boxes, in turns."""
+    """Time each variant from points to boxes, in milliseconds."""
     frame = open_frames(format="simulated", split="val", sensor=trained.sensor).frame(0)
     cloud = make_cloud(frame.points, trained.config, sensor=trained.sensor)
-    given = jax.device_put(trained.variables), cloud.points, cloud.valid
+    inputs = jax.device_put(trained.variables), cloud.points, cloud.valid
     jitted = {name: jax.jit(detect) for name, detect in programs(trained).items()}
     calls: dict[str, Call] = {
-        name: lambda detect=detect: jax.block_until_ready(detect(*given)) for name, detect in jitted.items()
+        name: lambda detect=detect: jax.block_until_ready(detect(*inputs)) for name, detect in jitted.items()
     }
     return interleaved(calls, repeats)
 
 
 def measure(args: Args) -> dict[str, Any]:
-    """Scores and times."""
+    """Compare scores and times."""
     trained = load_trained(args.weights)
     unseen = open_frames(format="simulated", split="val", sensor=trained.sensor, reading=trained.config.reading)
     sets: dict[str, Sequence[FrameSet]] = {"unseen simulated": [SelectedFrames(unseen, tuple(range(args.frames)))]}

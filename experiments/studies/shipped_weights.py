@@ -1,19 +1,19 @@
-"""The weights that come with the package, trained on simulated streets alone.
+"""Training, export and scores of the weights in the package.
 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --export
-    python -m experiments.studies.shipped_weights --name quickstart  # scores what is in the package
+    python -m experiments.studies.shipped_weights --name quickstart  # scores the weights in the package
 
-``hdl32e`` is the preset ``compact`` for nuScenes' sensor, ``quickstart`` the preset of that name. Every frame is
-another street. The training runs at low priority and saves every few minutes; the same command resumes it, bit for
-bit, after any kind of stop. ``--export`` trains nothing: it writes the running mean of the weights at the newest
-checkpoint into the package, as float16, scores them on unseen frames, and writes ``experiments/results/NAME.json``
-and their model card; another process may be training meanwhile. Without ``--work`` the weights in the package are
-scored on unseen frames, and nothing else. Where the folder is lost, ``--work NEW --warm-start hdl32e --seed 2``
-begins a new one-cycle schedule with the weights in the package, on streets ``seed * steps`` and on; choose a seed
-whose streets none of the trainings before it had.
+``hdl32e`` is the preset ``compact`` for nuScenes' sensor, ``quickstart`` the preset of the same name. Both are
+trained on simulated streets only, each frame on another street. The training runs at low priority and saves every
+few minutes; the same command resumes it with bit-identical results. ``--export`` does not train: it writes the
+averaged weights of the newest checkpoint into the package as float16, scores them on unseen frames, and writes
+``experiments/results/NAME.json`` and the model card; a training may run at the same time. Without ``--work``, the
+weights in the package are only scored. If the folder of the run is lost, ``--work NEW --warm-start hdl32e --seed
+2`` starts a new one-cycle schedule from the weights in the package, on streets from ``seed * steps``; choose a
+seed whose streets no earlier training used.
 
-Cost: half a second to three seconds a step, that is hours, on two CPU cores. Expected: an mAP of at least 0.6
+Cost: half a second to three seconds per step on two CPU cores, so hours in total. Expected: an mAP of at least 0.6
 for quickstart.
 """
 
@@ -49,10 +49,10 @@ from fcos_lidar_jax.simulation.streets import CITY
 from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
-_FRESH = change(copy_paste=None, class_balanced=False)  # What makes more of few frames has no use here.
+_FRESH = change(copy_paste=None, class_balanced=False)  # Not needed with unlimited frames.
 CONFIGS = {
     "quickstart": change(augment=None, optimizer__ema_decay=0.999)(_FRESH(QUICKSTART)),
-    # No street is shown twice. A mirrored or turned one would look down behind, and have its blind arcs elsewhere.
+    # Mirrored or rotated streets would face backwards and have other blind arcs.
     "hdl32e": change(
         augment__flip_y_probability=0.0,
         augment__max_rotation_rad=math.radians(3),
@@ -60,32 +60,32 @@ CONFIGS = {
     )(_FRESH(COMPACT)),
 }
 EVENER_CITY = dataclasses.replace(CITY, name="city, classes more even", city_classes=0.25)
-"""Each class is a tenth of the mean, however rare; at a city's frequencies most are hardly ever trained."""
-_MORE_OBJECTS = 120  # Of 60: what a step costs hardly depends on how many there are to learn from.
+"""At the frequencies of a city, most classes would hardly occur; here each has at least a tenth of the mean."""
+_MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
-_TESTS_ALONG = 40  # Unseen frames of the evaluations during training.
+_CURVE_FRAMES = 40  # Unseen frames of evaluations during training.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Args(Options):
-    """Which weights, how long, and where the run is."""
+    """Options of the weights."""
 
-    name: Literal["quickstart", "hdl32e"]  # Weights to make.
+    name: Literal["quickstart", "hdl32e"]  # Weights to train or score.
     work: Path | None = None  # Folder of the training run; default: score the weights in the package.
-    steps: int = 20_000  # Of the whole run.
-    seed: int = 1  # Of weights and streets; the demo trains with 0.
-    warm_start: Path | None = None  # Checkpoint or shipped weights to begin with; default: random ones.
+    steps: int = 20_000  # Updates of the whole run.
+    seed: int = 1  # Seed of weights and streets; the demo trains with 0.
+    warm_start: Path | None = None  # Checkpoint or shipped weights to start from; default: random weights.
     save_every: int = 150  # Steps between two checkpoints.
-    export: bool = False  # Write the present weights into the package instead of training.
-    test_frames: int = 200  # Unseen frames that the weights are scored on.
+    export: bool = False  # Write the current weights into the package instead of training.
+    test_frames: int = 200  # Unseen frames for the scores.
 
 
-_OF_TRAINING = ("steps", "seed", "warm_start", "save_every", "export")  # Options of no use without ``work``.
+_TRAINING_OPTIONS = ("steps", "seed", "warm_start", "save_every", "export")  # Require ``work``.
 
 
 def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, FrameSet]:
-    """Training frames of which none is shown twice, and unseen ones; in cities classes as frequent as there."""
+    """Create training frames that are all different, and unseen test frames."""
     unseen = open_frames(format="simulated", split="val", sensor=load_sensor(config.sensor))
     assert isinstance(unseen, SimulatedFrames)
     fresh = fresh_streets(config, steps=steps, seed=seed)[1]
@@ -96,21 +96,21 @@ def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, 
 
 
 def train(args: Args, work: Path) -> dict[str, Any]:
-    """Begin the run, or go on with it, to the end."""
+    """Start or resume the run and train to its end."""
     os.nice(_NICE)
     config = CONFIGS[args.name]
-    # What an export would refuse is refused before hours of training.
+    # Rejects before hours of training what the export would reject.
     earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
     frames, unseen = streets(config, steps=args.steps, seed=args.seed)
     schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
-    tests = SelectedFrames(unseen, tuple(range(_TESTS_ALONG)))
+    tests = SelectedFrames(unseen, tuple(range(_CURVE_FRAMES)))
     length = {"steps": args.steps, "seed": args.seed}
     trained(work, config, frames, **length, tests=tests, schedule=schedule, weights=args.warm_start)
     return training_record(work)
 
 
 def training_record(run: Path) -> dict[str, Any]:
-    """What a run's records say about its training."""
+    """Summarise the training of a run."""
     config = load_checkpoint(find_checkpoint(run)).config
     spec, records = read_json(run / "run.json", dict[str, Any]), read_metrics(run)
     done = max((r["step"] for r in records if "seconds" in r), default=0)
@@ -128,30 +128,32 @@ def training_record(run: Path) -> dict[str, Any]:
 
 
 def earlier_trainings(name: str, training: Mapping[str, Any], results: Path) -> list[dict[str, Any]]:
-    """The trainings that led to the weights that this one began with, as the last exports recorded them."""
+    """List the trainings before a warm start, as recorded by the last export."""
     file = results / f"{name}.json"
     if training["begun_with"] != name or not file.exists():
         return []
     before = read_json(file, dict[str, Any])
     if "training" not in before:
-        raise ValueError(f"{file}: training: missing, expected that of the weights that this one began with")
+        raise ValueError(
+            f"{file}: training: missing, expected the training of the weights that this one started from"
+        )
     return [t for t in (*before["earlier"], before["training"]) if t["seed"] != training["seed"]]
 
 
 def half_precision(checkpoint: Checkpoint) -> Checkpoint:
-    """The checkpoint with float16 weights, which are read as float32 again."""
+    """Convert the weights of a checkpoint to float16; they are read as float32 again."""
     halved = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), checkpoint.variables)
     return dataclasses.replace(checkpoint, variables=halved)
 
 
 def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
-    """The checkpoint with the preset's post-processing of today, which no training depends on."""
+    """Replace a checkpoint's post-processing, which training does not depend on, by the preset's current one."""
     config = dataclasses.replace(checkpoint.config, inference=CONFIGS[name].inference)
     return dataclasses.replace(checkpoint, config=config)
 
 
 def scores(args: Args) -> dict[str, Any]:
-    """What the weights in the package find in unseen frames."""
+    """Score the weights in the package on unseen frames."""
     folder = SHIPPED / args.name
     detector = load_trained(folder)
     _, unseen = streets(detector.config, steps=args.steps, seed=args.seed)
@@ -168,7 +170,7 @@ def scores(args: Args) -> dict[str, Any]:
 
 
 def export(args: Args, work: Path) -> dict[str, Any]:
-    """Write the weights of the newest checkpoint and their card; returns training and scores."""
+    """Write the weights of the newest checkpoint and their model card; returns training and scores."""
     folder, training = SHIPPED / args.name, training_record(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(find_checkpoint(work)), args.name)
@@ -182,10 +184,12 @@ def export(args: Args, work: Path) -> dict[str, Any]:
 
 
 def main(args: Args) -> None:
-    """Score, train, or export; the record of an export lies where the next one looks for those before it."""
+    """Score, train or export; the next export reads the record of this one."""
     if args.work is None:
-        if given := [name for name in _OF_TRAINING if getattr(args, name) != getattr(Args, name)]:
-            raise ValueError(f"--{given[0].replace('_', '-')}: is of a training, expected its folder in --work")
+        if changed := [name for name in _TRAINING_OPTIONS if getattr(args, name) != getattr(Args, name)]:
+            raise ValueError(
+                f"--{changed[0].replace('_', '-')}: only for a training, expected its folder in --work"
+            )
         save(scores(args), args.out)
         return
     record = export(args, args.work) if args.export else train(args, args.work)

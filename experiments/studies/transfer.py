@@ -1,19 +1,19 @@
-"""What does a detector of simulated streets find in real sweeps, and what does it give to a training on them?
+"""Transfer of a detector from simulated streets to real sweeps, without and with fine-tuning.
 
     python -m experiments.studies.transfer --data FOLDER
     python -m experiments.studies.transfer --checkpoint RUN --only simulated
     python -m experiments.studies.transfer --data FOLDER --only fine_tuning
 
-FOLDER holds ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_scene0103/`` (two of another) and
-``nuscenes_scene0061/`` (one of a third). The simulated keyframes are those of drives that no training has seen, as
-``fcos-lidar synthesize`` writes them. Average precision is by centre distance, as in nuScenes' benchmark, of all
-boxes that hold a point, within each class's range, and of those at 0-20 and 20-40 m. Means are over the classes
-that occur; the official mAP and NDS of the simulated drives stand beside them. The intervals are of simulated
-drives and of real keyframes drawn anew; the latter are too narrow, for keyframes of a scene resemble each other.
+FOLDER contains ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_scene0103/`` (two keyframes of
+another) and ``nuscenes_scene0061/`` (one of a third). The simulated keyframes are of unseen drives, as written by
+``fcos-lidar synthesize``. Average precision is by centre distance, as in nuScenes' benchmark, over all boxes with
+a point within their class's range, and over boxes at 0-20 m and 20-40 m. Means are over the classes that occur;
+simulated drives also have the official mAP and NDS. Bootstrap intervals resample simulated drives or real
+keyframes; the latter are too narrow, because keyframes of a scene are similar.
 
 Fine-tuning trains on 32 keyframes of scene-0523 from the checkpoint's weights, at a third of the learning rate,
-and from random ones, with as many steps, and tests on the other eight. The same command resumes it. Cost: five
-minutes on two CPU cores, and an hour for the fine-tuning.
+and from random weights, with as many steps, and tests on the other eight. The same command resumes it. Cost: five
+minutes on two CPU cores, and one hour for fine-tuning.
 """
 
 import dataclasses
@@ -42,32 +42,30 @@ from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 
-FROM_SCRATCH = change(copy_paste=None, class_balanced=False)(COMPACT)
-FINE_TUNING = change(optimizer__peak_learning_rate=1e-3)(FROM_SCRATCH)
 REAL = ("scene-0523, even", "scene-0523, odd", "scene-0103", "scene-0061")
 TEST = range(3, 11)  # Keyframes of scene-0523.
 TRAIN = [i for i in range(40) if i not in TEST]
-_SETS = 300  # Of keyframes, drawn for the intervals.
+_REPEATS = 300  # Bootstrap samples of an interval.
 
 
 @dataclasses.dataclass(frozen=True)
 class Args(Options):
-    """Which detector, and on what."""
+    """Options of the measurement."""
 
-    data: Path | None = None  # Folder with the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
+    data: Path | None = None  # Folder of the real data; default: the environment's FCOS_LIDAR_REAL_DATA.
     checkpoint: Path = Path("hdl32e")  # Detector: a checkpoint, a run, or shipped weights.
     only: tuple[str, ...] = ()
     """Parts to measure: simulated, fine_tuning, "scene-0523, even", "scene-0523, odd", scene-0103, scene-0061;
     default: all."""
     scenes: int = 50  # Simulated drives.
-    keyframes: int = 4  # Of each.
-    seed: int = 77  # Of the drives.
-    fine_tuning_steps: int = 1000  # Updates on real keyframes, one a step.
-    work: Path = Path("outputs/transfer")  # Folder of the simulated drives and of the fine-tuning runs.
+    keyframes: int = 4  # Keyframes per drive.
+    seed: int = 77  # Seed of the drives.
+    fine_tuning_steps: int = 1000  # Updates, each on one real keyframe.
+    work: Path = Path("outputs/transfer")  # Folder of simulated drives and fine-tuning runs.
 
 
 def simulated_drives(args: Args, sensor: Sensor) -> NuScenesFrames:
-    """Keyframes of the simulated drives, which are written first."""
+    """Write the simulated drives and open their keyframes."""
     spec = DatasetSpec(args.scenes, args.seed, args.keyframes, sensor, True, "v1.0-synthetic")
     root = args.work / f"drives_{args.scenes}_{args.keyframes}_{args.seed}"
     write_dataset(spec, root, workers=1, report=Progress("sweeps", spec.scenes * spec.sweeps).show)
@@ -77,7 +75,7 @@ def simulated_drives(args: Args, sensor: Sensor) -> NuScenesFrames:
 
 
 def parts(args: Args, detector: TrainedDetector) -> Iterator[tuple[str, FrameSet]]:
-    """What is to be measured, opened when its turn comes."""
+    """Open the selected data one after the other."""
     if not args.only or "simulated" in args.only:
         yield "simulated", simulated_drives(args, detector.sensor)
     if not args.only or {*args.only} & {*REAL}:
@@ -86,43 +84,52 @@ def parts(args: Args, detector: TrainedDetector) -> Iterator[tuple[str, FrameSet
 
 
 def drives_of(frames: NuScenesFrames) -> list[int]:
-    """The drive of each keyframe, counted from 0."""
+    """Number the drive of each keyframe, from 0."""
     scenes = [frames.nuscenes.scene_of(token) for token in frames.tokens]
     return np.unique(scenes, return_inverse=True)[1].tolist()
 
 
 def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
-    """Scores of a detector on frames, by range; official ones on simulated drives."""
-    found, read = detections(detector, frames)
+    """Score a detector on frames by range, and on simulated drives also with the official metrics."""
+    found, visited = detections(detector, frames)
     drives = drives_of(frames) if isinstance(frames, NuScenesFrames) else None
-    scores = scores_by_range(found, read, repeats=_SETS, groups=drives)
-    record: dict[str, Any] = {"keyframes": len(read), **scores}
+    scores = scores_by_range(found, visited, repeats=_REPEATS, groups=drives)
+    record: dict[str, Any] = {"keyframes": len(visited), **scores}
     if isinstance(frames, NuScenesFrames):
         evaluation = evaluate_keyframes(found, frames.nuscenes, frames.tokens, detector.classes)
         for name, key in (("official mAP", "mean_ap"), ("official NDS", "nd_score")):
             record[name] = {
                 "score": round(evaluation.summary[key], 4),
-                "interval": interval_of(evaluation, key, _SETS, drives),
+                "interval": interval_of(evaluation, key, _REPEATS, drives),
             }
     return record
 
 
 def fine_tuning(args: Args) -> dict[str, Any]:
-    """Scores on unseen keyframes of scene-0523, after training on the others from two beginnings."""
+    """Scores on unseen keyframes of scene-0523 after training on the others, with and without the checkpoint.
+
+    Both trainings use the checkpoint's network, which may differ from the preset's of today.
+    """
     street = open_frames(real_data(args.data, "nuscenes_scene0523"), split="scene0523", reading=cut_reading(1))
-    test, shown = (SelectedFrames(street, tuple(chosen)) for chosen in (TEST, TRAIN))
-    record: dict[str, Any] = {"steps": args.fine_tuning_steps, "keyframes": len(shown)}
-    beginnings = {"from the checkpoint": (FINE_TUNING, args.checkpoint), "from scratch": (FROM_SCRATCH, None)}
-    of = read_description(find_checkpoint(args.checkpoint))["hash"][:12]  # Others of the same name are others.
-    for name, (config, weights) in beginnings.items():
-        folder = args.work / of / name.replace(" ", "_")
-        detector = trained(folder, config, shown, steps=args.fine_tuning_steps, seed=0, weights=weights)
+    test, train = (SelectedFrames(street, tuple(indices)) for indices in (TEST, TRAIN))
+    record: dict[str, Any] = {"steps": args.fine_tuning_steps, "keyframes": len(train)}
+    model = load_trained(args.checkpoint).config.model
+    scratch = change(model=model, copy_paste=None, class_balanced=False)(COMPACT)
+    fine_tuned = change(optimizer__peak_learning_rate=1e-3)(scratch)
+    # The hash tells weights of the same name apart.
+    runs = args.work / read_description(find_checkpoint(args.checkpoint))["hash"][:12]
+    for name, config, weights in (
+        ("from the checkpoint", fine_tuned, args.checkpoint),
+        ("from scratch", scratch, None),
+    ):
+        options = {"steps": args.fine_tuning_steps, "seed": 0, "weights": weights}
+        detector = trained(runs / name.replace(" ", "_"), config, train, **options)
         record[name] = measured(detector, test)
     return record
 
 
 def main(args: Args) -> None:
-    """Measure the parts, write after each."""
+    """Measure the selected parts and save after each."""
     if unknown := {*args.only} - {"simulated", "fine_tuning", *REAL}:
         raise ValueError(f"--only: got {min(unknown)!r}, expected simulated, fine_tuning, or one of {REAL}")
     detector, folder = load_trained(args.checkpoint), find_checkpoint(args.checkpoint)
@@ -138,8 +145,8 @@ def main(args: Args) -> None:
             record["drives"] = {n: getattr(args, n) for n in ("scenes", "keyframes", "seed")}
         save(record, out, f"{name}: mAP {record[name]['all']['mAP']} on {len(frames)} keyframes")
     if not args.only or "fine_tuning" in args.only:
-        record["fine_tuning"] = found = fine_tuning(args)
-        scores = {n: found[n]["all"]["mAP"] for n in ("from the checkpoint", "from scratch")}
+        record["fine_tuning"] = runs = fine_tuning(args)
+        scores = {n: runs[n]["all"]["mAP"] for n in ("from the checkpoint", "from scratch")}
         save(record, out, f"fine-tuning: {json.dumps(scores)}")
 
 

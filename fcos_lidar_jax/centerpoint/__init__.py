@@ -1,4 +1,4 @@
-"""CenterPoint on pillars, the second detector: configuration, network, targets, losses and candidates."""
+"""CenterPoint on pillars: configuration, network, targets, losses and candidates."""
 
 from fcos_lidar_jax.centerpoint.config import CenterPointConfig, PillarConfig
 

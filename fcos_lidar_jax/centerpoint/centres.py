@@ -1,4 +1,4 @@
-"""Boxes as centres on a map from above: targets, losses and decoding of CenterPoint (Yin et al., CVPR 2021)."""
+"""Targets, heat-map loss and coding of boxes for CenterPoint (Yin et al., CVPR 2021)."""
 
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ _HARMLESS = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class CentreTargets(NamedTuple):
-    """What CenterPoint shall predict for one sample.
+    """Targets of one sample.
 
     Attributes:
-        heat: f32[h, w, k], 1 at the centres and falling around them.
-        cell: i32[m], cell below the centre of each box, 0 where it does not count.
-        boxes: f32[m, 9], a harmless box where it does not count.
-        valid: bool[m], boxes whose centre lies on the map.
+        heat: f32[h, w, k], Gaussians with a maximum of 1 at the centres.
+        cell: i32[m], cell of each box's centre, 0 for invalid boxes.
+        boxes: f32[m, 9], with harmless values for invalid boxes.
+        valid: bool[m], boxes with a centre on the map.
     """
 
     heat: Array
@@ -32,10 +32,10 @@ class CentreTargets(NamedTuple):
 def gaussian_radius(
     length: Float[Array, "*m"], width: Float[Array, "*m"], *, min_overlap: float
 ) -> Float[Array, "*m"]:
-    """How far a centre may be off, as CornerNet computes it and CenterPoint takes it over.
+    """Compute the radius of a Gaussian as CornerNet and CenterPoint do.
 
-    The least of three solutions of quadratic equations, one for each way in which two boxes that are aligned can
-    overlap; the larger root divided by 2, whatever the leading coefficient.
+    The minimum of the solutions of three quadratic equations, one for each way in which two aligned boxes can
+    overlap. Each solution is the larger root with 2 as the denominator, whatever the leading coefficient.
 
     >>> round(float(gaussian_radius(jnp.float32(5), jnp.float32(2.5), min_overlap=0.1)), 3)
     1.5
@@ -61,7 +61,7 @@ def centre_targets(
     min_overlap: float,
     min_radius: int,
 ) -> CentreTargets:
-    """Gaussians around the centres of the boxes of one sample, the greatest where those of a class meet.
+    """Place Gaussians at the box centres of one sample, with the maximum where Gaussians of a class overlap.
 
     Arguments after the arrays are static.
 
@@ -103,15 +103,15 @@ def focal_loss(
     labels: Int32[Array, "m"],
     valid: Bool[Array, "m"],
 ) -> tuple[Float[Array, "k"], Float[Array, "m"]]:
-    """Penalty-reduced focal loss of the heat map, alpha 2 and beta 4, as sums.
+    """Compute the penalty-reduced focal loss of the heat map with alpha 2 and beta 4, as sums.
 
     Args:
-        logits: of a centre of each class.
-        heat, cell, valid: of :func:`centre_targets`.
+        logits: logits of a centre, per class.
+        heat, cell, valid: from :func:`centre_targets`.
         labels: classes of the boxes.
 
     Returns:
-        what each class costs where there is no centre of it, and what each box costs at its centre.
+        the loss of each class over all cells without a centre of it, and the loss of each box at its centre.
 
     >>> no_box = jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32), jnp.zeros(1, bool)
     >>> away, at_boxes = focal_loss(jnp.zeros((1, 1, 1)), jnp.zeros((1, 1, 1)), *no_box)
@@ -125,8 +125,7 @@ def focal_loss(
 
 
 def encode_centres(boxes: Float32[Array, "*m 9"], cell: Int32[Array, "*m"], grid: Grid) -> Float32[Array, "*m 10"]:
-    """Regression targets of boxes in the cells below their centres, as :func:`fcos_lidar_jax.coding.encode` but
-    with x and y in cells.
+    """Compute the regression targets of boxes: :func:`fcos_lidar_jax.coding.encode` with x and y in cells.
 
     >>> box = jnp.array([1.5, 0.5, 0, 1, 1, 1, 0, 0, 0], jnp.float32)
     >>> encode_centres(box, jnp.int32(0), Grid(2, 2.0, (0.0, 0.0)))[:2].tolist()
@@ -143,10 +142,10 @@ def decode_centres(
     *,
     oriented: bool = False,
 ) -> Float[Array, "*m _"]:
-    """Boxes from the ten numbers of a cell, the inverse of :func:`encode_centres`.
+    """Decode boxes from the ten numbers of a cell, the inverse of :func:`encode_centres`.
 
-    ``x, y, z, l, w, h, yaw, vx, vy``, or with ``oriented`` as
-    :func:`fcos_lidar_jax.coding.decode_oriented` gives them.
+    The result is ``x, y, z, l, w, h, yaw, vx, vy``, or with ``oriented`` the form of
+    :func:`fcos_lidar_jax.coding.decode_oriented`.
 
     >>> box, cell, grid = jnp.arange(1, 10.0).at[6].set(0.5), jnp.int32(5), Grid(3, 2.0, (0.0, 0.0))
     >>> bool(jnp.allclose(decode_centres(encode_centres(box, cell, grid), cell, grid), box, atol=1e-5))

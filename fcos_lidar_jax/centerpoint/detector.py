@@ -17,11 +17,11 @@ from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
 from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.sensors import Sensor
 
-_BEYOND_M = 10.0  # How far outside the map, and above or below the sensor, a box may lie.
+_BEYOND_M = 10.0  # Maximum distance of a box outside the map, and above or below the sensor.
 
 
 def build(config: CenterPointConfig, sensor: Sensor) -> Detector:
-    """CenterPoint for the clouds of a sensor."""
+    """Build CenterPoint for the clouds of a sensor."""
     grid = pillar_grid(config.pillars, sensor)
     cells = pillar_grid(config.pillars, sensor, stride=config.pillars.output_stride)
     network = CenterPoint(config.pillars, config.class_groups, grid.side)
@@ -30,7 +30,7 @@ def build(config: CenterPointConfig, sensor: Sensor) -> Detector:
         return make_pillars(points, valid, grid=grid, sensor=sensor)
 
     def init(key: Any) -> Variables:
-        # Parameters do not depend on the number of points, and nothing of the forward pass is computed.
+        # Parameters do not depend on the number of points; the forward pass is not computed.
         features, cell = jax.ShapeDtypeStruct((1, 8, 10), jnp.float32), jax.ShapeDtypeStruct((1, 8), jnp.int32)
         pillars = Pillars(features, cell, jax.ShapeDtypeStruct((1,), jnp.int32))  # type: ignore[arg-type]
         return network.lazy_init(key, pillars, train=False)  # type: ignore[return-value]
@@ -48,11 +48,13 @@ def build(config: CenterPointConfig, sensor: Sensor) -> Detector:
 def centre_candidates(
     outputs: CentreOutputs, *, config: CenterPointConfig, grid: Grid
 ) -> tuple[Array, Array, Array, Array]:
-    """The best (cell, class) pairs of CenterPoint's heat map, decoded; boxes far outside the map are discarded.
+    """Select the best (cell, class) pairs of the heat map and decode their boxes.
+
+    Boxes far outside the map are discarded.
 
     Args:
-        outputs: of one sample.
-        config, grid: thresholds and counts, and the cells of the heat map (static).
+        outputs: predictions of one sample.
+        config, grid: thresholds, counts and the cells of the heat map (static).
 
     Returns:
         boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c].

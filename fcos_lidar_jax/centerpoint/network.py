@@ -1,4 +1,4 @@
-"""CenterPoint on pillars: point layers, a backbone that sees the scene from above, heads of centres and boxes."""
+"""Network of CenterPoint: point layers, a bird's-eye-view backbone, and heads for centres and boxes."""
 
 import math
 
@@ -14,13 +14,13 @@ from fcos_lidar_jax.models.convolution import FULL
 from fcos_lidar_jax.models.heads import Predictions
 from fcos_lidar_jax.models.layers import BatchNorm, Conv, ConvNorm, Image, pieces
 
-_NUMBERS = {"offset": 2, "height": 1, "size": 3, "heading": 2, "velocity": 2}  # In the order of ``coding.encode``.
+_NUMBERS = {"offset": 2, "height": 1, "size": 3, "heading": 2, "velocity": 2}  # As ordered by ``coding.encode``.
 
 
 class PointLayers(nn.Module):
-    """Points to an image: every point by itself, then the maximum over its pillar (PointPillars, section 2.1).
+    """Layers on each point, then the maximum over each pillar (PointPillars, section 2.1).
 
-    Each layer but the last has half the channels and gives each point its pillar's maxima beside its own.
+    Each layer but the last has half the channels and concatenates the maxima of the point's pillar.
     """
 
     channels: tuple[int, ...]
@@ -30,7 +30,7 @@ class PointLayers(nn.Module):
     def __call__(self, pillars: Pillars, *, train: bool) -> Image:
         x, cell, number = pillars.features[:, :, None], pillars.cell, self.side * self.side
         inside = (cell < number)[:, :, None, None]
-        where = inside | ~inside.any()  # The statistics of no point at all are those of zeros, not NaN.
+        where = inside | ~inside.any()  # Without any point, the statistics are of zeros, not NaN.
         maxima = x[:, :, 0]
         for i, wide in enumerate(self.channels):
             last = i == len(self.channels) - 1
@@ -46,14 +46,14 @@ class PointLayers(nn.Module):
 
 
 class Backbone(nn.Module):
-    """Three stages of 3x3 convolutions, the first of each at stride 2 (PointPillars, section 2.2)."""
+    """Three stages of 3x3 convolutions, each starting with stride 2 (PointPillars, section 2.2)."""
 
     blocks: tuple[int, ...]
     widths: tuple[int, ...]
 
     @nn.compact
     def __call__(self, x: Image, *, train: bool) -> list[Image]:
-        """The stages' outputs at 1/2, 1/4 and 1/8 of the grid."""
+        """Compute the stages' outputs at 1/2, 1/4 and 1/8 of the grid size."""
         levels = []
         for stage, (count, width) in enumerate(zip(self.blocks, self.widths, strict=True)):
             for block in range(count + 1):
@@ -63,7 +63,7 @@ class Backbone(nn.Module):
 
 
 def to_channels(x: Image, factor: int) -> Image:
-    """Squares of ``factor`` x ``factor`` cells to channels of one.
+    """Move squares of ``factor`` x ``factor`` cells into the channels of one cell.
 
     >>> to_channels(jnp.ones((1, 4, 4, 3)), 2).shape
     (1, 2, 2, 12)
@@ -74,7 +74,7 @@ def to_channels(x: Image, factor: int) -> Image:
 
 
 def from_channels(x: Image, factor: int) -> Image:
-    """The inverse of :func:`to_channels`.
+    """Invert :func:`to_channels`.
 
     >>> image = jnp.arange(48.0).reshape(1, 4, 4, 3)
     >>> bool((from_channels(to_channels(image, 2), 2) == image).all())
@@ -86,13 +86,13 @@ def from_channels(x: Image, factor: int) -> Image:
 
 
 class Neck(nn.Module):
-    """All stages at one resolution, side by side.
+    """Resample all stages to one resolution and concatenate them.
 
-    (Transposed) convolutions whose size is their stride are matrix products of squares of cells.
+    (Transposed) convolutions whose size equals their stride are matrix products of squares of cells.
     """
 
     channels: int
-    stride: int  # Of the output, pillars.
+    stride: int  # Side of an output cell, pillars.
 
     @nn.compact
     def __call__(self, levels: list[Image], *, train: bool) -> Image:
@@ -107,9 +107,9 @@ class Neck(nn.Module):
 
 
 class CentreHeads(nn.Module):
-    """A convolution for all, and for each group of classes a heat map and the numbers of a box."""
+    """A shared convolution, then a heat map and box regression for each group of classes."""
 
-    groups: tuple[int, ...]  # Of each class.
+    groups: tuple[int, ...]  # Group of each class.
     channels: int
     prior: float
 
@@ -119,7 +119,7 @@ class CentreHeads(nn.Module):
         bias, heat, regression = math.log(self.prior / (1 - self.prior)), [], []
         for group in range(max(self.groups) + 1):
             sizes = {**_NUMBERS, "heat": self.groups.count(group)}
-            # The hidden layers of all heads of a group are one convolution.
+            # The hidden layers of a group's heads are one convolution.
             hidden = ConvNorm(self.channels * len(sizes), name=f"group{group}_hidden")(x, train=train)
             predicted: dict[str, Array] = {}
             for (name, size), cut in zip(sizes.items(), pieces([self.channels] * len(sizes)), strict=True):
@@ -134,14 +134,14 @@ class CentreHeads(nn.Module):
 
 
 class CenterPoint(nn.Module):
-    """Points, backbone, neck and heads."""
+    """Point layers, backbone, neck and heads."""
 
     config: PillarConfig
     groups: tuple[int, ...]
     side: int
 
     def setup(self) -> None:
-        c = self.config  # the four names are the top level of the parameters
+        c = self.config  # The attributes' names are the top level of the parameters.
         self.points = PointLayers(c.point_channels, self.side)
         self.backbone = Backbone(c.backbone_blocks, c.backbone_widths)
         self.neck = Neck(c.neck_channels, c.output_stride)

@@ -7,12 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from fcos_lidar_jax.centerpoint.centres import (
-    centre_targets,
-    decode_centres,
-    encode_centres,
-    focal_loss,
-)
+from fcos_lidar_jax.centerpoint.centres import centre_targets, decode_centres, encode_centres, focal_loss
 from fcos_lidar_jax.centerpoint.config import CenterPointConfig
 from fcos_lidar_jax.centerpoint.pillars import Grid
 from fcos_lidar_jax.centerpoint.types import CentreOutputs
@@ -26,17 +21,17 @@ Parts = dict[str, Array]
 def sample_losses(
     outputs: CentreOutputs, boxes: Array, labels: Array, box_valid: Array, *, config: CenterPointConfig, grid: Grid
 ) -> tuple[Parts, Parts]:
-    """Targets and losses of one sample.
+    """Compute targets and losses of one sample.
 
     Args:
-        outputs: of one sample, as are the other arrays.
+        outputs: predictions.
         boxes: f32[m, 9]; NaN velocities are unknown.
         labels, box_valid: i32[m] and bool[m].
-        config, grid: choices, and the cells of the heat map (static).
+        config, grid: options, and the cells of the heat map (static).
 
     Returns:
-        sums of the two losses and counts of the boxes, each f32[g] or i32[g] by group of classes, and counts to be
-        summed over the batch.
+        the sums of both losses f32[g] per group of classes, and counts to sum over the batch, with the number of
+        boxes i32[g] per group.
     """
     pillars, groups = config.pillars, jnp.array(config.class_groups)
     targets = centre_targets(
@@ -67,10 +62,11 @@ def sample_losses(
 
 
 def make_sums(config: CenterPointConfig, grid: Grid) -> Callable[[CentreOutputs, Any, Batch], Sums]:
-    """The losses of a batch; ``grid`` holds the cells of the heat map.
+    """Make the function from outputs and ground truth of a batch to the sums of its losses.
 
-    The losses of every group of classes are divided by its own boxes: its sums are weighed so that the one
-    division by all boxes does it. Over micro-batches this is exact with one group; with more, each has its shares.
+    The loss of each group of classes is averaged over the group's own boxes: its sum is weighted so that the
+    division by all boxes gives this average. With micro-batches this is exact for one group only, since the
+    weights of several groups are computed per micro-batch.
     """
 
     def sums(outputs: CentreOutputs, _: Any, batch: Batch) -> Sums:

@@ -1,8 +1,8 @@
-"""Points to pillars, and what the points of a pillar say to one image from above (PointPillars, dynamic pillars).
+"""Division of point clouds into pillars, and features of the points (PointPillars with dynamic pillars).
 
-No pillar has a maximum of points and no cloud one of pillars: points are gathered by scatter, those that take no
-part in a cell behind the last one. Means are sums of integers and maxima are exact, so the result depends neither
-on the device nor on the order of the points.
+Neither points per pillar nor pillars per cloud are limited: points are combined by scatter operations, and
+excluded points go to an additional last cell. Means are sums of integers and maxima are exact, so the result
+depends neither on the device nor on the order of the points.
 """
 
 import dataclasses
@@ -17,17 +17,17 @@ from fcos_lidar_jax.centerpoint.types import Pillars
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor
 
-_STEPS_PER_M = 2.0**16  # Of the integers that means are computed with: far below what a LiDAR can tell.
+_STEPS_PER_M = 2.0**16  # Resolution of the integers in means, far finer than a LiDAR's.
 
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """A square of square cells, seen from above; row-major, rows by y and columns by x.
+    """A square of square cells in the ground plane, row-major, with rows along y and columns along x.
 
     Attributes:
         side: cells along each axis.
         cell_m: side of a cell, metres.
-        low_m: least x and y of the square, metres.
+        low_m: minimum x and y of the square, metres.
     """
 
     side: int
@@ -40,7 +40,7 @@ class Grid:
 
 
 def pillar_grid(config: PillarConfig, sensor: Sensor, *, stride: int = 1) -> Grid:
-    """The pillars around a sensor, or the cells of ``stride`` pillars a side.
+    """Create the grid of pillars around a sensor, or of cells with a side of ``stride`` pillars.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
     >>> pillar_grid(PillarConfig(), NUSCENES_HDL32E, stride=4)
@@ -52,7 +52,7 @@ def pillar_grid(config: PillarConfig, sensor: Sensor, *, stride: int = 1) -> Gri
 
 
 def cells_below(xy: Float[Array, "*n 2"], grid: Grid) -> tuple[Int32[Array, "*n"], Bool[Array, "*n"]]:
-    """The cell below each position, and whether there is one; the number of cells where there is none.
+    """Find the cell of each position and whether it is on the grid; outside, the cell is the number of cells.
 
     >>> cell, inside = cells_below(jnp.array([[0.5, 1.5], [-0.1, 0.0]]), Grid(2, 1.0, (0.0, 0.0)))
     >>> cell.tolist(), inside.tolist()
@@ -66,12 +66,12 @@ def cells_below(xy: Float[Array, "*n 2"], grid: Grid) -> tuple[Int32[Array, "*n"
 
 
 def cell_positions(cell: Int32[Array, "*n"], grid: Grid, *, part: float = 0.0) -> Float32[Array, "*n 2"]:
-    """x and y of the corner of least x and y, or ``part`` of the cell away from it along both, metres.
+    """Compute x and y in metres of a cell's minimum corner, plus ``part`` of the cell's side along both axes.
 
     >>> cell_positions(jnp.array([2]), Grid(2, 1.0, (0.0, 0.0)), part=0.5).tolist()
     [[0.5, 1.5]]
     """
-    # Looked up: computed, they would be rounded once in some programs and twice in others.
+    # Looked up in a table, because programs differ in how they round the computation.
     x, y = (np.float32(low + (np.arange(grid.side + 1) + part) * grid.cell_m) for low in grid.low_m)
     return jnp.stack([jnp.asarray(x)[cell % grid.side], jnp.asarray(y)[cell // grid.side]], axis=-1)
 
@@ -79,13 +79,13 @@ def cell_positions(cell: Int32[Array, "*n"], grid: Grid, *, part: float = 0.0) -
 def from_cell_means(
     values: Float32[Array, "n c"], cell: Int32[Array, "n"], num_cells: int
 ) -> Float32[Array, "n c"]:
-    """Every row without the mean over the rows of its cell, to a 65536th of the unit.
+    """Subtract from each row the mean over the rows of its cell, with a resolution of 1/65536.
 
     >>> from_cell_means(jnp.array([[1.0], [2.0], [9.0]]), jnp.array([0, 0, 1]), 2).tolist()
     [[-0.5], [0.5], [0.0]]
     """
     count = jnp.zeros(num_cells + 1, jnp.int32).at[cell].add(1)[cell]
-    with jax.enable_x64(True):  # for the sums alone
+    with jax.enable_x64(True):  # Only for the sums.
         steps = jnp.round(values * np.float32(_STEPS_PER_M)).astype(jnp.int64)
         total = jnp.zeros((num_cells + 1, values.shape[1]), jnp.int64).at[cell].add(steps)[cell]
         difference = (steps * count[:, None].astype(jnp.int64) - total).astype(jnp.float32)
@@ -93,7 +93,7 @@ def from_cell_means(
 
 
 def cell_maxima(values: Float[Array, "n c"], cell: Int32[Array, "n"], num_cells: int) -> Float[Array, "_ c"]:
-    """The greatest values of the rows of each cell, 0 at least, and a last row for those of no cell.
+    """Compute the maximum over the rows of each cell, at least 0, and a last row for rows outside all cells.
 
     Equal rows share the gradient.
 
@@ -107,15 +107,15 @@ def cell_maxima(values: Float[Array, "n c"], cell: Int32[Array, "n"], num_cells:
 def make_pillars(
     points: Float32[Array | np.ndarray, "n c"], valid: Bool[Array | np.ndarray, "n"], *, grid: Grid, sensor: Sensor
 ) -> Pillars:
-    """The pillar of every point of one cloud and its ten features (PointPillars, section 2.1).
+    """Find the pillar of each point of one cloud and compute its ten features (PointPillars, section 2.1).
 
-    Drops non-finite rows and those outside of the grid, of the sensor's limits or of the sector that it covers;
-    neither the vertical field of view nor the lasers matter.
+    Drops non-finite rows and rows outside the grid, the sensor's limits or its sector. The vertical field of view
+    and the lasers are ignored.
 
     Args:
-        points: x, y, z (metres), intensity (0-255), time lag (seconds), and columns that are ignored.
-        valid: rows that count.
-        grid, sensor: the pillars, and the limits (static).
+        points: x, y, z (metres), intensity (0-255), time lag (seconds), and ignored columns.
+        valid: rows that are points.
+        grid, sensor: pillars and limits (static).
 
     >>> cloud = np.array([[0.25, 0.5, 0, 9, 0], [0.75, 0.5, 1, 9, 0]], np.float32)
     >>> pillars = make_pillars(cloud, np.ones(2, bool), grid=Grid(2, 1.0, (0, 0)), sensor=Sensor("a", (0.1, 0), 8))
@@ -123,13 +123,12 @@ def make_pillars(
     ([0, 0], [-0.25, 0.0, -0.5, -0.25, 0.0])
     """
     with jax.named_scope("pillars"):
-        cloud, given = jnp.asarray(points)[:, :5], jnp.asarray(valid)
-        usable = given & jnp.isfinite(cloud).all(axis=1)
+        cloud, exists = jnp.asarray(points)[:, :5], jnp.asarray(valid)
+        usable = exists & jnp.isfinite(cloud).all(axis=1)
         cloud = jnp.where(usable[:, None], cloud, 0.0)
         low, high = sensor.limit_z_m
-        usable &= (
-            (jnp.abs(cloud[:, :2]) < sensor.limit_xy_m).all(axis=1) & (cloud[:, 2] > low) & (cloud[:, 2] < high)
-        )
+        within_xy = (jnp.abs(cloud[:, :2]) < sensor.limit_xy_m).all(axis=1)
+        usable &= within_xy & (cloud[:, 2] > low) & (cloud[:, 2] < high)
         if sensor.azimuth_limits_rad is not None:
             _, azimuth, _ = spherical(cloud[:, :3] - np.asarray(sensor.origin_m, np.float32))
             usable &= image_columns(azimuth, sensor)[1]
@@ -143,5 +142,5 @@ def make_pillars(
         return Pillars(
             features=jnp.where(usable[:, None], features, 0.0),
             cell=cell,
-            num_dropped=jnp.sum(given & ~usable, dtype=jnp.int32),
+            num_dropped=jnp.sum(exists & ~usable, dtype=jnp.int32),
         )

@@ -1,9 +1,9 @@
-"""Convolutions, with weight gradients in the form that suits the platform.
+"""Convolutions whose weight gradients suit the platform.
 
-XLA's CPU backend is good at values and input gradients, but up to five times slower than matrix products at the
-weight gradients of few channels on large images. On GPUs, XLA turns the weight gradient of a dilated convolution
-into a convolution whose kernel is as large as the image, for which cuDNN has no good algorithm: there it is
-computed as the weight gradient of an undilated one. Everything else is the library's.
+XLA's CPU backend computes values and input gradients well, but for large images with few channels its weight
+gradients are up to five times slower than matrix products. On GPUs, XLA turns the weight gradient of a dilated
+convolution into a convolution with a kernel as large as the image, for which cuDNN has no good algorithm; here it
+is computed as the weight gradient of an undilated convolution.
 """
 
 import functools
@@ -17,18 +17,17 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-Image = Float[Array, "b _ _ _"]  # Height, width and channels change from layer to layer.
+Image = Float[Array, "b _ _ _"]  # Batch, height, width and channels.
 Kernel = Float[Array, "_ _ _ _"]
 
 LARGE = 1 << 24
-"""Multiply-adds an image from which another form of the weight gradient is worth compiling."""
+"""Multiply-adds per image above which matrix products are worth compiling for the weight gradient on a CPU."""
 
 LOOP = 16
-"""How many times as many are needed for a loop over rows, which XLA compiles anew for each layer."""
-
+"""Multiple of ``LARGE`` above which a loop over rows is, which XLA compiles separately for each layer."""
 
 FULL = lax.Precision.HIGHEST
-"""For layers that take positions: by default GPUs and TPUs round float32 inputs to TF32 or bfloat16."""
+"""Precision of layers whose input contains positions, which GPUs and TPUs would round to TF32 or bfloat16."""
 
 
 def convolve(
@@ -41,10 +40,10 @@ def convolve(
     circular: bool = False,
     precision: lax.Precision | None = None,
 ) -> Image:
-    """Convolution with ``k // 2 * dilation`` zeros on both sides, or wrapped around the width.
+    """Convolve with ``k // 2 * dilation`` zeros on each side, or with wrap-around along the width.
 
-    Stride and dilation are those of both axes, ``groups`` is the ``feature_group_count``, the kernel's sizes are
-    odd. The result has the type of ``x``. Differentiable in reverse mode.
+    Stride and dilation apply to both axes, ``groups`` is ``feature_group_count``, and kernel sizes are odd. The
+    result has the dtype of ``x``. Differentiable in reverse mode.
 
     >>> convolve(jnp.ones((1, 8, 8, 2)), jnp.ones((3, 3, 2, 4)), stride=2).shape
     (1, 4, 4, 4)
@@ -82,16 +81,15 @@ def pointwise(
     dtype: DTypeLike | None = None,
     precision: lax.Precision | None = None,
 ) -> Image:
-    """A 1x1 convolution, summed in ``dtype``, by default that of ``x``: on a CPU as a matrix product.
+    """Compute a 1x1 convolution, accumulated in ``dtype`` (default: the dtype of ``x``).
 
     >>> pointwise(jnp.ones((1, 8, 8, 2)), jnp.ones((2, 4)))[0, 0, 0].tolist()
     [2.0, 2.0, 2.0, 2.0]
     """
     kernel = kernel.astype(x.dtype)
-    taken = (x.shape[0], -(-x.shape[1] // stride), -(-x.shape[2] // stride))
     product = functools.partial(_of_pixels, stride=stride, dtype=dtype or x.dtype, precision=precision)
-    large = math.prod(taken[1:]) * kernel.size >= LARGE
-    forms = {"cpu": functools.partial(_flat, stride=stride)} if large else {}
+    num_outputs = math.prod(-(-size // stride) for size in x.shape[1:3])
+    forms = {"cpu": functools.partial(_flat, stride=stride)} if num_outputs * kernel.size >= LARGE else {}
     return _with_weight_gradient(product, forms, x, kernel)
 
 
@@ -105,22 +103,22 @@ def _of_pixels(x: Image, kernel: Array, stride: int, dtype: DTypeLike, precision
         kernel = kernel[None, None]
         return lax.conv_general_dilated(x, kernel, strides, "VALID", dimension_numbers=layout, precision=precision)
 
-    if dtype != x.dtype:  # The library has no gradient of a convolution of two types.
+    if dtype != x.dtype:  # JAX has no gradient of a convolution with two dtypes.
         return matrix_product(x, kernel)
-    # On GPUs XLA fuses matrix products with what is around them, and fails at some: it aborts where there is a
+    # On GPUs, XLA fuses matrix products with neighbouring operations and fails for some: it aborts if there is a
     # stride (triton_tiling_propagation.cc: Check failed) and finds no tiles for others on an A100 (jaxlib 0.10.2).
     return lax.platform_dependent(x, kernel, cpu=matrix_product, default=convolution)
 
 
 def _multiply_adds(x: Image, kernel: Array) -> int:
-    """Of one image, at stride 1."""
+    """Multiply-adds per image at stride 1."""
     return x.shape[1] * x.shape[2] * kernel.size
 
 
 def _with_weight_gradient(
     product: Callable[..., Image], forms: dict[str, Callable[..., Array]], x: Image, kernel: Array
 ) -> Image:
-    """``product(x, kernel)``, whose weight gradient is ``forms[platform](x, g)``, else the library's."""
+    """Compute ``product(x, kernel)`` with the weight gradient ``forms[platform](x, g)``, by default JAX's."""
     return _custom(product, tuple(forms.items()), x, kernel) if forms else product(x, kernel)
 
 
@@ -151,13 +149,13 @@ _custom.defvjp(_forward, _backward)
 
 
 def _flat(x: Image, g: Image, *, stride: int) -> Float[Array, "_ _"]:
-    """Weight gradient of a 1x1 convolution, one product of all pixels, the wider side on the right."""
+    """Weight gradient of a 1x1 convolution: one product over all pixels, with the wider operand on the right."""
     x = x[:, ::stride, ::stride]
     x, g = x.reshape(-1, x.shape[-1]), g.reshape(-1, g.shape[-1])
     product = functools.partial(jnp.einsum, "pa,pb->ab", preferred_element_type=_summed_in(x))
     if x.shape[1] <= g.shape[1]:
         return product(x, g)
-    return lax.optimization_barrier(product(g, x)).T  # Without the barrier XLA turns it back: half the speed.
+    return lax.optimization_barrier(product(g, x)).T  # Without the barrier XLA undoes the swap, at half the speed.
 
 
 def _summed_in(x: Array) -> DTypeLike:
@@ -174,9 +172,9 @@ def _by_phases(
     groups: int,
     precision: lax.Precision | None,
 ) -> Kernel:
-    """Weight gradient at stride 1 as that of an undilated convolution.
+    """Weight gradient at stride 1, computed as the weight gradient of an undilated convolution.
 
-    Pixels that are ``dilation`` apart become neighbours in one of ``dilation * dilation`` smaller images.
+    Pixels at a distance of ``dilation`` become neighbours in one of ``dilation * dilation`` smaller images.
     """
 
     def phases(image: Array) -> Array:
@@ -200,10 +198,9 @@ def _by_phases(
 
 
 def _by_rows(x: Image, g: Image, *, sizes: tuple[int, ...], dilation: int, padding: tuple[int, int]) -> Kernel:
-    """Weight gradient at stride 1: for each row of the image one product for all taps.
+    """Weight gradient at stride 1: one product for all taps per image row, with the wider operand on the right.
 
-    The wider side is on the right. The samples of a batch are summed last, so that several devices exchange their
-    sums once and not in every row.
+    Samples are summed last, so that several devices exchange sums once instead of once per row.
     """
     (rows, columns), (high, wide) = sizes, padding
     (batch, height, _, inputs), (width, outputs) = x.shape, g.shape[2:]

@@ -1,4 +1,4 @@
-"""Detectors as pure functions, and FCOS-LiDAR's network."""
+"""Detectors as pure functions, and the network of FCOS-LiDAR."""
 
 import functools
 from collections.abc import Callable
@@ -28,21 +28,21 @@ Variables = dict[str, Any]  # ``params`` and ``batch_stats``, plain dicts of arr
 
 
 class Detector(NamedTuple):
-    """A detector as pure functions, with the configuration and the sensor that they were made for.
+    """A detector as pure functions, with its configuration and sensor.
 
     Attributes:
-        prepare: ``(points f32[n, c], valid bool[n]) -> input`` of one cloud, without parameters: a pytree with
-            ``num_dropped`` i32[], valid points that it leaves out. FCOS-LiDAR's is a
+        prepare: ``(points f32[n, c], valid bool[n]) -> input`` converts one cloud to the network's input: a pytree
+            with ``num_dropped`` i32[], the number of excluded valid points. FCOS-LiDAR's input is a
             :class:`~fcos_lidar_jax.types.RangeImage`.
         init: ``key -> variables``.
-        apply: ``(variables, inputs, train=False) -> (outputs, batch_stats)`` of a batch of inputs. The batch
-            statistics are the given ones unless training. FCOS-LiDAR's outputs are
+        apply: ``(variables, inputs, train=False) -> (outputs, batch_stats)`` for a batch of inputs. The batch
+            statistics are unchanged unless training. FCOS-LiDAR's outputs are
             :class:`~fcos_lidar_jax.types.Outputs`.
         sums: ``(outputs, inputs, batch) -> Sums``, the losses of a batch, see :class:`~fcos_lidar_jax.types.Sums`.
-        candidates: ``(outputs, input) -> (boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c])`` of one
+        candidates: ``(outputs, input) -> (boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c])`` for one
             cloud, before NMS.
-        config: all choices.
-        sensor: what the clouds are of.
+        config: configuration of the detector.
+        sensor: sensor of the clouds.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -51,7 +51,7 @@ class Detector(NamedTuple):
     >>> clouds = jax.ShapeDtypeStruct((2, 4096, 5), jnp.float32), jax.ShapeDtypeStruct((2, 4096), bool)
     >>> images = jax.eval_shape(jax.vmap(detector.prepare), *clouds)
     >>> outputs, _ = jax.eval_shape(detector.apply, variables, images)
-    >>> outputs.logits.shape  # all levels' locations; ten classes and the background
+    >>> outputs.logits.shape  # locations of all levels; ten classes and the background
     (2, 5460, 11)
     """
 
@@ -71,15 +71,15 @@ class Network(nn.Module):
     num_classes: int
 
     def setup(self) -> None:
-        c = self.config  # the names are the top level of the parameters
+        c = self.config  # The attributes' names are the top level of the parameters.
         self.stem = Stem(c.stem, c.circular_width, c.precision)
         if c.local_geometry:
-            normalised = c.channel_mean, c.channel_scale
-            self.local_geometry = LocalGeometry(c.fpn_channels, *normalised, c.circular_width)
+            self.local_geometry = LocalGeometry(c.fpn_channels, c.channel_mean, c.channel_scale, c.circular_width)
         self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width, c.remat)
         self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
-        sizes = self.num_classes, c.head_channels, c.head_convs
-        self.heads = Heads(*sizes, c.background_prior, c.tied_heads, c.circular_width)
+        self.heads = Heads(
+            self.num_classes, c.head_channels, c.head_convs, c.background_prior, c.tied_heads, c.circular_width
+        )
 
     def __call__(self, image: Image, *, train: bool) -> Outputs:
         with jax.named_scope("stem"):
@@ -98,10 +98,10 @@ class Network(nn.Module):
 
 
 def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, layout: ImageLayout) -> Image:
-    """Preprocessing of a range image: normalise, repeat rows, pad, join channel types and rounds.
+    """Preprocess range images: normalise, repeat rows, pad, and join channel types and rounds.
 
-    Empty slots stay zero in all nine channels. Of the ``9 r`` channels of the result those of one type are
-    adjacent (paper, figure 2).
+    Empty slots stay zero in all nine channels. The ``9 r`` channels of the result are ordered by type, then by
+    round (paper, figure 2).
 
     >>> network_input(jnp.zeros((1, 16, 256, 9, 2)), ModelConfig(), ImageLayout(16, 256, 2)).shape
     (1, 32, 256, 18)
@@ -115,7 +115,7 @@ def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, la
 
 @functools.cache
 def build_detector(config: Config, sensor: Sensor) -> Detector:
-    """The detector of a configuration for a sensor's clouds; equal arguments share one object and its programs.
+    """Build the detector of a configuration for a sensor; equal arguments share one object and its programs.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import TINY
@@ -134,26 +134,26 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
             return project_points(points, valid, image_of, num_rounds=num_rounds, prioritize_current=current_first)
 
     def init(key: Any) -> Variables:
-        # Parameters do not depend on the image's size, and nothing of the forward pass is computed.
+        # Parameters do not depend on the image's size; the forward pass is not computed.
         image = jax.ShapeDtypeStruct((1, 32, 32, 9 * num_rounds), jnp.float32)
         return network.lazy_init(key, image, train=False)  # type: ignore[return-value]
 
     def apply(variables: Variables, images: RangeImage, *, train: bool = False) -> tuple[Outputs, Any]:
-        # The image takes the parameters' type: float64 ones make everything behind it float64.
+        # The image takes the parameters' dtype, so that float64 parameters make the whole network float64.
         image = network_input(images.features, config.model, layout)
         image = image.astype(jax.tree.leaves(variables["params"])[0].dtype)
         outputs, updates = network.apply(variables, image, train=train, mutable=["batch_stats"] if train else [])
         return outputs, updates["batch_stats"] if train else variables["batch_stats"]
 
     def candidates(outputs: Outputs, image: RangeImage) -> tuple[Array, Array, Array, Array]:
-        choices: dict[str, Any] = {"config": config.inference, "axes": config.model.regression_axes}
-        return select_candidates(outputs, locate(image, layout), layout=layout, **choices)
+        axes = config.model.regression_axes
+        return select_candidates(outputs, locate(image, layout), config=config.inference, layout=layout, axes=axes)
 
     return Detector(prepare, init, apply, make_sums(config, sensor), candidates, config, sensor)
 
 
 class Parts(NamedTuple):
-    """FCOS-LiDAR's network in compiled parts. All but the first take all variables and the previous output."""
+    """Compiled parts of FCOS-LiDAR's network. All but the first take all variables and the previous output."""
 
     preprocess: Callable[[Any], Image]
     stem: Callable[[Variables, Any], Any]
@@ -163,7 +163,7 @@ class Parts(NamedTuple):
 
 
 def network_parts(config: Config, sensor: Sensor) -> Parts:
-    """The network of a configuration without ``local_geometry`` in parts, to be timed one by one.
+    """Split the network of a configuration without ``local_geometry`` into parts, to time each of them.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -184,7 +184,7 @@ def network_parts(config: Config, sensor: Sensor) -> Parts:
 
 
 def count_parameters(params: Any) -> dict[str, int]:
-    """Parameters of each part of the network, and in total.
+    """Count the parameters of each part of the network, and in total.
 
     >>> count_parameters({"stem": {"kernel": jnp.ones((3, 4))}, "fpn": {"bias": jnp.ones(2)}})
     {'stem': 12, 'fpn': 2, 'total': 14}

@@ -1,4 +1,4 @@
-"""Feature pyramid, P2 ... P7 (paper, section 3.4)."""
+"""Feature pyramid, P2 to P7 (paper, section 3.4)."""
 
 import flax.linen as nn
 import jax
@@ -8,7 +8,7 @@ from fcos_lidar_jax.models.layers import Conv, Image
 
 
 def double(x: Image) -> Image:
-    """Nearest upsampling by two.
+    """Upsample by two with nearest neighbours.
 
     >>> double(jnp.ones((1, 2, 3, 4))).shape
     (1, 4, 6, 4)
@@ -18,7 +18,7 @@ def double(x: Image) -> Image:
 
 
 class FeaturePyramid(nn.Module):
-    """1x1 laterals, top-down sums, 3x3 outputs; P6 and P7 by stride 2 from P5 and from ReLU(P6)."""
+    """1x1 laterals, top-down sums and 3x3 outputs; P6 and P7 from P5 and ReLU(P6) at stride 2."""
 
     channels: int
     circular: bool = False

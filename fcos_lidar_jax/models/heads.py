@@ -1,4 +1,4 @@
-"""Detection heads: two towers a level, class-specific predictions (paper, section 3.4)."""
+"""Detection heads: two towers per level and class-specific predictions (paper, section 3.4)."""
 
 import math
 
@@ -11,9 +11,10 @@ from fcos_lidar_jax.models.convolution import Image, convolve
 from fcos_lidar_jax.models.layers import Conv, GroupNorm, at_least_float32, normal, pieces
 from fcos_lidar_jax.types import Outputs
 
-_REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}  # Numbers a class of the four sibling layers.
+_REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}  # Numbers per class of the sibling layers.
 _LANES = 32
-"""Fused predictions are padded to a multiple of this: 110 channels run at half the speed of 128 on CPU."""
+"""The channels of fused predictions are padded to a multiple of this: on a CPU, 110 run at half the speed of
+128."""
 
 
 class Tower(nn.Module):
@@ -32,7 +33,7 @@ class Tower(nn.Module):
 
 
 class Predictions(nn.Module):
-    """Sibling 3x3 prediction layers, computed as one convolution."""
+    """Sibling 3x3 prediction layers in one convolution."""
 
     sizes: dict[str, int]
     biases: dict[str, tuple[float, ...]]
@@ -50,7 +51,7 @@ class Predictions(nn.Module):
         total = sum(self.sizes.values())
         kernel = jnp.concatenate(kernels, axis=-1)
         kernel = jnp.pad(kernel, [(0, 0)] * 3 + [(0, -total % _LANES)])
-        # Inputs rounded to TF32, the default of GPUs, move a centre by a millimetre: it counts from the point.
+        # Rounding to TF32 on GPUs moves a centre by a millimetre only, since it is relative to its point.
         y = convolve(x, kernel, circular=self.circular)[..., :total] + jnp.concatenate(biases)
         cuts = pieces(list(self.sizes.values()))
         return {name: y[..., cut] for name, cut in zip(self.sizes, cuts, strict=True)}
@@ -67,16 +68,15 @@ class Head(nn.Module):
 
     @nn.compact
     def __call__(self, x: Image, local: Image | None = None) -> Outputs:
-        """Predictions at all locations of the level, flattened.
+        """Predict at all locations of the level, flattened.
 
-        Local features of the locations, if given, join before the towers and again behind them, where no other
-        convolution than the predictions follows.
-        """
+        Local features, if given, are added before the towers and again after them, directly before the
+        predictions."""
         k = self.num_classes
         if local is not None:
             local = local.astype(x.dtype)
             x = x + local
-        # With zero logits for the classes this makes P(background) the prior.
+        # With zero class logits, this makes P(background) equal to the prior.
         prior = math.log(k * self.background_prior / (1 - self.background_prior))
         classes = Tower(self.channels, self.depth, self.circular, name="classification_tower")(x)
         boxes = Tower(self.channels, self.depth, self.circular, name="regression_tower")(x)
@@ -99,7 +99,7 @@ class Head(nn.Module):
 
 
 class Heads(nn.Module):
-    """One head for every level, or one for all (table 6)."""
+    """One head per level, or one head for all levels (table 6)."""
 
     num_classes: int
     channels: int
@@ -110,10 +110,9 @@ class Heads(nn.Module):
 
     @nn.compact
     def __call__(self, levels: list[Image], local: list[Image] | None = None) -> Outputs:
-        """Predictions at the locations of all levels, joined from P2 to P7; with local features of each level."""
+        """Predict at the locations of all levels, from P2 to P7, with optional local features per level."""
         options = self.num_classes, self.channels, self.depth, self.background_prior, self.circular
         shared = Head(*options, name="shared") if self.tied else None
-        given = local or [None] * len(levels)
-        pairs = zip(levels, given, strict=True)
+        pairs = zip(levels, local or [None] * len(levels), strict=True)
         outputs = [(shared or Head(*options, name=f"level{i + 2}"))(*pair) for i, pair in enumerate(pairs)]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *outputs)

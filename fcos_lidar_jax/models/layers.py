@@ -1,11 +1,11 @@
-"""Convolution and norms as the network needs them.
+"""Convolution and normalisation layers.
 
-A convolution computes in the type of its input; norms compute in float32 at least and give the type of their
-input back: mixed precision is one cast behind the first layer and one before the predictions.
+Convolutions compute in the dtype of their input. Norms compute in at least float32 and return the dtype of their
+input, so mixed precision needs only one cast after the first layer and one before the predictions.
 
-Padding is explicit and the same on both sides (``SAME`` at stride 2 would shift the receptive field).
-The norms are written out because XLA is several times slower on the library's forms: a group norm reshaped to
-two channels a group, and a batch norm that would need the stem's groups concatenated.
+Padding is explicit and symmetric; ``SAME`` at stride 2 would shift the receptive field. Flax's norms are not used
+because XLA runs them several times slower: its group norm reshapes to two channels per group, and its batch norm
+would need the stem's groups concatenated.
 """
 
 import itertools
@@ -21,28 +21,30 @@ from jaxtyping import Array
 
 from fcos_lidar_jax.models.convolution import Image, convolve
 
-EPSILON = 1e-5  # Of the variances of both norms.
+EPSILON = 1e-5  # Added to the variance in both norms.
 
 
 def norm_groups(channels: int) -> int:
-    """Groups of a group norm: two channels each, at most 32."""
+    """Number of groups of a group norm: groups of two channels, at most 32 groups."""
     return max(1, min(32, channels // 2))
 
 
 def normal(key: Array, shape: Sequence[int], stddev: Any) -> Array:
-    """``stddev * jax.random.normal(key, shape)``, to the bit; compiled for powers of two instead of for every
-    shape, for XLA takes seconds to compile each on a CPU."""
+    """``stddev * jax.random.normal(key, shape)``, bit-identical.
+
+    Compiled for powers of two instead of every shape, since XLA takes seconds to compile each on a CPU.
+    """
     size = math.prod(shape)
     return jax.random.normal(key, (1 << (size - 1).bit_length(),))[:size].reshape(shape) * stddev
 
 
 def kernel_init(key: Array, shape: Sequence[int]) -> Array:
-    """He's, over the outputs, as in ResNet."""
+    """He initialisation over the outputs, as in ResNet."""
     return normal(key, shape, jnp.sqrt(jnp.float32(2.0 / math.prod((*shape[:-2], shape[-1])))))
 
 
 class Conv(nn.Module):
-    """A convolution with its kernel and, where no norm follows, a bias."""
+    """Convolution with an optional bias, for layers without a norm."""
 
     features: int
     size: int = 3
@@ -62,16 +64,16 @@ class Conv(nn.Module):
 
 
 class BatchNorm(nn.Module):
-    """Batch norm of an image whose channels come in parts, over the global batch.
+    """Batch norm over the global batch, of an image whose channels are split into parts.
 
-    The variance is of two passes: the fast form cancels badly on metre-scale inputs.
+    The variance takes two passes, because the fast form loses precision on inputs in metres.
     """
 
-    momentum: float = 0.9  # Part of the running statistics that an update keeps.
+    momentum: float = 0.9  # Weight of the old running statistics in an update.
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool, where: Array | None = None) -> list[Image]:
-        """The parts, normalised; only what ``where`` marks, by default everything, enters the statistics."""
+        """Normalise the parts; ``where`` selects the values that enter the statistics, by default all."""
         cuts = pieces([part.shape[-1] for part in parts])
         total = cuts[-1].stop
         scale = self.param("scale", nn.initializers.ones, (total,))
@@ -79,10 +81,10 @@ class BatchNorm(nn.Module):
         running_mean = self.variable("batch_stats", "mean", jnp.zeros, (total,))
         running_var = self.variable("batch_stats", "var", jnp.ones, (total,))
         mean, var = running_mean.value, running_var.value
-        given, parts = parts[0].dtype, [at_least_float32(part) for part in parts]
+        input_dtype, parts = parts[0].dtype, [at_least_float32(part) for part in parts]
         if train:
             mean = jnp.concatenate([part.mean((0, 1, 2), where=where) for part in parts])
-            # Its derivative by the mean is zero; left out, the backward pass reads the image once less.
+            # The derivative of the variance by the mean is zero; omitting it saves one read of the image.
             fixed = lax.stop_gradient(mean)
             squares = [jnp.square(part - fixed[cut]) for part, cut in zip(parts, cuts, strict=True)]
             var = jnp.concatenate([square.mean((0, 1, 2), where=where) for square in squares])
@@ -91,16 +93,16 @@ class BatchNorm(nn.Module):
                 running_var.value = self.momentum * running_var.value + (1 - self.momentum) * var
         gain = scale * lax.rsqrt(var + EPSILON)
         shift = bias - mean * gain
-        return [(part * gain[cut] + shift[cut]).astype(given) for part, cut in zip(parts, cuts, strict=True)]
+        return [(part * gain[cut] + shift[cut]).astype(input_dtype) for part, cut in zip(parts, cuts, strict=True)]
 
 
 def at_least_float32(x: Array) -> Array:
-    """The same, in float32 if it was less precise."""
+    """Convert to float32 unless the dtype is at least as precise."""
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 
 
 def pieces(sizes: Sequence[int]) -> list[slice]:
-    """Consecutive slices of the given sizes.
+    """Make consecutive slices of the given sizes.
 
     >>> pieces([2, 3])
     [slice(0, 2, None), slice(2, 5, None)]
@@ -125,10 +127,10 @@ class ConvNorm(nn.Module):
 
 
 def recomputed(module: nn.Module) -> Callable[..., Image]:
-    """The module with the same parameters and results; the backward pass computes its activations again."""
+    """Recompute the activations of a module in the backward pass; parameters and results stay the same."""
 
-    def call(*given: Any, train: bool) -> Image:
-        return nn.remat(lambda module, *given: module(*given, train=train))(module, *given)
+    def call(*inputs: Any, train: bool) -> Image:
+        return nn.remat(lambda module, *inputs: module(*inputs, train=train))(module, *inputs)
 
     return call
 
@@ -138,17 +140,17 @@ class GroupNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Image) -> Image:
-        given, x = x.dtype, at_least_float32(x)
+        input_dtype, x = x.dtype, at_least_float32(x)
         channels = x.shape[-1]
         groups = norm_groups(channels)
         scale = self.param("scale", nn.initializers.ones, (channels,))
         bias = self.param("bias", nn.initializers.zeros, (channels,))
 
-        def of_group(per_channel: Array) -> Array:
+        def group_means(per_channel: Array) -> Array:
             grouped = per_channel.reshape(x.shape[0], groups, channels // groups).mean(-1)
             return jnp.repeat(grouped, channels // groups, axis=1)[:, None, None]
 
-        mean = of_group(x.mean((1, 2)))
-        var = of_group(jnp.square(x - lax.stop_gradient(mean)).mean((1, 2)))
+        mean = group_means(x.mean((1, 2)))
+        var = group_means(jnp.square(x - lax.stop_gradient(mean)).mean((1, 2)))
         gain = scale * lax.rsqrt(var + EPSILON)
-        return (x * gain + (bias - mean * gain)).astype(given)
+        return (x * gain + (bias - mean * gain)).astype(input_dtype)

@@ -10,7 +10,7 @@ _EXPANSION = 4
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3, 1x1 with a shortcut; the stride sits on the 3x3 and on the shortcut."""
+    """1x1, 3x3 and 1x1 convolutions with a shortcut; the 3x3 and the shortcut have the stride."""
 
     width: int
     stride: int = 1
@@ -29,16 +29,16 @@ class Bottleneck(nn.Module):
 
 
 class Backbone(nn.Module):
-    """The first 7x7 convolution, at stride 1 and without pooling, and four stages."""
+    """A 7x7 convolution at stride 1 without pooling, and four stages."""
 
     blocks: tuple[int, ...]
     widths: tuple[int, ...]
     circular: bool = False
-    remat: bool = False  # Of the first convolution and stage, whose activations are the largest.
+    remat: bool = False  # Recompute the largest activations: first convolution and stage.
 
     @nn.compact
     def __call__(self, x: Image, *, train: bool) -> list[Image]:
-        """C2, C3, C4, C5 at 1/1, 1/2, 1/4, 1/8 of the image."""
+        """Compute C2, C3, C4 and C5 at 1/1, 1/2, 1/4 and 1/8 of the image size."""
         module = ConvNorm(x.shape[-1], 7, circular=self.circular, name="first")
         x = (recomputed(module) if self.remat else module)(x, train=train)
         levels = []

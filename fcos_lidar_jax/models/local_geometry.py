@@ -1,8 +1,8 @@
-"""Local geometry: where the points around a pixel lie, seen from its own point. Not in the paper.
+"""Local geometry: offsets from each pixel's point to the points of the neighbouring pixels. Not in the paper.
 
-A box is regressed from the point of one pixel. Every convolution mixes pixels, whose points may be metres apart,
-so little of a single pixel is left at the heads. Local geometry gives it to them directly.
-"""
+A box is regressed from the point of one pixel, but every convolution mixes pixels whose points can be metres
+apart, so the heads see little of a single pixel. Local geometry is an additional input of the heads, pixel by
+pixel."""
 
 import itertools
 
@@ -16,15 +16,15 @@ from fcos_lidar_jax.models.layers import BatchNorm, kernel_init
 from fcos_lidar_jax.types import CHANNELS
 
 ROWS, COLUMNS = 1, 3
-"""How far the window reaches from its pixel."""
+"""Reach of the window from its pixel."""
 UNIT_M = 0.2
-"""Offsets are compressed by ``asinh(offset / UNIT_M)``: linear below a decimetre or two, logarithmic beyond."""
+"""Scale of ``asinh(offset / UNIT_M)``, which is linear for small offsets and logarithmic for large ones."""
 HIDDEN = 32
 OWN = tuple(map(CHANNELS.index, ("z", "range", "inclination", "intensity", "existence")))
 
 
 def window() -> list[tuple[int, int]]:
-    """Row and column of every neighbour within the padded window, in the order of its channels.
+    """List row and column of each neighbour in the window, in the order of the channels.
 
     >>> len(window()), window()[0]
     (20, (0, 0))
@@ -36,16 +36,16 @@ def window() -> list[tuple[int, int]]:
 def local_offsets(
     image: Image, *, mean: tuple[float, ...], scale: tuple[float, ...], circular: bool = False
 ) -> Image:
-    """Offsets from each pixel's first-round point to those of its neighbours in a window of 3 x 7 pixels.
+    """Compute the offsets between the first-round points of each pixel and its neighbours in a 3 x 7 window.
 
     Args:
-        image: the network's input, ``9 r`` channels, normalised, those of one type adjacent.
-        mean, scale: what the nine channels were shifted and divided by.
-        circular: the window wraps around the width; else there is nothing beside the image.
+        image: the network's normalised input with ``9 r`` channels, ordered by type.
+        mean, scale: normalisation of the nine channels.
+        circular: wrap the window around the width; otherwise there are no neighbours beyond the image.
 
     Returns:
-        f[b, h, w, 80]: per neighbour the radial, tangential and vertical offset, along the azimuth of the pixel's
-        point, as ``asinh(offset / UNIT_M)``, and 1 where both points exist; all four are 0 where one is missing.
+        f[b, h, w, 80]: for each neighbour the radial, tangential and vertical offset relative to the azimuth of
+        the pixel's point, as ``asinh(offset / UNIT_M)``, and 1. All four are 0 if one of the points is missing.
 
     >>> nine = (0.0,) * 9, (1.0,) * 9
     >>> wall = jnp.zeros((1, 1, 2, 9)).at[..., 0].set(jnp.array([5.0, 5.2])).at[..., 7].set(1.0)
@@ -55,7 +55,9 @@ def local_offsets(
     """
     first = image[..., :: image.shape[-1] // 9]
     exists = (first[..., 7] > 0).astype(image.dtype)
-    points = [first[..., i] * scale[i] for i in range(3)]  # Shifted by the means: only differences count.
+    points = [
+        first[..., i] * scale[i] for i in range(3)
+    ]  # Still shifted by the means, which cancel in the offsets.
     azimuth = first[..., 4] * scale[4] + mean[4]
     cos, sin = jnp.cos(azimuth), jnp.sin(azimuth)
     height, width = image.shape[1:3]
@@ -64,21 +66,21 @@ def local_offsets(
         x = jnp.pad(x, ((0, 0), (0, 0), (COLUMNS, COLUMNS)), mode="wrap" if circular else "constant")
         return jnp.pad(x, ((0, 0), (ROWS, ROWS), (0, 0)))
 
-    around, there = [padded(x) for x in points], padded(exists)
+    neighbours, neighbour_exists = [padded(x) for x in points], padded(exists)
     channels = []
     for row, column in window():
         cut = (slice(None), slice(row, row + height), slice(column, column + width))
-        dx, dy, dz = (other[cut] - own for other, own in zip(around, points, strict=True))
-        both = there[cut] * exists
+        dx, dy, dz = (other[cut] - own for other, own in zip(neighbours, points, strict=True))
+        both = neighbour_exists[cut] * exists
         offsets = cos * dx + sin * dy, cos * dy - sin * dx, dz
         channels += [*(jnp.arcsinh(offset / UNIT_M) * both for offset in offsets), both]
     return jnp.stack(channels, axis=-1)
 
 
 def own_numbers(image: Image) -> Image:
-    """Height, range, inclination, intensity and existence of each pixel's first-round point, normalised.
+    """Select height, range, inclination, intensity and existence of each pixel's first-round point.
 
-    The azimuth and what depends on it are left out: an object looks the same wherever it is around the sensor.
+    Channels that depend on the azimuth are left out: an object looks the same in every direction from the sensor.
 
     >>> own_numbers(jnp.arange(18.0).reshape(1, 1, 1, 18))[0, 0, 0].tolist()  # two rounds
     [4.0, 6.0, 10.0, 12.0, 14.0]
@@ -87,7 +89,7 @@ def own_numbers(image: Image) -> Image:
 
 
 class LocalGeometry(nn.Module):
-    """Features of :func:`local_offsets` and :func:`own_numbers`: two 1x1 convolutions with batch norm and ReLU."""
+    """Two 1x1 convolutions, each with batch norm and ReLU, of :func:`local_offsets` and :func:`own_numbers`."""
 
     features: int
     mean: tuple[float, ...]

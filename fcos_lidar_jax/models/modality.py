@@ -13,15 +13,15 @@ from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.models.convolution import FULL, Image, Kernel, convolve, pointwise
 from fcos_lidar_jax.models.layers import BatchNorm, kernel_init, pieces
 
-Form = Literal["split", "dense", "grouped"]  # How the stem's convolutions are computed, see :class:`Stem`.
+Form = Literal["split", "dense", "grouped"]  # Formulation of the stem's convolutions, see :class:`Stem`.
 _MODALITIES = (3, 3, 1, 1, 1)
-"""Channel types a modality: (x, y, z), (range, azimuth, inclination), intensity, existence, time lag."""
+"""Channel types per modality: (x, y, z), (range, azimuth, inclination), intensity, existence, time lag."""
 _WIDE = 24
-"""Output channels below which a convolution of one group costs more than a block-diagonal one of several."""
+"""Output channels below which separate convolutions cost more than one block-diagonal convolution."""
 
 
 def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]:
-    """(input channels, output channels) of each group; the input's channels of one type are adjacent.
+    """List (input channels, output channels) of each group of the first convolution.
 
     >>> channel_groups(StemConfig(groups="modalities"), 5)
     [(15, 96), (15, 96), (5, 32), (5, 32), (5, 32)]
@@ -34,7 +34,10 @@ def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]
 
 
 def bundles(groups: Sequence[tuple[int, int]], form: str) -> list[slice]:
-    """The groups that each convolution computes: all, equal neighbours, or as few as make it wide enough.
+    """Assign groups to convolutions.
+
+    ``"dense"`` has one convolution of all groups, ``"grouped"`` one per run of equal groups, and ``"split"`` as
+    many as possible that have enough output channels.
 
     >>> bundles([(5, 8)] * 9, "split")
     [slice(0, 3, None), slice(3, 6, None), slice(6, 9, None)]
@@ -44,20 +47,19 @@ def bundles(groups: Sequence[tuple[int, int]], form: str) -> list[slice]:
     [slice(0, 2, None), slice(2, 3, None)]
     """
     if form == "grouped":
-        runs = [len(list(run)) for _, run in itertools.groupby(groups)]
-        return pieces(runs)
+        return pieces([len(list(run)) for _, run in itertools.groupby(groups)])
     cuts, width = [0], 0
     for end, (_, outputs) in enumerate(groups, 1):
         width += outputs
         if form == "split" and width >= _WIDE:
             cuts.append(end)
             width = 0
-    # Narrow groups that are left over join the last bundle.
+    # Remaining narrow groups join the last bundle.
     return [slice(*ends) for ends in itertools.pairwise([*cuts[: max(1, len(cuts) - 1)], len(groups)])]
 
 
 def block_diagonal(kernels: Sequence[Kernel]) -> Kernel:
-    """One kernel of all channels that lets no group see another.
+    """Combine the kernels of several groups into one kernel without connections between groups.
 
     >>> block_diagonal([jnp.ones((3, 3, 1, 2)), jnp.ones((3, 3, 2, 4))])[0, 0].sum(axis=1).tolist()
     [2.0, 4.0, 4.0]
@@ -72,7 +74,7 @@ def block_diagonal(kernels: Sequence[Kernel]) -> Kernel:
 
 
 class ModalityBranch(nn.Module):
-    """The grouped convolutions of one dilation rate, each with batch norm and ReLU."""
+    """Grouped convolutions with one dilation, each with batch norm and ReLU."""
 
     config: StemConfig
     groups: tuple[tuple[int, int], ...]
@@ -83,7 +85,7 @@ class ModalityBranch(nn.Module):
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
-        together = bundles(self.groups, self.form)
+        cuts = bundles(self.groups, self.form)
         sizes, widths = zip(*self.groups, strict=True)
         for layer in range(self.config.num_convs):
             kernels = [
@@ -91,31 +93,29 @@ class ModalityBranch(nn.Module):
                 for g, (size, width) in enumerate(zip(sizes, widths, strict=True))
             ]
             precision = None if layer else FULL
-            parts = [self._convolve(x, kernels[cut], precision) for x, cut in zip(parts, together, strict=True)]
+            parts = [self._convolve(x, kernels[cut], precision) for x, cut in zip(parts, cuts, strict=True)]
             parts = [jax.nn.relu(x) for x in BatchNorm(name=f"norm{layer}")(parts, train=train)]
-            if self.precision == "bfloat16":  # only behind the first layer: metres need more bits
+            if self.precision == "bfloat16":  # Only after the first layer, since positions need more bits.
                 parts = [x.astype(jnp.bfloat16) for x in parts]
             sizes = widths
         return list(parts)
 
     def _convolve(self, x: Image, kernels: Sequence[Kernel], precision: lax.Precision | None) -> Image:
-        """One convolution of the groups of channels in ``x``."""
-        grouped = self.form == "grouped"  # Then all are of one shape.
+        grouped = self.form == "grouped"  # All kernels have the same shape.
         kernel = jnp.concatenate(kernels, axis=-1) if grouped else block_diagonal(kernels)
-        groups = len(kernels) if grouped else 1
-        how = {"dilation": self.dilation, "groups": groups, "circular": self.circular, "precision": precision}
-        return convolve(x, kernel, **how)
+        options = {"dilation": self.dilation, "circular": self.circular, "precision": precision}
+        return convolve(x, kernel, groups=len(kernels) if grouped else 1, **options)
 
 
 class Stem(nn.Module):
     """Parallel modality-wise branches, merged by 1x1 convolutions and summed.
 
-    Takes a normalised image of ``9 r`` channels, those of one type adjacent.
+    The input is a normalised image with ``9 r`` channels, ordered by type.
 
-    The same function in three forms, with the same parameters: ``"split"``, independent chains, of which narrow
-    ones are joined; ``"dense"``, one block-diagonal kernel, with several times the operations;
-    ``"grouped"``, ``feature_group_count``. The last two are for comparison: on CPUs the grouped form is slow, and
-    where a batch is split over devices XLA gathers its images on every one of them.
+    Three forms compute the same function with the same parameters: ``"split"`` has independent chains, of which
+    narrow ones are joined; ``"dense"`` has one block-diagonal kernel and several times the operations;
+    ``"grouped"`` uses ``feature_group_count``. The last two are for comparison: on CPUs the grouped form is slow,
+    and if a batch is split over devices XLA gathers its images on each of them.
     """
 
     config: StemConfig
@@ -130,14 +130,14 @@ class Stem(nn.Module):
         groups = channel_groups(config, num_rounds)
         sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups, form)]
         parts = [image[..., cut] for cut in pieces(sizes)]
-        merged = jnp.zeros((), image.dtype)  # the sum over all groups keeps the image's precision
+        merged = jnp.zeros((), image.dtype)  # The sum over all groups has the image's precision.
         computed = image.dtype
         shape = (sum(width for _, width in groups), config.out_channels)
         num_kernels = len(config.dilations) if config.merge == "per_branch" else 1
         kernels = [self.param(f"merge{i}", nn.initializers.he_normal(), shape) for i in range(num_kernels)]
         for index, dilation in enumerate(config.dilations):
             if index:
-                # One branch after the other: side by side, their features would need more of a GPU's memory.
+                # Compute branches one after the other, since their features together need more GPU memory.
                 parts, merged = lax.platform_dependent(
                     (parts, merged), cpu=lambda both: both, default=lax.optimization_barrier
                 )
@@ -145,7 +145,7 @@ class Stem(nn.Module):
             branch = ModalityBranch(config, tuple(groups), *options, name=f"branch{index}")
             features = branch(parts, train=train)
             computed = features[0].dtype
-            # Accumulated group by group: no concatenation of all features is ever written.
+            # Accumulated group by group, which avoids writing a concatenation of all features.
             for feature, rows in zip(features, pieces([f.shape[-1] for f in features]), strict=True):
                 kernel = kernels[index % num_kernels][rows]
                 merged = merged + pointwise(feature, kernel, dtype=image.dtype)

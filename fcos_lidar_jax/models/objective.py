@@ -1,4 +1,4 @@
-"""Assignment and losses of FCOS-LiDAR: predictions, targets and the losses between them, as sums."""
+"""Assignment and losses of FCOS-LiDAR, as sums."""
 
 import functools
 from collections.abc import Callable
@@ -21,9 +21,9 @@ from fcos_lidar_jax.types import Batch, Locations, Outputs, RangeImage, Sums, Ta
 
 
 def location_owners(image: RangeImage, locations: Locations, boxes: Array, box_valid: Array) -> Array:
-    """The box of every location of one sample, -1 for none.
+    """Find the box that owns each location of one sample, -1 for none.
 
-    Tested once for each cell of the sensor's image: repeated rows and coarser levels see the same points.
+    Each cell of the sensor's image is tested once: repeated rows and coarser levels have the same points.
     """
     first = image.features[..., 0].reshape(-1, 9)
     cell_owner = owners(first[:, :3], first[:, 7] > 0, boxes, box_valid)
@@ -42,17 +42,17 @@ def sample_losses(
     layout: ImageLayout,
     axes: Axes,
 ) -> tuple[dict[str, tuple[Array, Array]], Targets, dict[str, Array]]:
-    """Assignment and losses of one sample (paper, section 3.4).
+    """Assign targets and compute the losses of one sample (paper, section 3.4).
 
     Args:
-        outputs, image: of one sample, as are the other arrays.
+        outputs, image: predictions and range image.
         boxes: f32[m, 9]; NaN velocities are unknown.
         labels, box_valid: i32[m] and bool[m].
-        config, layout: weights and choices, and sizes (static).
-        axes: of the regression, see :mod:`fcos_lidar_jax.coding` (static).
+        config, layout: weights, options and sizes (static).
+        axes: axes of the regression, see :mod:`fcos_lidar_jax.coding` (static).
 
     Returns:
-        the four losses as (sum, count), the targets, and counts to be summed over the batch.
+        the four losses as (sum, count), the targets, and counts to sum over the batch.
     """
     background = outputs.logits.shape[-1] - 1
     locations = locate(image, layout)
@@ -62,7 +62,7 @@ def sample_losses(
 
     regression = jnp.take_along_axis(outputs.regression, label[:, None, None], axis=2)[..., 0]
     iou_logit = jnp.take_along_axis(outputs.iou_logits, label[:, None], axis=1)[:, 0]
-    # What has no owner gets a harmless box, so that nothing overflows on the way to being masked.
+    # Locations without an owner get a harmless box, so that nothing overflows before it is masked.
     box = jnp.where((owner >= 0)[:, None], box, jnp.array([0, 0, 0, 1, 1, 1, 0, 0, 0], jnp.float32))
     predicted = decode_oriented(regression, locations.points, locations.azimuth_rad, axes=axes)
     truth = oriented(box)
@@ -73,10 +73,8 @@ def sample_losses(
     regressed = positive if config.regress_on == "positives" else owner >= 0
     quality = iou if config.quality == "iou" else losses.centreness(predicted, truth, config.centreness_m)
     with jax.named_scope("losses"):
-        label, target = (
-            jnp.where(positive, label, background),
-            encode(box, locations.points, locations.azimuth_rad, axes=axes),
-        )
+        label = jnp.where(positive, label, background)
+        target = encode(box, locations.points, locations.azimuth_rad, axes=axes)
         parts = {
             "classification": losses.classification_loss(outputs.logits, label, locations.occupied),
             "l1": losses.l1_loss(regression, target, regressed, velocity_weight=config.velocity_weight),
@@ -98,7 +96,7 @@ def sample_losses(
 
 
 def make_sums(config: Config, sensor: Sensor) -> Callable[[Outputs, RangeImage, Batch], Sums]:
-    """The losses of a batch, from the network's outputs, its range images and the ground truth."""
+    """Make the function from outputs, range images and ground truth of a batch to the sums of its losses."""
     options: dict[str, Any] = {"layout": image_layout(sensor, config.model), "axes": config.model.regression_axes}
     losses_of = functools.partial(sample_losses, config=config.loss, **options)
 

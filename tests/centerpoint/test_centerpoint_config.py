@@ -55,5 +55,5 @@ def test_the_fields_that_detectors_share_go_from_one_configuration_to_another():
     peer = CenterPointConfig.of(NUSCENES, max_points=9)
     assert (peer.max_points, peer.optimizer, peer.pillars) == (9, NUSCENES.optimizer, PillarConfig())
     assert Config.of(CenterPointConfig.of(NUSCENES)) == NUSCENES != CenterPointConfig.of(NUSCENES)
-    with pytest.raises(ValueError, match="model: got 'choices', expected none"):
+    with pytest.raises(ValueError, match="model: got 'changes', expected the default"):
         CenterPointConfig.of(COMPACT)

@@ -97,7 +97,7 @@ def test_each_class_is_predicted_by_its_group():
     grid = pillar_grid(config.pillars, SENSOR)  # type: ignore[arg-type]
     cloud = make_frame(0, SENSOR).points
     pillars = make_pillars(cloud, np.ones(len(cloud), bool), grid=grid, sensor=SENSOR)
-    outputs, _ = detector.apply(variables, jax.tree.map(lambda leaf: leaf[None], pillars))
+    outputs, _ = jax.jit(detector.apply)(variables, jax.tree.map(lambda leaf: leaf[None], pillars))
     seen = {g: [k for k in range(10) if groups[k] == g] for g in range(3)}
     expected = [10.0 * groups[k] + seen[groups[k]].index(k) for k in range(10)]
     np.testing.assert_allclose(outputs.heat[0, 3, 4], expected)

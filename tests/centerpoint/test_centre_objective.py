@@ -10,12 +10,7 @@ import pytest
 from tiny_peer import CONFIG, host_batch
 from tiny_run import SENSOR
 
-from fcos_lidar_jax.centerpoint.centres import (
-    centre_targets,
-    decode_centres,
-    encode_centres,
-    focal_loss,
-)
+from fcos_lidar_jax.centerpoint.centres import centre_targets, decode_centres, encode_centres, focal_loss
 from fcos_lidar_jax.centerpoint.objective import sample_losses
 from fcos_lidar_jax.centerpoint.pillars import pillar_grid
 from fcos_lidar_jax.centerpoint.types import CentreOutputs
@@ -51,18 +46,19 @@ def test_sums_are_those_of_a_loop_over_boxes(config):
     boxes, labels, valid = ground_truth()
     boxes = boxes.at[::2, 7:].set(jnp.nan)
     predicted = outputs(config)
-    parts, counts = sample_losses(predicted, boxes, labels, valid, config=config, grid=GRID)
+    losses_of = jax.jit(functools.partial(sample_losses, config=config, grid=GRID))
+    parts, counts = losses_of(predicted, boxes, labels, valid)
     options = {"num_classes": 10, "min_overlap": PILLARS.min_overlap, "min_radius": PILLARS.min_radius}
     targets = centre_targets(boxes, labels, valid, grid=GRID, **options)
     away, at = focal_loss(predicted.heat, targets.heat, targets.cell, labels, targets.valid)
+    numbers = np.asarray(encode_centres(targets.boxes, targets.cell, GRID))
     groups = config.class_groups
     heat, l1, count = (np.zeros(max(groups) + 1) for _ in range(3))
     for k in range(10):
         heat[groups[k]] += away[k]
     for m in np.flatnonzero(targets.valid):
         g, row, column = groups[labels[m]], *divmod(int(targets.cell[m]), GRID.side)
-        wanted = np.asarray(encode_centres(targets.boxes[m], targets.cell[m], GRID))
-        difference = np.abs(predicted.regression[row, column, g] - wanted)
+        difference = np.abs(predicted.regression[row, column, g] - numbers[m])
         l1[g] += np.nansum(difference * ([1.0] * 8 + [0.2] * 2))
         heat[g] += at[m]
         count[g] += 1
@@ -78,12 +74,13 @@ def test_every_group_is_divided_by_its_own_boxes():
     totals, (_, of_batch) = objective(variables["params"], variables["batch_stats"], batch)
     metrics = batch_metrics(of_batch, GROUPED.loss)
     pillars = jax.vmap(detector.prepare)(batch.points, batch.valid)
-    found, _ = detector.apply(variables, pillars, train=True)
+    found, _ = jax.jit(functools.partial(detector.apply, train=True))(variables, pillars)
+    losses_of = jax.jit(functools.partial(sample_losses, config=GROUPED, grid=GRID))
     sums, boxes = {"classification": np.zeros(6), "l1": np.zeros(6)}, np.zeros(6)
     for i in range(2):
         truth = (jnp.asarray(leaf[i]) for leaf in (batch.boxes, batch.labels, batch.box_valid))
         sample = jax.tree.map(lambda leaf, i=i: leaf[i], found)
-        own, count = sample_losses(sample, *truth, config=GROUPED, grid=GRID)
+        own, count = losses_of(sample, *truth)
         sums, boxes = {name: sums[name] + own[name] for name in sums}, boxes + count["positives"]
     assert np.count_nonzero(boxes) > 2
     expected = {name: float((part / np.maximum(boxes, 1)).sum()) for name, part in sums.items()}

@@ -22,7 +22,7 @@ CELL = {"changes": "base", "seed": 0, "scores": {"mAP": 0.1, "AP": {}, "curve": 
 
 def test_the_tables_of_today_find_every_committed_cell(tmp_path):
     scale = quarter(tmp_path)
-    rows = [row for table in (*TABLES, *study_tables()) for row in table.rows]
+    rows = [row for table in (*TABLES.values(), *study_tables()) for row in table.rows]
     known = {changes_of(row.change(scale.base), scale.base) for row in rows}
     cells = read_cells(SECTOR, scale)
     assert len(cells) == 20
@@ -32,7 +32,7 @@ def test_the_tables_of_today_find_every_committed_cell(tmp_path):
 @pytest.mark.parametrize("file", sorted(SECTOR.glob("*.md")), ids=lambda file: file.stem)
 def test_a_committed_table_is_that_of_its_cells(tmp_path, file):
     scale, record = quarter(tmp_path), json.loads(file.with_suffix(".json").read_text())
-    (table,) = [t for t in (*TABLES, *study_tables()) if t.name == record["table"]]
+    (table,) = [t for t in (*TABLES.values(), *study_tables()) if t.name == record["table"]]
     table, cells = table.only(tuple(row["label"] for row in record["rows"])), read_cells(SECTOR, scale)
     configs = {row.label: changes_of(row.change(scale.base), scale.base) for row in table.rows}
     by_row = {label: [cells[own, seed] for seed in record["seeds"]] for label, own in configs.items()}

@@ -4,7 +4,6 @@ import dataclasses
 import doctest
 import importlib
 import json
-import math
 import re
 import sys
 from pathlib import Path
@@ -18,14 +17,14 @@ from study_tables import study_tables
 from experiments.changes import change
 from experiments.paper import PAPER
 from experiments.paper_tables import __main__ as all_tables
-from experiments.paper_tables import table1_mrv_rounds, table2_priority, table6_untied_heads, tables
-from experiments.paper_tables import table8_test_submission as table8
+from experiments.paper_tables import submission as table8
+from experiments.paper_tables import tables
+from experiments.paper_tables.__main__ import TABLES, TablesArgs
 from experiments.paper_tables.cells import add_cell, run_name
 from experiments.paper_tables.grid import run_cell
 from experiments.paper_tables.scales import smoke
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
-from experiments.statistics import interval
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -60,7 +59,7 @@ def test_a_table_of_ones_own_has_no_columns_of_the_paper_and_says_what_smoke_is_
         assert "paper" not in text
         assert "the scores mean nothing" in text
         assert ("Two seeds can agree by chance" in text) == (len(seeds) == 2)
-    train_table(table1_mrv_rounds.TABLE)
+    train_table(TABLES["table1"])
     assert "mAP, paper | difference, paper" in (tmp_path / "smoke" / "table1.md").read_text()
 
 
@@ -74,14 +73,6 @@ def test_the_examples_in_the_docstrings_hold(name):
     assert result.failed == 0
 
 
-def test_intervals_are_students():
-    values = [3.0, 5.0, 10.0]
-    mean, low, high = interval(values)
-    error = math.sqrt(sum((v - 6) ** 2 for v in values) / 2 / 3)
-    assert (mean, low, high) == pytest.approx((6.0, 6 - 4.302653 * error, 6 + 4.302653 * error))
-    assert interval([1.0]) is None
-
-
 def test_change_replaces_fields_at_any_depth():
     changed = change(num_sweeps=1, model__stem__dilations=(1, 1, 1), projection__num_rounds=7)(NUSCENES)
     assert (changed.num_sweeps, changed.model.stem.dilations, changed.projection.num_rounds) == (1, (1, 1, 1), 7)
@@ -92,7 +83,7 @@ def test_change_replaces_fields_at_any_depth():
 
 
 def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_table, capsys):
-    rows = {row["label"]: row for row in train_table(table1_mrv_rounds.TABLE, seeds=(0, 1))["rows"]}
+    rows = {row["label"]: row for row in train_table(TABLES["table1"], seeds=(0, 1))["rows"]}
     multi, single = rows["multi, 5 rounds"], rows["single, 5 rounds"]
     np.testing.assert_allclose(multi["mAP_difference"]["interval"], [40.0] * 3)
     assert multi["paper_difference"] == {"mAP": 2.06, "NDS": 1.88}
@@ -107,11 +98,11 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_
 
 
 def test_chosen_rows_come_with_their_references():
-    chosen = table1_mrv_rounds.TABLE.only(("single, 5 rounds",))
+    chosen = TABLES["table1"].only(("single, 5 rounds",))
     assert [row.label for row in chosen.rows] == ["single, 1 round", "single, 5 rounds", "multi, 1 round"]
-    assert table1_mrv_rounds.TABLE.only(()) == table1_mrv_rounds.TABLE
+    assert TABLES["table1"].only(()) == TABLES["table1"]
     with pytest.raises(ValueError, match="--rows: got 'nine', expected some of: tied, untied"):
-        table6_untied_heads.TABLE.only(("untied", "nine"))
+        TABLES["table6"].only(("untied", "nine"))
 
 
 def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
@@ -122,7 +113,7 @@ def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
 
     for scale in (Pretended(), Looked(name="looked")):
         folder = tmp_path / scale.name
-        train_table(table6_untied_heads.TABLE, scale=scale, seeds=(0, 1), out=folder, runs=folder)
+        train_table(TABLES["table6"], scale=scale, seeds=(0, 1), out=folder, runs=folder)
         drawn = folder / "smoke" / "table6_curves.png"
         assert drawn.exists() == isinstance(scale, Looked)
     assert drawn.read_bytes().startswith(b"\x89PNG")
@@ -133,7 +124,7 @@ def test_a_row_without_a_curve_is_left_out_of_the_picture(tmp_path):
     curve = {"curve": [[100, 0.1], [200, 0.2]]}
     rows = [{"label": "gone", "scores": [None, None]}, {"label": "there", "scores": [None, curve]}]
     record = {"rows": rows, "scale": "sector", "seeds": [0, 1]}
-    tables.draw_learning(table1_mrv_rounds.TABLE, record, tmp_path / "curves.png")
+    tables.draw_learning(TABLES["table1"], record, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
@@ -153,7 +144,7 @@ def test_scores_by_distance_and_class_are_means_over_the_seeds(tmp_path):
 def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_table):
     scale = Pretended(diverges=((1, 0), (3, 0), (3, 1)))
     options = {"scale": scale, "seeds": (0, 1, 2)}
-    rows = {row["label"]: row for row in train_table(table1_mrv_rounds.TABLE, **options)["rows"]}
+    rows = {row["label"]: row for row in train_table(TABLES["table1"], **options)["rows"]}
     # Seeds 1 and 2 are left of one round, seed 2 of three, all of five.
     assert rows["multi, 1 round"]["mAP"]["mean"] == pytest.approx(11.5)
     assert rows["multi, 3 rounds"]["mAP"] == {"mean": pytest.approx(32.0), "interval": None}
@@ -163,15 +154,15 @@ def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_ta
     assert rows["multi, 3 rounds"]["diverged"] == said
     assert f"multi, 3 rounds: {said[1]}" in (tmp_path / "smoke" / "table1.md").read_text()
     asked = scale.asked
-    train_table(table1_mrv_rounds.TABLE, **options)
+    train_table(TABLES["table1"], **options)
     assert scale.asked == asked
     gone = dataclasses.replace(scale, diverges=tuple((n, 0) for n in (1, 3, 5, 7)))
-    record = train_table(table1_mrv_rounds.TABLE, scale=gone, out=tmp_path / "gone", runs=tmp_path / "gone")
+    record = train_table(TABLES["table1"], scale=gone, out=tmp_path / "gone", runs=tmp_path / "gone")
     assert all(row["mAP"] is None for row in record["rows"])
 
 
 def test_only_figures_leaves_the_finished_table_alone(tmp_path, train_table):
-    options = {"table": table2_priority.TABLE, "figures": lambda _: {"columns": {"with priority": {"kept": 3.0}}}}
+    options = {"table": TABLES["table2"], "figures": lambda _: {"columns": {"with priority": {"kept": 3.0}}}}
     train_table(**options)
     before = (tmp_path / "smoke" / "table2.md").read_text()
     assert "seeds [0]; epochs 40; batch size 2; accumulate 1; precision float32.\n" in before
@@ -183,7 +174,7 @@ def test_only_figures_leaves_the_finished_table_alone(tmp_path, train_table):
 
 def test_a_picture_of_other_seeds_does_not_stay(tmp_path, train_table):
     for seeds in ((0, 1), (0,)):
-        train_table(table6_untied_heads.TABLE, seeds=seeds)
+        train_table(TABLES["table6"], seeds=seeds)
         assert (tmp_path / "smoke" / "table6.png").exists() == (len(seeds) > 1)
 
 
@@ -200,31 +191,36 @@ def test_a_picture_of_other_seeds_does_not_stay(tmp_path, train_table):
 def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, fields, message):
     rows = tuple(Row(label, change(), **fields) for label in labels)
     with pytest.raises(ValueError, match=re.escape(message)):
-        dataclasses.replace(table6_untied_heads.TABLE, rows=rows)
+        dataclasses.replace(TABLES["table6"], rows=rows)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different ones, none below 0"),
+        (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different seeds of at least 0"),
         (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/cloud.f16.bin there"),
-        (["--data-root", "nowhere"], "--data-root: is of --scale nuscenes, got --scale smoke"),
-        (["--scale", "sector", "--steps", "5"], "--steps: is of --scale nuscenes, got --scale sector"),
+        (["--data-root", "nowhere"], "--data-root: only for --scale nuscenes, got --scale smoke"),
+        (["--scale", "sector", "--steps", "5"], "--steps: only for --scale nuscenes, got --scale sector"),
+        (["--tables", "table9"], f"--tables: got 'table9', expected some of {', '.join(TABLES)}"),
+        (
+            ["--tables", "table1", "table2", "--rows", "base"],
+            "--rows: got ['base'], expected none unless --tables names one table",
+        ),
         (["--scale", "nuscenes"], "--data-root: missing, expected the data set for --scale nuscenes"),
         (["--scale", "nuscenes", "--data-root", "nowhere"], "nowhere: no such folder, expected a data root"),
     ],
 )
 def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_path, options, message):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["table6_untied_heads.py", *options])
+    monkeypatch.setattr(sys, "argv", ["tables", *options])
     with pytest.raises(SystemExit, match="1"):
-        run_script(lambda args: run_table(table6_untied_heads.TABLE, args), Args, None)
-    assert capsys.readouterr().err == f"table6_untied_heads.py: error: {message}\n"
+        run_script(all_tables.main, TablesArgs, None)
+    assert capsys.readouterr().err == f"tables: error: {message}\n"
     assert list(tmp_path.iterdir()) == []
 
 
 def test_every_row_of_the_tables_has_its_paper_figures():
-    for table in all_tables.TABLES[:6]:
+    for table in list(TABLES.values())[:6]:
         paper = PAPER["tables"][table.name]["rows"]
         assert [row.paper for row in table.rows] == list(paper)
         assert table.reference in [row.label for row in table.rows]
@@ -250,11 +246,6 @@ def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(t
     assert [c.model.head_channels for c in (fade, c128, both)] == [64, 128, 128]
     gains = [row["paper_difference"] for row in train_table(table8.TABLE)["rows"]]
     assert gains == [{}, {"mAP": 2}, {"mAP": 0.6}, {}]
-
-
-def test_rows_are_of_one_table():
-    with pytest.raises(ValueError, match=r"--rows: got \['base'\], expected none"):
-        all_tables.main(Args(rows=("base",)))
 
 
 def test_table_8_submits_nothing_of_a_run_that_did_not_end(tmp_path, monkeypatch):
@@ -283,7 +274,7 @@ def tiny_smoke(cache):
         change(optimizer__epochs=1)(tiny_run.CONFIG),
         tiny_run.STEPS * tiny_run.CONFIG.optimizer.batch_size,
     )
-    sizes = {"train_frames": frames, "test_frames": 1, "looks": 2}
+    sizes = {"train_frames": frames, "test_frames": 1, "evaluations": 2}
     return dataclasses.replace(smoke(cache), base=base, sensor=tiny_run.SENSOR, **sizes)
 
 

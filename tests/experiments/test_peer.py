@@ -60,7 +60,8 @@ def test_the_peer_refuses_a_data_set():
 def test_a_cell_that_is_looked_at_says_how_long_and_how_far(tmp_path, monkeypatch):
     """A detector that finds all within 20 m and nothing beyond, after two steps of 1.5 and 2.5 seconds."""
     plain = smoke(tmp_path)
-    scale = dataclasses.replace(plain, looks=1, reach_m=40.0, sensor=quarter(tmp_path).sensor, num_objects=40)
+    extent = {"reach_m": 40.0, "sensor": quarter(tmp_path).sensor, "num_objects": 40}
+    scale = dataclasses.replace(plain, evaluations=1, **extent)
     records = [{"step": 1, "seconds": 1.5}, {"step": 2, "seconds": 2.5, "test/mAP": 0.25}]
 
     def near(_, frames):
@@ -81,4 +82,4 @@ def test_a_cell_that_is_looked_at_says_how_long_and_how_far(tmp_path, monkeypatc
     assert scores["ranges"]["0-20 m"]["mAP"] == pytest.approx(1)
     assert scores["ranges"]["20-40 m"]["mAP"] == 0
     assert 0 < scores["ranges"]["all"]["mAP"] < 1
-    assert "ranges" not in dataclasses.replace(scale, looks=0).score(scale.base, 0, tmp_path)
+    assert "ranges" not in dataclasses.replace(scale, evaluations=0).score(scale.base, 0, tmp_path)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from experiments.changes import change
-from experiments.paper_tables import __main__ as all_tables
 from experiments.paper_tables import scales
+from experiments.paper_tables.paper_rows import PAPER_TABLES
 from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, smoke
 from fcos_lidar_jax.cli import prepare
 from fcos_lidar_jax.cli.data import DataOptions
@@ -34,7 +34,7 @@ def test_the_sector_is_a_quarter_of_the_sensor_at_its_resolution(tmp_path):
     assert scale.sensor.column_rad == pytest.approx(NUSCENES_HDL32E.column_rad)
     assert (scale.sensor.num_rows, scale.sensor.num_columns) == (32, 272)
     assert scale.describe()["streets"]["name"] == "city"
-    for table in all_tables.TABLES[:6]:
+    for table in PAPER_TABLES[:6]:
         for row in table.rows:
             scale.check(row.change(scale.base))
     frame = scale.frames("test", 10).frame(0)

@@ -141,7 +141,9 @@ def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     assert {name: scored[name] for name in names} == {name: record[name] for name in names}
     assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
     for option in ({"export": True}, {"seed": 7}, {"warm_start": tmp_path}):
-        with pytest.raises(ValueError, match=r"--(export|seed|warm-start): is of a training, expected its folder"):
+        with pytest.raises(
+            ValueError, match=r"--(export|seed|warm-start): only for a training, expected its folder"
+        ):
             shipped_weights.main(dataclasses.replace(args, **option))
     # Scores alone are no training to go on from, nor to write a card of; nothing is overwritten.
     results = tmp_path / "results"
@@ -194,29 +196,37 @@ def test_a_card_has_the_figures_of_its_own_weights_alone(shipped, tmp_path):
 def test_a_card_of_other_weights_is_refused(shipped, tmp_path):
     _, record = shipped
     (tmp_path / "hdl32e.json").write_text(json.dumps({**record, "hash": "other"}))
-    with refused(f"hdl32e.json: hash: got other, expected that of the weights: {record['hash']}"):
+    with refused(f"hdl32e.json: hash: got other, expected the hash of the weights: {record['hash']}"):
         model_card.write_card("hdl32e", tmp_path)
 
 
-def test_fine_tuning_from_other_weights_of_the_same_name_is_another_run(tmp_path, monkeypatch):
-    folders = []
+def test_fine_tuning_trains_the_network_of_its_checkpoint(tmp_path, monkeypatch):
+    """Other weights of the same name are another run."""
+    runs = []
     monkeypatch.setattr(transfer, "real_data", lambda *_: tmp_path)
     monkeypatch.setattr(transfer, "open_frames", lambda *_, **__: SimulatedFrames(TINY, 40))
-    monkeypatch.setattr(transfer, "trained", lambda folder, *_, **__: folders.append(folder))
+    monkeypatch.setattr(
+        transfer, "trained", lambda folder, config, *_, **options: runs.append((folder, config, options))
+    )
     monkeypatch.setattr(transfer, "measured", lambda *_: {})
+    weights = tmp_path / "weights"
     for value in (0.0, 1.0):
-        weights = jax.tree.map(lambda leaf, v=value: leaf + np.float32(v), untrained(CONFIG, TINY))
-        shutil.rmtree(tmp_path / "weights", ignore_errors=True)
-        save_checkpoint(tmp_path / "weights", Checkpoint(CONFIG, TINY, weights, 3))
-        transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=tmp_path / "weights", work=tmp_path))
-    assert len(set(folders)) == 4
+        variables = jax.tree.map(lambda leaf, v=value: leaf + np.float32(v), untrained(CONFIG, TINY))
+        shutil.rmtree(weights, ignore_errors=True)
+        save_checkpoint(weights, Checkpoint(CONFIG, TINY, variables, 3))
+        transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=weights, work=tmp_path))
+    assert len({folder for folder, _, _ in runs}) == 4
+    assert all(config.model == CONFIG.model for _, config, _ in runs)
+    assert [options["weights"] for _, _, options in runs] == [weights, None] * 2
+    rates = [config.optimizer.peak_learning_rate for _, config, _ in runs]
+    assert rates[0] == rates[1] / 3
 
 
 def test_a_card_counts_the_frames_of_all_trainings(shipped, tmp_path):
     _, record = shipped
     legs = [{**record["training"], "frames_seen": n, "curve": [[n - 1, n / 10]]} for n in (3, 5)]
     card = model_card.write_card("hdl32e", tmp_path, {**record, "earlier": legs[:1], "training": legs[1]})
-    assert "| frames seen in all | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n" in card.read_text()
+    assert "| training frames | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n" in card.read_text()
 
 
 def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
@@ -224,15 +234,3 @@ def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
     (package / "hdl32e" / "notes.md").write_text("more")
     with pytest.raises(CheckpointError, match=r"notes\.md: found a file that does not belong to the checkpoint"):
         load_checkpoint(package / "hdl32e")
-
-
-def test_scores_by_range_see_what_lies_there():
-    boxes = np.array([[10, 0, 0, 4, 2, 1.5, 0, 0, 0], [30, 0, 0, 4, 2, 1.5, 0, 0, 0]], np.float32)
-    frame = Frame(np.zeros((0, 5), np.float32), boxes, np.zeros(2, np.int32), np.full(2, 9, np.int32))
-    none = np.zeros(0)
-    found = Detections(boxes[:1], np.ones(1), np.zeros(1, int), np.ones(1, bool), none)
-    scores = scores_by_range([found], [frame])
-    assert scores["0-20 m"]["AP"] == {"car": pytest.approx(1, abs=1e-6)}
-    assert scores["20-40 m"]["AP"] == {"car": 0}
-    assert scores["all"]["truths"] == {"car": 2}
-    assert 0.3 < scores["all"]["AP"]["car"] < 0.6

@@ -7,13 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
 from tiny_run import CONFIG, SENSOR, images_of
 
 from fcos_lidar_jax.config import ModelConfig, StemConfig
 from fcos_lidar_jax.locations import STRIDES, image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters, layers
-from fcos_lidar_jax.models.convolution import convolve
 from fcos_lidar_jax.models.detector import Network, network_input
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.layers import BatchNorm, GroupNorm
@@ -137,21 +135,6 @@ def test_stem_variants_of_tables_3_4_5_keep_the_size(config):
     assert out.shape == (1, 8, 8, 8)
     merges = [name for name in variables["params"] if name.startswith("merge")]
     assert len(merges) == (1 if config.merge == "shared" else len(config.dilations))
-
-
-@pytest.mark.parametrize(("stride", "dilation", "size"), [(1, 1, 1), (2, 1, 1), (1, 6, 3), (2, 1, 3), (1, 1, 7)])
-def test_convolve_is_the_library_convolution_with_symmetric_padding(stride, dilation, size):
-    x, kernel = normal(0, 2, 12, 16, 3), normal(1, size, size, 3, 4)
-    pad = size // 2 * dilation
-    expected = lax.conv_general_dilated(
-        x,
-        kernel,
-        (stride, stride),
-        [(pad, pad)] * 2,
-        rhs_dilation=(dilation, dilation),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-    )
-    np.testing.assert_allclose(convolve(x, kernel, stride=stride, dilation=dilation), expected, atol=1e-5)
 
 
 def test_batch_norm_is_the_library_one_over_parts():

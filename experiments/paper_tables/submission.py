@@ -1,12 +1,8 @@
-"""Table 8: the test-set model: wider heads ("c128"), no pasted objects at the end ("fade"), the results file.
+"""Table 8: the test-set model with wider heads ("c128") and copy-paste switched off at the end ("fade").
 
-    python -m experiments.paper_tables.table8_test_submission  # smoke: minutes, a toy
-    python -m experiments.paper_tables.table8_test_submission --scale sector  # 4 rows, 12 cells
-    python -m experiments.paper_tables.table8_test_submission --scale nuscenes --data-root DIR --test-version V
-
-The results file is ``results_nusc.json``, for the server at nuScenes: of the test split at full scale, of a
-simulated one otherwise. The other systems' rows are the paper's quotations. Expected of the paper: c128 is worth
-about 0.6 points of mAP, on the validation set; fade about 2, of which set it does not say.
+Writes ``results_nusc.json`` for the nuScenes server: for the test split at the full scale, otherwise for simulated
+frames. The rows of other systems are quoted from the paper. The paper: c128 gains about 0.6 mAP on the validation
+set; fade gains about 2, on a set that it does not name.
 """
 
 import json
@@ -17,8 +13,7 @@ from experiments.changes import change
 from experiments.paper import PAPER
 from experiments.paper_tables.cells import changes_of, read_cells, run_name
 from experiments.paper_tables.scales import NuScenesLayout, write_submission
-from experiments.paper_tables.tables import Args, Row, Table, make_scale, run_table
-from experiments.script import run_script
+from experiments.paper_tables.tables import Args, Row, Table, make_scale
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -29,33 +24,33 @@ from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.training.plan import RUN_SPEC
 
-_PART_FADED = 8  # The paper's five epochs of forty.
-_SUBMITTED = "c128 and fade"  # Row whose detector writes the results file.
+_FADED_PART = 8  # Five of forty epochs in the paper.
+_SUBMITTED = "c128 and fade"  # Row of the detector that writes the results file.
 
 
 def pasting(config: Config) -> Config:
-    """With copy-paste, where the scale does without."""
+    """Add copy-paste if the scale does without."""
     return config if config.copy_paste else change(copy_paste=QUICKSTART.copy_paste)(config)
 
 
 def faded(config: Config) -> Config:
-    """Without copy-paste in the last eighth of the epochs, at least one."""
-    return change(fade_epochs=max(config.optimizer.epochs // _PART_FADED, 1))(pasting(config))
+    """Switch copy-paste off in the last eighth of the epochs, at least one."""
+    return change(fade_epochs=max(config.optimizer.epochs // _FADED_PART, 1))(pasting(config))
 
 
 def wide(config: Config) -> Config:
-    """With twice the channels in the heads."""
+    """Double the channels of the heads."""
     return change(model__head_channels=2 * config.model.head_channels)(config)
 
 
 def finished(run: Path) -> bool:
-    """Whether the folder holds a run's last checkpoint."""
+    """Return whether a run has its last checkpoint."""
     spec, kept = run / RUN_SPEC, Checkpoints(run / CHECKPOINTS).paths()
     return bool(kept) and int(kept[-1].name) == json.loads(spec.read_text(encoding="utf-8"))["steps"]
 
 
 def submission(args: Args) -> list[str]:
-    """Write the results file of the trained c128 with fade, and say where."""
+    """Write the results file of the trained detector; returns lines that say where, or why not."""
     scale, seed = make_scale(args), args.seeds[0] if args.seeds else 0
     config = wide(faded(scale.base))
     changes = changes_of(config, scale.base)
@@ -83,7 +78,7 @@ def submission(args: Args) -> list[str]:
 
 
 def figures(args: Args) -> dict[str, Any]:
-    """The paper's rows, and the results file."""
+    """Quote the paper's rows and write the results file."""
     quoted = PAPER["tables"]["table8"]["rows"]
     lines = ["Test set, paper (quoted there from the systems' own papers):", ""]
     lines += ["| method | mAP | NDS |", "|---|---|---|"]
@@ -103,6 +98,3 @@ TABLE = Table(
     reference="base",
     figures=figures,
 )
-
-if __name__ == "__main__":
-    run_script(lambda args: run_table(TABLE, args), Args, __doc__)

@@ -1,0 +1,101 @@
+"""Fields of frozen dataclasses: checks at construction, and conversion from parsed JSON."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+
+def check(condition: bool, field: str, got: object, expected: str) -> None:
+    """Raise a ValueError with the field, the found and the expected value unless a condition holds.
+
+    >>> check(0 > 1, "epochs", 0, "at least 1")
+    Traceback (most recent call last):
+    ValueError: epochs: got 0, expected at least 1
+    """
+    if not condition:
+        raise ValueError(f"{field}: got {got!r}, expected {expected}")
+
+
+def check_least(record: Any, least: int, *fields: str) -> None:
+    """Check that fields of a dataclass are not below a number."""
+    for field in fields:
+        check(getattr(record, field) >= least, field, getattr(record, field), f"at least {least}")
+
+
+def check_choices(record: Any) -> None:
+    """Check that every ``Literal`` field of a dataclass holds one of its choices."""
+    for name, hint in get_type_hints(type(record)).items():
+        if get_origin(hint) is Literal:
+            choices = get_args(hint)
+            value = getattr(record, name)
+            check(value in choices, name, value, "one of " + ", ".join(map(repr, choices)))
+
+
+def check_hashable(record: Any) -> None:
+    """Check that a dataclass has no list or array: compiled programs are looked up by its hash."""
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if dataclasses.is_dataclass(value):
+            check_hashable(value)
+        else:
+            check(type(value).__hash__ is not None, field.name, value, "a tuple")
+
+
+def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> Any:
+    """Convert a parsed JSON value to a dataclass, a tuple, a ``Literal``, an optional or a plain type.
+
+    ``msgspec.convert`` does not suffice: it ignores unknown fields of dataclasses, fills in missing ones, and
+    its messages lack the found value and the choices of a ``Literal``.
+
+    Args:
+        kind: type of the result. Integers are accepted as floats; nothing else is converted.
+        value: parsed JSON value.
+        where: name of the value's source in error messages.
+        defaults: use the default of a field that is missing.
+
+    Raises:
+        ValueError: one line with ``where``, the field, the found and the expected value.
+
+    >>> from_json(tuple[float, ...], [1, 2.5], "a.json")
+    (1.0, 2.5)
+    >>> from_json(tuple[float, ...], [1, True], "a.json")
+    Traceback (most recent call last):
+    ValueError: a.json[1]: got True, expected float
+    """
+    if dataclasses.is_dataclass(kind):
+        return _dataclass_from_json(kind, value, where, defaults)
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return value  # Checked by the dataclass, see check_choices.
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{where}: got {value!r}, expected a list")
+        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
+        if len(kinds) != len(value):
+            raise ValueError(f"{where}: got {len(value)} values, expected {len(kinds)}")
+        return tuple(from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+    if args:  # AugmentConfig | None
+        return None if value is None else from_json(args[0], value, where)
+    accepted = int | float if kind is float else kind
+    fits = kind is not float or (isinstance(value, int | float) and not 1e300 < abs(value) < math.inf)
+    if not (isinstance(value, accepted) and fits) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{where}: got {value!r}, expected {kind.__name__}")
+    return kind(value)
+
+
+def _dataclass_from_json(kind: Any, value: Any, where: str, defaults: bool) -> Any:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where}: got {type(value).__name__}, expected a JSON object")
+    hints = get_type_hints(kind)
+    for name in value:
+        if name not in hints:
+            raise ValueError(f"{where}.{name}: unknown field, expected one of {', '.join(hints)}")
+    for field in dataclasses.fields(kind):
+        if field.name not in value and not (defaults and field.default is not dataclasses.MISSING):
+            raise ValueError(f"{where}.{field.name}: missing")
+    fields = {name: from_json(hints[name], entry, f"{where}.{name}") for name, entry in value.items()}
+    try:
+        return kind(**fields)
+    except ValueError as error:
+        raise ValueError(f"{where}.{error}") from None
