@@ -261,7 +261,7 @@ BAD = {
     "out of range": ("detect HOME/away.npy", "away.npy: none of its .* points is usable"),
     "nothing finite": ("detect HOME/all_nan.npy", r"all_nan.npy: none .*\(5 not finite"),
     "good then bad": ("detect HOME/good.npy HOME/none.npy", "none.npy: no such file"),
-    "no input": ("detect", "expected point files or --sweeps"),
+    "no input": ("detect", "expected either point files or --sweeps"),
     "bad columns": ("detect HOME/empty.bin --columns 9", "columns: got 9"),
     "columns of npy": ("detect HOME/good.npy --columns 5", "are for raw .bin files"),
     "list of sweeps": ("detect HOME/s.json", "s.json: expected a point file, or --sweeps before a list of sweeps"),
@@ -304,11 +304,11 @@ BAD = {
     "detect into a device": ("detect HOME/none.npy --out /dev/null", "/dev/null: found a device or a pipe"),
     "detect into a checkpoint": (
         "detect HOME/none.npy --out HOME/checkpoint/boxes.json",
-        "--out: .*found a place in the checkpoint",
+        "--out: .*inside of the checkpoint",
     ),
     "pictures into a checkpoint": (
         "detect HOME/none.npy --pictures HOME/checkpoint/pictures",
-        "--pictures: .*found a place in the checkpoint",
+        "--pictures: .*inside of the checkpoint",
     ),
     "synthesize for laser numbers": (
         "synthesize --scenes 1 --sensor argoverse2",

@@ -279,11 +279,11 @@ MISTAKES = {
     ),
     "out into the checkpoint": (
         f"--data-root HOME --version {VERSION} --checkpoint HOME/checkpoint --out HOME/checkpoint/scores",
-        "--out: .*found a place in the checkpoint",
+        "--out: .*inside of the checkpoint",
     ),
     "out of the detector's name": (
         f"--data-root HOME --version {VERSION} --checkpoint quickstart --out quickstart",
-        "--out: quickstart: found the name of the checkpoint, expected another one",
+        "--out: quickstart: the name of the checkpoint, expected another one",
     ),
     "batches of results": (f"--results x {TRUTH} --batch-size 2", "--batch-size: got 2, expected none with --res"),
     "backend of results": (

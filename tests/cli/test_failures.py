@@ -26,20 +26,20 @@ def fail_with(error):
         (FileNotFoundError(2, "No such file", "a"), "[Errno 2] No such file: 'a'"),
         (OverflowError(), "OverflowError without a message"),
         (RecursionError("maximum recursion depth"), "nested too deeply: expected a file or an option with fewer"),
-        (MemoryError(), "out of memory: in training --optimizer.accumulate"),
-        (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: in training --optimizer.accumulate"),
+        (MemoryError(), "out of memory: for training, --optimizer.accumulate"),
+        (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: for training, --optimizer.accumulate"),
         (RuntimeError("Unable to initialize backend 'x': no"), "expected a platform of this machine: Unable to"),
         (
             RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
-            "another process ended, see what it says: UNK",
+            "another process ended, see its output: UNK",
         ),
         (
             RuntimeError("Gloo context initialization failed: Read error"),
-            "the connection of the processes failed: G",
+            "the connection between the processes failed: G",
         ),
         (
             RuntimeError("Gloo AllGather failed: Timed out"),
-            "the connection of the processes failed: Gloo AllGather",
+            "the connection between the processes failed: Gloo AllGather",
         ),
         (ValueError("x" * 120_000), "x" * 900),
     ],
@@ -57,10 +57,8 @@ def test_a_defect_is_one_line_that_names_its_report(capsys, tmp_path, monkeypatc
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert exit_code("program", fail_with(KeyError("lost"))) == 1
     (report,) = tmp_path.iterdir()
-    line = (
-        f"program: error: unexpected KeyError: a defect: the full report is {report}, please attach it to an issue"
-    )
-    assert capsys.readouterr().err == f"{line} of the project: 'lost'\n"
+    line = f"unexpected KeyError: 'lost': this is a bug, please attach the full report {report} to an issue"
+    assert capsys.readouterr().err == f"program: error: {line}\n"
     text = report.read_text()
     assert "Traceback (most recent call last)" in text
     assert "arguments: [" in text

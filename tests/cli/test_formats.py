@@ -159,7 +159,7 @@ def test_data_without_splits_are_told_where_all_frames_serve_both_ends(tmp_path,
     for name, splits in (("with", True), ("without", False)):
         if not splits:
             (root / "splits.json").unlink()
-        for args, said in ((train_it, "all 3 frames are trained on"), (evaluate_it, "all 3 frames are evaluated")):
+        for args, said in ((train_it, "training on all 3 frames"), (evaluate_it, "evaluating all 3 frames")):
             with pytest.raises(AssertionError):  # stopped
                 command(args, tmp_path / name / args[:5])
             assert (f"{root}: no splits: {said}" in capsys.readouterr().err) != splits
@@ -181,11 +181,11 @@ def test_frames_that_are_trained_and_evaluated_on_are_told(tmp_path, capsys, mon
 
     a, b, c = (f"{i:03d}" for i in range(3))
     training, evaluation = "train quickstart --no-copy-paste", "evaluate --checkpoint quickstart"
-    told = "of the 2 frames to evaluate on are trained on too"
+    told = "of the 2 evaluation frames are also training frames"
     assert f"1 {told}" in said({"train": [a, b], "val": [b, c]}, training)
-    assert "trained on too" not in said({"train": [a], "val": [b, c]}, training)
+    assert "also training frames" not in said({"train": [a], "val": [b, c]}, training)
     assert f"2 {told}" in said({"all": [a, b, c]}, f"{training} --val-split all --val-samples 1:3")
-    assert f"{root}: no split val: all, the only one" in said({"all": [a, b, c]}, evaluation)
+    assert f"{root}: no split val: evaluating all, the only split" in said({"all": [a, b, c]}, evaluation)
     for splits, line in (({"train": [a], "val": [b, c]}, evaluation), ({"all": [a]}, f"{evaluation} --split all")):
         assert "no split val" not in said(splits, line)
 

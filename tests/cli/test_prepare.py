@@ -150,7 +150,7 @@ def test_an_index_of_another_version_is_made_anew_and_said(root, tmp_path, capsy
     file.write_text(damage(file.read_text()))
     command(*prepare(root, tmp_path / "i"))
     said = next(line for line in capsys.readouterr().err.splitlines() if expected in line)
-    assert said.endswith(": making it anew")
+    assert said.endswith(": rebuilding it")
     assert contents(tmp_path / "i") == before
 
 

@@ -65,7 +65,7 @@ def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path, caps
         window.write_text(json.dumps(listed[: index + 1][::-1]))
         capsys.readouterr()
         command("detect --sweeps", window, "--checkpoint", home / "checkpoint", "--out", out)
-        said = f"{window}: the first {WINDOW} of {index + 1} sweeps are fused, as many as the detector was trained"
+        said = f"{window}: fuses the first {WINDOW} of {index + 1} sweeps, as the detector was trained"
         assert (said in capsys.readouterr().err) == (index >= WINDOW)
         [expected] = json.loads(out.read_text())["files"]
         assert len(expected["boxes"]) > 0
@@ -176,10 +176,10 @@ MISTAKES = {
     "no line": ("HOME/drive --poses HOME/none.txt", "none.txt: no pose in it"),
     "no file": ("HOME/drive --poses HOME/nothing.txt", "nothing.txt: no such file"),
     "tracks without poses": ("HOME/drive --track", "--track: found no poses"),
-    "no source": ("", "expected a folder of point files or --data-root"),
+    "no source": ("", "expected either a folder of point files or a recording"),
     "no scene": ("--data-root HOME", "--data-root and --scene together"),
-    "keyframes of a folder": ("HOME/drive --keyframes", "--keyframes: expected with --data-root alone"),
-    "poses of a scene": ("--data-root HOME --scene a --poses HOME/poses.txt", "--poses: expected with a folder"),
+    "keyframes of a folder": ("HOME/drive --keyframes", "--keyframes: expected only with --data-root"),
+    "poses of a scene": ("--data-root HOME --scene a --poses HOME/poses.txt", "--poses: expected only with a folder"),
     "no data set": ("--data-root HOME --scene a", "expected"),
     "score": ("HOME/drive --min-score 2", "--min-score: got 2, expected"),
     "angle": ("HOME/drive --yaw-deg nan", "--yaw-deg: got nan, expected an angle"),
@@ -187,13 +187,13 @@ MISTAKES = {
     "out into a cloud": ("HOME/drive --out HOME/drive/1.000000.npy", "--out: .*the same file as"),
     "out into the checkpoint": (
         "HOME/drive --out HOME/checkpoint/checkpoint.json",
-        "--out: .*found a place in the checkpoint",
+        "--out: .*inside of the checkpoint",
     ),
     "points of a scene": (
         "--data-root HOME --scene a --max-file-points 5",
-        "--max-file-points: expected with a folder or a recording alone",
+        "--max-file-points: expected only with a folder or a recording",
     ),
-    "links of a folder": ("HOME/drive --follow-links", "--follow-links: expected with --data-root alone"),
+    "links of a folder": ("HOME/drive --follow-links", "--follow-links: expected only with --data-root"),
     "page into poses": (
         "HOME/drive --poses HOME/poses.txt --page HOME/poses.txt",
         "--page: .*the same file as .*poses.txt",

@@ -108,14 +108,14 @@ def test_a_line_tells_the_time_of_each_stage(home, tmp_path, capsys):
 
 
 MISTAKES = {
-    "topics of a folder": ("HOME/drive --topic /points", "--topic: expected with a recording of ROS"),
+    "topics of a folder": ("HOME/drive --topic /points", "--topic: expected only with a ROS recording"),
     "poses twice": (
         "HOME/ros1.bag --odometry tf --poses HOME/poses.txt",
-        "--poses: expected with .* without --odom",
+        "--poses: expected only with .* without --odom",
     ),
     "layout of a recording": (
         "HOME/ros1.bag --columns 4",
-        "--columns: expected with a folder of point files alone",
+        "--columns: expected only with a folder of point files",
     ),
     "no such topic": (
         "HOME/ros1.bag --topic /x",
