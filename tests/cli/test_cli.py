@@ -8,13 +8,14 @@ import shutil
 from pathlib import Path
 from unittest.mock import Mock
 
+import jax
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, page_content
 from PIL import Image
-from tiny_run import TINY_CONFIG, untrained
+from tiny_run import TINY_CONFIG, bits, untrained
 
-from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import demo, main
 from fcos_lidar_jax.cli import detect as detect_command
@@ -403,3 +404,13 @@ def test_demo_trains_from_nothing_to_report(drive, tmp_path):
     unseen = out / "unseen" / "frame_000.npy"
     command("detect", unseen, "--checkpoint", out / "run", "--out", boxes)
     assert files_of(boxes)[0]["num_points"] == len(np.load(unseen))
+
+
+def test_a_checkpoint_replaces_another_completely(home, tmp_path):
+    checkpoint = load_checkpoint(home / "checkpoint")
+    save_checkpoint(tmp_path / "c", checkpoint)
+    doubled = jax.tree.map(lambda leaf: leaf * 2, checkpoint.variables)
+    save_checkpoint(tmp_path / "c", dataclasses.replace(checkpoint, variables=doubled, step=8))
+    again = load_checkpoint(tmp_path / "c")
+    assert (again.step, bits(again.variables)) == (8, bits(doubled))
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]
