@@ -1,4 +1,4 @@
-"""The command line: whatever a command does, a failure becomes one line and an exit code here."""
+"""The entry point of the command line, which turns each failure into one line and an exit code."""
 
 import contextlib
 import os
@@ -15,9 +15,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import NoReturn, TextIO
 
 _LESS_MEMORY = (
-    "in training --optimizer.accumulate N takes a batch in N parts, --model.precision bfloat16 halves the "
-    "activations, and --model.remat computes the largest ones again instead of keeping them; elsewhere "
-    "--batch-size 1 needs the least"
+    "for training, --optimizer.accumulate N splits each batch into N parts, --model.precision bfloat16 halves the "
+    "activations, and --model.remat recomputes the largest ones; other commands need the least with --batch-size 1"
 )
 _MAX_LINE = 1000
 _CLOSED_CONNECTION = "closed by peer|reset by peer|Broken pipe|Read error|Write error"
@@ -25,10 +24,10 @@ _CLOSED_PIPE = 128 + signal.SIGPIPE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command, by default that of the process's arguments (``argv`` is without the program's name).
+    """Run the command of ``argv``, by default the arguments of the process without the program's name.
 
     Returns:
-        exit code, see :func:`exit_code`. Usage errors leave with 2.
+        the exit code, see :func:`exit_code`; usage errors exit with 2.
     """
 
     def work() -> None:
@@ -40,16 +39,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def exit_code(program: str, work: Callable[[], object]) -> int:
-    """Call ``work``; one line on standard error, which begins with the program's name, says why it failed.
+    """Call ``work`` and explain a failure in one line on standard error, which starts with the program's name.
 
-    What is no foreseeable failure is a defect: the line then says where the full report is. SIGTERM and SIGHUP end
-    the work like an exception, so that nothing is left half-written.
+    Unexpected exceptions are treated as bugs: the line names a file with the full report. SIGTERM and SIGHUP raise
+    an exception in ``work``, so that it leaves no half-written files.
 
     Returns:
-        0, 1 after a failure, 130 when interrupted, 141 where nobody reads the output any more.
+        0; 1 after a failure; 130 after Ctrl-C; 141 if the reader of the output has gone.
 
     Raises:
-        SystemExit: with 143 or 129 after SIGTERM or SIGHUP; and what ``work`` raises of it.
+        SystemExit: with 143 or 129 after SIGTERM or SIGHUP, or raised by ``work``.
 
     >>> exit_code("example", lambda: 0)
     0
@@ -65,8 +64,8 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     failures = [_flush(stream) for stream in (sys.stdout, sys.stderr)]
     if any(isinstance(failure, BrokenPipeError) for failure in failures):
         return _CLOSED_PIPE
-    if (lost := failures[0]) is not None and not code and (stopped is None or not stopped.code):
-        print(f"{program}: error: standard output: cannot be written: {lost.strerror}", file=sys.stderr)
+    if (failure := failures[0]) is not None and not code and (stopped is None or not stopped.code):
+        print(f"{program}: error: standard output: cannot be written: {failure.strerror}", file=sys.stderr)
         return 1
     if stopped is not None:
         raise stopped
@@ -83,7 +82,7 @@ def _attempt(program: str, work: Callable[[], object]) -> int:
     except Exception as error:
         if isinstance(error, BrokenPipeError) and any(map(_is_unread, (sys.stdout, sys.stderr))):
             raise
-        line = _explain(error) or f"unexpected {type(error).__name__}: {_write_report(error)}: {_words(error)}"
+        line = _explain(error) or f"unexpected {type(error).__name__}: {_words(error)}: {_write_report(error)}"
         print(f"{program}: error: {line if len(line) <= _MAX_LINE else line[:_MAX_LINE] + '...'}", file=sys.stderr)
         return 1
     return 0
@@ -94,7 +93,7 @@ def _words(error: BaseException) -> str:
 
 
 def _explain(error: Exception) -> str | None:
-    """What to tell about a failure that is no defect of the program; None for others."""
+    """Explain an expected failure; None for a bug."""
     text = _words(error)
     if isinstance(error, RecursionError):
         return "nested too deeply: expected a file or an option with fewer levels"
@@ -104,17 +103,17 @@ def _explain(error: Exception) -> str | None:
         return (
             f"JAX_PLATFORMS: got {os.environ.get('JAX_PLATFORMS')!r}, expected a platform of this machine: {text}"
         )
-    if isinstance(error, RuntimeError) and "Gloo" in text:  # JAX's connection to other processes, on CPUs
-        gone = "Gloo context initialization" not in text and re.search(_CLOSED_CONNECTION, text)
-        told = "another process ended, see what it says" if gone else "the connection of the processes failed"
-        return f"{told}: {text}"
+    if isinstance(error, RuntimeError) and "Gloo" in text:  # JAX's connection between processes on CPUs
+        if "Gloo context initialization" not in text and re.search(_CLOSED_CONNECTION, text):
+            return f"another process ended, see its output: {text}"
+        return f"the connection between the processes failed: {text}"
     if isinstance(error, ValueError | OSError | ArithmeticError):
         return text or f"{type(error).__name__} without a message"
     return None
 
 
 def _write_report(error: Exception) -> str:
-    """Write all that is known of a defect to a file; returns where it is and what to do with it."""
+    """Write the report of a bug to a file; returns a sentence that names the file."""
     lines = [f"arguments: {sys.argv}", f"python {platform.python_version()} on {platform.platform()}"]
     for package in ("fcos-lidar-jax", "jax", "jaxlib", "flax", "numpy"):
         with contextlib.suppress(PackageNotFoundError):
@@ -124,21 +123,21 @@ def _write_report(error: Exception) -> str:
         with open(handle, "w", encoding="utf-8", errors="replace") as file:
             file.write("\n".join([*lines, "", *traceback.format_exception(error)]))
     except OSError:
-        return "a defect; its report could not be written"
-    return f"a defect: the full report is {name}, please attach it to an issue of the project"
+        return "this is a bug; its report could not be written"
+    return f"this is a bug, please attach the full report {name} to an issue"
 
 
 def _is_unread(stream: TextIO) -> bool:
-    """Whether an output is a pipe of which the other end is closed."""
+    """Whether an output is a pipe whose other end is closed."""
     try:
         (poll := select.poll()).register(stream.fileno(), 0)
-    except (OSError, ValueError):  # no file at all
+    except (OSError, ValueError):  # not a file
         return False
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def _flush(stream: TextIO) -> OSError | None:
-    """Write what is waiting; the failure where it cannot be. What still follows then leads nowhere, in silence."""
+    """Flush a stream; returns the failure, after which further output is discarded."""
     failure = None
     try:
         stream.flush()
@@ -153,25 +152,28 @@ def _flush(stream: TextIO) -> OSError | None:
 
 @contextlib.contextmanager
 def _ending_signals() -> Iterator[None]:
-    """Make the signals that would end the process at once raise SystemExit, in the main thread."""
-    own = threading.current_thread() is threading.main_thread()
-    asked = [n for n in (signal.SIGTERM, signal.SIGHUP) if own and signal.getsignal(n) is signal.SIG_DFL]
+    """Raise SystemExit in the main thread for SIGTERM and SIGHUP, unless they have handlers already."""
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if is_main and signal.getsignal(n) is signal.SIG_DFL]
 
     def end(number: int, _: object) -> NoReturn:
         raise SystemExit(128 + number)
 
-    for number in asked:
+    for number in numbers:
         signal.signal(number, end)
     try:
         yield
     finally:
-        for number in asked:
+        for number in numbers:
             signal.signal(number, signal.SIG_DFL)
 
 
 @contextlib.contextmanager
 def _raising_again() -> Iterator[None]:
-    """Raise again what a signal raised in a finalizer or a weak reference's callback, where Python drops it."""
+    """Raise the exception of a signal again if it was lost.
+
+    Python drops exceptions from finalizers and callbacks of weak references, and some libraries replace them.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -196,7 +198,7 @@ def _raising_again() -> Iterator[None]:
     except Exception as error:
         cause: BaseException | None = error
         while (cause := cause.__cause__ or cause.__context__) is not None:
-            if isinstance(cause, KeyboardInterrupt | SystemExit):  # which a library took for a failure of its own
+            if isinstance(cause, KeyboardInterrupt | SystemExit):  # replaced by a library
                 raise cause from None
         raise
     finally:
@@ -207,10 +209,9 @@ def _raising_again() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _importing(program: str) -> Iterator[None]:
-    """Let Ctrl-C end the process at once: half an import may turn it into any other error."""
-    own = threading.current_thread() is threading.main_thread()
+    """End the process at once on Ctrl-C: an interrupted import may raise any other error."""
     before = signal.getsignal(signal.SIGINT)
-    if not own or before is not signal.default_int_handler:
+    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
         yield
         return
 

@@ -1,4 +1,4 @@
-"""``fcos-lidar benchmark``: how long a detector takes, stage by stage and for several clouds at once."""
+"""``fcos-lidar benchmark``: how long a detector takes, per stage and for batches."""
 
 import dataclasses
 import functools
@@ -13,47 +13,48 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
+from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference import Backend, CloudDetector, TrainedDetector, load_detector
+from fcos_lidar_jax.inference import CloudDetector, TrainedDetector, load_detector
 from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.export import ExportedDetector
 from fcos_lidar_jax.inference.openvino import OpenVinoDetector
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
 from fcos_lidar_jax.simulation.frames import make_frame
 
-_SIMULATED = 3  # Clouds, where no files are given.
-_SIDE = 2048  # Of the matrices whose product is timed.
+_NUM_SIMULATED = 3  # clouds, without files
+_MATRIX_SIZE = 2048
 
 
 @dataclasses.dataclass(frozen=True)
 class Benchmark:
-    """Time a detector on one device: each stage, the whole from file to boxes, and clouds a second.
+    """Time a detector on one device: each stage, the whole path from file to boxes, and batches.
 
-    Stages take turns, and each its clouds in turn, after a run that compiles; `detect` is one program of the three
-    stages above it. Of an exported detector there is no more than `detect` to see. Of the network also the
-    operations are counted, and its speed compared with that of a float32 product of matrices, which does little
-    but multiply: narrow channels, which move more than they multiply, are far below.
+    The stages take turns after a first run that compiles them. `detect` is a single program of the stages prepare,
+    network and postprocess; an exported detector has only this program. The network's operations are counted as
+    well, and its speed is compared with the product of two float32 matrices. Expect a small share of that speed:
+    narrow channels move more data than they multiply.
     """
 
-    files: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]] = ()
-    """Point files, one cloud each, or folders of them. Default: simulated clouds of the detector's sensor."""
-    checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")] = tyro.MISSING
-    """Trained detector: a checkpoint; a run, which stands for its last one, RUN/best for its best; a file of
-    `export`; or `hdl32e` or `quickstart`, which come with the package."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None  # Also write the figures as JSON.
-    batch: tuple[int, ...] = ()
-    """Clouds at once. Default: 1, 2 and 4, or what the file was exported for."""
-    repeats: int = 20  # Turns.
-    backend: Backend = "xla"  # What the network runs in, as for `fcos-lidar detect`.
+    files: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], option("INPUT", default="simulated clouds of the detector's sensor")]
+    ] = ()
+    """Point files, one cloud per file, or folders of them."""
+    checkpoint: options.Detector = tyro.MISSING
+    out: Annotated[Path | None, option("FILE")] = None  # Also write the times as JSON.
+    batch: Annotated[tuple[int, ...], option("N...", default="1 2 4, or the exported size")] = ()  # Batch sizes.
+    repeats: int = 20  # Turns of every stage.
+    backend: options.Backend = "xla"
 
 
 def run(args: Benchmark) -> None:
-    """Measure, print, and write."""
+    """Measure, print, and write the times."""
     check_at_least(args, 1, "repeats")
     if any(size < 1 for size in args.batch):
         raise ValueError(f"--batch: got {min(args.batch)}, expected at least 1")
@@ -77,20 +78,20 @@ def run(args: Benchmark) -> None:
 def measure(
     detector: CloudDetector, files: tuple[Path, ...], batch: tuple[int, ...], repeats: int
 ) -> dict[str, Any]:
-    """Times of the stages, of the whole, and of several clouds at once.
+    """Times of the stages, of the whole path, and of batches.
 
     Args:
         detector: from a checkpoint or an exported file.
-        files: point files; none for simulated clouds, which are not read.
-        batch: clouds at once; none for what is usual.
-        repeats: turns.
+        files: point files; empty for simulated clouds, which are not read from disk.
+        batch: batch sizes; empty for the default.
+        repeats: turns of every stage.
 
     Raises:
-        ValueError: a file that cannot be read, or a batch that an exported detector does not take.
+        ValueError: a file cannot be read, or an exported detector does not accept a batch size.
     """
     sensor = detector.sensor
     read = functools.partial(read_points, sensor=sensor)
-    arrays = [read(file) for file in files] or [make_frame(seed, sensor).points for seed in range(_SIMULATED)]
+    arrays = [read(file) for file in files] or [make_frame(seed, sensor).points for seed in range(_NUM_SIMULATED)]
     clean = functools.partial(make_cloud, config=detector.config, sensor=sensor)
     clouds = [clean(points) for points in arrays]
     takes = detector.record["batch"] if isinstance(detector, ExportedDetector) else "any"
@@ -112,7 +113,7 @@ def measure(
         calls["whole"] = _in_turn(lambda given: detect(1, [start(given)]), files or arrays)
     calls["product"] = _product()
     stages = interleaved(calls, repeats, percentile=95)
-    product_gflops = 2 * _SIDE**3 / 1e6 / stages.pop("product")["median_ms"]
+    product_gflops = 2 * _MATRIX_SIZE**3 / 1e6 / stages.pop("product")["median_ms"]
     together = {
         size: functools.partial(detect, size, list(itertools.islice(itertools.cycle(clouds), size)))
         for size in sizes
@@ -126,18 +127,19 @@ def measure(
     if isinstance(detector, TrainedDetector) and (gflop := _network_gflop(detector)):
         gflops = 1e3 * gflop / stages["network"]["median_ms"]
         speed = {"gflop": gflop, "gflops": gflops, "product_gflops": product_gflops}
-        record["network"] = {**_rounded(speed), "share": round(gflops / product_gflops, 3)}
+        rounded = {name: float(f"{value:.4g}") for name, value in speed.items()}
+        record["network"] = {**rounded, "share": round(gflops / product_gflops, 3)}
     return record
 
 
 def _product() -> Call:
-    """A float32 product of two matrices: what arithmetic reaches on this device."""
-    matrix, multiply = jnp.ones((_SIDE, _SIDE)), jax.jit(jnp.matmul)
+    """Product of two float32 matrices, the arithmetic speed within reach of this device."""
+    matrix, multiply = jnp.ones((_MATRIX_SIZE, _MATRIX_SIZE)), jax.jit(jnp.matmul)
     return lambda: multiply(matrix, matrix)
 
 
 def _network_gflop(detector: TrainedDetector) -> float:
-    """Operations of the network for one cloud as XLA counts them before it optimises; 0 where it does not."""
+    """Operations of the network for one cloud, counted by XLA before optimisation; 0 if it does not count."""
     stages, columns = make_stages(detector.model), detector.sensor.point_columns
     points = jax.ShapeDtypeStruct((detector.config.max_points, columns), jnp.float32)
     image = jax.eval_shape(stages.prepare, points, jax.ShapeDtypeStruct(points.shape[:1], bool))
@@ -145,12 +147,8 @@ def _network_gflop(detector: TrainedDetector) -> float:
     return (counted or {}).get("flops", 0.0) / 1e9
 
 
-def _rounded(values: dict[str, float]) -> dict[str, float]:
-    return {name: float(f"{value:.4g}") for name, value in values.items()}
-
-
 def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
-    """Calls of a function with one value after the other."""
+    """Call a function with one value after the other."""
     turns = itertools.cycle(values)
     return lambda: function(next(turns))
 
@@ -158,8 +156,8 @@ def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
 def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
     stages = make_stages(detector.model)
     prepare, postprocess = jax.jit(stages.prepare), jax.jit(stages.postprocess)
-    of_xla = functools.partial(jax.jit(stages.network), jax.device_put(detector.variables))
-    network = detector.network if isinstance(detector, OpenVinoDetector) else of_xla
+    run_by_xla = functools.partial(jax.jit(stages.network), jax.device_put(detector.variables))
+    network = detector.network if isinstance(detector, OpenVinoDetector) else run_by_xla
     on_device = [jax.device_put((cloud.points, cloud.valid)) for cloud in clouds]
     images = [prepare(*cloud) for cloud in on_device]
     outputs = [network(image) for image in images]
@@ -171,22 +169,12 @@ def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
 
 
 def as_text(record: dict[str, Any]) -> str:
-    """The figures as a table."""
-    lines = _as_lines(record)
-    if network := record.get("network"):
-        lines.append(
-            "network: {gflop:.4g} GFLOP a cloud, {gflops:.4g} GFLOP/s, {share:.2f} of what a float32 product of "
-            "matrices reaches here ({product_gflops:.4g})".format(**network)
-        )
-    return "\n".join(lines)
-
-
-def _as_lines(record: dict[str, Any]) -> list[str]:
+    """Format the times as a table."""
 
     def line(name: str, times: Times) -> str:
         return f"{name:<12}{times['median_ms']:>12.2f}{times['p95_ms']:>12.2f}"
 
-    return [
+    lines = [
         f"{record['checkpoint']}: {record['clouds']} clouds of {record['points']} points, {record['repeats']} "
         f"turns, {record['backend']}, {record['device']} ({record['processor']}, {record['cores']} cores), "
         f"jax {record['jax']}",
@@ -195,3 +183,9 @@ def _as_lines(record: dict[str, Any]) -> list[str]:
         f"{'batch':<12}{'median ms':>12}{'95 % ms':>12}{'clouds/s':>12}",
         *(f"{line(size, t)}{t['clouds_per_s']:>12.2f}" for size, t in record["throughput"].items()),
     ]
+    if network := record.get("network"):
+        lines.append(
+            "network: {gflop:.4g} GFLOP per cloud, {gflops:.4g} GFLOP/s, {share:.2f} of the speed of a float32 "
+            "matrix product ({product_gflops:.4g} GFLOP/s)".format(**network)
+        )
+    return "\n".join(lines)

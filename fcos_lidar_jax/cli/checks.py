@@ -1,29 +1,48 @@
-"""What several commands refuse, in the same words."""
+"""Checks that several commands make before they begin to work."""
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.files import check_writable
 
 
-def check_at_least(args: object, least: int, *options: str) -> None:
-    """Refuse numbers below a bound; options that are None were not given.
+def option_name(field: str) -> str:
+    """Name of a field's option as it is typed.
+
+    >>> option_name("batch_size")
+    '--batch-size'
+    """
+    return f"--{field.replace('_', '-')}"
+
+
+def check_at_least(args: object, least: int, *fields: str) -> None:
+    """Reject numbers below a bound; None passes.
 
     Raises:
-        ValueError: naming the option as it is typed.
+        ValueError: naming the option, its value and the bound.
     """
-    for name in options:
-        value = getattr(args, name)
+    for field in fields:
+        value = getattr(args, field)
         if value is not None and value < least:
-            raise ValueError(f"--{name.replace('_', '-')}: got {value}, expected at least {least}")
+            raise ValueError(f"{option_name(field)}: got {value}, expected at least {least}")
+
+
+def check_score_and_angle(args: Any) -> None:
+    """Reject a ``min_score`` outside of 0 to 1 and a ``yaw_deg`` that is not finite."""
+    if not 0 <= args.min_score <= 1:
+        raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
+    if not math.isfinite(args.yaw_deg):
+        raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
 
 
 def check_out_folder(out: Path, option: str = "--out") -> None:
-    """Refuse what cannot be a folder to write to, before any work is done.
+    """Reject a path that cannot be a folder to write to.
 
     Raises:
-        ValueError: naming the option and the file.
+        ValueError: it is a file.
         OSError: it cannot be written to.
     """
     if out.exists() and not out.is_dir():
@@ -32,15 +51,15 @@ def check_out_folder(out: Path, option: str = "--out") -> None:
 
 
 def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
-    """Refuse a place that no file can be written to, before any work is done.
+    """Reject a path to which no file can be written.
 
     Args:
-        option: as it is typed.
+        option: its name as it is typed.
         out: its value.
-        keep: files that the command reads or writes besides.
+        keep: other files that the command reads or writes.
 
     Raises:
-        ValueError: it is one of those to keep.
+        ValueError: the path is one of ``keep``.
         OSError: it is a folder, a device or a link, or cannot be written.
     """
     for other in keep:
@@ -50,20 +69,20 @@ def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
 
 
 def check_outside(option: str, out: Path | None, checkpoint: Path) -> None:
-    """Refuse to write into the detector that is used: into a checkpoint's folder, or over an exported file.
+    """Reject an output inside of the checkpoint's folder, over an exported file, or with the checkpoint's name.
 
     Args:
-        option: as it is typed.
-        out: its value; None where it was not given.
+        option: its name as it is typed.
+        out: its value, if any.
         checkpoint: a path or a name, see :func:`find_checkpoint`.
 
     Raises:
-        ValueError: naming the option and the place.
+        ValueError: naming the option and the path.
     """
     if out is None:
         return
     place = out.resolve()
     if find_checkpoint(checkpoint).resolve() in (place, *place.parents):
-        raise ValueError(f"{option}: {out}: found a place in the checkpoint, expected one elsewhere")
-    if place == checkpoint.resolve() and not checkpoint.exists():  # It would stand for the detector the next time.
-        raise ValueError(f"{option}: {out}: found the name of the checkpoint, expected another one")
+        raise ValueError(f"{option}: {out}: inside of the checkpoint, expected a path elsewhere")
+    if place == checkpoint.resolve() and not checkpoint.exists():  # a later command would take it for the detector
+        raise ValueError(f"{option}: {out}: the name of the checkpoint, expected another one")

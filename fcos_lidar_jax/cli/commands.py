@@ -1,4 +1,4 @@
-"""All commands: their options, and what each does."""
+"""All commands with their options."""
 
 import contextlib
 import io
@@ -33,27 +33,27 @@ _COMMANDS = {
     "project": (project.Project, project.run),
     "export": (export.Export, export.run),
     "benchmark": (benchmark.Benchmark, benchmark.run),
-}  # name -> its options and what it does
+}  # name -> (options, function)
 
 Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _) in _COMMANDS.items()))
 
 
 def parse(argv: Sequence[str] | None) -> Callable[[], object]:
-    """The command of some arguments, ready to run; usage errors leave with 2.
+    """Parse the arguments; returns the command, ready to run. Usage errors exit with 2.
 
     Raises:
-        ValueError: a configuration refuses an option's value.
+        ValueError: a configuration rejects a value.
     """
-    unread, refused, command = io.StringIO(), None, None
+    output, rejection, command = io.StringIO(), None, None
     try:
-        with contextlib.redirect_stdout(unread), contextlib.redirect_stderr(unread):
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             command = _parse(argv)
     except SystemExit as leaving:
-        refused = _refused_value(leaving)
-    if refused is not None:
-        raise ValueError(refused)
+        rejection = _rejection(leaving)
+    if rejection is not None:
+        raise ValueError(rejection)
     if command is None:
-        command = _parse(argv)  # Once more, to be read: help, or what is wrong with the usage.
+        command = _parse(argv)  # again, to print the help or the usage error
     run = next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))
     return partial(run, command)
 
@@ -64,19 +64,19 @@ def _parse(argv: Sequence[str] | None) -> Any:
         prog="fcos-lidar",
         description="FCOS-LiDAR in JAX: 3D object detection on LiDAR range images.",
         args=argv,
-        config=(tyro.conf.CascadeSubcommandArgs,),  # a command's options may stand behind its preset
+        config=(tyro.conf.CascadeSubcommandArgs,),  # options of a command may follow its preset
     )  # type: ignore[call-overload]
 
 
-def _refused_value(leaving: SystemExit) -> str | None:
-    """What a configuration says about a value, with the name of its option; None where something else is wrong.
+def _rejection(leaving: SystemExit) -> str | None:
+    """The configuration's message about a value, with the option's name; None for other usage errors.
 
-    tyro shows such an error under a name of its own, in a frame of several lines.
+    tyro would print such a message in a frame of several lines, under a name of its own.
     """
     place, error = getattr(leaving.__context__, "arg", None), getattr(leaving.__context__, "__context__", None)
     parts = place.split(".") if isinstance(place, str) else []
     if "config" not in parts or not isinstance(error, ValueError):
         return None
-    field, _, said = str(error).partition(": ")
+    field, _, message = str(error).partition(": ")
     path = [*parts[parts.index("config") + 1 :], field]
-    return f"--{'.'.join(path).replace('_', '-')}: {said}"
+    return f"--{'.'.join(path).replace('_', '-')}: {message}"

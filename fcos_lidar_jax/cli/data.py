@@ -1,9 +1,10 @@
-"""The options that name a data set, the same for every command."""
+"""The options that select a data set."""
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal, get_args
 
+from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.cli.processes import tell
 from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
@@ -13,23 +14,26 @@ from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.input_pipeline.open import DataSet, Format, default_split, find_data_set, open_frames
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 
+_FORMATS = f"{{{','.join(get_args(Format))}}}"
+
 
 @dataclasses.dataclass(frozen=True)
 class DataOptions:
-    """Which data set, and how it is read."""
+    """Options that select a data set."""
 
-    data_root: Path | None = None  # Folder of the data set; --format simulated needs none.
-    format: Format | None = None  # Layout of the data set; recognised by default.
-    version: str | None = None
-    """nuScenes: folder of the tables, such as v1.0-trainval; may be left out where there is one."""
-    index: Path | None = None
-    """Where fcos-lidar prepare puts the objects and, for nuScenes, the index; default: DATA_ROOT/.fcos_lidar, for
-    nuScenes DATA_ROOT/.fcos_lidar/VERSION."""
-    splits: Path | None = None
-    """JSON file with own splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
-    class_map: Path | None = None  # JSON file {name in the data: name to use, or null for objects to leave out}.
-    follow_links: bool = False  # Read files to which links lead outside of DATA_ROOT.
-    allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps where files of older sweeps are missing.
+    data_root: Annotated[Path | None, option("DIR")] = None
+    """Folder of the data set. Leave it out for --format simulated."""
+    format: Annotated[Format | None, option(_FORMATS, default="recognised")] = None  # Layout of the data set.
+    version: Annotated[str | None, option("NAME", default="the only one")] = None
+    """nuScenes: folder of the tables, such as v1.0-trainval."""
+    index: Annotated[Path | None, option("DIR", default="DATA_ROOT/.fcos_lidar[/VERSION]")] = None
+    """Folder that `fcos-lidar prepare` writes: the objects and, for nuScenes, the index."""
+    splits: Annotated[Path | None, option("FILE", default="those of the data")] = None
+    """JSON file with custom splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
+    class_map: Annotated[Path | None, option("FILE")] = None
+    """JSON file that renames classes: {name in the data: new name, or null to leave out its objects}."""
+    follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
+    allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.
 
     def find(self) -> DataSet:
         return find_data_set(self.data_root, self.format, self.version)
@@ -46,31 +50,37 @@ class DataOptions:
         sensor: Sensor | None = None,
         option: str = "--samples",
     ) -> FrameSet:
-        """Frames for a detector, their labels those of its classes.
+        """Open frames whose labels index the classes of a configuration.
 
-        Boxes of other classes are left out; a line on standard error counts them.
+        Boxes of other classes are left out and counted on standard error.
 
         Args:
-            config: sweeps, close points and classes.
-            split: which part; None for all.
-            samples: ranges of the frames, see :func:`parse_ranges`, as given by ``option``; None for all.
-            sensor: for layouts that do not define theirs; default: the configuration's.
+            config: how clouds are read, and the classes.
+            split: name of the split; None for all frames.
+            samples: ranges of the split's frames, see :func:`parse_ranges`; None for all.
+            sensor: for formats that do not define one; by default the configuration's.
+            option: name of the option that ``samples`` came from.
         """
         frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:
             frames = SelectedFrames(frames, tuple(parse_ranges(samples, len(frames), option)))
         mapped = MappedFrames(frames, config.classes)
-        if lost := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
-            counts = ", ".join(f"{count} {name}" for name, count in lost.items())
-            tell(f"boxes of classes that the detector does not have are left out: {counts}")
+        if left_out := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
+            counts = ", ".join(f"{count} {name}" for name, count in left_out.items())
+            tell(f"left out boxes of classes that the detector does not have: {counts}")
         return mapped
 
     def open_whole(
-        self, split: str | None, reading: CloudReading, sensor: Sensor | None = None, *, missing: bool = True
+        self,
+        split: str | None,
+        reading: CloudReading,
+        sensor: Sensor | None = None,
+        *,
+        report_missing: bool = True,
     ) -> FrameSet:
-        """Frames with all of their own classes; the sensor is for data that do not say theirs.
+        """Open frames with the classes of the data; ``sensor`` is for formats that do not define one.
 
-        With ``missing`` a line on standard error counts the sweeps whose file is missing.
+        With ``report_missing`` a line on standard error counts the missing sweep files.
         """
         data = self.find()
         frames = open_frames(
@@ -86,7 +96,7 @@ class DataOptions:
             allow_missing_sweeps=self.allow_missing_sweeps,
             follow_links=self.follow_links,
         )
-        if missing and isinstance(frames, NuScenesFrames):
+        if report_missing and isinstance(frames, NuScenesFrames):
             number = frames.nuscenes.missing_sweeps(list(frames.tokens), reading.num_sweeps)
             if number:
                 tell(f"{number} sweep files of split {split!r} are missing")
@@ -94,34 +104,32 @@ class DataOptions:
 
 
 def read_class_map(file: Path | None) -> ClassMap | None:
-    """The translation of class names in a JSON file; None for none.
+    """Read a JSON file that renames classes; None stays None.
 
     Raises:
         ValueError: naming the file.
     """
-    if file is None:
-        return None
-    return read_json(file, dict[str, str | None], what="a translation of class names")
+    return None if file is None else read_json(file, dict[str, str | None], what="a translation of class names")
 
 
 def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]:
-    """Indices of ``FIRST:LAST[,FIRST:LAST...]``: ranges of ``number`` frames in any order, without their ends.
+    """Indices of ``FIRST:LAST[,FIRST:LAST...]``: ranges of ``number`` frames in any order, ``LAST`` excluded.
 
     Raises:
-        ValueError: naming the option and the range that is malformed, out of bounds or overlaps.
+        ValueError: naming the option and a range that is malformed, out of bounds or overlapping.
 
     >>> parse_ranges("0:2,5:7", 7)
     [0, 1, 5, 6]
     """
-    found: list[int] = []
+    indices: list[int] = []
     for part in text.split(","):
         first, colon, last = part.partition(":")
         if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
             raise ValueError(f"{option}: got {part!r}, expected FIRST:LAST")
-        indices = range(int(first), int(last))
-        if not indices or int(last) > number:
+        new = range(int(first), int(last))
+        if not new or int(last) > number:
             raise ValueError(f"{option}: got {part!r}, expected FIRST < LAST within the {number} frames")
-        if set(indices) & set(found):
+        if set(new) & set(indices):
             raise ValueError(f"{option}: {part!r} overlaps with another range of {text!r}")
-        found += indices
-    return found
+        indices += new
+    return indices

@@ -1,6 +1,5 @@
-"""The training of ``fcos-lidar demo --train``: the shipped quickstart, and its preset trained from scratch."""
+"""The training of ``fcos-lidar demo --train``: the quickstart preset from scratch, beside its shipped weights."""
 
-import dataclasses
 import json
 import sys
 import time
@@ -30,100 +29,97 @@ from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.range_image import draw_range_image
 from fcos_lidar_jax.visualization.report import write_report
 
-_SHOWN_FRAMES = 3
-_FRAMES_ALONG = 10  # Test frames of the evaluations during training.
-_EVALUATIONS = 6  # During training.
+_NUM_DRAWN = 3  # frames in the report and in the folder unseen
+_NUM_VALIDATED = 10  # test frames of the evaluations during training
+_NUM_EVALUATIONS = 6
 
 _TITLES = {"shipped": "shipped weights", "after": "trained here", "before": "untrained"}
+_Pictures = list[tuple[str, Path]]  # captions and files
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainingDemo:
-    """Where to, and how long."""
+def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
+    """Detect with the shipped weights, train, detect again, and write the report.
 
-    out: Path  # Folder for the results.
-    steps: int  # Training steps; 0 for none.
-    test_frames: int  # Unseen frames to evaluate on.
-    seed: int  # Of the weights and the training frames.
+    Writes metrics.json, pictures, report.html, unseen clouds with their boxes, and the run with its checkpoints.
+    Ctrl-C ends the training early and evaluates the result.
 
-
-def run(args: TrainingDemo) -> None:
-    """Detect with the shipped weights, train, detect again, and report.
-
-    Writes metrics.json, pictures, report.html, the unseen clouds with their boxes, which ``fcos-lidar detect``
-    reads, and the run with its checkpoints. Ctrl-C ends the training early and evaluates what there is.
+    Args:
+        out: folder for the results.
+        steps: training steps; 0 for no training.
+        test_frames: number of unseen frames to evaluate on.
+        seed: of the weights and the training frames.
     """
     began = time.monotonic()
     shipped = load_trained("quickstart")
-    tests = unseen_frames(shipped.sensor, args.test_frames)
+    tests = unseen_frames(shipped.sensor, test_frames)
     frames = [tests.frame(i) for i in range(len(tests))]
-    found: dict[str, list[Detections]] = {}
+    detections: dict[str, list[Detections]] = {}
     metrics: dict[str, Any] = {}
 
     def assess(model: str, detector: TrainedDetector) -> str:
-        """Detect in the test frames and evaluate; returns the scores as a line of text."""
-        found[model] = [prediction.detections for prediction in predict(detector, tests)]
-        summary = metrics[model] = evaluate_frames(found[model], frames, metric_of(NUSCENES_CLASSES)).summary
+        """Evaluate on the test frames; returns the score as a line of text."""
+        detections[model] = [prediction.detections for prediction in predict(detector, tests)]
+        summary = metrics[model] = evaluate_frames(detections[model], frames, metric_of(NUSCENES_CLASSES)).summary
         minutes = (time.monotonic() - began) / 60
-        return f"mAP {summary['mean_ap']:.3f} on {args.test_frames} unseen frames, after {minutes:.1f} minutes"
+        return f"mAP {summary['mean_ap']:.3f} on {test_frames} unseen frames, after {minutes:.1f} minutes"
 
     line = assess("shipped", shipped)
-    _save_frames(args.out / "unseen", frames, found)
+    _save_frames(out / "unseen", frames, detections)
     limit_m = shipped.sensor.limit_xy_m
-    pictures = _draw_frames(args.out, "shipped", frames, found["shipped"], limit_m)
+    pictures = _draw_frames(out, "shipped", frames, detections["shipped"], limit_m)
     print(f"shipped weights: {line}; see {pictures[0][1]}", flush=True)
-    run_folder = args.out / "run"
-    if args.steps:
-        _train(args, run_folder)
-        trained = load_trained(run_folder)  # what a user would load
-        assess("before", TrainedDetector(trained.model, trained.model.init(jax.random.key(args.seed))))
+    run_folder = out / "run"
+    if steps:
+        _train(run_folder, steps, test_frames, seed)
+        trained = load_trained(run_folder)
+        assess("before", TrainedDetector(trained.model, trained.model.init(jax.random.key(seed))))
         line = assess("after", trained)
         metrics["training"] = _training_record(run_folder)
-        _save_frames(args.out / "unseen", frames, found)
-        pictures += _draw_frames(args.out, "after", frames, found["after"], limit_m)
-    points, path = frames[0].points, args.out / "range_image.png"
+        _save_frames(out / "unseen", frames, detections)
+        pictures += _draw_frames(out, "after", frames, detections["after"], limit_m)
+    points, path = frames[0].points, out / "range_image.png"
     image = project_points(points, np.ones(len(points), bool), shipped.sensor, num_rounds=1)
     draw_range_image(image, path, title="unseen frame 0 as the network sees it")
     pictures.append(("The range image of unseen frame 0.", path))
-    if args.steps:
+    if steps:
         pictures += [
-            ("The parts of the loss through the training.", run_folder / "loss.png"),
-            ("Scores through the training, on some of the unseen frames.", run_folder / "scores.png"),
+            ("The parts of the loss during the training.", run_folder / "loss.png"),
+            ("Scores during the training, on some of the unseen frames.", run_folder / "scores.png"),
         ]
     metrics["minutes"] = round((time.monotonic() - began) / 60, 2)
-    atomic_write(args.out / "metrics.json", lambda p: p.write_text(json.dumps(_without_nan(metrics), indent=1)))
-    _report(args, metrics, pictures)
-    if args.steps:
+    atomic_write(out / "metrics.json", lambda p: p.write_text(json.dumps(_without_nan(metrics), indent=1)))
+    _report(out, test_frames, metrics, pictures)
+    if steps:
         print(f"trained here: {line}; untrained {metrics['before']['mean_ap']:.3f}")
     print(
-        f"look at {args.out / 'report.html'}, or detect by yourself:\n"
-        f"  fcos-lidar detect {args.out / 'unseen' / 'frame_000.npy'} "
-        f"--checkpoint {run_folder if args.steps else 'quickstart'} "
-        f"--out boxes.json --pictures {args.out / 'detected'}"
+        f"look at {out / 'report.html'}, or detect in a cloud yourself:\n"
+        f"  fcos-lidar detect {out / 'unseen' / 'frame_000.npy'} "
+        f"--checkpoint {run_folder if steps else 'quickstart'} "
+        f"--out boxes.json --pictures {out / 'detected'}"
     )
 
 
-def _train(args: TrainingDemo, folder: Path) -> None:
-    config, frames = fresh_streets(QUICKSTART, steps=args.steps, seed=args.seed)
-    every = max(-(-args.steps // _EVALUATIONS), 1)
+def _train(folder: Path, steps: int, test_frames: int, seed: int) -> None:
+    config, frames = fresh_streets(QUICKSTART, steps=steps, seed=seed)
+    every = max(-(-steps // _NUM_EVALUATIONS), 1)
     print(f"training from random weights on {len(frames)} simulated frames", file=sys.stderr)
     try:
         train(
             config,
             frames,
             folder,
-            steps=args.steps,
-            seed=args.seed,
-            tests=unseen_frames(frames.sensor, min(_FRAMES_ALONG, args.test_frames)),
+            steps=steps,
+            seed=seed,
+            tests=unseen_frames(frames.sensor, min(_NUM_VALIDATED, test_frames)),
             resume=(folder / RUN_SPEC).exists(),
             devices=jax.devices()[:1],
             schedule=Schedule(every, every),
             threads=1,
         )
     except KeyboardInterrupt:
-        if find_checkpoint(folder) == folder:
+        if find_checkpoint(folder) == folder:  # no checkpoint yet
             raise
-        print("evaluating what there is", file=sys.stderr)
+        print("evaluating the last checkpoint", file=sys.stderr)
 
 
 def _training_record(folder: Path) -> dict[str, Any]:
@@ -138,56 +134,55 @@ def _training_record(folder: Path) -> dict[str, Any]:
 
 
 def _without_nan(value: Any) -> Any:
-    """JSON has no NaN: null instead."""
+    """Replace NaN by None, since JSON has no NaN."""
     if isinstance(value, dict):
         return {k: _without_nan(v) for k, v in value.items()}
     return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _draw_frames(
-    out: Path, model: str, frames: list[Frame], found: list[Detections], limit_m: float
-) -> list[tuple[str, Path]]:
+    out: Path, model: str, frames: list[Frame], detections: list[Detections], limit_m: float
+) -> _Pictures:
     pictures = []
-    for i, (frame, detections) in enumerate(zip(frames[:_SHOWN_FRAMES], found, strict=False)):
+    for i, (frame, boxes) in enumerate(zip(frames[:_NUM_DRAWN], detections, strict=False)):
         path, title = out / f"{model}_{i}.png", f"unseen frame {i}, {_TITLES[model]}"
-        draw_frame(path, frame, detections, title, limit_m=limit_m, classes=NUSCENES_CLASSES)
+        draw_frame(path, frame, boxes, title, limit_m=limit_m, classes=NUSCENES_CLASSES)
         pictures.append((f"Unseen frame {i} from above, {_TITLES[model]}.", path))
     return pictures
 
 
-def _save_frames(folder: Path, frames: list[Frame], found: dict[str, list[Detections]]) -> None:
-    """A few unseen clouds with truth and detections, as files that other commands read."""
-    for i, frame in enumerate(frames[:_SHOWN_FRAMES]):
+def _save_frames(folder: Path, frames: list[Frame], detections: dict[str, list[Detections]]) -> None:
+    """Write a few unseen clouds, and JSON files with their truth and detections."""
+    for i, frame in enumerate(frames[:_NUM_DRAWN]):
         boxes = zip(frame.labels, frame.boxes.tolist(), strict=True)
         record = {
             "truth": [{"label": NUSCENES_CLASSES[label], "box": box} for label, box in boxes],
-            **{m: as_records(d[i], NUSCENES_CLASSES, min_score=SHOWN_SCORE) for m, d in found.items()},
+            **{m: as_records(d[i], NUSCENES_CLASSES, min_score=SHOWN_SCORE) for m, d in detections.items()},
         }
         text = json.dumps(record, indent=1)
         atomic_write(folder / f"frame_{i:03d}.npy", lambda path, points=frame.points: np.save(path, points))
         atomic_write(folder / f"frame_{i:03d}.json", lambda path, text=text: path.write_text(text))
 
 
-def _report(args: TrainingDemo, metrics: dict[str, Any], pictures: list[tuple[str, Path]]) -> None:
+def _report(out: Path, test_frames: int, metrics: dict[str, Any], pictures: _Pictures) -> None:
     models = [model for model in _TITLES if model in metrics]
     rows = [
         (name.replace("_", " "), *(metrics[model]["mean_dist_aps"][name] for model in models))
         for name in metrics["shipped"]["mean_dist_aps"]
     ]
-    distances = ", ".join(f"{d:g}" for d in DISTANCES_M)
     summary = {f"mAP, {_TITLES[model]}": metrics[model]["mean_ap"] for model in models}
-    summary["unseen frames"] = args.test_frames
-    lead = "A small detector on simulated LiDAR frames that it has never seen: with the weights that are shipped"
-    if args.steps:
-        training = metrics["training"]
+    summary["unseen frames"] = test_frames
+    lead = "A small detector on unseen simulated LiDAR frames: with the shipped weights"
+    if training := metrics.get("training"):
         summary |= {"training steps": training["steps"], "frames seen": training["frames_seen"]}
-        lead += ", and with those of a few minutes of training from scratch"
-    caption = f"Average precision by class, mean over the matching distances {distances} m"
+        lead += ", and after a few minutes of training from scratch"
+    distances = ", ".join(f"{d:g}" for d in DISTANCES_M)
+    caption = f"Average precision per class, mean over the matching distances {distances} m"
     write_report(
-        args.out / "report.html",
+        out / "report.html",
         title="FCOS-LiDAR: first contact",
         lead=f"{lead}.",
-        summary={**summary, "minutes, all in all": metrics["minutes"]},
+        summary={**summary, "total minutes": metrics["minutes"]},
         tables=[(caption, ("class", *(_TITLES[model] for model in models)), rows)],
         pictures=pictures,
     )

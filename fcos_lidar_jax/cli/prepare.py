@@ -1,4 +1,4 @@
-"""``fcos-lidar prepare``: an index of large tables, and the ground-truth database for copy-paste."""
+"""``fcos-lidar prepare``: the ground-truth database for copy-paste, and the index of nuScenes' tables."""
 
 import dataclasses
 import json
@@ -6,12 +6,13 @@ import re
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
@@ -25,25 +26,26 @@ from fcos_lidar_jax.progress import Progress
 
 @dataclasses.dataclass(frozen=True)
 class Prepare:
-    """Make a data set ready for training: cut the objects for copy-paste out of the training split and, for
-    nuScenes, make an index of the tables.
+    """Prepare a data set for training: cut objects for copy-paste out of the training split and, for nuScenes,
+    index the tables.
 
-    Both are verified when they are opened, and both can be made again at any time. Ctrl-C, or a kill, loses one
-    scene of objects at most: the same command resumes.
+    Both are verified whenever they are opened and can be rebuilt at any time. After Ctrl-C or a kill, the same
+    command resumes and repeats at most one scene of objects.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
-    train_split: str | None = None
-    """Split whose objects are cut out; default: train, or mini_train for a version that ends in mini; all frames
-    where the data have no splits. A nuScenes version without annotations gets an index alone."""
-    num_sweeps: int = NUSCENES.num_sweeps  # Sweeps an object's points are taken from, where the data have sweeps.
+    train_split: Annotated[
+        str | None, option("SPLIT", default="train, mini_train, or all frames without splits")
+    ] = None
+    """Split to cut objects from. A nuScenes version without annotations only gets an index."""
+    num_sweeps: int = NUSCENES.num_sweeps  # Sweeps per object, if the data have sweeps.
     min_points: int = CopyPasteConfig().min_points
-    """Points, of all its sweeps, that an object needs; a training may ask for more by copy_paste.min_points."""
+    """Points an object needs over all its sweeps; --copy-paste.min-points of training may ask for more."""
     workers: int = 1  # Processes that cut objects.
 
 
 def run(args: Prepare) -> None:
-    """Make index and database, and print what there is now."""
+    """Build the index and the database, and print a record of them."""
     check_at_least(args, 1, "workers", "num_sweeps", "min_points")
     data, began = args.data.find(), time.monotonic()
     if not data.on_disk:
@@ -74,14 +76,14 @@ def _prepare(args: Prepare, data: DataSet, folder: Path) -> dict[str, Any]:
 
 
 def _make_index(tables: Path, folder: Path) -> Index:
-    """The index in the folder, made anew unless there is one that fits."""
+    """Open the index in the folder; build it if it is missing or does not fit the tables."""
     if has_index(folder):
         try:
             return open_index(folder, tables=tables)
         except TableError as error:
-            print(f"{error}: making it anew", file=sys.stderr)
+            print(f"{error}: rebuilding it", file=sys.stderr)
     for left_over in folder.glob(".*"):
-        if re.fullmatch(r"\.[0-9a-f]{12}\.(npy|json)", left_over.name):  # of a killed run
+        if re.fullmatch(r"\.[0-9a-f]{12}\.(npy|json)", left_over.name):  # of a killed process
             left_over.unlink()
     began = last = time.monotonic()
 

@@ -1,16 +1,18 @@
-"""``fcos-lidar project``: one point file to a multi-round range image."""
+"""``fcos-lidar project``: the multi-round range image of a point file."""
 
 import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 import tyro
 
+from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
+from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
 from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
@@ -23,24 +25,21 @@ from fcos_lidar_jax.sensors import load_sensor
 class Project:
     """Project a point file to its multi-round range image.
 
-    Writes point_index i32[h,w,r] (row of the file, -1 empty), features f32[h,w,9,r] (x, y, z, range, azimuth,
+    Writes point_index i32[h,w,r] (row in the file, -1 for empty), features f32[h,w,9,r] (x, y, z, range, azimuth,
     inclination, intensity, existence, time lag) and the counts to a .npz file, and prints the counts as JSON.
     """
 
-    file: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FILE")]]
+    file: tyro.conf.Positional[Annotated[Path, option("FILE")]]
     """Point file: .pcd.bin, .bin, .npy, .npz, .pcd or .feather."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE.npz")]  # Where the range image goes.
-    png: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None  # Also draw the image, round by round.
-    sensor: str = "nuscenes_hdl32e"  # Sensor preset, or a sensor file.
+    out: Annotated[Path, option("FILE.npz")]  # File for the range image.
+    png: Annotated[Path | None, option("FILE.png")] = None  # Also draw the range image, one panel per round.
+    sensor: options.Sensor = "nuscenes_hdl32e"
     rounds: int = 5  # Rounds of the projection.
-    prioritize_current: bool = True  # Points of the current sweep win every collision with older ones.
-    remove_close: Literal["all", "sweeps", "none"] | None = None
-    """Drop points within a metre of the sensor in x and y: of all sweeps, of the older ones, or none. Default: of
-    all."""
-    columns: int | None = None
-    """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
-    dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
-    max_file_points: int = MAX_POINTS  # Refuse a point file of more points.
+    prioritize_current: bool = True  # Let points of the current sweep win every collision with older points.
+    remove_close: options.Close = None
+    columns: options.Columns = None
+    dtype: options.Dtype = None
+    max_file_points: options.MaxFilePoints = MAX_POINTS
 
 
 def run(args: Project) -> None:

@@ -1,4 +1,4 @@
-"""``fcos-lidar stream``: the boxes of a drive, sweep by sweep."""
+"""``fcos-lidar stream``: the boxes of a drive, one sweep after the other."""
 
 import contextlib
 import dataclasses
@@ -7,13 +7,21 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 import tyro
 
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
+from fcos_lidar_jax.cli import options
+from fcos_lidar_jax.cli.checks import (
+    check_at_least,
+    check_out_file,
+    check_outside,
+    check_score_and_angle,
+    option_name,
+)
+from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.drives import Drive, folder_drive
@@ -24,7 +32,7 @@ from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import as_records, confident
 from fcos_lidar_jax.files import line_writer
-from fcos_lidar_jax.inference import Backend, CloudDetector, load_detector
+from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open import find_data_set
@@ -35,57 +43,56 @@ from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_reco
 
 @dataclasses.dataclass(frozen=True)
 class Stream:
-    """Detect boxes in a drive, sweep by sweep, and write a line of JSON for each as it comes.
+    """Detect boxes in a drive, and write one line of JSON per sweep as soon as it is ready.
 
-    Every sweep has those before it fused into its frame, as many as the detector was trained with. Boxes are those
-    of `fcos-lidar detect --sweeps`.
+    As many earlier sweeps as the detector was trained with are fused into each sweep. The boxes are those of
+    `fcos-lidar detect --sweeps`.
     """
 
-    checkpoint: Annotated[Path, tyro.conf.arg(metavar="C")]  # Trained detector, as for `fcos-lidar detect`.
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE.jsonl")]  # Where the lines go.
-    source: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="SOURCE")]] = None
-    """Folder of point files, one sweep each; a recording of ROS 1 (.bag) or ROS 2 (its folder, .mcap, .db3); or
-    one of KITTI raw or a log of Argoverse 2, which have their poses."""
-    poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Poses of the sweeps, from the sensor to the world: lines `t x y z qx qy qz qw` (TUM); or, for a folder
-    alone, FILE.json, a list [{"file", "timestamp_us", "sensor_to_world": 4x4}] in the order of time. Without poses
-    each sweep is on its own."""
-    topic: str | None = None  # Clouds (PointCloud2) of a recording of ROS; may be left out where there is one.
-    odometry: Annotated[str | None, tyro.conf.arg(metavar="T|tf")] = None
-    """Poses of a recording of ROS: a topic of Odometry, PoseStamped or PoseWithCovarianceStamped; or tf."""
-    data_root: Path | None = None  # Instead of a folder: a data set in the layout of nuScenes.
-    scene: str | None = None  # Its scene.
-    version: str | None = None  # Its folder of tables; may be left out where there is one.
-    index: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Its index, where `fcos-lidar prepare --index` put it elsewhere."""
-    keyframes: bool = False  # Detect in the scene's keyframes alone; the sweeps between are fused where need be.
-    allow_missing_sweeps: bool = False  # Pass over sweeps of the scene whose file is missing.
-    follow_links: bool = False  # Read files to which links lead outside of DATA_ROOT.
-    page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
-    """Also write a page that shows the drive: one file for any browser, which asks for nothing else."""
-    rrd: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
-    """Also write a recording for the viewer rerun, with `pip install 'fcos-lidar-jax[viz]'`."""
-    yaw_deg: float = 0.0
-    """Turn the clouds by this angle about z for the detector, and the boxes back: 90 where x points ahead, as in
-    most recordings of ROS, and the detector is of nuScenes' sensor, whose y axis does (`hdl32e`)."""
-    track: bool = False  # Give every box the identity of its object over time; needs poses.
-    min_score: float = 0.0  # Leave out boxes below this score.
-    backend: Backend = "xla"  # What the network runs in, as for `fcos-lidar detect`.
-    columns: int | None = None
-    """Values a point in a raw file of another layout: 3, 4, 5 (the fifth is the time lag) or 6."""
-    dtype: Literal["float16", "float32", "float64"] | None = None  # Number type of a raw file of another layout.
-    max_file_points: int = MAX_POINTS  # Refuse a point file of more points.
+    checkpoint: options.Detector
+    out: Annotated[Path, option("FILE.jsonl")]  # File to write.
+    source: tyro.conf.Positional[Annotated[Path | None, option("SOURCE")]] = None
+    """Folder of point files, one per sweep; ROS 1 (.bag) or ROS 2 (folder, .mcap, .db3) recording; KITTI raw
+    drive; or Argoverse 2 log."""
+    poses: Annotated[
+        Path | None, option("FILE", default="those of the source; without any, sweeps are not fused")
+    ] = None
+    """Poses from sensor to world for a folder or a ROS recording, lines `t x y z qx qy qz qw` (TUM). For a folder
+    also FILE.json: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], oldest first."""
+    topic: Annotated[str | None, option("T", default="the only one")] = None
+    """ROS: topic of the PointCloud2 messages."""
+    odometry: Annotated[str | None, option("T|tf")] = None
+    """ROS: poses from a topic (Odometry, PoseStamped or PoseWithCovarianceStamped) or from tf."""
+    data_root: Annotated[Path | None, option("DIR")] = None  # Data set in the nuScenes layout, instead of SOURCE.
+    scene: Annotated[str | None, option("NAME")] = None  # With --data-root: the scene to detect in.
+    version: Annotated[str | None, option("NAME", default="the only one")] = None
+    """With --data-root: folder of the tables."""
+    index: Annotated[Path | None, option("DIR", default="DATA_ROOT/.fcos_lidar/VERSION")] = None
+    """With --data-root: folder of the index, as given to `fcos-lidar prepare --index`."""
+    keyframes: bool = False  # With --data-root: detect in keyframes only, still fusing the sweeps between them.
+    allow_missing_sweeps: bool = False  # With --data-root: skip sweeps whose file is missing.
+    follow_links: bool = False  # With --data-root: follow links that lead out of DATA_ROOT.
+    page: options.Page = None
+    rrd: Annotated[Path | None, option("FILE.rrd")] = None
+    """Also write a recording for the Rerun viewer. Needs pip install 'fcos-lidar-jax[viz]'."""
+    yaw_deg: options.Yaw = 0.0
+    track: bool = False  # Give each box the number of its object over time. Needs poses.
+    min_score: options.MinScore = 0.0
+    backend: options.Backend = "xla"
+    columns: options.Columns = None
+    dtype: options.Dtype = None
+    max_file_points: options.MaxFilePoints = MAX_POINTS
 
 
 def run(args: Stream) -> None:
-    """Detect, write a line a sweep, and the page at the end."""
+    """Detect, write one line per sweep, and the page at the end."""
     _check(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
     drive, at_us = _open(args, detector)
     if args.track and not drive.posed:
-        raise ValueError("--track: found no poses, expected --poses FILE, or --odometry of a recording of ROS")
+        raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
     if not drive.posed:
-        print("no poses: every sweep is detected on its own, without those before it", file=sys.stderr)
+        print("no poses: every sweep is detected on its own, without earlier sweeps", file=sys.stderr)
     _tell(drive.notes)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
@@ -110,24 +117,24 @@ def run(args: Stream) -> None:
                 tracks, ids = track(tracks, to_world(boxes, found.sweep.sensor_to_world), labels, scores, dt)
                 record["boxes"] = [b | {"track": int(i)} for b, i in zip(record["boxes"], ids, strict=True)]
             write_line(record)
-            look = {"name": Path(found.sweep.name).name, "ids": ids}
+            details = {"name": Path(found.sweep.name).name, "ids": ids}
             if drive.posed:
-                look |= {"time_us": found.sweep.time_us, "pose": found.sweep.sensor_to_world}
+                details |= {"time_us": found.sweep.time_us, "pose": found.sweep.sensor_to_world}
             points = found.sweep.points[:, :4]
-            record_rerun(points, (boxes, labels, scores), **look)
+            record_rerun(points, (boxes, labels, scores), **details)
             if args.page is not None:
-                frames.append(page_frame(points, (boxes, labels, scores), **look))
+                frames.append(page_frame(points, (boxes, labels, scores), **details))
             before_us = found.sweep.time_us
     _tell(drive.notes)
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:
-        shown: dict[str, Any] = {"min_score": args.min_score} if args.min_score else {}
-        write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source), **shown)
+        threshold: dict[str, Any] = {"min_score": args.min_score} if args.min_score else {}
+        write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source), **threshold)
 
 
 @contextlib.contextmanager
 def _write_lines(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A function that writes a record as a line. What stood in the file is lost with the first, not before."""
+    """A function that writes a record as a line. The first line replaces an earlier file."""
     with contextlib.ExitStack() as stack:
         opened: list[Callable[[bytes], None]] = []
 
@@ -140,7 +147,7 @@ def _write_lines(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
 
 
 def _announcing(sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
-    """The sweeps; the first one, once it could be read, has the detector compiled."""
+    """The sweeps. After reading the first one, say that the detector is compiled."""
     for number, sweep in enumerate(sweeps):
         if not number:
             print("compiling the detector", file=sys.stderr, flush=True)
@@ -148,13 +155,13 @@ def _announcing(sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
 
 
 def _tell(notes: list[str]) -> None:
-    """Each once."""
+    """Print each note once."""
     while notes:
         print(f"note: {notes.pop(0)}", file=sys.stderr)
 
 
 class _Timing(contextlib.AbstractContextManager):
-    """Seconds of each sweep by stage, and how many programs were compiled until its end."""
+    """Seconds per sweep and stage, and the number of programs compiled up to each sweep."""
 
     def __init__(self) -> None:
         self._reading, self._to_boxes, self._writing = list[float](), list[float](), list[float]()
@@ -172,13 +179,13 @@ class _Timing(contextlib.AbstractContextManager):
 
     def detect(self, stream: Iterable[Found]) -> Iterator[Found]:
         for found in _timed(stream, self._to_boxes, self._writing):
-            self._reading.append(sum(self._read))  # Also of sweeps that are only fused.
+            self._reading.append(sum(self._read))  # including sweeps that are only fused
             self._read.clear()
             yield found
             self._until.append(self._programs)
 
     def summary(self) -> str:
-        """A line with the medians; the first sweep, for which the detector is compiled, stands apart."""
+        """A line with the medians. The first sweep, which includes the compilation, is listed separately."""
         number = len(self._until)
         if number < 2:
             return f"{number} sweeps"
@@ -191,7 +198,7 @@ class _Timing(contextlib.AbstractContextManager):
 
 
 def _timed(items: Iterable[Any], within: list[float], between: list[float]) -> Iterator[Any]:
-    """The items; how long each took to come is added to one list, and how long it was in use to the other."""
+    """The items. Appends the seconds to produce each item to ``within``, and to consume it to ``between``."""
     began = time.perf_counter()
     for item in items:
         ready = time.perf_counter()
@@ -203,36 +210,33 @@ def _timed(items: Iterable[Any], within: list[float], between: list[float]) -> I
 
 def _check(args: Stream) -> None:
     check_at_least(args, 1, "max_file_points")
-    if not 0 <= args.min_score <= 1:
-        raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
-    if not np.isfinite(args.yaw_deg):
-        raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
+    check_score_and_angle(args)
     if args.source is not None and not args.source.exists():
         raise ValueError(f"{args.source}: no such file or folder")
     if (args.source is None) == (args.data_root is None):
-        raise ValueError("stream: expected a folder of point files or --data-root, or a recording, one of them")
+        raise ValueError("stream: expected either a folder of point files or a recording, or --data-root")
     if (args.data_root is None) != (args.scene is None):
         raise ValueError("stream: expected --data-root and --scene together")
     is_ros = args.source is not None and is_ros_bag(args.source)
-    foreign: dict[str, str] = {}  # an option, and what alone it is for
+    foreign: dict[str, str] = {}  # options that do not fit the source, and what they are for
     if args.source is not None:
         of_scenes = "version", "index", "keyframes", "allow_missing_sweeps", "follow_links"
         foreign |= dict.fromkeys(of_scenes, "--data-root")
     elif args.max_file_points != MAX_POINTS:
-        raise ValueError("--max-file-points: expected with a folder or a recording alone")
+        raise ValueError("--max-file-points: expected only with a folder or a recording")
     if args.source is None or is_ros or _is_log(args):
         foreign |= dict.fromkeys(("columns", "dtype"), "a folder of point files")
     if not is_ros:
-        foreign |= dict.fromkeys(("topic", "odometry"), "a recording of ROS (.bag, .mcap, .db3, metadata.yaml)")
+        foreign |= dict.fromkeys(("topic", "odometry"), "a ROS recording (.bag, .mcap, .db3, metadata.yaml)")
     if args.source is None or args.odometry is not None:
-        foreign["poses"] = "a folder of point files, or a recording of ROS without --odometry,"
+        foreign["poses"] = "a folder of point files, or with a ROS recording without --odometry"
     if given := [name for name in foreign if getattr(args, name)]:
-        raise ValueError(f"--{given[0].replace('_', '-')}: expected with {foreign[given[0]]} alone")
+        raise ValueError(f"{option_name(given[0])}: expected only with {foreign[given[0]]}")
     keep = [path for path in (args.source, args.poses) if path is not None and path.is_file()]
     if args.source is not None and args.source.is_dir():
         keep += [path for path in args.source.rglob("*") if path.name.lower().endswith(ENDINGS)]
-    for option, out in (("--out", args.out), ("--page", args.page), ("--rrd", args.rrd)):
-        check_outside(option, out, args.checkpoint)
+    for name, out in (("--out", args.out), ("--page", args.page), ("--rrd", args.rrd)):
+        check_outside(name, out, args.checkpoint)
     check_out_file("--out", args.out, keep=keep)
     if args.page is not None:
         check_out_file("--page", args.page, keep=[*keep, args.out])
@@ -243,13 +247,13 @@ def _check(args: Stream) -> None:
 
 
 def _is_log(args: Stream) -> bool:
-    """Whether the source is a drive of KITTI or Argoverse 2, which knows its poses and its files' layout."""
+    """Whether the source is a KITTI raw drive or an Argoverse 2 log, which define their poses and file layout."""
     source = args.source
     return args.poses is None and source is not None and (is_kitti_raw(source) or is_argoverse2_log(source))
 
 
 def _open(args: Stream, detector: CloudDetector) -> tuple[Drive, Collection[int] | None]:
-    """The drive, and the times of the sweeps to detect in; None for all."""
+    """Open the drive; also returns the times of the sweeps to detect in, None for all."""
     if args.source is not None:
         return _open_source(args, args.source, detector.sensor), None
     assert args.data_root is not None
@@ -257,9 +261,9 @@ def _open(args: Stream, detector: CloudDetector) -> tuple[Drive, Collection[int]
     version = find_data_set(args.data_root, "nuscenes", args.version).version
     allowed = {"allow_missing_sweeps": args.allow_missing_sweeps, "follow_links": args.follow_links}
     data = NuScenes(args.data_root, version, index=args.index, **allowed)
-    alone = args.keyframes and detector.config.num_sweeps == 1
+    only_keyframes = args.keyframes and detector.config.num_sweeps == 1
     at_us = data.keyframe_times_us(args.scene) if args.keyframes else None
-    return Drive(data.drive(args.scene, keyframes=alone)), at_us
+    return Drive(data.drive(args.scene, keyframes=only_keyframes)), at_us
 
 
 def _open_source(args: Stream, source: Path, sensor: Sensor) -> Drive:
@@ -275,7 +279,7 @@ def _open_source(args: Stream, source: Path, sensor: Sensor) -> Drive:
 
 
 def _record(found: Found, classes: tuple[str, ...], min_score: float, drive: Drive) -> dict[str, Any]:
-    """A line's content, in the words of ``fcos-lidar detect``; null where it is not known."""
+    """A line with the fields of ``fcos-lidar detect``; unknown values are null."""
     cloud, sweep = found.cloud, found.sweep
     dropped = int(found.detections.num_dropped) + cloud.num_removed
     record: dict[str, Any] = {"file": sweep.name, "timestamp_us": sweep.time_us if drive.timed else None}

@@ -4,40 +4,44 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
+from typing import Annotated
 
+from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
+from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset
-from fcos_lidar_jax.simulation.render import SWEEPS_PER_KEYFRAME, DatasetSpec
+from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.simulation.streets import STREETS
 
 
 @dataclasses.dataclass(frozen=True)
 class Synthesize:
-    """Simulate streets with objects of all ten classes, seen by a turning LiDAR, and write them as a data set in
-    the official nuScenes layout.
+    """Simulate drives through streets with objects of the ten nuScenes classes, seen by a rotating LiDAR, and
+    write them in the official nuScenes layout.
 
-    The same options give the same bytes, and a scene does not depend on how many there are. Ctrl-C, or a kill,
-    loses the scene at hand: the same command resumes. The last fifth of the scenes is the split val, the others
-    are train; the official devkit, which reserves those names, knows them as synthetic_val and synthetic_train.
+    The same options give the same bytes, and a scene does not depend on the number of scenes. After Ctrl-C or a
+    kill, the same command resumes and repeats one scene. The last fifth of the scenes is the split val, the rest
+    is train. The official devkit reserves these names; there they are called synthetic_val and synthetic_train.
     """
 
-    out: Path  # Folder of the data set: new or empty, or where the same command was stopped.
-    scenes: int  # How many; with the defaults a scene lasts 19.5 s and takes 272 MB.
-    seed: int = 0  # Another seed gives other streets.
-    keyframes: int = 40  # Annotated keyframes a scene, at 2 Hz, with nine sweeps between two of them.
-    sensor: str = "nuscenes_hdl32e"  # Sensor preset, or a sensor file.
-    streets: str = "city"  # Varied streets (city), or such with few things besides objects (plain).
+    out: Annotated[Path, option("DIR")]  # Folder of the data set: new or empty, or of an interrupted call.
+    scenes: int  # Number of scenes. By default a scene lasts 19.5 s and takes 272 MB.
+    seed: int = 0  # Seed of the streets.
+    keyframes: int = 40  # Annotated keyframes per scene, at 2 Hz, with nine sweeps between two keyframes.
+    sensor: options.Sensor = "nuscenes_hdl32e"
+    streets: Annotated[str, option(f"{{{','.join(STREETS)}}}")] = "city"
+    """Varied streets (city), or streets with little besides the objects (plain)."""
     rolling_shutter: bool = True
-    """Car and objects move while the sensor turns, as they do in real data; takes about twice as long."""
-    workers: int = 1  # Processes.
-    version: str = "v1.0-synthetic"  # Folder of the tables.
+    """Move the ego vehicle and objects while the sensor turns, as in real data. Takes about twice as long."""
+    workers: int = 1  # Processes that simulate.
+    version: Annotated[str, option("NAME")] = "v1.0-synthetic"  # Folder of the tables.
 
 
 def run(args: Synthesize) -> None:
-    """Write the data set, and print what it holds."""
+    """Write the data set, and print a record of it."""
     check_at_least(args, 1, "scenes", "keyframes", "workers")
     check_at_least(args, 0, "seed")
     if not args.version or args.version.startswith(".") or Path(args.version).name != args.version:
@@ -49,13 +53,15 @@ def run(args: Synthesize) -> None:
     check_out_folder(args.out)
     sensor = load_sensor(args.sensor)
     if sensor.row_source == "laser":
-        found = f"{sensor.name}, whose rows come from laser numbers"
-        raise ValueError(f"--sensor: got {found}, expected one without: the layout of nuScenes has none")
+        raise ValueError(
+            f"--sensor: got {sensor.name}, whose rows come from laser numbers, expected another one: the nuScenes "
+            "layout has no laser numbers"
+        )
     fields = args.scenes, args.seed, args.keyframes, sensor, args.rolling_shutter, args.version
-    order = DatasetSpec(*fields, STREETS[args.streets])
-    sweeps = args.scenes * ((args.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1)
+    spec = DatasetSpec(*fields, STREETS[args.streets])
+    sweeps = args.scenes * spec.sweeps
     progress = Progress("sweeps", sweeps)
-    if not write_dataset(order, args.out, workers=args.workers, report=progress.show):
+    if not write_dataset(spec, args.out, workers=args.workers, report=progress.show):
         print(f"{args.out}: was there already", file=sys.stderr)
     record = {
         "data_root": str(args.out),

@@ -12,8 +12,9 @@ import jax
 import tyro
 
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_of
-from fcos_lidar_jax.cli.checks import check_out_folder
+from fcos_lidar_jax.cli.checks import check_out_folder, option_name
 from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
@@ -29,14 +30,14 @@ from fcos_lidar_jax.training.plan import check_numbers, check_run
 
 _ABOUT = {
     "nuscenes": "the paper's detector on ten sweeps",
-    "nuscenes_single": "the same on one sweep",
+    "nuscenes_single": "the paper's detector on one sweep",
     "nuscenes_test": "the paper's test-set model",
     "kitti": "one sweep of KITTI's camera view, three classes",
     "argoverse2": "one sweep of Argoverse 2, 26 classes",
-    "compact": "one sweep of nuScenes, quick on two CPU cores",
-    "quickstart": "small enough for two CPU cores",
+    "compact": "a smaller network on one sweep of nuScenes, for two CPU cores",
+    "quickstart": "smaller still, for a short-range sensor and tests",
     "centerpoint_pillars": "CenterPoint on ten sweeps, for comparison",
-    "centerpoint_compact": "CenterPoint on one sweep, of about the cost of compact",
+    "centerpoint_compact": "CenterPoint on one sweep, at about the cost of compact",
 }
 _PRESETS: Any = (
     Annotated[
@@ -44,52 +45,60 @@ _PRESETS: Any = (
     ]
     for name, preset in PRESETS.items()
 )
-_OBJECTS = "objects"  # Folder in the run's, where objects of single frames are cut.
-_MAX_SIMULATED = 2000  # Simulated frames that may be made before the first step: minutes.
+_OBJECTS = "objects"  # folder in the run's folder for objects cut from selected frames
+_MAX_SIMULATED = 2000  # simulated frames that may be made before the first step, which takes minutes
 _Preset: Any = reduce(or_, _PRESETS)
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a preset: fcos-lidar train PRESET --data-root DIR --out DIR; every number of the preset is an option,
-    see fcos-lidar train PRESET --help.
+    """Train a preset: fcos-lidar train PRESET --data-root DIR --out DIR.
 
-    OUT gets checkpoints, metrics.jsonl, TensorBoard events, curves and pictures. All local devices share each
-    batch. Ctrl-C and SIGTERM save and stop; the same command with --resume resumes, bit for bit.
+    Every field of the preset is an option, see fcos-lidar train PRESET --help. OUT gets checkpoints,
+    metrics.jsonl, TensorBoard events, curves and pictures. All local devices share each batch. Ctrl-C and SIGTERM
+    save a checkpoint and stop. The same command with --resume continues, bit-identical to an uninterrupted run.
     """
 
     config: Annotated[_Preset, tyro.conf.arg(name=""), tyro.conf.AvoidSubcommands]  # type: ignore[valid-type]
-    """The preset, with its changes."""
+    """Preset to train."""
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
-    out: Path  # Folder of the run.
-    train_split: str | None = None
-    """Default: train, or mini_train for a version that ends in mini; all frames where the data have no splits."""
-    val_split: str | None = None
-    """Evaluated on along the way; default: val or mini_val where there is one; "none" for no evaluation."""
-    samples: str | None = None
-    """FIRST:LAST: frames of the training split in their order, LAST excluded; several, separated by commas."""
-    val_samples: str | None = None  # Likewise, of the split that is evaluated on.
-    resume: bool = False  # Go on from the newest checkpoint in OUT.
-    weights: Path | None = None  # Begin with the weights of this checkpoint, or of the last of this run.
-    steps: int | None = None  # Updates, instead of optimizer.epochs passes over the training set.
-    seed: int = 0  # Of weights, order, pasted objects and augmentation.
-    evaluate_every: int | None = None  # Steps between two evaluations; default: a tenth of the run.
-    save_every: int | None = None  # Steps between two checkpoints; default: a fiftieth of the run.
-    keep: int = 2  # Newest checkpoints that are kept beside the best.
-    no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without flips, rotations and scales.
-    no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Without objects of other frames.
-    threads: int | None = None
-    """Threads that prepare batches, per worker process if there are any. Default: the available cores, divided
-    among the workers, less one if there are more than two; at most 16."""
-    workers: int = 0  # Worker processes that prepare batches in place of the main process; 0 for none.
+    out: Annotated[Path, option("DIR")]  # Folder of the run.
+    train_split: Annotated[
+        str | None, option("SPLIT", default="train, mini_train, or all frames without splits")
+    ] = None
+    """Split to train on."""
+    val_split: Annotated[str | None, option("SPLIT|none", default="val or mini_val, if there is one")] = None
+    """Split to evaluate on during training; none for no evaluation."""
+    samples: Annotated[str | None, option("FIRST:LAST,...", default="all")] = None
+    """Ranges of the training split's frames, LAST excluded."""
+    val_samples: Annotated[str | None, option("FIRST:LAST,...", default="all")] = None
+    """Ranges of the frames of --val-split, LAST excluded."""
+    resume: bool = False  # Continue from the newest checkpoint in OUT.
+    weights: Annotated[Path | None, option("C", default="random weights")] = None
+    """Start from the weights of a checkpoint, of the last checkpoint of a run, or from shipped weights."""
+    steps: Annotated[int | None, option("N", default="--optimizer.epochs passes over the frames")] = None
+    """Training steps."""
+    seed: int = 0  # Seed of weights, frame order, pasted objects and augmentation.
+    evaluate_every: Annotated[int | None, option("N", default="a tenth of the run")] = None
+    """Steps between two evaluations."""
+    save_every: Annotated[int | None, option("N", default="a fiftieth of the run")] = None
+    """Steps between two checkpoints."""
+    keep: int = 2  # Number of newest checkpoints to keep beside the best one.
+    no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Turn off flips, rotations and scaling.
+    no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Do not paste objects of other frames.
+    threads: Annotated[
+        int | None, option("N", default="the cores per worker, less one if more than two; at most 16")
+    ] = None
+    """Threads that prepare batches, per worker process if there are any."""
+    workers: int = 0  # Worker processes that prepare batches; 0 for threads of the main process.
     no_packing: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Send batches to GPUs and TPUs unpacked: more bytes, the same results. CPUs always get them unpacked."""
+    """Send batches to GPUs and TPUs unpacked, with more bytes and the same results. CPUs never use packing."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
-    """Several processes share each batch."""
+    """Share each batch among several processes."""
 
 
 def run(args: Train) -> None:
-    """Train, and print where the result is."""
+    """Train, and print the paths of the run and its checkpoints."""
     _check(args)
     schedule = Schedule(args.save_every, args.evaluate_every, args.keep)
     join_processes(args.processes)
@@ -100,11 +109,13 @@ def run(args: Train) -> None:
     try:
         with contextlib.ExitStack() as held:
             with agreed("cannot train"):
-                if task.cuts_objects and is_main_process:  # one cuts, the others find it done
+                if task.cuts_objects and is_main_process:  # the other processes open the result
                     check_numbers(task.steps, args.seed)
                     held.enter_context(folder_lock(args.out, "training"))
-                    check_run(args.out, resume=args.resume)  # another process may have been faster
-                    _cut_objects(args.out, task)
+                    check_run(args.out, resume=args.resume)  # another process may have started the run
+                    assert task.config.copy_paste is not None
+                    min_points = task.config.copy_paste.min_points
+                    database.prepare_database(task.frames, args.out / _OBJECTS, min_points=min_points)
             with agreed("cannot train"):
                 objects = _objects(args, task)
             state = train(
@@ -120,7 +131,7 @@ def run(args: Train) -> None:
             )
     except (KeyboardInterrupt, SystemExit):
         if checkpoints.paths():
-            tell("the same command with --resume goes on")
+            tell("the same command with --resume continues")
         raise
     if is_main_process:
         paths = checkpoints.paths()
@@ -131,19 +142,17 @@ def run(args: Train) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """What is trained, on what."""
-
     config: Config
     data: DataSet
     split: str | None
     frames: FrameSet
     tests: FrameSet | None
     steps: int
-    cuts_objects: bool  # Pasted objects are those of these frames alone, cut in the run's folder.
+    cuts_objects: bool  # pasted objects come only from these frames and are stored in the run's folder
 
 
 def _open(args: Train) -> _Task:
-    """Open the data; refuse what does not fit together."""
+    """Open the data, and check that they fit the options."""
     config = dataclasses.replace(
         args.config,
         augment=None if args.no_augment else args.config.augment,
@@ -160,18 +169,18 @@ def _open(args: Train) -> _Task:
     _check_sensor(config, data, frames)
     tests = _open_tests(args, config, data)
     if split is None and args.samples is None and tests is None:
-        tell(f"{data.root}: no splits: all {len(frames)} frames are trained on, none is left to evaluate on")
+        tell(f"{data.root}: no splits: training on all {len(frames)} frames, with no evaluation")
     if tests is not None:
         _tell_of_overlap(frames, tests)
     if not data.on_disk:
         _check_simulated(len(frames), config)
     steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
-    own = args.samples is not None or not data.on_disk
-    return _Task(config, data, split, frames, tests, steps, own and config.copy_paste is not None)
+    cuts_objects = config.copy_paste is not None and (args.samples is not None or not data.on_disk)
+    return _Task(config, data, split, frames, tests, steps, cuts_objects)
 
 
 def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
-    # The default sensor is that of the preset, which --name may have renamed.
+    # --sensor was given if it differs from the preset's sensor; --name may have renamed the preset.
     presets = [preset for preset in PRESETS.values() if preset.name == config.name] or PRESETS.values()
     if data.reader.sensor is None and config.sensor not in (frames.sensor.name, *(p.sensor for p in presets)):
         raise ValueError(
@@ -180,7 +189,7 @@ def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
 
 
 def _open_tests(args: Train, config: Config, data: DataSet) -> FrameSet | None:
-    """The frames to evaluate on along the way, if there are any."""
+    """Open the frames to evaluate on during training, if any."""
     split, tests = args.val_split or args.data.split("val", required=False), None
     if split != "none" and (split or args.val_samples):
         tests = args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
@@ -197,29 +206,24 @@ def _check(args: Train) -> None:
     if args.val_split == "none":
         for name in ("val_samples", "evaluate_every"):
             if (given := getattr(args, name)) is not None:
-                option = f"--{name.replace('_', '-')}"
-                raise ValueError(f"{option}: got {given!r} with --val-split none, which evaluates nothing")
+                raise ValueError(
+                    f"{option_name(name)}: got {given!r} with --val-split none, which turns evaluation off"
+                )
 
 
 def _check_simulated(number: int, config: Config) -> None:
-    """Simulated frames are made one by one, so nothing should need all of very many before the first step."""
-    wanted = {"class_balanced": config.class_balanced, "copy_paste": config.copy_paste is not None}
-    if number > _MAX_SIMULATED and any(wanted.values()):
-        options = " ".join(f"--no-{name.replace('_', '-')}" for name, on in wanted.items() if on)
+    """Reject options that would simulate very many frames before the first step."""
+    costly = {"--no-class-balanced": config.class_balanced, "--no-copy-paste": config.copy_paste is not None}
+    if number > _MAX_SIMULATED and any(costly.values()):
+        options = " ".join(name for name, is_on in costly.items() if is_on)
         raise ValueError(
             f"--format simulated: all {number} frames would be made before the first step, expected {options}, or "
             f"at most {_MAX_SIMULATED} of them by --samples"
         )
 
 
-def _cut_objects(out: Path, task: _Task) -> None:
-    """Cut the objects of the training frames alone in the run's folder, which is locked."""
-    assert task.config.copy_paste is not None
-    database.prepare_database(task.frames, out / _OBJECTS, min_points=task.config.copy_paste.min_points)
-
-
 def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
-    """The objects to paste: those just cut, or those prepared of the split."""
+    """Open the objects to paste, just cut or prepared for the split; None without copy-paste."""
     config, split = task.config, task.split
     if config.copy_paste is None:
         return None
@@ -227,30 +231,29 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
         return database.open_database(args.out / _OBJECTS)
     folder = database.objects_folder(args.data.index or task.data.index, split)
     if not folder.is_dir():
-        of = "" if split is None else f" --train-split {split}"
+        option = "" if split is None else f" --train-split {split}"
         raise ValueError(
-            f"{folder}: no objects here, expected those of the training frames: run fcos-lidar prepare{of}, "
+            f"{folder}: no objects here, expected objects of the training frames: run fcos-lidar prepare{option}, "
             "or train with --no-copy-paste"
         )
     source = database.read_manifest(folder).source
     if config.num_sweeps > database.MAX_SWEEPS:
         raise ValueError(
-            f"num_sweeps: got {config.num_sweeps}, expected at most {database.MAX_SWEEPS} with pasted objects, or "
+            f"num_sweeps: got {config.num_sweeps}, expected at most {database.MAX_SWEEPS} with copy-paste, or "
             "--no-copy-paste"
         )
-    # Objects of more sweeps than are fused will do: those too many are left out.
+    # Objects cut from more sweeps fit too: their surplus sweeps are left out.
     sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
     if not any(source == args.data.open_whole(split, database.cut_reading(n)).fingerprint() for n in sweeps):
         raise ValueError(
-            f"{folder}: cut from other frames than those of split {split!r}, with another --class-map, or from "
-            f"fewer sweeps than {config.num_sweeps}, expected these: run fcos-lidar prepare again, with the same "
-            "options for the data"
+            f"{folder}: cut from other frames than split {split!r}, with another --class-map, or from fewer than "
+            f"{config.num_sweeps} sweeps: run fcos-lidar prepare again, with the same data options"
         )
     return database.open_database(folder)
 
 
 def _tell_of_overlap(frames: FrameSet, tests: FrameSet) -> None:
-    """Print how many frames are both trained and evaluated on."""
+    """Count the frames that are both trained and evaluated on."""
     names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
     if shared := len(names & tested):
-        tell(f"{shared} of the {len(tests)} frames to evaluate on are trained on too: scores will be too high")
+        tell(f"{shared} of the {len(tests)} evaluation frames are also training frames: scores will be too high")

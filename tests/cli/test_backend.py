@@ -1,4 +1,4 @@
-"""``--backend openvino`` of the commands, and the network's graph as a file."""
+"""``--backend openvino``, and the export of the network as an ONNX graph."""
 
 import json
 import re
@@ -28,34 +28,32 @@ def home(tmp_path_factory):
     return folder
 
 
-def test_detect_and_stream_find_what_xla_finds(home, tmp_path):
+def test_detect_and_stream_agree_with_xla(home, tmp_path):
+    files = {}
     for backend in ("xla", "openvino"):
-        options = "--checkpoint", home / "checkpoint", "--backend", backend, "--out"
-        command("detect", home / "clouds", *options, tmp_path / f"{backend}.json")
-        command("stream", home / "clouds", *options, tmp_path / f"{backend}.jsonl")
-    ours, found = (json.loads((tmp_path / f"{name}.json").read_text())["files"] for name in ("xla", "openvino"))
-    for a, b in zip(ours, found, strict=True):
+        out = tmp_path / f"{backend}.json"
+        command("detect", home / "clouds", "--checkpoint", home / "checkpoint", "--backend", backend, "--out", out)
+        files[backend] = json.loads(out.read_text())["files"]
+    for a, b in zip(*files.values(), strict=True):
         assert a["num_dropped"] == b["num_dropped"]
-        scores = [[box["score"] for box in of["boxes"]] for of in (a, b)]
+        scores = [[box["score"] for box in file["boxes"]] for file in (a, b)]
         assert len(scores[0]) > 0
         np.testing.assert_allclose(*scores, atol=0.02)  # bfloat16
-    lines = [json.loads(line) for line in (tmp_path / "openvino.jsonl").read_text().splitlines()]
-    assert [line["boxes"] for line in lines] == [file["boxes"] for file in found]
+    options = "--backend openvino --checkpoint", home / "checkpoint"
+    command("stream", home / "clouds", *options, "--out", tmp_path / "a.jsonl")
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert [line["boxes"] for line in lines] == [file["boxes"] for file in files["openvino"]]
 
 
 def test_benchmark_times_the_same_stages(home, tmp_path):
-    command(
-        "benchmark --backend openvino --repeats 1 --batch 1 2 --checkpoint",
-        home / "checkpoint",
-        "--out",
-        tmp_path / "a",
-    )
+    options = "--backend openvino --repeats 1 --batch 1 2 --checkpoint", home / "checkpoint"
+    command("benchmark", *options, "--out", tmp_path / "a")
     record = json.loads((tmp_path / "a").read_text())
     assert list(record["stages"]) == ["clean", "prepare", "network", "postprocess", "detect", "whole"]
     assert record["backend"] in ("openvino float32", "openvino bfloat16")
 
 
-def test_evaluate_resumes_with_the_same_backend_alone(home, tmp_path):
+def test_evaluate_accepts_the_backend(home, tmp_path):
     data = "--format simulated --sensor tiny --samples 0:2 --no-report --checkpoint"
     command("evaluate", data, home / "checkpoint", "--backend openvino --out", tmp_path)
     assert json.loads((tmp_path / "metrics_summary.json").read_text())["mean_ap"] >= 0
@@ -70,7 +68,7 @@ def test_export_writes_the_graph(home, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out.splitlines()[0])["bytes"] == (tmp_path / "a.onnx").stat().st_size
 
 
-def test_the_documents_lines_run(home):
+def test_the_python_of_the_export_page_runs(home):
     text = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
     code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[-1]
     command("export --network-only --format onnx --checkpoint quickstart --out", home / "network.onnx")

@@ -1,4 +1,4 @@
-"""The second detector through the same commands: train, evaluate, detect, export, benchmark."""
+"""CenterPoint with every command: train, evaluate, detect, export, benchmark."""
 
 import json
 
@@ -32,7 +32,7 @@ def home(tmp_path_factory):
     return folder
 
 
-def test_the_loss_falls_and_is_that_of_its_parts(home):
+def test_the_loss_falls_and_is_the_weighted_sum_of_its_parts(home):
     lines = [line for line in read_metrics(home / "run") if "loss/total" in line]
     assert len(lines) == STEPS
     totals = [line["loss/total"] for line in lines]
@@ -47,22 +47,22 @@ def test_evaluates_and_detects(home, tmp_path):
     assert 0 <= json.loads((tmp_path / "scores" / "metrics_summary.json").read_text())["mean_ap"] <= 1
     command("detect", home / "cloud.npy", "--checkpoint", home / "run", "--out", tmp_path / "boxes.json")
     [record] = json.loads((tmp_path / "boxes.json").read_text())["files"]
-    found = fcos.load_detector(home / "run")(home / "cloud.npy")
-    assert [box["box"] for box in record["boxes"]] == found.boxes[found.valid].tolist()
+    detections = fcos.load_detector(home / "run")(home / "cloud.npy")
+    assert [box["box"] for box in record["boxes"]] == detections.boxes[detections.valid].tolist()
     assert record["boxes"]
 
 
-def test_a_checkpoint_and_an_exported_file_give_back_the_detector(home):
+def test_checkpoint_and_exported_file_hold_the_detector(home):
     trained = load_trained(home / "run")
-    again = load_checkpoint(find_checkpoint(home / "run"))
-    assert again.config == trained.config
-    assert type(again.config) is CenterPointConfig
-    assert bits(again.variables) == bits(trained.variables)
+    checkpoint = load_checkpoint(find_checkpoint(home / "run"))
+    assert checkpoint.config == trained.config
+    assert type(checkpoint.config) is CenterPointConfig
+    assert bits(checkpoint.variables) == bits(trained.variables)
     command("export --checkpoint", home / "run", "--out", home / "detector.fcos")
     exported = fcos.load_detector(home / "detector.fcos")
     assert exported.config == trained.config
     for a, b in zip(*(jax.tree.leaves(d(home / "cloud.npy")) for d in (exported, trained)), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-4)  # the same bits where programs are optimised
+        np.testing.assert_allclose(a, b, atol=1e-4)  # bit-identical with compiler optimisation
 
 
 def test_benchmark_times_the_same_stages(home, tmp_path):
@@ -71,7 +71,7 @@ def test_benchmark_times_the_same_stages(home, tmp_path):
     assert list(stages) == ["clean", "prepare", "network", "postprocess"]
 
 
-def test_what_runs_range_images_alone_refuses_it_in_one_line(home, tmp_path, capsys):
+def test_onnx_and_openvino_reject_it_in_one_line(home, tmp_path, capsys):
     run, cloud, out = (str(path) for path in (home / "run", home / "cloud.npy", tmp_path / "out"))
     export = ["export", "--checkpoint", run, "--network-only", "--format", "onnx", "--out", out]
     detect = ["detect", cloud, "--checkpoint", run, "--backend", "openvino", "--out", out]

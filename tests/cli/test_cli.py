@@ -1,8 +1,9 @@
-"""The command line as a user meets it: good runs, and one line for every mistake."""
+"""The commands ``detect``, ``project`` and ``demo``: their results, and one line per mistake in any command."""
 
 import dataclasses
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 from unittest.mock import Mock
@@ -18,6 +19,7 @@ from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpo
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import demo, main
 from fcos_lidar_jax.cli import detect as detect_command
+from fcos_lidar_jax.cli.commands import _COMMANDS
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
@@ -26,7 +28,7 @@ from fcos_lidar_jax.simulation.frames import make_frame
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A folder with an untrained checkpoint, a damaged and a foreign one, and clouds good and bad."""
+    """A folder with valid and invalid checkpoints, clouds and sensors; the detector is untrained."""
     folder = tmp_path_factory.mktemp("home")
     checkpoint = Checkpoint(TINY_CONFIG, TINY, untrained(TINY_CONFIG, TINY), 7)
     save_checkpoint(folder / "checkpoint", checkpoint)
@@ -60,16 +62,24 @@ def home(tmp_path_factory):
     return folder
 
 
-def test_detect_writes_the_contract(home, tmp_path, capsys):
-    out, files = tmp_path / "boxes.json", [home / "good.npy", home / "nan.npy"]
-    look = "--pictures", tmp_path, "--page", tmp_path / "page.html"
-    command("detect", *files, "--checkpoint", home / "checkpoint", "--out", out, *look)
+def detect(home, *words):
+    """The arguments of ``detect`` with the detector of ``home``."""
+    return ["detect", *map(str, words), "--checkpoint", str(home / "checkpoint")]
+
+
+def files_of(out):
+    return json.loads(out.read_text())["files"]
+
+
+def test_detect_writes_boxes_pictures_and_a_page(home, tmp_path, capsys):
+    out, clouds, page = tmp_path / "boxes.json", [home / "good.npy", home / "nan.npy"], tmp_path / "page.html"
+    command(*detect(home, *clouds, "--out", out, "--pictures", tmp_path, "--page", page))
     progress = capsys.readouterr().err.strip().splitlines()
     assert len(progress) == 2
     assert "2/2" in progress[1]
-    good, bad = json.loads(out.read_text())["files"]
-    assert good["file"] == str(files[0])
-    assert good["num_points"] == len(np.load(files[0])) == bad["num_points"]
+    good, bad = files_of(out)
+    assert good["file"] == str(clouds[0])
+    assert good["num_points"] == len(np.load(clouds[0])) == bad["num_points"]
     assert bad["num_dropped"] == good["num_dropped"] + 1
     for box in good["boxes"]:
         assert set(box) == {"label", "score", "box"}
@@ -81,7 +91,7 @@ def test_detect_writes_the_contract(home, tmp_path, capsys):
     assert len(scores) > 0
     assert scores == sorted(scores, reverse=True)
     assert len(list(tmp_path.glob("*.png"))) == 2
-    for file, frame in zip((good, bad), page_content(tmp_path / "page.html")["frames"], strict=True):
+    for file, frame in zip((good, bad), page_content(page)["frames"], strict=True):
         assert frame["name"] == Path(file["file"]).name
         assert frame["boxes"] == [box["box"] for box in file["boxes"]]
         assert [frame["pose"], frame["truth"]] == [None, None]
@@ -89,127 +99,97 @@ def test_detect_writes_the_contract(home, tmp_path, capsys):
 
 def test_detect_turns_clouds_for_the_detector_and_boxes_back(home, tmp_path):
     cloud = np.load(home / "good.npy")
-    np.save(tmp_path / "ahead.npy", np.column_stack([cloud[:, 1], -cloud[:, 0], cloud[:, 2:]]))  # x ahead
-    checkpoint, page = ("--checkpoint", home / "checkpoint"), tmp_path / "page.html"
-    command("detect", home / "good.npy", *checkpoint, "--out", tmp_path / "a.json")
-    command(
-        "detect", tmp_path / "ahead.npy", *checkpoint, "--yaw-deg 90 --out", tmp_path / "b.json", "--page", page
-    )
-    right, ahead = (json.loads((tmp_path / f"{name}.json").read_text())["files"][0]["boxes"] for name in "ab")
+    np.save(tmp_path / "ahead.npy", np.column_stack([cloud[:, 1], -cloud[:, 0], cloud[:, 2:]]))  # x forward
+    page = tmp_path / "page.html"
+    command(*detect(home, home / "good.npy", "--out", tmp_path / "a.json"))
+    command(*detect(home, tmp_path / "ahead.npy", "--out", tmp_path / "b.json"), "--yaw-deg 90 --page", page)
+    right, ahead = (files_of(tmp_path / f"{name}.json")[0]["boxes"] for name in "ab")
     assert len(right) == len(ahead) > 0
-    for one, other in zip(right, ahead, strict=True):
-        assert one["label"] == other["label"]
-        assert one["score"] == pytest.approx(other["score"], abs=1e-4)
-        x, y, z, length, width, height, yaw, vx, vy = one["box"]
+    for a, b in zip(right, ahead, strict=True):
+        assert a["label"] == b["label"]
+        assert a["score"] == pytest.approx(b["score"], abs=1e-4)
+        x, y, z, length, width, height, yaw, vx, vy = a["box"]
         expected = [y, -x, z, length, width, height, yaw - np.pi / 2, vy, -vx]
-        found = np.array(other["box"])
-        found[6] += 2 * np.pi * round((expected[6] - found[6]) / (2 * np.pi))
-        np.testing.assert_allclose(found, expected, atol=2e-3)
+        box = np.array(b["box"])
+        box[6] += 2 * np.pi * round((expected[6] - box[6]) / (2 * np.pi))
+        np.testing.assert_allclose(box, expected, atol=2e-3)
     [frame] = page_content(page)["frames"]
     assert frame["boxes"] == [box["box"] for box in ahead]
 
 
-@pytest.mark.parametrize("look", [[], ["--page", "page.html", "--pictures", "pictures"]], ids=["plain", "look"])
-def test_a_stopped_detect_resumes(home, tmp_path, capsys, monkeypatch, look):
-    """What is done is not detected again; another option, or another file of that name, is."""
+@pytest.mark.parametrize("more", [[], ["--page", "page.html", "--pictures", "pictures"]], ids=["plain", "drawn"])
+def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more):
     monkeypatch.chdir(tmp_path)
     clouds = [shutil.copy(home / "good.npy", tmp_path / f"{name}.npy") for name in "abcd"]
-    detect = ["detect", *clouds, "--checkpoint", home / "checkpoint", *look]
-    command(*detect, "--out whole.json")
+    words = detect(home, *clouds, *more)
+    command(*words, "--out whole.json")
     shutil.move(clouds[3], tmp_path / "away.npy")
-    capsys.readouterr()
-    assert_one_line_error(capsys, [*map(str, detect), "--out", "boxes.json"], "d.npy: no such file")
+    if more:
+        shutil.rmtree("pictures")
+    assert_one_line_error(capsys, [*words, "--out", "boxes.json"], "d.npy: no such file")
     assert not (tmp_path / "boxes.json").exists()
     log = tmp_path / ".boxes.json.resume_log"
     done = len(log.read_text().splitlines()) - 1
     assert 1 <= done <= 3
-    # A mistake with other options, which begins no log of its own, loses nothing.
+    # A mistake with other options before their first result loses nothing.
     other = "--min-score", "0.5", "--out", "boxes.json"
-    assert_one_line_error(capsys, ["detect", "d.npy", "--checkpoint", str(home / "checkpoint"), *other], "no such")
+    assert_one_line_error(capsys, detect(home, "d.npy", *other), "no such")
     assert len(log.read_text().splitlines()) == 1 + done
     shutil.move(tmp_path / "away.npy", clouds[3])
+    if more:
+        next((tmp_path / "pictures").iterdir()).unlink()  # a missing picture is drawn again
     monkeypatch.setattr(detect_command, "predict", predicted := Mock(wraps=detect_command.predict))
-    command(*detect, "--out boxes.json")
-    assert f"{done}/4  detected before" in capsys.readouterr().err
-    assert predicted.call_args.kwargs["indices"] == list(range(done, 4))
+    command(*words, "--out boxes.json")
+    number = done - bool(more)
+    assert number == 0 or f"{number}/4  detected before" in capsys.readouterr().err
+    assert len(predicted.call_args.kwargs["indices"]) == 4 - number
     assert (tmp_path / "boxes.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
     assert not log.exists()
-    if look:
+    if more:
         page = page_content(tmp_path / "page.html")
         assert [frame["name"] for frame in page["frames"]] == ["a.npy", "b.npy", "c.npy", "d.npy"]
         assert page["score"] == 0.3
-        assert len(list((tmp_path / "pictures").iterdir())) == 4
-
-
-def test_a_resumed_detect_draws_what_has_no_picture(home, tmp_path, capsys):
-    for name in "abc":
-        shutil.copy(home / "good.npy", tmp_path / f"{name}.npy")
-    options = (
-        "--checkpoint",
-        home / "checkpoint",
-        "--out",
-        tmp_path / "x.json",
-        "--pictures",
-        tmp_path / "pictures",
-    )
-    files = [tmp_path / f"{name}.npy" for name in "abc"]
-    assert_one_line_error(capsys, [*map(str, ["detect", *files, tmp_path / "d.npy", *options])], "d.npy: no such")
-    shutil.rmtree(tmp_path / "pictures")
-    command("detect", *files, *options, "--min-score 0 --page", tmp_path / "page.html")
-    names = sorted(picture.name for picture in (tmp_path / "pictures").iterdir())
-    assert names == ["0001_a.npy.png", "0002_b.npy.png", "0003_c.npy.png"]
+        names = sorted(picture.name for picture in (tmp_path / "pictures").iterdir())
+        assert names == [f"000{i}_{name}.npy.png" for i, name in enumerate("abcd", 1)]
 
 
 @pytest.mark.parametrize("name", ["x.resume_log", "x", "x.json"])
-def test_any_name_will_do_for_the_boxes(home, tmp_path, name):
-    command("detect", home / "good.npy", "--checkpoint", home / "checkpoint", "--out", tmp_path / name)
+def test_detect_accepts_any_name_for_its_output(home, tmp_path, name):
+    command(*detect(home, home / "good.npy", "--out", tmp_path / name))
     assert [file.name for file in tmp_path.iterdir()] == [name]
-    assert len(json.loads((tmp_path / name).read_text())["files"]) == 1
+    assert len(files_of(tmp_path / name)) == 1
 
 
-def test_a_page_shows_at_first_what_was_asked_for(home, tmp_path):
+def test_a_page_starts_with_the_given_min_score(home, tmp_path):
     page = tmp_path / "page.html"
-    options = "--min-score 0.25 --page", page, "--out", tmp_path / "x.json"
-    command("detect", home / "good.npy", "--checkpoint", home / "checkpoint", *options)
+    command(*detect(home, home / "good.npy", "--out", tmp_path / "x.json"), "--min-score 0.25 --page", page)
     assert page_content(page)["score"] == 0.25
 
 
-@pytest.mark.parametrize("other", [["--min-score", "0.3"], ["--yaw-deg", "90"], ["--remove-close", "none"], []])
-def test_detect_resumes_only_what_would_be_the_same(home, tmp_path, capsys, other):
+@pytest.mark.parametrize("change", ["--min-score 0.3", "--yaw-deg 90", "--remove-close none", "other clouds"])
+def test_detect_does_not_resume_with_other_options_or_clouds(home, tmp_path, capsys, change):
     clouds = [shutil.copy(home / "good.npy", tmp_path / f"{name}.npy") for name in "abc"]
-    words = [
-        "detect",
-        *clouds,
-        tmp_path / "d.npy",
-        "--checkpoint",
-        home / "checkpoint",
-        "--out",
-        tmp_path / "x.json",
-    ]
-    assert_one_line_error(capsys, [*map(str, words)], "d.npy: no such file")
-    if not other:
+    out = "--out", tmp_path / "x.json"
+    assert_one_line_error(capsys, detect(home, *clouds, tmp_path / "d.npy", *out), "d.npy: no such file")
+    if change == "other clouds":
         for cloud in clouds:
             shutil.copy(home / "nan.npy", cloud)
-    words.remove(tmp_path / "d.npy")
-    command(*words, *other)
+    command(*detect(home, *clouds, *out), "" if change == "other clouds" else change)
     assert "detected before" not in capsys.readouterr().err
-    dropped = {file["num_dropped"] for file in json.loads((tmp_path / "x.json").read_text())["files"]}
-    assert len(dropped) == 1
+    assert len({file["num_dropped"] for file in files_of(tmp_path / "x.json")}) == 1
 
 
 def test_two_detections_into_a_file_are_refused(home, tmp_path, capsys):
     with file_lock(tmp_path / ".x.json.resume_log"):
-        words = ["detect", home / "good.npy", "--checkpoint", home / "checkpoint", "--out", tmp_path / "x.json"]
-        assert_one_line_error(capsys, [*map(str, words)], "x.json: in use: another process is detecting")
+        words = detect(home, home / "good.npy", "--out", tmp_path / "x.json")
+        assert_one_line_error(capsys, words, "x.json: in use: another process is detecting")
 
 
-def test_a_file_name_is_no_formula(home, tmp_path):
-    """Nor need it be text."""
+def test_file_names_may_hold_formulas_and_invalid_utf8(home, tmp_path):
     cloud = tmp_path / os.fsdecode(b"$\\frac{a$\xff.npy")
     shutil.copy(home / "good.npy", cloud)
-    where = ["--out", tmp_path / "a.json", "--pictures", tmp_path / "pictures"]
-    command("detect", cloud, "--checkpoint", home / "checkpoint", *where)
-    assert json.loads((tmp_path / "a.json").read_text())["files"][0]["file"] == str(cloud)
+    command(*detect(home, cloud, "--out", tmp_path / "a.json", "--pictures", tmp_path / "pictures"))
+    assert files_of(tmp_path / "a.json")[0]["file"] == str(cloud)
     assert len(list((tmp_path / "pictures").iterdir())) == 1
     command("project", cloud, "--sensor tiny --out", tmp_path / "a.npz", "--png", tmp_path / "a.png")
 
@@ -221,7 +201,7 @@ def test_detect_fuses_sweeps(home, tmp_path):
     several = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
     save_checkpoint(tmp_path / "several", Checkpoint(several, TINY, untrained(several, TINY), 7))
     command("detect --sweeps", sweeps, "--checkpoint", tmp_path / "several", "--out", out)
-    [result] = json.loads(out.read_text())["files"]
+    [result] = files_of(out)
     points = np.load(home / "good.npy")
     close = (np.abs(points[:, :2]) < 1).all(axis=1).sum()
     assert result["num_points"] == 2 * len(points)
@@ -261,7 +241,7 @@ BAD = {
     "out of range": ("detect HOME/away.npy", "away.npy: none of its .* points is usable"),
     "nothing finite": ("detect HOME/all_nan.npy", r"all_nan.npy: none .*\(5 not finite"),
     "good then bad": ("detect HOME/good.npy HOME/none.npy", "none.npy: no such file"),
-    "no input": ("detect", "expected point files or --sweeps"),
+    "no input": ("detect", "expected either point files or --sweeps"),
     "bad columns": ("detect HOME/empty.bin --columns 9", "columns: got 9"),
     "columns of npy": ("detect HOME/good.npy --columns 5", "are for raw .bin files"),
     "list of sweeps": ("detect HOME/s.json", "s.json: expected a point file, or --sweeps before a list of sweeps"),
@@ -304,11 +284,11 @@ BAD = {
     "detect into a device": ("detect HOME/none.npy --out /dev/null", "/dev/null: found a device or a pipe"),
     "detect into a checkpoint": (
         "detect HOME/none.npy --out HOME/checkpoint/boxes.json",
-        "--out: .*found a place in the checkpoint",
+        "--out: .*inside of the checkpoint",
     ),
     "pictures into a checkpoint": (
         "detect HOME/none.npy --pictures HOME/checkpoint/pictures",
-        "--pictures: .*found a place in the checkpoint",
+        "--pictures: .*inside of the checkpoint",
     ),
     "synthesize for laser numbers": (
         "synthesize --scenes 1 --sensor argoverse2",
@@ -358,39 +338,40 @@ def test_usage_errors_exit_with_2(line):
 def test_usage_error_names_the_nearest_option(capsys):
     with pytest.raises(SystemExit):
         main(["detect", "x.npy", "--out", "a", "--chekpoint", "b"])
-    shown = capsys.readouterr()
-    assert "--checkpoint" in shown.err + shown.out
+    printed = capsys.readouterr()
+    assert "--checkpoint" in printed.err + printed.out
 
 
-@pytest.mark.parametrize(
-    "name", ["demo", "synthesize", "train", "evaluate", "detect", "export", "benchmark", "project"]
-)
-def test_help_explains(name, capsys):
+@pytest.mark.parametrize("name", _COMMANDS)
+def test_help_describes_every_option(name, capsys):
     with pytest.raises(SystemExit) as stopped:
         main([name, "--help"])
     assert stopped.value.code == 0
-    assert "--out" in capsys.readouterr().out
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    assert "--data-root" in text if name == "prepare" else "--out" in text
+    # An option without a text would be followed at once by its default; None is not a helpful default.
+    assert re.findall(r"--[\w-]+(?: [^ a-z]\S*)? \((?:default|optional|required)", text) == []
+    assert "default: None" not in text
 
 
 @pytest.fixture(scope="module")
 def drive(home):
-    """The demo's results for a network that compiles in seconds; three keyframes, and two steps of training."""
+    """The results of a demo of three keyframes and two training steps, with a network that compiles in seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "WEIGHTS", str(home / "checkpoint"))
         command("demo --keyframes 3 --train --steps 2 --test-frames 3 --out", home / "demo")
     return home / "demo"
 
 
-def test_demo_writes_the_benchmarks_numbers_of_its_drive(drive, home, tmp_path):
-    """Those that ``evaluate`` finds in the data set that it leaves."""
+def test_demo_writes_the_metrics_of_evaluate_on_its_drive(drive, home, tmp_path):
     place = ["--data-root", drive / "drive", "--split", "train", "--checkpoint", home / "checkpoint"]
     command("evaluate --no-report --out", tmp_path / "evaluation", *place)
-    ours, again = (
+    demo_metrics, metrics = (
         json.loads((folder / "metrics_summary.json").read_text()) for folder in (drive, tmp_path / "evaluation")
     )
-    assert ours.pop("eval_time") > 0 < again.pop("eval_time")
-    assert ours["cfg"]["max_boxes_per_sample"] == 500
-    assert json.dumps(ours) == json.dumps(again)
+    assert demo_metrics.pop("eval_time") > 0 < metrics.pop("eval_time")
+    assert demo_metrics["cfg"]["max_boxes_per_sample"] == 500
+    assert json.dumps(demo_metrics) == json.dumps(metrics)
     assert set(json.loads((drive / "bootstrap.json").read_text())) >= {"mean_ap", "nd_score", "level"}
 
 
@@ -422,14 +403,14 @@ def test_demo_trains_from_nothing_to_report(drive, tmp_path):
     assert "://" not in report  # no outside address; base64 has no colon
     unseen = out / "unseen" / "frame_000.npy"
     command("detect", unseen, "--checkpoint", out / "run", "--out", boxes)
-    assert json.loads(boxes.read_text())["files"][0]["num_points"] == len(np.load(unseen))
+    assert files_of(boxes)[0]["num_points"] == len(np.load(unseen))
 
 
-def test_a_checkpoint_takes_the_place_of_another_whole(home, tmp_path):
-    first = load_checkpoint(home / "checkpoint")
-    save_checkpoint(tmp_path / "c", first)
-    doubled = jax.tree.map(lambda leaf: leaf * 2, first.variables)
-    save_checkpoint(tmp_path / "c", dataclasses.replace(first, variables=doubled, step=8))
+def test_a_checkpoint_replaces_another_completely(home, tmp_path):
+    checkpoint = load_checkpoint(home / "checkpoint")
+    save_checkpoint(tmp_path / "c", checkpoint)
+    doubled = jax.tree.map(lambda leaf: leaf * 2, checkpoint.variables)
+    save_checkpoint(tmp_path / "c", dataclasses.replace(checkpoint, variables=doubled, step=8))
     again = load_checkpoint(tmp_path / "c")
     assert (again.step, bits(again.variables)) == (8, bits(doubled))
-    assert [p.name for p in tmp_path.iterdir()] == ["c"]
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]

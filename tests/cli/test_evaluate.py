@@ -1,4 +1,4 @@
-"""The command `evaluate`: from files, from a checkpoint, restarted, reported; one line for every mistake."""
+"""``fcos-lidar evaluate``: from files and from a checkpoint, resumed, reported; one line per mistake."""
 
 import dataclasses
 import json
@@ -52,7 +52,7 @@ def read(file):
 
 
 def by_files(folder, results, truth, **options):
-    """Evaluate results against truth, both given as what their files hold, into the folder ``out``."""
+    """Evaluate results against truth, both given as content of files, into the folder ``out``."""
     for name, content in (("r.json", results), ("t.json", truth)):
         (folder / name).write_text(json.dumps(content))
     files = {"results": folder / "r.json", "ground_truth": folder / "t.json"}
@@ -61,7 +61,7 @@ def by_files(folder, results, truth, **options):
 
 @pytest.fixture(scope="module")
 def by_tables(home, tmp_path_factory):
-    """The folder of an evaluation of the results file against the tables, with intervals and report."""
+    """The results file evaluated against the tables, with intervals and a report: the output folder."""
     out = tmp_path_factory.mktemp("by_tables")
     run(Evaluate(out=out, results=home / "results.json", **place(home), bootstrap=20, sensor="tiny"))
     return out
@@ -70,7 +70,7 @@ def by_tables(home, tmp_path_factory):
 def test_results_against_a_file_of_truth_and_against_the_tables(home, by_tables, tmp_path, capsys):
     results, truth = home / "results.json", home / "truth.json"
     run(Evaluate(DataOptions(), tmp_path, results=results, ground_truth=truth, report=False))
-    shown = capsys.readouterr()
+    printed = capsys.readouterr()
     summaries = [read(folder / "metrics_summary.json") for folder in (tmp_path, by_tables)]
     expected = evaluate_detections(read(results), read(truth))
     assert list(summaries[0]) == list(expected)
@@ -79,11 +79,11 @@ def test_results_against_a_file_of_truth_and_against_the_tables(home, by_tables,
     assert json.dumps(summaries[0]) == json.dumps(summaries[1]) == json.dumps(expected)
     assert {path.name for path in tmp_path.iterdir()} == FILES
     assert read(tmp_path / "results_nusc.json") == read(results) or "NaN" in results.read_text()
-    assert f"NDS {expected['nd_score']:.4f}  mAP {expected['mean_ap']:.4f}  on 6 samples" in shown.out
-    assert re.search(r"warning: .*rotation: normalised", shown.err)
+    assert f"NDS {expected['nd_score']:.4f}  mAP {expected['mean_ap']:.4f}  on 6 samples" in printed.out
+    assert re.search(r"warning: .*rotation: normalised", printed.err)
 
 
-def test_the_official_keys_in_the_official_order(by_tables):
+def test_the_summary_has_the_official_keys_in_order(by_tables):
     summary = read(by_tables / "metrics_summary.json")
     keys = "label_aps mean_dist_aps mean_ap label_tp_errors tp_errors tp_scores nd_score eval_time cfg meta"
     assert list(summary) == keys.split()
@@ -105,20 +105,18 @@ def test_a_page_shows_the_worst_and_the_best_frames(by_tables):
     assert 'href="frames.html"' in (by_tables / "report.html").read_text()
 
 
-def test_the_report_shows_the_numbers_of_the_summary(by_tables):
+def test_the_report_shows_the_metrics_of_the_summary(by_tables):
     page = (by_tables / "report.html").read_text()
     summary, drawn = read(by_tables / "metrics_summary.json"), read(by_tables / "bootstrap.json")
     text = re.sub(r'src="data:[^"]*"', "", page)
     assert "http" not in text
-    # 10 precision and 10 error curves; the three samples from above and as range images.
+    # 10 precision and 10 error curves; three samples from above and as range images.
     assert page.count("data:image/png;base64,") == 26
-    body = text[text.index("<body>") :]
-    cells = re.findall(r"<td>([^<]*)</td>", body)
-    shown = {cell for cell in cells if re.fullmatch(r"\d+\.\d{3}", cell)}
-    numbers = {f"{value:.3f}" for value in leaves(summary) if isinstance(value, float)}
-    assert shown <= numbers
+    cells = re.findall(r"<td>([^<]*)</td>", text[text.index("<body>") :])
+    numbers = {cell for cell in cells if re.fullmatch(r"\d+\.\d{3}", cell)}
+    assert numbers <= {f"{value:.3f}" for value in leaves(summary) if isinstance(value, float)}
     for value in (summary["nd_score"], summary["mean_ap"], *summary["tp_errors"].values()):
-        assert f"{value:.3f}" in shown
+        assert f"{value:.3f}" in numbers
     spans = {f"{drawn[key]['low']:.3f} to {drawn[key]['high']:.3f}" for key in ("nd_score", "mean_ap")}
     assert spans == {cell for cell in cells if " to " in cell}
     assert drawn["mean_ap"]["low"] <= summary["mean_ap"] <= drawn["mean_ap"]["high"]
@@ -130,26 +128,26 @@ def leaves(value):
     return [value]
 
 
-def test_a_checkpoint_is_run_restarted_and_evaluated(home, tmp_path, monkeypatch, capsys):
+def test_a_checkpoint_is_evaluated_and_an_interrupted_evaluation_resumes(home, tmp_path, monkeypatch, capsys):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    run(Evaluate(out=whole, checkpoint=home / "checkpoint", **place(home), batch_size=1, report=False))
-    shown = capsys.readouterr()
-    assert "frames 6/6" in shown.err
+    options = {"checkpoint": home / "checkpoint", **place(home), "report": False}
+    run(Evaluate(out=whole, **options))
+    assert "frames 6/6" in capsys.readouterr().err
     assert {path.name for path in whole.iterdir()} == FILES
     results = read(whole / "results_nusc.json")
     assert set(results["results"]) == {f"s{s}k{k}" for s in range(2) for k in range(3)}
     assert results["meta"]["use_lidar"]
     assert 0 < len(results["results"]["s0k0"]) <= 30
 
-    # Interrupted after two batches of two; what is done is not done again.
-    args = Evaluate(out=cut, checkpoint=home / "checkpoint", **place(home), batch_size=2, report=False)
+    # Interrupted after two batches of two, which are not repeated.
+    args = Evaluate(out=cut, batch_size=2, **options)
     done = []
 
-    def interrupted(found, token, pose, classes):
+    def interrupted(detections, token, pose, classes):
         done.append(token)
         if len(done) == 5:
             raise KeyboardInterrupt
-        return entries(found, token, pose, classes)
+        return entries(detections, token, pose, classes)
 
     entries = comparison.result_entries
     monkeypatch.setattr(comparison, "result_entries", interrupted)
@@ -159,30 +157,30 @@ def test_a_checkpoint_is_run_restarted_and_evaluated(home, tmp_path, monkeypatch
     run(args)
     assert len(done) == 5 + 2
     assert {path.name for path in cut.iterdir()} == FILES
-    again = read(cut / "results_nusc.json")
+    resumed = read(cut / "results_nusc.json")["results"]
     for token, boxes in results["results"].items():
-        assert [b["detection_name"] for b in boxes] == [b["detection_name"] for b in again["results"][token]]
+        assert [b["detection_name"] for b in boxes] == [b["detection_name"] for b in resumed[token]]
         for field in ("translation", "size", "detection_score"):
-            ours, theirs = ([box[field] for box in found] for found in (boxes, again["results"][token]))
-            np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
+            expected, values = ([box[field] for box in part] for part in (boxes, resumed[token]))
+            np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-4)
+    expected, summary = (read(folder / "metrics_summary.json") for folder in (whole, cut))
     for name in ("mean_ap", "nd_score"):
-        ours, theirs = (read(folder / "metrics_summary.json")[name] for folder in (whole, cut))
-        assert ours == pytest.approx(theirs, abs=1e-6)
+        assert summary[name] == pytest.approx(expected[name], abs=1e-6)
 
 
 def test_a_resume_log_of_another_detector_is_not_used(home):
     detector, data = load_detector(home / "checkpoint"), NuScenes(home, VERSION)
     tokens = tuple(data.split(SPLIT))
-    frames, fewer = (NuScenesFrames(data, chosen, sensor=TINY) for chosen in (tokens, tokens[1:]))
+    frames, fewer = (NuScenesFrames(data, part, sensor=TINY) for part in (tokens, tokens[1:]))
     other = dataclasses.replace(detector, variables=jax.tree.map(lambda leaf: leaf + 1, detector.variables))
     runs = ((detector, frames, 1), (other, frames, 1), (detector, fewer, 1), (detector, frames, 2))
-    found = {_fingerprint(*run) for run in runs}
-    assert len(found) == len(runs)
-    os.utime(home / next(iter(data.sweep_files(tokens[0], 1))))  # a cloud was written anew
-    assert _fingerprint(*runs[0]) not in found
+    fingerprints = {_fingerprint(*run) for run in runs}
+    assert len(fingerprints) == len(runs)
+    os.utime(home / next(iter(data.sweep_files(tokens[0], 1))))  # as if the cloud was written again
+    assert _fingerprint(*runs[0]) not in fingerprints
 
 
-def test_no_report_is_left_beside_other_numbers(home, tmp_path):
+def test_an_earlier_report_is_removed(home, tmp_path):
     by_files(tmp_path, read(home / "results.json"), read(home / "truth.json"))
     assert (tmp_path / "out" / "report.html").is_file()
     mine = tmp_path / "out" / "pictures" / "mine.png"
@@ -193,16 +191,16 @@ def test_no_report_is_left_beside_other_numbers(home, tmp_path):
 
 
 @pytest.mark.parametrize("empty", ["truth", "results", "both"])
-def test_empty_sides_are_told_in_words(home, tmp_path, capsys, empty):
+def test_explains_empty_truth_and_empty_results(home, tmp_path, capsys, empty):
     results, truth = read(home / "results.json"), read(home / "truth.json")
     if empty in ("truth", "both"):
         truth = {token: {**sample, "boxes": []} for token, sample in truth.items()}
     if empty in ("results", "both"):
         results["results"] = {token: [] for token in truth}
     by_files(tmp_path, results, truth, bootstrap=3)
-    shown = capsys.readouterr().err
-    assert ("no ground truth is evaluated:" in shown) == (empty != "results")
-    assert ("the results contain no boxes" in shown) == (empty != "truth")
+    errors = capsys.readouterr().err
+    assert ("no ground truth is evaluated:" in errors) == (empty != "results")
+    assert ("the results contain no boxes" in errors) == (empty != "truth")
     assert read(tmp_path / "out" / "metrics_summary.json")["nd_score"] == 0
     assert (tmp_path / "out" / "report.html").is_file()
 
@@ -215,8 +213,7 @@ def test_classes_without_truth_are_named(home, tmp_path, capsys):
     assert re.search("no ground truth is evaluated for .*bus.*barrier", capsys.readouterr().err)
 
 
-def test_a_class_map_changes_the_truth_that_a_detector_is_compared_with(home, tmp_path):
-    """Which is no longer the benchmark's: no NDS."""
+def test_with_a_class_map_the_metric_is_not_the_official_one(home, tmp_path):
     (tmp_path / "map.json").write_text(json.dumps(dict.fromkeys(NUSCENES_CLASSES[1:], None)))
     data = dataclasses.replace(place(home)["data"], class_map=tmp_path / "map.json")
     run(Evaluate(data, tmp_path / "out", split=SPLIT, checkpoint=home / "checkpoint", report=False))
@@ -226,15 +223,15 @@ def test_a_class_map_changes_the_truth_that_a_detector_is_compared_with(home, tm
     assert (tmp_path / "out" / "detections.json").exists()
 
 
-def test_results_are_evaluated_with_the_tables_alone(home, by_tables, tmp_path, capsys):
-    """Without a point file, in a folder whose name is no UTF-8; the report has boxes alone."""
+def test_results_need_only_the_tables(home, by_tables, tmp_path, capsys):
+    """Without point files the report shows only boxes. The folder's name is not valid UTF-8."""
     root = tmp_path / os.fsdecode(b"M\xfcnchen")
     shutil.copytree(home / VERSION, root / VERSION)
     options = {**place(home), "data": DataOptions(data_root=root, version=VERSION)}
     run(Evaluate(out=tmp_path / "out", results=home / "results.json", **options))
-    shown = capsys.readouterr()
-    assert "6 files of keyframes are missing: the report shows boxes without points" in shown.err
-    assert "mAP" in shown.out
+    printed = capsys.readouterr()
+    assert "6 files of keyframes are missing: the report shows boxes without points" in printed.err
+    assert "mAP" in printed.out
     summary, expected = (read(folder / "metrics_summary.json") for folder in (tmp_path / "out", by_tables))
     assert summary["mean_ap"] == expected["mean_ap"] > 0
     assert "M?nchen" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -279,11 +276,11 @@ MISTAKES = {
     ),
     "out into the checkpoint": (
         f"--data-root HOME --version {VERSION} --checkpoint HOME/checkpoint --out HOME/checkpoint/scores",
-        "--out: .*found a place in the checkpoint",
+        "--out: .*inside of the checkpoint",
     ),
     "out of the detector's name": (
         f"--data-root HOME --version {VERSION} --checkpoint quickstart --out quickstart",
-        "--out: quickstart: found the name of the checkpoint, expected another one",
+        "--out: quickstart: the name of the checkpoint, expected another one",
     ),
     "batches of results": (f"--results x {TRUTH} --batch-size 2", "--batch-size: got 2, expected none with --res"),
     "backend of results": (
@@ -299,7 +296,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_named_before_anything_is_written(home, tmp_path, capsys, name):
+def test_mistakes_get_one_line_and_leave_nothing(home, tmp_path, capsys, name):
     line, message = MISTAKES[name]
     line += "" if "--out" in line else " --out OUT"
     args = line.replace("HOME", str(home)).replace("OUT", str(tmp_path / "out")).split()

@@ -1,4 +1,4 @@
-"""Every failure of a command ends in one line and an exit code: expected ones, defects, signals, closed pipes."""
+"""Every failure ends in one line and an exit code: expected failures, bugs, signals, closed pipes."""
 
 import os
 import signal
@@ -20,47 +20,45 @@ def fail_with(error):
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [
         (ValueError("a.npy: two\n  lines"), "a.npy: two lines"),
         (FileNotFoundError(2, "No such file", "a"), "[Errno 2] No such file: 'a'"),
         (OverflowError(), "OverflowError without a message"),
         (RecursionError("maximum recursion depth"), "nested too deeply: expected a file or an option with fewer"),
-        (MemoryError(), "out of memory: in training --optimizer.accumulate"),
-        (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: in training --optimizer.accumulate"),
+        (MemoryError(), "out of memory: for training, --optimizer.accumulate"),
+        (RuntimeError("RESOURCE_EXHAUSTED: 8 GiB"), "out of memory: for training, --optimizer.accumulate"),
         (RuntimeError("Unable to initialize backend 'x': no"), "expected a platform of this machine: Unable to"),
         (
             RuntimeError("UNKNOWN: Gloo AllGather failed: Read error"),
-            "another process ended, see what it says: UNK",
+            "another process ended, see its output: UNK",
         ),
         (
             RuntimeError("Gloo context initialization failed: Read error"),
-            "the connection of the processes failed: G",
+            "the connection between the processes failed: G",
         ),
         (
             RuntimeError("Gloo AllGather failed: Timed out"),
-            "the connection of the processes failed: Gloo AllGather",
+            "the connection between the processes failed: Gloo AllGather",
         ),
         (ValueError("x" * 120_000), "x" * 900),
     ],
 )
-def test_an_expected_failure_is_one_line(capsys, error, told):
+def test_an_expected_failure_is_one_line(capsys, error, message):
     assert exit_code("program", fail_with(error)) == 1
-    shown = capsys.readouterr()
-    assert shown.err.startswith("program: error: ")
-    assert told in shown.err
-    assert (shown.err.count("\n"), shown.out) == (1, "")
-    assert len(shown.err) < 1100
+    printed = capsys.readouterr()
+    assert printed.err.startswith("program: error: ")
+    assert message in printed.err
+    assert (printed.err.count("\n"), printed.out) == (1, "")
+    assert len(printed.err) < 1100
 
 
-def test_a_defect_is_one_line_that_names_its_report(capsys, tmp_path, monkeypatch):
+def test_a_bug_is_one_line_that_names_its_report(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert exit_code("program", fail_with(KeyError("lost"))) == 1
     (report,) = tmp_path.iterdir()
-    line = (
-        f"program: error: unexpected KeyError: a defect: the full report is {report}, please attach it to an issue"
-    )
-    assert capsys.readouterr().err == f"{line} of the project: 'lost'\n"
+    line = f"unexpected KeyError: 'lost': this is a bug, please attach the full report {report} to an issue"
+    assert capsys.readouterr().err == f"program: error: {line}\n"
     text = report.read_text()
     assert "Traceback (most recent call last)" in text
     assert "arguments: [" in text
@@ -101,7 +99,7 @@ sys.exit(main(["--help"]))
 """
 
 
-def test_an_interruption_of_the_imports_is_one_line():
+def test_ctrl_c_during_imports_is_one_line():
     done = run_python("-c", INTERRUPTED)
     assert (done.returncode, done.stderr) == (130, "fcos-lidar: interrupted\n")
 
@@ -150,18 +148,18 @@ sys.exit(exit_code("program", work))
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("rest_s", [60, 0])
-def test_a_signal_in_a_weak_reference_s_callback_is_not_lost(tmp_path, number, rest_s):
-    """Python drops what the callback raises: the work that follows is stopped, and what is done is whole."""
+def test_a_signal_in_the_callback_of_a_weak_reference_is_not_lost(tmp_path, number, rest_s):
+    """Python drops exceptions of such callbacks. Later work is stopped nevertheless; finished files are whole."""
     (tmp_path / "a.json").write_text("before")
     done = run_python("-c", IN_A_CALLBACK, tmp_path / "a.json", int(number), rest_s)
-    told = "program: interrupted\n" if number == signal.SIGINT else ""
-    assert (done.returncode, done.stderr) == (128 + number, told)
+    line = "program: interrupted\n" if number == signal.SIGINT else ""
+    assert (done.returncode, done.stderr) == (128 + number, line)
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
-    # Work that would end at once is stopped or done, as the machine's load has it; the file is whole either way.
+    # Work that is almost done is stopped or finished, depending on the load of the machine.
     assert (tmp_path / "a.json").read_text() in (["before"] if rest_s else ["before", "half"])
 
 
-def test_a_library_that_takes_a_signal_for_a_failure_does_not_hide_it():
+def test_a_library_cannot_hide_a_signal_behind_its_own_error():
     def work():
         try:
             raise KeyboardInterrupt
@@ -171,7 +169,7 @@ def test_a_library_that_takes_a_signal_for_a_failure_does_not_hide_it():
     assert exit_code("program", work) == 130
 
 
-def test_nobody_reads_the_help_any_more():
+def test_a_closed_output_pipe_ends_in_silence():
     read, write = os.pipe()
     os.close(read)
     words = [sys.executable, "-m", "fcos_lidar_jax", "--help"]
@@ -181,9 +179,8 @@ def test_nobody_reads_the_help_any_more():
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
 
 
-@pytest.mark.parametrize("work", ["lambda: print('found')", "lambda: sys.exit(0)"])
+@pytest.mark.parametrize("work", ["lambda: print('text')", "lambda: sys.exit(0)"])
 def test_an_output_on_a_full_disk_is_one_line(tmp_path, work):
-    """What is printed waits until the end, where the disk turns out to be full."""
     script = tmp_path / "script.py"
     script.write_text(
         "import os, sys\nfrom fcos_lidar_jax.cli import exit_code\n"
@@ -195,5 +192,5 @@ def test_an_output_on_a_full_disk_is_one_line(tmp_path, work):
         done = subprocess.run(
             [sys.executable, script], env=environment, stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
-    said = "program: error: standard output: cannot be written: No space left on device\n"
-    assert (done.returncode, done.stderr) == (1, said)
+    line = "program: error: standard output: cannot be written: No space left on device\n"
+    assert (done.returncode, done.stderr) == (1, line)

@@ -1,4 +1,4 @@
-"""Commands that are killed, find a full disk or may not write; the tests of each command ask more of this."""
+"""Commands that are killed, or meet a full disk or a read-only folder. Tests of single commands ask more."""
 
 import hashlib
 import json
@@ -13,7 +13,7 @@ import ctypes, os, resource, signal, sys, time
 from pathlib import Path
 from fcos_lidar_jax.cli import commands, main
 
-def give_up_privileges():  # of root, for which permissions do not hold otherwise
+def give_up_privileges():  # file permissions do not restrict root
     if not os.geteuid():
         header, none = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
         assert not ctypes.CDLL(None).capset(header, none)
@@ -22,7 +22,7 @@ def give_up_privileges():  # of root, for which permissions do not hold otherwis
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A simulated data set, and what `evaluate` makes of it when it is left alone."""
+    """A simulated data set, and the files of an undisturbed evaluation on it."""
     folder = tmp_path_factory.mktemp("faults")
     folder.chmod(0o755)
     command(*SYNTHESIZE, "--out", folder / "data")
@@ -40,17 +40,17 @@ def prepare(home):
 
 
 def contents(folder):
-    """Checksum of every file but the lock; of the summary all but the time that it took."""
+    """Checksums of all files except the lock, leaving out the time in the summary."""
     files = (file for file in folder.rglob("*") if file.is_file() and file.name != ".lock")
-    found = {str(file.relative_to(folder)): file.read_bytes() for file in files}
-    if "metrics_summary.json" in found:
-        summary = json.loads(found["metrics_summary.json"])
-        found["metrics_summary.json"] = json.dumps({**summary, "eval_time": 0}).encode()
-    return {name: hashlib.blake2b(content).hexdigest() for name, content in found.items()}
+    content_of = {str(file.relative_to(folder)): file.read_bytes() for file in files}
+    if "metrics_summary.json" in content_of:
+        summary = json.loads(content_of["metrics_summary.json"])
+        content_of["metrics_summary.json"] = json.dumps({**summary, "eval_time": 0}).encode()
+    return {name: hashlib.blake2b(content).hexdigest() for name, content in content_of.items()}
 
 
 def error_line(done):
-    """The one line of a command that gave up."""
+    """The error of a command that failed."""
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("fcos-lidar: error: ")]
@@ -58,7 +58,7 @@ def error_line(done):
 
 
 @pytest.mark.parametrize("name", ["synthesize", "prepare", "evaluate"])
-def test_a_folder_that_may_not_be_written_to_is_named(home, tmp_path, name):
+def test_a_read_only_folder_is_named(home, tmp_path, name):
     words = {"synthesize": SYNTHESIZE, "prepare": prepare(home), "evaluate": evaluate(home)}[name]
     folder = tmp_path / "read_only"
     folder.mkdir(mode=0o555)
@@ -68,7 +68,7 @@ def test_a_folder_that_may_not_be_written_to_is_named(home, tmp_path, name):
     assert list(folder.iterdir()) == []
 
 
-def test_a_data_set_on_a_full_disk_is_finished_when_there_is_room(home, tmp_path):
+def test_synthesize_resumes_after_a_full_disk(home, tmp_path):
     limit = "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))"
     code = f"{HELPERS}\n{limit}\nsys.exit(main(sys.argv[1:]))"
     error_line(run_python("-c", code, *SYNTHESIZE, "--out", tmp_path / "data"))
@@ -90,7 +90,7 @@ for lines in (1, 3):  # frames that the resume log holds when the command is kil
 """
 
 
-def test_a_killed_evaluation_goes_on_to_the_same_files(home, tmp_path):
+def test_a_killed_evaluation_resumes_to_the_same_files(home, tmp_path):
     out = tmp_path / "evaluated"
     done = run_python("-c", HELPERS + KILLED, *evaluate(home), "--out", out)
     assert done.returncode == 0, done.stderr

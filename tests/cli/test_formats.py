@@ -1,6 +1,6 @@
-"""Every format from the command line: prepare, train, evaluate, detect; and the same boxes in every way.
+"""Every format from the command line: prepare, train, evaluate and detect; and equal boxes from all entry points.
 
-The folder of own data is that of tests/cli/test_own_data.py.
+tests/cli/test_own_data.py covers the format ``folder``.
 """
 
 import contextlib
@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import get_args
 from unittest.mock import Mock
 
-import jax
 import numpy as np
 import pytest
 from commands import command
@@ -73,6 +72,16 @@ def simulated(root: Path) -> Made:
 MAKERS = (nuscenes, argoverse2, kitti, simulated)
 
 
+OWN_CLASSES = {"person": "pedestrian", "post": "barrier", "vehicle": "car"}
+
+
+def own_data(folder: Path, **sizes: int) -> tuple[Path, str]:
+    """A data set in the format ``folder`` with the sensor of the quickstart; returns its root and its options."""
+    root = make_folder(folder / "data", sensor=fcos.load_sensor("short_range"), **sizes)
+    (folder / "map.json").write_text(json.dumps(OWN_CLASSES))
+    return root, f"--class-map {folder}/map.json --data-root {root}"
+
+
 def test_every_format_is_tried():
     assert {make.__name__ for make in MAKERS} | {"folder"} == set(get_args(Format))
 
@@ -102,36 +111,30 @@ def test_prepares_trains_evaluates_and_detects(make, tmp_path, capsys):
 
 
 def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path):
-    """A folder's cloud of more points than the detector takes, by the command, the evaluation and Python."""
-    root = tmp_path / "data"
-    make_folder(root, train=2, val=1, sensor=fcos.load_sensor("short_range"))
+    """By detect, evaluate and Python, for a cloud with more points than the detector accepts."""
+    root, data = own_data(tmp_path, train=2, val=1)
     rng = np.random.default_rng(0)
     dense = np.load(root / "clouds" / "000.npy")
     dense = np.concatenate([dense, dense[rng.integers(0, len(dense), 4000)] + rng.normal(0, 0.05, (4000, 4))])
     np.save(root / "clouds" / "000.npy", dense.astype(np.float32))
-    names = {"person": "pedestrian", "post": "barrier", "vehicle": "car"}
-    (tmp_path / "map.json").write_text(json.dumps(names))
     command("detect", root / "clouds", "--checkpoint quickstart --out", tmp_path / "boxes.json")
     by_command = json.loads((tmp_path / "boxes.json").read_text())["files"]
     assert by_command[0]["num_truncated"] > 0
-    command(
-        *("evaluate --data-root", root, "--class-map", tmp_path / "map.json", "--split train"),
-        *("--checkpoint quickstart --out", tmp_path / "scores", "--no-report"),
-    )
+    command("evaluate", data, "--split train --checkpoint quickstart --no-report --out", tmp_path / "scores")
     evaluated = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
     detector = fcos.load_detector("quickstart")
     for i, frame in enumerate(evaluated):
         assert frame["boxes"] == by_command[i]["boxes"]
-        dense = frame["name"] == "000"
-        with pytest.warns(UserWarning, match="share a cell") if dense else contextlib.nullcontext():
-            found = detector(np.load(root / "clouds" / f"{frame['name']}.npy"))
-        count = int(found.valid.sum())
+        is_dense = frame["name"] == "000"
+        with pytest.warns(UserWarning, match="share a cell") if is_dense else contextlib.nullcontext():
+            detections = detector(np.load(root / "clouds" / f"{frame['name']}.npy"))
+        count = int(detections.valid.sum())
         assert count == len(frame["boxes"]) > 0
-        assert [box["box"] for box in frame["boxes"]] == found.boxes[:count].tolist()
-        assert [box["score"] for box in frame["boxes"]] == found.scores[:count].tolist()
+        assert [box["box"] for box in frame["boxes"]] == detections.boxes[:count].tolist()
+        assert [box["score"] for box in frame["boxes"]] == detections.scores[:count].tolist()
 
 
-def test_a_cloud_of_another_sensor_is_told_in_one_line(tmp_path, capsys):
+def test_a_cloud_of_another_sensor_causes_one_warning(tmp_path, capsys):
     cloud = make_frame(0, fcos.load_sensor("nuscenes_hdl32e")).points
     np.save(tmp_path / "cloud.npy", cloud)
     command("detect", tmp_path / "cloud.npy", "--checkpoint quickstart --out", tmp_path / "boxes.json")
@@ -143,93 +146,78 @@ def test_a_cloud_of_another_sensor_is_told_in_one_line(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_data_without_splits_are_told_where_all_frames_serve_both_ends(tmp_path, capsys, monkeypatch):
-    root = tmp_path / "data"
-    make_folder(root, train=2, val=1, sensor=fcos.load_sensor("short_range"))
-    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
-    data = f"--class-map {tmp_path}/map.json --data-root {root}"
-    train_it = f"train quickstart --no-copy-paste {data} --out"
-    evaluate_it = f"evaluate {data} --checkpoint quickstart --out"
+@pytest.fixture
+def messages(tmp_path, capsys, monkeypatch):
+    """``messages(command)`` runs a command on own data up to the training or detection; returns its messages."""
+    root, data = own_data(tmp_path, train=2, val=1)
+    for name in ("train.train", "evaluate.write_predictions"):
+        monkeypatch.setattr(f"fcos_lidar_jax.cli.{name}", Mock(side_effect=KeyboardInterrupt))
 
-    def stop(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", stop)
-    monkeypatch.setattr("fcos_lidar_jax.cli.evaluate.write_predictions", stop)
-    for name, splits in (("with", True), ("without", False)):
-        if not splits:
-            (root / "splits.json").unlink()
-        for args, said in ((train_it, "all 3 frames are trained on"), (evaluate_it, "all 3 frames are evaluated")):
-            with pytest.raises(AssertionError):  # stopped
-                command(args, tmp_path / name / args[:5])
-            assert (f"{root}: no splits: {said}" in capsys.readouterr().err) != splits
-
-
-def test_frames_that_are_trained_and_evaluated_on_are_told(tmp_path, capsys, monkeypatch):
-    root = tmp_path / "data"
-    make_folder(root, train=2, val=1, sensor=fcos.load_sensor("short_range"))
-    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
-    data = f"--class-map {tmp_path}/map.json --data-root {root}"
-    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", Mock(side_effect=KeyboardInterrupt))
-    monkeypatch.setattr("fcos_lidar_jax.cli.evaluate.write_predictions", Mock(side_effect=KeyboardInterrupt))
-
-    def said(splits, line):
-        (root / "splits.json").write_text(json.dumps(splits))
-        with pytest.raises(AssertionError):  # stopped
+    def run(line: str, splits: dict[str, list[str]] | None) -> str:
+        (root / "splits.json").unlink(missing_ok=True)
+        if splits is not None:
+            (root / "splits.json").write_text(json.dumps(splits))
+        with pytest.raises(AssertionError):  # interrupted
             command(line, data, "--out", tmp_path / "out")
         return capsys.readouterr().err
 
-    a, b, c = (f"{i:03d}" for i in range(3))
-    training, evaluation = "train quickstart --no-copy-paste", "evaluate --checkpoint quickstart"
-    told = "of the 2 frames to evaluate on are trained on too"
-    assert f"1 {told}" in said({"train": [a, b], "val": [b, c]}, training)
-    assert "trained on too" not in said({"train": [a], "val": [b, c]}, training)
-    assert f"2 {told}" in said({"all": [a, b, c]}, f"{training} --val-split all --val-samples 1:3")
-    assert f"{root}: no split val: all, the only one" in said({"all": [a, b, c]}, evaluation)
-    for splits, line in (({"train": [a], "val": [b, c]}, evaluation), ({"all": [a]}, f"{evaluation} --split all")):
-        assert "no split val" not in said(splits, line)
+    return run
 
 
-def test_own_data_may_be_prepared_elsewhere_and_detections_are_those_evaluated(tmp_path, capsys):
-    """As for data on a disk that cannot be written to; and the report names the frames."""
-    root, index = tmp_path / "data", tmp_path / "prepared"
-    make_folder(root, train=2, val=2, sensor=fcos.load_sensor("short_range"))
-    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
-    data = f"--class-map {tmp_path}/map.json --data-root {root} --index {index}"
+TRAINING, EVALUATION = "train quickstart --no-copy-paste", "evaluate --checkpoint quickstart"
+A, B, C = (f"{i:03d}" for i in range(3))
+
+
+def test_warns_if_frames_are_both_trained_and_evaluated_on(messages):
+    overlap = "of the 2 evaluation frames are also training frames"
+    assert f"1 {overlap}" in messages(TRAINING, {"train": [A, B], "val": [B, C]})
+    assert "also training frames" not in messages(TRAINING, {"train": [A], "val": [B, C]})
+    assert f"2 {overlap}" in messages(f"{TRAINING} --val-split all --val-samples 1:3", {"all": [A, B, C]})
+    assert "data: no split val: evaluating all, the only split" in messages(EVALUATION, {"all": [A, B, C]})
+    assert "no split val" not in messages(EVALUATION, {"train": [A], "val": [B, C]})
+    assert "no split val" not in messages(f"{EVALUATION} --split all", {"all": [A]})
+    for line, expected in ((TRAINING, "training on all 3 frames"), (EVALUATION, "evaluating all 3 frames")):
+        assert f"data: no splits: {expected}" in messages(line, None)
+        assert "no splits" not in messages(line, {"train": [A, B], "val": [C]})
+
+
+def test_prepares_into_another_folder_and_evaluates_given_detections(tmp_path):
+    """For data on a read-only disk; the report names the frames."""
+    root, data = own_data(tmp_path, train=2, val=2)
+    data += f" --index {tmp_path}/prepared"
     command("prepare", data)
     assert not (root / ".fcos_lidar").exists()
     command("train quickstart", data, "--out", tmp_path / "run", *NETWORK_OPTIONS, "--steps 2 --fade-epochs 0")
-    for name in ("a", "b"):
-        command("evaluate", data, "--checkpoint quickstart --out", tmp_path / name)
+    out, evaluate = tmp_path / "scores", f"evaluate {data} --checkpoint quickstart --out"
+    command(evaluate, out)
     for line in ("The worst sample", "The best sample"):
-        assert re.search(rf"{line}.*00[23]", (tmp_path / "a" / "report.html").read_text())
-    record = json.loads((tmp_path / "b" / "detections.json").read_text())
+        assert re.search(rf"{line}.*00[23]", (out / "report.html").read_text())
+    record = json.loads((out / "detections.json").read_text())
     record["frames"][0]["boxes"] = []
     (tmp_path / "given.json").write_text(json.dumps(record))
-    command(
-        "evaluate", data, "--checkpoint quickstart --results", tmp_path / "given.json", "--out", tmp_path / "b"
-    )
-    assert (tmp_path / "b" / "detections.json").read_bytes() == (tmp_path / "given.json").read_bytes()
+    command(evaluate, out, "--results", tmp_path / "given.json")
+    assert (out / "detections.json").read_bytes() == (tmp_path / "given.json").read_bytes()
 
 
-def test_training_on_another_sensors_clouds_is_told_before_the_step_is_compiled(tmp_path, capsys, monkeypatch):
+def test_training_warns_of_another_sensors_clouds_before_compiling(tmp_path, capsys, monkeypatch):
     frames = SimulatedFrames(fcos.load_sensor("nuscenes_hdl32e"), 2)
     wrong = InMemoryFrames((frames.frame(0), frames.frame(1)), fcos.load_sensor("short_range"), frames.classes)
     monkeypatch.setattr("fcos_lidar_jax.training.run.jit_step", lambda step, mesh: None)
     with pytest.raises(TypeError):  # there is no step
         train(dataclasses.replace(QUICKSTART, copy_paste=None), wrong, tmp_path / "run", steps=1)
-    told, compiling = capsys.readouterr().err.splitlines()[:2]
-    assert told.startswith("warning: frame 0: points hardly of sensor 'short_range'")
+    warning, compiling = capsys.readouterr().err.splitlines()[:2]
+    assert warning.startswith("warning: frame 0: points hardly of sensor 'short_range'")
     assert compiling.startswith("compiling")
 
 
-def test_batches_change_boxes_by_rounding_alone(tmp_path):
+def test_larger_batches_change_boxes_only_by_rounding():
     detector = fcos.load_detector("quickstart")
     frames = fcos.open_frames(format="simulated", split="val", sensor=detector.sensor)
-    one, two = ([p.detections for p in predict(detector, frames, indices=range(4), batch_size=n)] for n in (1, 2))
-    for a, b in zip(one, two, strict=True):
+    singles, pairs = (
+        [p.detections for p in predict(detector, frames, indices=range(4), batch_size=n)] for n in (1, 2)
+    )
+    for a, b in zip(singles, pairs, strict=True):
         sure = a.scores > 0.3
         assert sure.any()
         np.testing.assert_allclose(b.scores[: sure.sum()], a.scores[sure], atol=1e-4)
         np.testing.assert_allclose(b.boxes[: sure.sum()], a.boxes[sure], atol=1e-4)
-    assert jax.tree.structure(one[0]) == jax.tree.structure(two[0])

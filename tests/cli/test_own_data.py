@@ -1,4 +1,4 @@
-"""The page about own data does what it says: scripts and commands run as they stand, on a smaller network."""
+"""The scripts and commands of docs/own_data.md run as written, with a smaller network."""
 
 import json
 import re
@@ -34,7 +34,7 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     assert (scale > 0).all()
     points = np.concatenate([namespace["frames"].frame(i).points for i in range(40)])
     points = points[(np.abs(points[:, :2]) < namespace["frames"].sensor.limit_xy_m).all(axis=1)]
-    # Nearly every point has a cell of its own.
+    # Nearly every point has its own cell.
     np.testing.assert_allclose(mean[:3], points[:, :3].mean(axis=0), atol=0.15)
     np.testing.assert_allclose(scale[:3], points[:, :3].std(axis=0), rtol=0.05)
 
@@ -48,23 +48,25 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     assert Path("evaluation/report.html").exists()
     assert list(Path("pictures").iterdir())
 
-    # The page's last step: what was detected becomes labels.
+    # The last step of the page turns detections into labels.
     namespace["as_annotations"](Path("boxes.json"), Path("my_lidar/boxes"))
-    [found] = json.loads(Path("boxes.json").read_text())["files"]
+    [detected] = json.loads(Path("boxes.json").read_text())["files"]
     relabelled = FolderFrames("my_lidar").frame(35)
-    np.testing.assert_allclose(relabelled.boxes, np.array([box["box"] for box in found["boxes"]]).reshape(-1, 9))
+    np.testing.assert_allclose(
+        relabelled.boxes, np.array([box["box"] for box in detected["boxes"]]).reshape(-1, 9)
+    )
 
 
-def test_own_data_have_their_sensor_whatever_the_configuration_is_called(tmp_path, capsys):
+def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_path, capsys):
     args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
     args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--fade-epochs", "4", "--steps", "4"]
     args += ["--copy-paste.targets", "2", "2", "2"]
-    ignored = r"--sensor: got '\w+', expected none: .*/sensor.json has 'tiny'"
+    rejected = r"--sensor: got '\w+', expected none: .*/sensor.json has 'tiny'"
     for name, sensor, message in (
         ([], [], "no objects here"),  # refused after the sensor
-        ([], ["--sensor", "kitti_hdl64e"], ignored),
+        ([], ["--sensor", "kitti_hdl64e"], rejected),
         (["--name", "mine"], [], "no objects here"),
-        (["--name", "mine"], ["--sensor", "waymo_top"], ignored),
+        (["--name", "mine"], ["--sensor", "waymo_top"], rejected),
     ):
         assert_one_line_error(capsys, [*args, *name, *sensor], message)
     (tmp_path / "data" / "splits.json").unlink()

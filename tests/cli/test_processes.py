@@ -64,7 +64,7 @@ def test_a_process_alone_meets_nobody(monkeypatch):
 
 def test_others_that_are_not_met_are_told_in_one_line(monkeypatch):
     monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=RuntimeError("DEADLINE_EXCEEDED: late")))
-    with pytest.raises(OSError, match=r"^10.0.0.1:12345: the processes did not meet: DEADLINE_EXCEEDED: late$"):
+    with pytest.raises(OSError, match=r"^10.0.0.1:12345: the processes did not connect: DEADLINE_EXCEEDED: late$"):
         join_processes(BY_HAND, {})
 
 

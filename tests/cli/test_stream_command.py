@@ -1,63 +1,97 @@
-"""``fcos-lidar stream``: the boxes of ``detect --sweeps``, from all kinds of poses; one line for every mistake."""
+"""``fcos-lidar stream``: the boxes of ``detect --sweeps``, whatever form a drive was recorded in."""
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, page_content
+from made_argoverse2 import STEP_NS, make_log
+from made_bags import FORMS, structured, write_recording
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.cli import stream as cli_stream
+from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
+from fcos_lidar_jax.data.nuscenes import NuScenes
+from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.inference.stream import detect_stream
 from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
 
-SWEEPS, WINDOW, STEP_US = 5, 3, 100_000
+SWEEPS, WINDOW, START_NS, STEP = 5, 3, 1_700_000_000_000_000_000, 100_000_000
+TIMES_US = [(START_NS + index * STEP) // 1000 for index in range(SWEEPS)]
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A detector of three sweeps, a drive with poses as JSON and TUM, and what ``detect`` finds in it."""
+    """A detector of three sweeps, and a drive as a folder with poses in JSON and TUM and as ROS recordings."""
     folder = tmp_path_factory.mktemp("home")
     config = dataclasses.replace(TINY_CONFIG, num_sweeps=WINDOW)
     save_checkpoint(folder / "checkpoint", Checkpoint(config, TINY, untrained(config, TINY), 7))
     (folder / "drive").mkdir()
-    rng, listed, lines = np.random.default_rng(0), [], ["# t x y z qx qy qz qw"]
-    for index in range(SWEEPS):
-        turn, place = Rotation.from_euler("zy", [0.1 * index, 0.01]), rng.normal(0, 2, 3)
-        name, time_us = f"{(10**6 + index * STEP_US) / 1e6:.6f}.npy", 10**6 + index * STEP_US
-        np.save(folder / "drive" / name, make_frame(index, TINY).points)
-        pose = np.eye(4)
-        quaternion = [float(f"{v:.9f}") for v in turn.as_quat()]
-        lines.append(" ".join(map(repr, [time_us / 1e6, *place.tolist(), *quaternion])))
-        x, y, z, w = np.array(quaternion)
-        pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), place
-        listed.append({"file": f"drive/{name}", "timestamp_us": time_us, "sensor_to_world": pose.tolist()})
-    (folder / "poses.json").write_text(json.dumps(listed))
+    rng, stamps = np.random.default_rng(0), [START_NS + index * STEP for index in range(SWEEPS)]
+    clouds = [make_frame(index, TINY).points for index in range(SWEEPS)]
+    places = rng.normal(0, 2, (SWEEPS, 3))
+    turns = Rotation.from_euler("zy", [[0.1 * index, 0.01] for index in range(SWEEPS)]).as_quat()
+    listed, lines = [], []
+    for stamp, cloud, place, turn in zip(stamps, clouds, places, turns, strict=True):
+        name = f"{stamp}.npy"
+        np.save(folder / "drive" / name, cloud)
+        lines.append(" ".join(map(repr, [stamp / 1e9, *place.tolist(), *turn.tolist()])))
+        pose = pose_matrix(turn[[3, 0, 1, 2]], place).tolist()
+        listed.append({"file": f"drive/{name}", "timestamp_us": stamp // 1000, "sensor_to_world": pose})
     (folder / "poses.txt").write_text("\n".join(lines))
-    (folder / "backwards.json").write_text(json.dumps(listed[::-1]))
-    (folder / "short.json").write_text(json.dumps(listed[:-1]))
-    (folder / "gap.txt").write_text("\n".join([lines[1], "9 0 0 0 0 0 0 1"]))
-    (folder / "twice.txt").write_text("\n".join([lines[1], lines[1]]))
-    (folder / "words.txt").write_text("1 2 3")
-    (folder / "long.txt").write_text("\n".join([lines[1], "2 0 0 0 0 0 0 7"]))
-    (folder / "none.txt").write_text("# nothing")
+    (folder / "poses.json").write_text(json.dumps(listed))
+
+    for name, poses in (("backwards", listed[::-1]), ("short", listed[:-1])):
+        (folder / f"{name}.json").write_text(json.dumps(poses))
+    invalid = {
+        "gap": f"{lines[1]}\n1800000000 0 0 0 0 0 0 1",
+        "twice": f"{lines[1]}\n{lines[1]}",
+        "words": "1 2 3",
+        "long": f"{lines[1]}\n1800000000 0 0 0 0 0 0 7",
+        "none": "# nothing",
+        "late": "1 0 0 0 0 0 0 1",
+    }
+    for name, text in invalid.items():
+        (folder / f"{name}.txt").write_text(text)
+    (folder / "poses.mcap").write_text("not a recording")
+
+    def content(make):
+        yield "/imu", make.text("nothing")
+        for stamp, cloud, place, turn in zip(stamps, clouds, places, turns, strict=True):
+            yield "/odom", make.odometry(stamp, place, turn, "lidar")
+            yield "/tf", make.transform(stamp, "odom", "lidar", place, turn)
+            yield "/points", make.cloud(stamp, structured(cloud))
+
+    for form in FORMS:
+        write_recording(folder / form.replace(" ", "_"), form, content)
     return folder
 
 
-def stream(home, out, *more):
-    command("stream", home / "drive", "--checkpoint", home / "checkpoint", "--out", out, *more)
+def recording(home, form):
+    place = home / form.replace(" ", "_")
+    return {"ros1": place.with_suffix(".bag"), "mcap file": place / f"{place.name}.mcap"}.get(form, place)
+
+
+def stream(home, out, source, *more):
+    command("stream", source, "--checkpoint", home / "checkpoint", "--out", out, *more)
     text = out.read_text()
     assert text.endswith("\n")
     return [json.loads(line) for line in text.splitlines()]
 
 
+def without_file(lines):
+    assert len(lines[0]["boxes"]) > 0
+    return [{name: value for name, value in line.items() if name != "file"} for line in lines]
+
+
 def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path, capsys):
-    lines = stream(home, tmp_path / "boxes.jsonl", "--poses", home / "poses.json")
+    lines = stream(home, tmp_path / "boxes.jsonl", home / "drive", "--poses", home / "poses.json")
     listed = json.loads((home / "poses.json").read_text())
     assert len(lines) == SWEEPS
     for index, line in enumerate(lines):
@@ -65,7 +99,7 @@ def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path, caps
         window.write_text(json.dumps(listed[: index + 1][::-1]))
         capsys.readouterr()
         command("detect --sweeps", window, "--checkpoint", home / "checkpoint", "--out", out)
-        said = f"{window}: the first {WINDOW} of {index + 1} sweeps are fused, as many as the detector was trained"
+        said = f"{window}: fuses the first {WINDOW} of {index + 1} sweeps, as the detector was trained"
         assert (said in capsys.readouterr().err) == (index >= WINDOW)
         [expected] = json.loads(out.read_text())["files"]
         assert len(expected["boxes"]) > 0
@@ -76,7 +110,19 @@ def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path, caps
         assert line["file"] == str(home / listed[index]["file"])
 
 
-def test_keyframes_are_detected_in_with_the_sweeps_between(home, tmp_path, capsys):
+def test_all_forms_of_a_drive_have_the_same_boxes(home, tmp_path):
+    out = tmp_path / "boxes.jsonl"
+    expected = without_file(stream(home, out, home / "drive", "--poses", home / "poses.json"))
+    assert [line["timestamp_us"] for line in expected] == TIMES_US
+    assert without_file(stream(home, out, home / "drive", "--poses", home / "poses.txt")) == expected
+    for form, how in zip(FORMS, ("/odom --topic /points", "tf", "/odom", "tf --topic /points"), strict=True):
+        source = recording(home, form)
+        lines = stream(home, out, source, f"--odometry {how}")
+        assert without_file(lines) == expected, form
+        assert lines[2]["file"] == f"{source}: /points: message 2"
+
+
+def test_keyframes_option_skips_the_boxes_of_other_sweeps(home, tmp_path, capsys):
     (tmp_path / "sensor.json").write_text(json.dumps(sensor_to_json(TINY)))
     data = f"--data-root {tmp_path}/data --scene {{scene}} --checkpoint {home}/checkpoint"
     command(f"synthesize --out {tmp_path}/data --scenes 1 --keyframes 3 --sensor {tmp_path}/sensor.json")
@@ -92,30 +138,24 @@ def test_keyframes_are_detected_in_with_the_sweeps_between(home, tmp_path, capsy
     assert set(lines) < set(every.read_text().splitlines())
 
 
-def test_lines_of_poses_give_the_same_to_their_last_digits(home, tmp_path):
-    ours = stream(home, tmp_path / "a.jsonl", "--poses", home / "poses.txt")
-    for line, expected in zip(
-        ours, stream(home, tmp_path / "b.jsonl", "--poses", home / "poses.json"), strict=True
-    ):
-        assert line["timestamp_us"] == expected["timestamp_us"]
-        np.testing.assert_allclose(line["sensor_to_world"], expected["sensor_to_world"], atol=1e-12)
-        assert line["num_points"] == expected["num_points"]
-
-
-def test_without_poses_every_sweep_is_on_its_own(home, tmp_path, capsys):
-    lines = stream(home, tmp_path / "boxes.jsonl", "--min-score 0.01")
+def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys):
+    lines = stream(home, tmp_path / "boxes.jsonl", home / "drive", "--min-score 0.01")
     assert capsys.readouterr().err.count("no poses: every sweep is detected on its own") == 1
     where = "--checkpoint", home / "checkpoint", "--out", tmp_path / "b.json"
     command("detect", home / "drive", *where, "--min-score 0.01")
     single = json.loads((tmp_path / "b.json").read_text())["files"]
     assert [line["boxes"] for line in lines] == [file["boxes"] for file in single]
     assert {line["timestamp_us"] for line in lines} == {None}
+    recorded = stream(home, tmp_path / "a.jsonl", recording(home, "mcap"))  # whose times are known
+    assert [(line["timestamp_us"], line["sensor_to_world"]) for line in recorded] == [(t, None) for t in TIMES_US]
 
 
 def test_tracks_and_page(home, tmp_path):
     page = tmp_path / "page.html"
-    lines = stream(home, tmp_path / "b.jsonl", "--poses", home / "poses.json", "--track --page", page)
-    plain = stream(home, tmp_path / "c.jsonl", "--poses", home / "poses.json")
+    lines = stream(
+        home, tmp_path / "b.jsonl", home / "drive", "--poses", home / "poses.json", "--track --page", page
+    )
+    plain = stream(home, tmp_path / "c.jsonl", home / "drive", "--poses", home / "poses.json")
     for line, bare, frame in zip(lines, plain, page_content(page)["frames"], strict=True):
         ids = [box.pop("track") for box in line["boxes"]]
         assert len(set(ids)) == len(ids) > 0
@@ -125,7 +165,19 @@ def test_tracks_and_page(home, tmp_path):
         assert frame["scores"] == [box["score"] for box in line["boxes"]]
 
 
-def test_what_came_before_a_bad_cloud_is_written_in_whole_lines(home, tmp_path, capsys):
+def test_prints_the_time_of_each_stage(home, tmp_path, capsys):
+    stream(home, tmp_path / "a.jsonl", recording(home, "ros1"), "--odometry tf --page", tmp_path / "page.html")
+    number = r"\d+\.\d"
+    line = (
+        rf"5 sweeps: the first, which compiles, {number} s; the others ({number}) ms reading, ({number}) ms "
+        rf"detection, ({number}) ms writing \(medians\), 0 compilations"
+    )
+    matches = [match for text in capsys.readouterr().err.splitlines() if (match := re.fullmatch(line, text))]
+    assert len(matches) == 1
+    assert float(matches[0][2]) > 0
+
+
+def test_sweeps_before_an_invalid_cloud_are_written(home, tmp_path, capsys):
     for index in range(2):
         np.save(tmp_path / f"{index}.npy", make_frame(index, TINY).points)
     (tmp_path / "2.npy").write_text("nothing")
@@ -155,16 +207,25 @@ def test_an_interruption_leaves_whole_lines(home, tmp_path, monkeypatch):
 def test_a_recording_for_rerun(home, tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     file = tmp_path / "drive.rrd"
-    lines = stream(home, tmp_path / "b.jsonl", "--poses", home / "poses.json", "--rrd", file)
+    lines = stream(home, tmp_path / "b.jsonl", home / "drive", "--poses", home / "poses.json", "--rrd", file)
     assert file.read_bytes()[:3] == b"RRF"
     assert len(lines) == SWEEPS
 
 
 MISTAKES = {
-    "time going back": ("HOME/drive --poses HOME/backwards.json", r"1.300000.npy: time: got 1300000 us, expected"),
-    "cloud without a pose": ("HOME/drive --poses HOME/short.json", r"short.json: no pose of .*1.400000.npy"),
-    "gap": ("HOME/drive --poses HOME/gap.txt", r"gap.txt: .*1.100000.npy: at 1.1 s: a gap in the poses"),
-    "poses going back": ("HOME/drive --poses HOME/twice.txt", r"twice.txt: line 2: time: got 1.0 s after 1.0 s"),
+    "time going back": (
+        "HOME/drive --poses HOME/backwards.json",
+        r"17000000003\d+.npy: time: got 17000000003\d+ us, expected",
+    ),
+    "cloud without a pose": ("HOME/drive --poses HOME/short.json", r"short.json: no pose of .*17000000004\d+.npy"),
+    "gap": (
+        "HOME/drive --poses HOME/gap.txt",
+        r"gap.txt: .*17000000001\d+.npy: at 1700000000.1\d* s: a gap in the poses",
+    ),
+    "poses going back": (
+        "HOME/drive --poses HOME/twice.txt",
+        r"twice.txt: line 2: time: got 1700000000.\d+ s after 1700000000.\d+ s",
+    ),
     "words": (
         "HOME/drive --poses HOME/words.txt",
         r"words.txt: line 1: got '1 2 3', expected t x y z qx qy qz qw",
@@ -176,28 +237,52 @@ MISTAKES = {
     "no line": ("HOME/drive --poses HOME/none.txt", "none.txt: no pose in it"),
     "no file": ("HOME/drive --poses HOME/nothing.txt", "nothing.txt: no such file"),
     "tracks without poses": ("HOME/drive --track", "--track: found no poses"),
-    "no source": ("", "expected a folder of point files or --data-root"),
+    "no source": ("", "expected either a folder of point files or a recording"),
     "no scene": ("--data-root HOME", "--data-root and --scene together"),
-    "keyframes of a folder": ("HOME/drive --keyframes", "--keyframes: expected with --data-root alone"),
-    "poses of a scene": ("--data-root HOME --scene a --poses HOME/poses.txt", "--poses: expected with a folder"),
+    "keyframes of a folder": ("HOME/drive --keyframes", "--keyframes: expected only with --data-root"),
+    "poses of a scene": (
+        "--data-root HOME --scene a --poses HOME/poses.txt",
+        "--poses: expected only with a folder",
+    ),
     "no data set": ("--data-root HOME --scene a", "expected"),
     "score": ("HOME/drive --min-score 2", "--min-score: got 2, expected"),
     "angle": ("HOME/drive --yaw-deg nan", "--yaw-deg: got nan, expected an angle"),
     "no folder": ("HOME/nowhere", "nowhere: no such file or folder"),
-    "out into a cloud": ("HOME/drive --out HOME/drive/1.000000.npy", "--out: .*the same file as"),
+    "out into a cloud": ("HOME/drive --out HOME/drive/1700000000000000000.npy", "--out: .*the same file as"),
     "out into the checkpoint": (
         "HOME/drive --out HOME/checkpoint/checkpoint.json",
-        "--out: .*found a place in the checkpoint",
+        "--out: .*inside of the checkpoint",
     ),
     "points of a scene": (
         "--data-root HOME --scene a --max-file-points 5",
-        "--max-file-points: expected with a folder or a recording alone",
+        "--max-file-points: expected only with a folder or a recording",
     ),
-    "links of a folder": ("HOME/drive --follow-links", "--follow-links: expected with --data-root alone"),
+    "links of a folder": ("HOME/drive --follow-links", "--follow-links: expected only with --data-root"),
     "page into poses": (
         "HOME/drive --poses HOME/poses.txt --page HOME/poses.txt",
         "--page: .*the same file as .*poses.txt",
     ),
+    "topics of a folder": ("HOME/drive --topic /points", "--topic: expected only with a ROS recording"),
+    "poses twice": (
+        "HOME/ros1.bag --odometry tf --poses HOME/poses.txt",
+        "--poses: expected only with .* without --odom",
+    ),
+    "layout of a recording": (
+        "HOME/ros1.bag --columns 4",
+        "--columns: expected only with a folder of point files",
+    ),
+    "no such topic": (
+        "HOME/ros1.bag --topic /x",
+        r"ros1.bag: topic: got '/x', .*: /points \(sensor_msgs/msg/Point",
+    ),
+    "tracks without odometry": ("HOME/ros1.bag --track", "--track: found no poses, expected .*--odometry"),
+    "no such recording": ("HOME/other.bag", "other.bag: no such file or folder"),
+    "no recording": ("HOME/poses.mcap", "poses.mcap: cannot be read: File magic is invalid"),
+    "poses of another time": (
+        "HOME/ros1.bag --poses HOME/late.txt",
+        "late.txt: .*/points: message 0: at 17.* a gap",
+    ),
+    "page into the recording": ("HOME/ros1.bag --page HOME/ros1.bag", "--page: .*the same file"),
 }
 
 
@@ -212,3 +297,66 @@ def test_mistakes_are_one_line(home, tmp_path, capsys, case):
     assert all(file.read_bytes() == content for file, content in before.items())
     # Lost with the first line of the new one.
     assert (out.read_text() == "an earlier result") == (case != "time going back")
+
+
+def test_time_going_back_is_one_line_after_what_came_before(home, tmp_path, capsys):
+    cloud = structured(make_frame(0, TINY).points)
+    times = (5000, 4000)
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: (("/p", make.cloud(t, cloud)) for t in times))
+    out = tmp_path / "boxes.jsonl"
+    args = ["stream", str(bag), "--checkpoint", str(home / "checkpoint"), "--out", str(out)]
+    assert_one_line_error(capsys, args, r"a: /p: message 1: time: got 4 us, expected more than the 5 us of")
+    assert len(out.read_text().splitlines()) == 1
+
+
+def test_a_log_of_argoverse2_is_a_source(home, tmp_path):
+    log = make_log(tmp_path / "log", 0, sweeps=4, sensor=dataclasses.replace(TINY, row_source="laser"))
+    lines = stream(home, tmp_path / "a.jsonl", log)
+    frames = Argoverse2Frames(log)
+    assert [line["timestamp_us"] for line in lines] == [frames.time_us(i) for i in range(4)]
+    assert np.diff([line["timestamp_us"] for line in lines]).tolist() == [STEP_NS // 1000] * 3
+    for index, line in enumerate(lines):
+        assert line["sensor_to_world"] == frames.pose(index).tolist()
+    # As from a folder with the same clouds and poses, where the file is of the same kind.
+    listed = [
+        {key: line[key] for key in ("file", "timestamp_us", "sensor_to_world")}
+        | {"file": line["file"].removeprefix(f"{tmp_path}/")}
+        for line in lines
+    ]
+    (tmp_path / "poses.json").write_text(json.dumps(listed))
+    folder = log / "sensors" / "lidar"
+    assert stream(home, tmp_path / "b.jsonl", folder, "--poses", tmp_path / "poses.json") == lines
+
+
+@pytest.mark.real_data
+def test_a_real_scene_has_the_same_boxes_in_all_forms(real_data, home, tmp_path):
+    root, out = real_data / "nuscenes_scene0523", tmp_path / "boxes.jsonl"
+    # The index brings the tables' quaternions to unit length, which changes last digits: all have the index's.
+    index = NuScenes(root, "v1.0-scene0523").index
+    [scene], rows = set(index.scene_name.astype(str).tolist()), index.sample_sweep
+
+    def content(make):
+        mount = index.sweep_sensor[rows[0]]
+        extrinsic = index.sensor_translation[mount], index.sensor_rotation[mount][[1, 2, 3, 0]]
+        yield "/tf_static", make.transform(0, "base_link", "lidar", *extrinsic)
+        for row in rows.tolist():
+            stamp = int(index.sweep_time_us[row]) * 1000
+            points = np.fromfile(root / index.sweep_file[row].decode(), np.float32).reshape(-1, 5)
+            ego = index.ego_translation[row], index.ego_rotation[row][[1, 2, 3, 0]]
+            yield "/odom", make.odometry(stamp, *ego)
+            yield "/points", make.cloud(stamp, structured(points))
+
+    how = "--keyframes --checkpoint", home / "checkpoint", "--out", out
+    command("stream --data-root", root, "--scene", scene, *how)
+    expected = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len(expected) == len(rows) == 40
+    lines = [
+        {"file": line["file"], "timestamp_us": line["timestamp_us"], "sensor_to_world": line["sensor_to_world"]}
+        for line in expected
+    ]
+    (tmp_path / "poses.json").write_text(json.dumps(lines))
+    folder = root / "samples" / "LIDAR_TOP"
+    assert stream(home, out, folder, "--poses", tmp_path / "poses.json") == expected
+    for form in ("ros1", "sqlite", "mcap"):
+        bag = write_recording(tmp_path / form.replace(" ", "_"), form, content)
+        assert without_file(stream(home, out, bag, "--odometry /odom")) == without_file(expected), form

@@ -126,7 +126,7 @@ def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, interru
     assert (code, again_code) == (130, 143), errors + again_errors
     for told in (errors, again_errors):
         assert "Traceback" not in told
-        assert "which is saved\nthe same command with --resume goes on\n" in told
+        assert "which is saved\nthe same command with --resume continues\n" in told
     assert 0 < stopped_at < again_at < 2000
     assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, again_at)]
     # Nothing was done twice or left out.
@@ -192,18 +192,18 @@ BAD = {
     ),
     "evaluation of nothing": (
         "--val-split none --evaluate-every 4",
-        "--evaluate-every: got 4 with --val-split none, which evaluates nothing",
+        "--evaluate-every: got 4 with --val-split none, which turns evaluation off",
     ),
     "test samples of nothing": (
         "--val-split none --val-samples 0:1",
-        "--val-samples: got '0:1' with --val-split none, which evaluates nothing",
+        "--val-samples: got '0:1' with --val-split none, which turns evaluation off",
     ),
     "objects of more points": (
         "--copy-paste.min-points 3",
         "copy_paste.min_points: got 3, expected at least the database's 5",
     ),
     "sensor": ("--sensor sonar", "sonar: no such sensor"),
-    "more sweeps than prepared": ("--num-sweeps 2", "cut from other frames than those of split 'train'"),
+    "more sweeps than prepared": ("--num-sweeps 2", "cut from other frames than split 'train'"),
     "objects of another split": (
         "--train-split val",
         "objects/val: no objects here, .* prepare --train-split val",

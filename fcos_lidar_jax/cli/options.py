@@ -1,0 +1,74 @@
+"""Options that several commands have, with one help text for each."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from fcos_lidar_jax import inference
+
+
+def option(metavar: str | None = None, *, default: str | None = None, text: str | None = None) -> Any:
+    """Describe an option in the help.
+
+    Args:
+        metavar: what stands for the value.
+        default: text for a default that is None; without it the help calls the option optional.
+        text: help text; by default the comment or docstring of the field.
+    """
+
+    def hint(label: str) -> str:
+        shown = default or ("" if label in ("None", "") else label)
+        return f"(default: {shown})" if shown else "(optional)"
+
+    return tyro.conf.arg(metavar=metavar, help=text, help_behavior_hint=hint)
+
+
+_DETECTOR = (
+    "Trained detector: a checkpoint; the folder of a run, for its last checkpoint; RUN/best, for its best one; "
+    "{}hdl32e or quickstart, the shipped weights."
+)
+_RAW = "in raw files of another layout"
+
+Trained = Annotated[Path, option("C", text=_DETECTOR.format(""))]
+DETECTOR_TEXT = _DETECTOR.format("a file written by `fcos-lidar export`; ")
+Detector = Annotated[Path, option("C", text=DETECTOR_TEXT)]
+Backend = Annotated[
+    inference.Backend,
+    option(
+        text="Runtime of the network. openvino is faster on CPUs, uses bfloat16 where the processor supports it, "
+        "and needs pip install 'fcos-lidar-jax[cpu]'."
+    ),
+]
+BatchSize = Annotated[
+    int, option(text="Clouds per device and call. Another size changes boxes and scores by rounding.")
+]
+Close = Annotated[
+    Literal["all", "sweeps", "none"] | None,
+    option(
+        "{all,sweeps,none}",
+        default="as the detector was trained, else all",
+        text="Drop points within a metre of the sensor in x and y: of all sweeps, of older sweeps only, or none.",
+    ),
+]
+Columns = Annotated[
+    int | None,
+    option("N", default="by ending", text=f"Values per point {_RAW}: 3, 4, 5 (the fifth is the time lag) or 6."),
+]
+Dtype = Annotated[
+    Literal["float16", "float32", "float64"] | None,
+    option("{float16,float32,float64}", default="float32", text=f"Number type {_RAW}."),
+]
+MaxFilePoints = Annotated[int, option(text="Refuse point files with more points than this.")]
+MinScore = Annotated[float, option(text="Leave out boxes with a lower score.")]
+Page = Annotated[
+    Path | None, option("FILE.html", text="Also write a page for a browser, one file that works offline.")
+]
+Sensor = Annotated[str, option("SENSOR", text="Sensor preset, or a sensor file.")]
+Yaw = Annotated[
+    float,
+    option(
+        text="Turn the clouds by this angle about z before detection, and the boxes back. Use 90 if x points "
+        "forward and the detector expects y forward, as hdl32e does."
+    ),
+]
