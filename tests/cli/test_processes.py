@@ -1,4 +1,4 @@
-"""Several processes as one: the options, and two processes on this machine that train and evaluate."""
+"""Several processes: the options, and two processes on this machine that train and evaluate together."""
 
 import json
 import re
@@ -49,20 +49,20 @@ JOINED = {
 
 
 @pytest.mark.parametrize("case", JOINED)
-def test_jax_is_told_which_process_this_is_and_which_gpus_it_takes(case, monkeypatch):
+def test_passes_the_process_and_its_gpus_to_jax(case, monkeypatch):
     options, environment, place, ids = JOINED[case]
     monkeypatch.setattr(jax.distributed, "initialize", initialize := Mock())
     join_processes(options, environment)
     initialize.assert_called_once_with(*place, local_device_ids=ids)
 
 
-def test_a_process_alone_meets_nobody(monkeypatch):
+def test_a_single_process_does_not_connect(monkeypatch):
     monkeypatch.setattr(jax.distributed, "initialize", initialize := Mock())
     join_processes(ProcessOptions(), SRUN | ALONE)
     initialize.assert_not_called()
 
 
-def test_others_that_are_not_met_are_told_in_one_line(monkeypatch):
+def test_a_failed_connection_is_one_line(monkeypatch):
     monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=RuntimeError("DEADLINE_EXCEEDED: late")))
     with pytest.raises(OSError, match=r"^10.0.0.1:12345: the processes did not connect: DEADLINE_EXCEEDED: late$"):
         join_processes(BY_HAND, {})
@@ -70,14 +70,11 @@ def test_others_that_are_not_met_are_told_in_one_line(monkeypatch):
 
 @pytest.mark.parametrize(
     ("options", "line"),
-    [
-        (BY_HAND, "10.0.0.1:12345: this process cannot join: invalid literal"),
-        (BY_LAUNCHER, "the cluster of the environment: this process cannot join: invalid literal"),
-    ],
+    [(BY_HAND, "10.0.0.1:12345: this"), (BY_LAUNCHER, "the cluster of the environment: this")],
 )
-def test_what_is_wrong_is_not_blamed_on_a_missing_launcher(monkeypatch, options, line):
+def test_other_errors_are_not_blamed_on_a_missing_launcher(monkeypatch, options, line):
     monkeypatch.setattr(jax.distributed, "initialize", Mock(side_effect=ValueError("invalid literal")))
-    with pytest.raises(ValueError, match=f"^{line}$"):
+    with pytest.raises(ValueError, match=f"^{line} process cannot join: invalid literal$"):
         join_processes(options, {})
     with pytest.raises(ValueError, match=r"^JAX_LOCAL_DEVICE_IDS: got 'x', expected numbers of GPUs"):
         join_processes(options, {"JAX_LOCAL_DEVICE_IDS": "x"})
@@ -115,7 +112,7 @@ OF_EVALUATE = {
 @pytest.mark.parametrize("name", [*BAD, *OF_EVALUATE])
 def test_options_that_cannot_work_get_one_line(tmp_path, capsys, name, monkeypatch):
     line, message = (BAD | OF_EVALUATE)[name]
-    # In these tests JAX has begun to work long ago, which it would complain about first.
+    # JAX is in use already in these tests, and would complain about that first.
     monkeypatch.setattr(jax.distributed, "initialize", jax._src.distributed.global_state.initialize)
     evaluate = ["evaluate", "--format", "simulated", "--out", str(tmp_path / "out"), *line.split()]
     evaluate += [] if name == "results" else ["--checkpoint", "quickstart"]
@@ -127,7 +124,7 @@ def test_options_that_cannot_work_get_one_line(tmp_path, capsys, name, monkeypat
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """Two scenes of six keyframes, one to train and one to test on, with an index; a checkpoint beside them."""
+    """Two scenes of six keyframes, one for training and one for tests, with an index; a checkpoint beside them."""
     home = tmp_path_factory.mktemp("home")
     (home / "sensor.json").write_text(json.dumps(sensor_to_json(SENSOR)))
     command("synthesize --scenes 2 --keyframes 6 --out", home / "data", "--sensor", home / "sensor.json")
@@ -142,11 +139,15 @@ def start(args: list[str], **variables: str) -> subprocess.Popen[str]:
     return subprocess.Popen(words, env=child_environment(**variables), text=True, **pipes)
 
 
-def start_two(how: str, *args: list[str]) -> list[subprocess.Popen[str]]:
-    """The command as two processes, each with its own arguments, that find each other one way or the other."""
+def free_port() -> str:
     with socket.socket() as free:
         free.bind(("localhost", 0))
-        port = str(free.getsockname()[1])
+        return str(free.getsockname()[1])
+
+
+def start_two(how: str, *args: list[str]) -> list[subprocess.Popen[str]]:
+    """Start the command as two processes, each with its own arguments, connected by ``how``."""
+    port = free_port()
 
     def one(index: int) -> subprocess.Popen[str]:
         if how == "coordinator":
@@ -159,7 +160,7 @@ def start_two(how: str, *args: list[str]) -> list[subprocess.Popen[str]]:
 
 
 def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
-    """Exit codes and what was printed."""
+    """Wait for the end; returns exit codes and output."""
     try:
         printed = [process.communicate(timeout=200) for process in processes]
     finally:
@@ -170,29 +171,19 @@ def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
 
 def evaluate(data: Path, out: Path, *more: str) -> list[str]:
     """The command on the six keyframes of the split val."""
-    checkpoint = str(data.parent / "start")
-    return [
-        "evaluate",
-        "--data-root",
-        str(data),
-        "--checkpoint",
-        checkpoint,
-        "--no-report",
-        "--out",
-        str(out),
-        *more,
-    ]
+    where = ["--data-root", str(data), "--checkpoint", str(data.parent / "start"), "--out", str(out)]
+    return ["evaluate", *where, "--no-report", *more]
 
 
 def contents(out: Path) -> dict[str, str]:
-    """Of all files, but for how long the evaluation took."""
+    """Content of all files, without the time in the summary."""
     texts = {path.name: path.read_text() for path in out.iterdir() if path.name != ".lock"}
     return {name: re.sub(r'"eval_time": [^,]*', "", text) for name, text in texts.items()}
 
 
 @pytest.fixture(scope="module")
 def alone(root, tmp_path_factory) -> dict[str, str]:
-    """What one process writes."""
+    """The files of a single process."""
     out = tmp_path_factory.mktemp("alone")
     command(*evaluate(root, out))
     return contents(out)
@@ -217,9 +208,11 @@ def error_lines(text: str) -> list[str]:
     return [line for line in text.splitlines() if line.startswith("fcos-lidar: error: ")]
 
 
-def test_a_cloud_that_one_cannot_read_ends_all_and_what_is_done_stays_done(root, alone, tmp_path):
-    """The second process has data of its own, in which its cloud of the third pair of frames is cut:
-    the first pair is done, the second is not yet written."""
+def test_an_unreadable_cloud_ends_both_processes_and_keeps_finished_frames(root, alone, tmp_path):
+    """The second process has its own data, in which its cloud of the third pair of frames is cut.
+
+    The first pair is finished then, and the second not yet written.
+    """
     other = shutil.copytree(root, tmp_path / "home" / "data")
     shutil.copytree(root.parent / "start", other.parent / "start")
     data = NuScenes(other, "v1.0-synthetic")
@@ -229,8 +222,8 @@ def test_a_cloud_that_one_cannot_read_ends_all_and_what_is_done_stays_done(root,
     both = [evaluate(data, tmp_path / "both") for data in (root, other)]
     first, second = ended(start_two("coordinator", *both))
     assert (first[0], second[0]) == (1, 1)
-    told = "fcos-lidar: error: process 1: cannot read its frames, see what it says"
-    assert error_lines(first[2]) == [told]
+    line = "fcos-lidar: error: process 1: cannot read its frames, see what it says"
+    assert error_lines(first[2]) == [line]
     (line,) = error_lines(second[2])
     assert f"{file}: got {len(whole) - 1} bytes" in line
     assert {path.name for path in (tmp_path / "both").iterdir()} == {"results_nusc.resume_log", ".lock"}
@@ -250,14 +243,14 @@ def test_processes_with_different_detectors_are_refused(root, tmp_path):
         assert (code, error_lines(errors)) == (1, [f"fcos-lidar: error: {line}"])
 
 
-def test_what_the_first_cannot_do_ends_all(root, tmp_path):
-    """Begin, for another works in the folder; and write, for a folder stands where a file is to be."""
-    out, begun = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see what it says"
+def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
+    """The folder is in use; then a folder stands in the place of a file."""
+    out, line = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see what it says"
     with in_use(out):
         first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
     assert (first[0], second[0]) == (1, 1)
     assert "in use: process" in error_lines(first[2])[0]
-    assert error_lines(second[2]) == [begun]
+    assert error_lines(second[2]) == [line]
     (out / "results_nusc.resume_log").mkdir()
     first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
     assert (first[0], second[0]) == (1, 1)
@@ -266,22 +259,19 @@ def test_what_the_first_cannot_do_ends_all(root, tmp_path):
 
 
 def start_one(args: list[str]) -> list[subprocess.Popen[str]]:
-    """A cluster of one process."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    return [start([*args, "--coordinator", f"localhost:{port}", "--num-processes", "1", "--process-index", "0"])]
+    """Start a cluster of one process."""
+    return [start([*args, "--coordinator", f"localhost:{free_port()}", "--num-processes=1", "--process-index=0"])]
 
 
 def wait_for(file: Path, process: subprocess.Popen[str]) -> None:
-    """Until the file has content, or the process has ended."""
+    """Wait until the file has content, or the process has ended."""
     until = time.monotonic() + 100
     while not (file.exists() and file.stat().st_size) and process.poll() is None and time.monotonic() < until:
         time.sleep(0.01)
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_sigterm_to_one_stops_all_after_the_same_frames(root, tmp_path, number):
+def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path, number):
     frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
     args = ["evaluate", *frames, "--checkpoint", str(root.parent / "start"), "--out", str(tmp_path / "all")]
     processes = start_one(args) if number == 1 else start_two("coordinator", args, args)
@@ -312,7 +302,7 @@ def train(data: Path, out: Path) -> list[str]:
     return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often]
 
 
-def test_data_that_one_cannot_open_end_all(root, tmp_path):
+def test_data_that_one_process_cannot_open_end_both(root, tmp_path):
     both = [train(root, tmp_path / "run"), [*train(root, tmp_path / "run"), "--data-root", str(tmp_path / "gone")]]
     first, second = ended(start_two("coordinator", *both))
     assert (first[0], second[0]) == (1, 1)
@@ -330,18 +320,17 @@ def two_devices(root, tmp_path_factory) -> list[dict]:
     return read_metrics(out)
 
 
-_OF_ONE = {"seconds", "waiting_seconds", "samples_per_second"}  # Time.
-_OF_ONE |= {"pasted_objects", "truncated_points", "truncated_boxes", "invalid_points"}  # The first one's own rows.
+_NOT_SHARED = {"seconds", "waiting_seconds", "samples_per_second"}
+_NOT_SHARED |= {"pasted_objects", "truncated_points", "truncated_boxes", "invalid_points"}  # per process
 
 
-@pytest.mark.parametrize("how", ["coordinator", "slurm"])
-def test_two_processes_train_as_one_with_two_devices(root, two_devices, tmp_path, how):
-    first, second = ended(start_two(how, *[train(root, tmp_path / "run")] * 2))
+def test_two_processes_train_like_one_with_two_devices(root, two_devices, tmp_path):
+    first, second = ended(start_two("coordinator", *[train(root, tmp_path / "run")] * 2))
     assert (first[0], second[0]) == (0, 0), first[2] + second[2]
-    found = read_metrics(tmp_path / "run")
-    assert len(found) == STEPS + 1
+    metrics = read_metrics(tmp_path / "run")
+    assert len(metrics) == STEPS + 1
     assert (tmp_path / "run" / "objects" / "manifest.json").is_file()
-    for ours, theirs in zip(found, two_devices, strict=True):
-        assert ours.keys() == theirs.keys()
-        for name in ours.keys() - _OF_ONE:
-            assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name
+    for line, expected in zip(metrics, two_devices, strict=True):
+        assert line.keys() == expected.keys()
+        for name in line.keys() - _NOT_SHARED:
+            assert line[name] == pytest.approx(expected[name], rel=1e-4), name

@@ -1,4 +1,4 @@
-"""``fcos-lidar train`` on a small simulated data set: from tables to a run, and one line for what goes wrong."""
+"""``fcos-lidar train`` on a small simulated data set, and one line per mistake."""
 
 import json
 import re
@@ -44,32 +44,31 @@ def train(root: Path, out: Path, *more: str) -> list[str]:
     return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often, *tests, *more]
 
 
-def test_trains_evaluates_and_says_where_the_best_checkpoint_is(root, tmp_path, capsys):
+def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys):
     start, out = root.parent / "start", tmp_path / "run"
     command(*train(root, out, "--weights", str(start), "--samples", "1:2", "--copy-paste.min-points", "3"))
-    said = json.loads(capsys.readouterr().out)
+    record = json.loads(capsys.readouterr().out)
     last = str(out / "checkpoints" / "00000004")
-    assert said == {"run": str(out), "steps": STEPS, "checkpoint": last, "best": last}
+    assert record == {"run": str(out), "steps": STEPS, "checkpoint": last, "best": last}
     spec = json.loads((out / "run.json").read_text())
     assert (spec["weights"], spec["frames"], spec["steps"]) == (str(start), 1, STEPS)
     lines = read_metrics(out)
     assert [line["step"] for line in lines if "test/mAP" in line] == [4]
-    # Objects of the chosen keyframes alone.
+    # Objects come only from the selected keyframes.
     manifest = json.loads((out / "objects" / "manifest.json").read_text())
     assert ([shard["name"] for shard in manifest["shards"]], manifest["min_points"]) == (["scene-0001"], 3)
-    # Four steps from the given weights, not from random ones: AdamW moves a weight by a rate a step at most.
-    trained = load_checkpoint(said["checkpoint"]).variables["params"]
+    # Training started at the given weights: a step of AdamW moves a weight by the learning rate at most.
+    trained = load_checkpoint(record["checkpoint"]).variables["params"]
     moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), trained, weights()["params"])
     reach = 1.1 * sum(line["learning_rate"] for line in lines if "learning_rate" in line)
     assert 0 < max(jax.tree.leaves(moved)) < reach
-    # Detection and evaluation take the run for its best checkpoint.
     cloud = next((root / "samples" / "LIDAR_TOP").iterdir())
     command("detect", cloud, "--checkpoint", out, "--out", tmp_path / "boxes.json")
 
 
 @pytest.fixture(scope="module")
 def child():
-    """Starts the command as a process."""
+    """``child(args)`` starts the command as a process."""
     started = []
 
     def start(args: list[str]) -> subprocess.Popen[str]:
@@ -88,7 +87,7 @@ def checkpoints(out: Path) -> list[str]:
 
 
 def wait_for_a_step(process: subprocess.Popen[str], out: Path, beyond: int = 0) -> None:
-    """Until the run has done more steps, or is over."""
+    """Wait until the run has done more steps, or has ended."""
     until = time.monotonic() + 200
     while process.poll() is None and time.monotonic() < until:
         if (out / "metrics.jsonl").exists() and len(read_metrics(out)) > beyond:
@@ -97,66 +96,52 @@ def wait_for_a_step(process: subprocess.Popen[str], out: Path, beyond: int = 0) 
 
 
 def long(root: Path) -> list[str]:
-    """Options of a run that is to be stopped."""
+    """Options of a run that the test stops."""
     more = ["--weights", str(root.parent / "start"), "--no-copy-paste", "--steps", "2000", "--val-split", "none"]
     return [*more, "--save-every", "2000"]
 
 
 def stop(process: subprocess.Popen[str], number: int, out: Path, beyond: int = 0) -> tuple[int, str, int]:
-    """Ask a run to stop as soon as it has done a step more: its exit code, messages, and steps done in all."""
+    """Send a signal after one more step; returns the exit code, the messages and the total steps."""
     wait_for_a_step(process, out, beyond)
     process.send_signal(number)
     _, errors = process.communicate(timeout=200)
     return process.returncode, errors, len(read_metrics(out))
 
 
-@pytest.fixture(scope="module")
-def interrupted(root, tmp_path_factory, child):
-    """A run of one process that got Ctrl-C: its folder, and what :func:`stop` tells."""
-    out = tmp_path_factory.mktemp("interrupted") / "run"
-    return out, *stop(child(train(root, out, *long(root))), signal.SIGINT, out)
-
-
-def test_signals_save_and_exit_with_their_codes_and_resume_goes_on(root, interrupted, tmp_path, child):
-    """Where a stopped and resumed run ends, tests/training/test_run.py tells."""
-    first, code, errors, stopped_at = interrupted
-    out = shutil.copytree(first, tmp_path / "run")
+def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
+    """tests/training/test_run.py compares the result of a resumed run."""
+    out = tmp_path / "run"
+    code, errors, stopped_at = stop(child(train(root, out, *long(root))), signal.SIGINT, out)
     resumed = child(train(root, out, *long(root), "--resume"))
-    again_code, again_errors, again_at = stop(resumed, signal.SIGTERM, out, stopped_at)
-    assert (code, again_code) == (130, 143), errors + again_errors
-    for told in (errors, again_errors):
-        assert "Traceback" not in told
-        assert "which is saved\nthe same command with --resume continues\n" in told
-    assert 0 < stopped_at < again_at < 2000
-    assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, again_at)]
-    # Nothing was done twice or left out.
-    assert [line["step"] for line in read_metrics(out)] == list(range(1, again_at + 1))
+    resumed_code, resumed_errors, end = stop(resumed, signal.SIGTERM, out, stopped_at)
+    assert (code, resumed_code) == (130, 143), errors + resumed_errors
+    for text in (errors, resumed_errors):
+        assert "Traceback" not in text
+        assert "which is saved\nthe same command with --resume continues\n" in text
+    assert 0 < stopped_at < end < 2000
+    assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, end)]
+    # No step was repeated or left out.
+    assert [line["step"] for line in read_metrics(out)] == list(range(1, end + 1))
 
 
-def test_two_processes_are_one_run_and_stop_together(root, interrupted, tmp_path, child):
-    """Each reads its half of the batch; the first step is that of one process, and asking the second to stop stops
-    both after the same step, saved once."""
+def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, child):
+    """tests/cli/test_processes.py compares their steps with a single process."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    together = tmp_path / "together"
     cluster = ["--coordinator", f"localhost:{port}", "--num-processes", "2"]
-    both = [child(train(root, together, *long(root), *cluster, "--process-index", str(i))) for i in range(2)]
-    wait_for_a_step(both[0], together)
+    out = tmp_path / "run"
+    both = [child(train(root, out, *long(root), *cluster, "--process-index", str(i))) for i in range(2)]
+    wait_for_a_step(both[0], out)
     both[1].send_signal(signal.SIGTERM)
     for process in both:
         _, errors = process.communicate(timeout=200)
         assert process.returncode == 143, errors
         assert "Traceback" not in errors
-    records = read_metrics(together)
-    assert 0 < len(records) < 2000
-    assert checkpoints(together) == [f"{len(records):08d}"]
-    expected, found = read_metrics(interrupted[0])[0], records[0]
-    for name in ("positives", "unique_positives", "positives_per_level", "candidates"):
-        assert found[name] == expected[name], name
-    for name in ("loss/total", "loss/classification", "loss/l1", "loss/iou", "loss/iou_prediction"):
-        assert found[name] == pytest.approx(expected[name], rel=1e-5), name
-    assert found["gradient_norm"] == pytest.approx(expected["gradient_norm"], rel=1e-4)
+    steps = len(read_metrics(out))
+    assert 0 < steps < 2000
+    assert checkpoints(out) == [f"{steps:08d}"]
 
 
 BAD = {
@@ -219,16 +204,16 @@ def test_mistakes_get_one_line_and_leave_nothing(root, tmp_path, capsys, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_very_many_simulated_frames_are_not_made_before_the_first_step(tmp_path, capsys):
+def test_rejects_options_that_simulate_all_frames_before_the_first_step(tmp_path, capsys):
     args = ["train", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out")]
     message = "all 100000 frames would be made before the first step, expected --no-class-balanced"
-    for given, said in (((), f"{message} --no-copy-paste"), (("--no-copy-paste",), message)):
-        assert_one_line_error(capsys, [*args, *given], f"{said}, or at most 2000 of them by --samples")
+    for more, line in (((), f"{message} --no-copy-paste"), (("--no-copy-paste",), message)):
+        assert_one_line_error(capsys, [*args, *more], f"{line}, or at most 2000 of them by --samples")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
-    """The objects of some samples are cut in the run's folder, so before they are."""
+    """Even before objects of --samples are cut, which happens in the run's folder."""
     with in_use(tmp_path / "run"):
         assert_one_line_error(capsys, train(root, tmp_path / "run", "--samples", "0:1"), "run: in use: process ")
         assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"]
@@ -238,17 +223,17 @@ def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
     ("option", "value"),
     [("--model.precision", "float16"), ("--loss.l1-weight", "many"), ("--optimizer.epochs", "1.5")],
 )
-def test_a_value_of_another_kind_is_a_usage_error(root, tmp_path, capsys, option, value):
+def test_a_value_of_another_type_is_a_usage_error(root, tmp_path, capsys, option, value):
     with pytest.raises(SystemExit) as stopped:
         cli.main(train(root, tmp_path / "out", option, value))
-    shown = capsys.readouterr()
+    printed = capsys.readouterr()
     assert stopped.value.code == 2
-    assert option.split(".")[1].replace("-", "_") in (shown.err + shown.out).replace("-", "_")
+    assert option.split(".")[1].replace("-", "_") in (printed.err + printed.out).replace("-", "_")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "said"),
+    ("option", "value", "message"),
     [
         ("--optimizer.batch-size", "0", "got 0, expected at least 1"),
         ("--optimizer.accumulate", "3", "got 3, expected a divisor of the batch size 2"),
@@ -259,12 +244,12 @@ def test_a_value_of_another_kind_is_a_usage_error(root, tmp_path, capsys, option
         ("--num-sweeps", "0", "got 0, expected at least 1"),
     ],
 )
-def test_what_a_configuration_refuses_is_told_in_one_line(root, tmp_path, capsys, option, value, said):
-    assert_one_line_error(capsys, train(root, tmp_path / "out", option, value), re.escape(f"{option}: {said}"))
+def test_values_that_the_configuration_rejects_get_one_line(root, tmp_path, capsys, option, value, message):
+    assert_one_line_error(capsys, train(root, tmp_path / "out", option, value), re.escape(f"{option}: {message}"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_prepare_there_is_a_line_that_names_it(root, tmp_path, capsys):
+def test_without_prepare_the_error_names_it(root, tmp_path, capsys):
     copy = shutil.copytree(root, tmp_path / "data", ignore=shutil.ignore_patterns(".fcos_lidar"))
     shutil.copy(root.parent / "sensor.json", tmp_path)
     message = "v1.0-synthetic: no index here, expected one: run fcos-lidar prepare$"
