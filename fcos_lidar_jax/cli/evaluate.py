@@ -61,9 +61,9 @@ class Evaluate:
     The detections come from a detector that is run over a split (--checkpoint) or from a file (--results). The
     truth comes from a data set (--data-root) or, for an official results file, from a file (--ground-truth). The
     command writes metrics_summary.json, curves.json, report.html, frames.html, which shows the worst and the best
-    frames, and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI it adds KITTI's
-    own metric, metrics_kitti.json, and its result files, results_kitti. After Ctrl-C or a kill, the same command
-    resumes and repeats at most one batch.
+    frames, and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI it adds the
+    benchmark's own metric, metrics_kitti.json, and its result files, results_kitti. After Ctrl-C or a kill, the
+    same command resumes and repeats at most one batch.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
