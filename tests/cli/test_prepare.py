@@ -117,7 +117,7 @@ def test_a_stale_index_is_made_anew_and_said(root, tmp_path, capsys):
     capsys.readouterr()
     command(*prepare(copy, tmp_path / "i"))
     out, err = capsys.readouterr()
-    assert "sample_annotation.json: the index was made of another one" in err
+    assert "sample_annotation.json: the index was made from another table" in err
     assert json.loads(out)["annotations"] == 16 * SCENES - 1
     command(*prepare(copy, tmp_path / "new"))
     assert contents(tmp_path / "i") == contents(tmp_path / "new")
