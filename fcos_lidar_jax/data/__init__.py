@@ -1,1 +1,1 @@
-"""Where points and boxes come from."""
+"""Readers of point clouds and boxes."""

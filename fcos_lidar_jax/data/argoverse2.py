@@ -13,7 +13,7 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
 from fcos_lidar_jax.data.class_mapping import map_labels, unknown_name
 from fcos_lidar_jax.data.drives import Drive
-from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
+from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points, size_and_time
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, find_bad_pose, fuse_sweeps
@@ -28,27 +28,27 @@ _TRANSLATION = ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 _POSE = {"timestamp_ns": "iu", **dict.fromkeys((*_ROTATION, *_TRANSLATION), "fiu")}
 _BOX = {**_POSE, **dict.fromkeys(_SIZE, "fiu"), "num_interior_pts": "iu", "track_uuid": "O", "category": "O"}
-"""Column -> NumPy's letters of the types that it may have."""
+"""Column -> NumPy's type letters that it may have."""
 
 
 class Argoverse2Frames(FrameSet):
     """All sweeps of some logs, by log and time: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
     Reads ``ROOT/[SPLIT/]LOG/sensors/lidar/TIMESTAMP_NS.feather``, ``LOG/city_SE3_egovehicle.feather`` and
-    ``LOG/annotations.feather``; a log without annotations, as in the test split, has no boxes. Points and boxes
-    stay in the frame of the ego vehicle (x forward, y left, z up). Boxes of the 26 classes of the detection
-    benchmark; the taxonomy's other four are left out. Velocities are not annotated: they are those of the tracks
-    in the city's frame, by the rule of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, along the axes of
-    the ego vehicle.
+    ``LOG/annotations.feather``. A log without annotations, as in the test split, has no boxes. Points and boxes
+    stay in the ego vehicle's frame (x forward, y left, z up). Boxes outside the 26 classes of the detection
+    benchmark are dropped. Velocities are not annotated: they follow from the tracks in the city frame, by the rule
+    of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, and are given along the ego vehicle's axes.
 
     Args:
-        root: the folder of the splits, of logs, or of one log.
-        split: its logs alone; all of them without it.
-        sensor: whose points they are; with rows by laser number.
-        reading: sweeps to fuse at most, fewer at the beginning of a log, and which points are dropped.
+        root: folder of splits, of logs, or of one log.
+        split: read only its logs.
+        sensor: sensor that recorded the points.
+        reading: maximum number of sweeps to fuse, and which points are dropped.
 
     Raises:
-        ValueError: here or on reading a frame, naming the file, the row, the field, found and expected.
+        ValueError: at construction or on reading a frame, with the file, the row, the field, the found and the
+            expected value.
     """
 
     classes = ARGOVERSE2_CLASSES
@@ -75,7 +75,7 @@ class Argoverse2Frames(FrameSet):
         return len(self._sweeps)
 
     def frame(self, index: int) -> Frame:
-        """One sweep, read anew, fused with those before it."""
+        """Read one sweep, fused with the sweeps before it."""
         older = min(self._sweeps[index][2], self.reading.num_sweeps - 1)
         chain = range(index, index - older - 1, -1)
         sweeps = (Sweep(read_points(self._file(i), self.sensor), self.pose(i), self.time_us(i)) for i in chain)
@@ -83,7 +83,6 @@ class Argoverse2Frames(FrameSet):
         return Frame(points, *self._boxes(index), num_close)
 
     def truth(self, index: int) -> Frame:
-        """As of any frame set; the cloud is not read."""
         return Frame(no_points(self.sensor), *self._boxes(index))
 
     def labels(self, index: int) -> np.ndarray:
@@ -130,10 +129,11 @@ def is_argoverse2_log(folder: Path) -> bool:
 
 
 def argoverse2_drive(log: Path, sensor: Sensor, *, max_points: int = MAX_POINTS) -> Drive:
-    """The sweeps of a log in the order of time, in the frame of the ego vehicle, with its poses in the city.
+    """The sweeps of a log in temporal order, in the ego vehicle's frame, with poses in the city frame.
 
     Raises:
-        ValueError: here or on reading a sweep, naming the file, the row, the field, found and expected.
+        ValueError: at the call or on reading a sweep, with the file, the row, the field, the found and the
+            expected value.
     """
     poses, stamps = _read_poses(log / _POSES), _stamps(log)
 
@@ -147,19 +147,19 @@ def argoverse2_drive(log: Path, sensor: Sensor, *, max_points: int = MAX_POINTS)
 
 
 def find_splits(root: Path) -> list[str]:
-    """Folders of logs in a folder."""
+    """Names of the folders that contain logs."""
     return sorted(
         folder.name for folder in root.iterdir() if folder.is_dir() and next(folder.glob(f"*/{_SWEEPS}"), 0)
     )
 
 
 def _logs(folder: Path) -> list[Path]:
-    """The logs in a folder, or the folder where it is one."""
-    return [folder] if (folder / _SWEEPS).is_dir() else sorted(p.parents[1] for p in folder.glob(f"*/{_SWEEPS}"))
+    """The logs in a folder, or the folder itself if it is a log."""
+    return [folder] if is_argoverse2_log(folder) else sorted(p.parents[1] for p in folder.glob(f"*/{_SWEEPS}"))
 
 
 def _stamps(log: Path) -> list[int]:
-    """Times of a log's sweeps in nanoseconds, from their files' names."""
+    """Times of a log's sweeps in nanoseconds, from the file names."""
     stamps = []
     for file in (log / _SWEEPS).glob("*.feather"):
         if not (file.stem.isascii() and file.stem.isdecimal()) or str(int(file.stem)) != file.stem:
@@ -172,10 +172,10 @@ def _stamps(log: Path) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class _Poses:
-    """Where the ego vehicle was."""
+    """The ego vehicle's poses in a log."""
 
     file: Path
-    time_ns: np.ndarray  # i64[p], rising
+    time_ns: np.ndarray  # i64[p], increasing
     matrices: np.ndarray  # f64[p, 4, 4], ego vehicle to city
 
     def at(self, time_ns: np.ndarray | int) -> np.ndarray:
@@ -190,17 +190,16 @@ class _Poses:
 class _Boxes(NamedTuple):
     """All boxes of a log, by time."""
 
-    time_ns: np.ndarray  # i64[m], rising
+    time_ns: np.ndarray  # i64[m], increasing
     boxes: np.ndarray  # f32[m, 9]
     labels: np.ndarray  # i32[m]
     num_points: np.ndarray  # i32[m]
 
 
 def _read_log(log: Path) -> tuple[_Poses, _Boxes]:
-    """Poses and boxes of a log, kept until one of its files changes."""
+    """Poses and boxes of a log, cached until one of its files changes."""
     files = (log / _POSES, log / _BOXES)
-    states = (((s := file.stat()).st_size, s.st_mtime_ns) if file.exists() else None for file in files)
-    return _cached_log(*files, *states)
+    return _cached_log(*files, *map(size_and_time, files))
 
 
 @functools.lru_cache(maxsize=32)
@@ -231,7 +230,7 @@ def _read_boxes(file: Path, poses: _Poses) -> _Boxes:
     if (bad := find_bad_box(boxes)) is not None:
         raise ValueError(f"{file}: row {bad[0]}: {bad[1]}")
     velocity = _track_velocities(table["track_uuid"], time_ns, (ego @ in_ego)[:, :3, 3], ego)
-    possible = (np.abs(velocity) <= LIMITS["vx"]).all(axis=1)  # a track that jumps has none
+    possible = (np.abs(velocity) <= LIMITS["vx"]).all(axis=1)  # the velocity of a jumping track is unknown
     boxes[possible, 7:] = velocity[possible]
     boxes = boxes.astype(np.float32)
     boxes[:, 6] = wrap_angle(boxes[:, 6])
@@ -243,7 +242,7 @@ def _read_boxes(file: Path, poses: _Poses) -> _Boxes:
 
 
 def _track_velocities(track: np.ndarray, time_ns: np.ndarray, in_city: np.ndarray, ego: np.ndarray) -> np.ndarray:
-    """f64[m, 2]: velocity of every box along the ego vehicle's axes, NaN where it is not known."""
+    """f64[m, 2]: velocity of every box along the ego vehicle's axes, NaN if unknown."""
     _, track = np.unique(track.astype(str), return_inverse=True)
     order = np.lexsort((time_ns, track))
     follows = track[order][1:] == track[order][:-1]
@@ -255,7 +254,7 @@ def _track_velocities(track: np.ndarray, time_ns: np.ndarray, in_city: np.ndarra
 
 
 def _read_table(file: Path, kinds: Mapping[str, str]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Columns of a table, whole numbers as i64, others as f64, texts as objects; and the pose of every row."""
+    """Columns of a table (integers as i64, other numbers as f64, text as objects) and the pose of every row."""
     if not file.is_file():
         raise ValueError(f"{file}: no such file, expected one for every log")
     wide = {"fiu": np.float64, "iu": np.int64, "O": object}

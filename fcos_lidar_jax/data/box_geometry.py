@@ -1,19 +1,18 @@
-"""Boxes in the ground plane, on the host: which of them overlap, and which points they hold."""
+"""Box geometry on the host: plausibility, overlap in the ground plane, and the points inside boxes."""
 
 import numpy as np
 
 from fcos_lidar_jax.geometry import points_in_box
 
 LIMITS = dict.fromkeys("xyz", 10_000.0) | dict.fromkeys("lwh", 500.0) | {"yaw": 1000.0, "vx": 500.0, "vy": 500.0}
-"""Field of a box -> largest magnitude that is no mistake: metres, radians, metres a second."""
+"""Field of a box -> largest plausible magnitude: metres, radians, metres per second."""
 _CELL_M = 0.5
-_MAX_CELLS = 1024  # along a side: a box far away makes the cells larger, not the grid
-_SLACK_M = 1e-3
-"""Far above the rounding of float32 coordinates: the coarse tests never lose a point that lies inside."""
+_MAX_CELLS = 1024  # per side: a box far away makes the cells larger instead of the grid
+_SLACK_M = 1e-3  # far above float32 rounding, so that the coarse tests never lose an inside point
 
 
 def find_bad_box(boxes: np.ndarray) -> tuple[int, str] | None:
-    """The first box that no object can have, and what is wrong with it; None where all can be.
+    """The row of the first implausible box and its problem; None if all boxes are plausible.
 
     Args:
         boxes: [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``; an unknown velocity is NaN twice.
@@ -36,9 +35,9 @@ def find_bad_box(boxes: np.ndarray) -> tuple[int, str] | None:
 
 
 def footprints_overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Whether the rotated rectangles of boxes share some area, bool[...]; elementwise with broadcasting.
+    """Whether the rotated rectangles of boxes share area, bool[...]; elementwise with broadcasting.
 
-    Touching is no overlap. Separating axes, float64.
+    Touching does not count. Uses separating axes in float64.
 
     Args:
         a, b: [..., >= 7], ``x, y, z, l, w, h, yaw, ...``.
@@ -84,13 +83,13 @@ def count_inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 
 def points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
-    """Rows of the points inside each upright box, boundary included: one ascending i64 array a box.
+    """Rows of the points inside each upright box, boundary included: one ascending i64 array per box.
 
-    All points are looked up once in a coarse grid of the ground that marks where boxes are; only the few near a
-    box are tested exactly, by :func:`inside_box`.
+    Looks up all points in a coarse grid of the ground and tests only the points near a box exactly, by
+    :func:`inside_box`.
 
     Args:
-        points: [n, >= 3], metres; non-finite ones are in no box.
+        points: [n, >= 3], metres; non-finite points are in no box.
         boxes: [m, >= 7], ``x, y, z, l, w, h, yaw, ...``.
 
     >>> box = np.array([[0, 0, 0, 4, 2, 2, 0.0]])
@@ -106,25 +105,22 @@ def points_in_boxes(points: np.ndarray, boxes: np.ndarray) -> list[np.ndarray]:
     x = points[near, 0].astype(np.float64)
     first = np.searchsorted(x, boxes[:, 0] - reach[:, 0], side="left")
     last = np.searchsorted(x, boxes[:, 0] + reach[:, 0], side="right")
-    found = []
-    for box, i, j in zip(boxes, first, last, strict=True):
-        rows = near[i:j]
-        found.append(np.sort(rows[inside_box(points[rows], box)]))
-    return found
+    candidates = (near[i:j] for i, j in zip(first, last, strict=True))
+    return [np.sort(rows[inside_box(points[rows], box)]) for box, rows in zip(boxes, candidates, strict=True)]
 
 
 def _reach(boxes: np.ndarray) -> np.ndarray:
-    """Half the sides of the upright rectangle around each footprint, f64[m, 2]."""
+    """Half the sides of the axis-aligned rectangle around each footprint, f64[m, 2]."""
     cos, sin = np.abs(np.cos(boxes[:, 6])), np.abs(np.sin(boxes[:, 6]))
     l, w = boxes[:, 3], boxes[:, 4]
     return np.stack([l * cos + w * sin, l * sin + w * cos], axis=1) / 2 + _SLACK_M
 
 
 def _near_boxes(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Rows of the points in a cell of the ground that some box touches, ascending."""
+    """Rows of the points in grid cells that some box touches, ascending."""
     low, high = (centres - reach).min(axis=0), (centres + reach).max(axis=0)
     cell_m = max(_CELL_M, float((high - low).max()) / _MAX_CELLS)
-    # One cell around everything stays free: what lies outside is sent there.
+    # One free cell around everything takes the points outside.
     low -= cell_m
     shape = ((high - low) / cell_m).astype(np.int64) + 2
     occupied = np.zeros(shape, bool)
@@ -134,7 +130,7 @@ def _near_boxes(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> n
         occupied[i:k, j:l] = True
     cells = []
     for axis in (0, 1):
-        with np.errstate(over="ignore", invalid="ignore"):  # of what is far away or not finite
+        with np.errstate(over="ignore", invalid="ignore"):  # far or non-finite points
             cell = (points[:, axis] - points.dtype.type(low[axis])) * points.dtype.type(1 / cell_m)
         # fmax and fmin turn NaN into a number, so that the conversion is defined.
         np.fmax(cell, 0, out=cell)

@@ -1,4 +1,4 @@
-"""Frames that are slow to make, kept on disk from the first time on."""
+"""A disk cache for frames that are slow to make."""
 
 import dataclasses
 import json
@@ -20,18 +20,15 @@ _TRUTH = ("boxes", "labels", "num_points")
 
 @dataclasses.dataclass(frozen=True)
 class CachedFrames(WrappedFrames):
-    """A frame set that makes every frame once.
+    """A frame set that makes every frame once and keeps it on disk.
 
-    The folder holds ``frames.json``, which says whose frames they are, and an archive of NumPy arrays for every
-    frame that was asked for. Threads and processes may share it: files appear whole, and whoever makes a frame
-    twice makes the same one. A damaged file is made anew, and a line on standard error says so.
-
-    What the description cannot tell, such as changed code of the same version, goes unnoticed: the folder is then
-    to be deleted.
+    The folder contains ``frames.json``, which describes the frame set, and one ``.npz`` archive per requested
+    frame. Threads and processes may share the folder, since files appear whole. A damaged file is made again, with
+    a warning on standard error. Changed code of the same version goes unnoticed: delete the folder then.
 
     Raises:
-        ValueError: at construction, where the folder holds the frames of another set.
-        OSError: a file that cannot be written.
+        ValueError: at construction, if the folder contains another set's frames.
+        OSError: a file cannot be written.
 
     >>> import tempfile
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -44,24 +41,29 @@ class CachedFrames(WrappedFrames):
     ['000001.npz', 'frames.json']
     """
 
-    frames: FrameSet  # what is kept: a dataclass whose fields JSON can hold
+    frames: FrameSet  # a dataclass with fields that JSON can represent
     folder: Path  # new, empty, or begun with the same frames
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        wanted, file = _description(self.frames), self.folder / _DESCRIPTION
+        own, file = _description(self.frames), self.folder / _DESCRIPTION
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"{self.folder}: found a file, expected a folder")
-        # In this order: another process may begin the same cache at this moment.
-        stray = sorted(p.name for p in self.folder.glob("*.npz") if not p.name.startswith("."))
+        # Listed before the description is looked for: another process may begin the same cache at this moment.
+        archives = sorted(p.name for p in self.folder.glob("*.npz") if not p.name.startswith("."))
         if not file.is_file():
-            if stray:
-                raise ValueError(f"{self.folder}: found {stray[0]} without {_DESCRIPTION}, expected a new folder")
-            atomic_write(file, lambda path: path.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8"))
-        _compare(file, wanted)
+            if archives:
+                problem = f"found {archives[0]} without {_DESCRIPTION}, expected a new folder"
+                raise ValueError(f"{self.folder}: {problem}")
+            atomic_write(file, lambda path: path.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8"))
+        stored = read_json(file, dict[str, Any])
+        for name in {**own, **stored}:
+            if name not in own or name not in stored or own[name] != stored[name]:
+                values = (record.get(name, "nothing") for record in (stored, own))
+                there, got = (v["name"] if isinstance(v, dict) and "name" in v else v for v in values)  # sensors
+                raise ValueError(f"{file}: {name}: found {there}, expected {got}: this folder keeps other frames")
 
     def frame(self, index: int) -> Frame:
-        """One frame, read from its file; made and written where there is none."""
         arrays = self._read(index, (*_TRUTH, "points", "num_close"))
         if arrays is not None:
             num_close = int(arrays.pop("num_close"))
@@ -72,12 +74,9 @@ class CachedFrames(WrappedFrames):
         return frame
 
     def truth(self, index: int) -> Frame:
-        """As of any frame set; where there is no file yet, the whole frame is made and written."""
+        """:meth:`frame` without its points; makes and writes the whole frame if there is no file yet."""
         arrays = self._read(index, _TRUTH)
-        if arrays is None:
-            return without_points(self.frame(index))
-        boxes, labels, num_points = (arrays[name] for name in _TRUTH)
-        return Frame(no_points(self.sensor), boxes, labels, num_points)
+        return without_points(self.frame(index)) if arrays is None else Frame(no_points(self.sensor), **arrays)
 
     labels = FrameSet.labels
 
@@ -85,20 +84,20 @@ class CachedFrames(WrappedFrames):
         return self.folder / f"{index:06d}.npz"
 
     def _read(self, index: int, names: Sequence[str]) -> dict[str, np.ndarray] | None:
-        """Arrays of a frame's file; None where there is no whole one."""
+        """Arrays of a frame's file; None if the file is missing or damaged."""
         file = self._file(index)
         try:
             return parse_npz(file.read_bytes(), names)
         except FileNotFoundError:
             return None
-        except Exception as error:  # wrong bytes in an archive raise nearly anything
+        except Exception as error:  # damaged archives raise arbitrary exceptions
             reason = str(error).partition("\n")[0] or type(error).__name__
             print(f"warning: {file}: damaged ({reason}): made anew", file=sys.stderr, flush=True)
             return None
 
 
 def _description(frames: FrameSet) -> dict[str, Any]:
-    """What decides every byte of the frames, as JSON returns it."""
+    """Everything that determines the frames, as JSON returns it."""
     kind = type(frames)
     if not dataclasses.is_dataclass(frames):
         raise ValueError(f"frames: got {kind.__name__}, expected a dataclass")
@@ -107,17 +106,3 @@ def _description(frames: FrameSet) -> dict[str, Any]:
     except TypeError as error:
         raise ValueError(f"frames: {kind.__name__}: expected fields that JSON can hold: {error}") from None
     return {"version": __version__, "kind": kind.__qualname__, **fields}
-
-
-def _compare(file: Path, wanted: dict[str, Any]) -> None:
-    """Refuse the folder of another frame set."""
-    found = read_json(file, dict[str, Any])
-    for name in [*wanted, *(set(found) - set(wanted))]:
-        if name not in found or name not in wanted or found[name] != wanted[name]:
-            there, got = (_shown(record.get(name, "nothing")) for record in (found, wanted))
-            raise ValueError(f"{file}: {name}: found {there}, expected {got}: this folder keeps other frames")
-
-
-def _shown(value: Any) -> Any:
-    """A sensor by its name."""
-    return value["name"] if isinstance(value, dict) and "name" in value else value

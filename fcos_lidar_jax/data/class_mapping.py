@@ -1,4 +1,4 @@
-"""Classes by name: from those of a data set to those of a detector."""
+"""Mapping of classes by name, from a data set to a detector."""
 
 import dataclasses
 import difflib
@@ -10,14 +10,14 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames
 from fcos_lidar_jax.files import checksum
 
 ClassMap = Mapping[str, str | None]
-"""Name in the data -> name to use instead, None for objects to leave out; other names stay."""
+"""Name in the data -> name to use instead; None drops the objects, unlisted names stay."""
 
 
 def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None = None) -> np.ndarray:
-    """i32[len(of)]: index into ``to`` of each class ``of`` the data by name, translated first; -1 if left out.
+    """i32[len(of)]: index into ``to`` of each class in ``of`` after the class map; -1 for dropped classes.
 
     Raises:
-        ValueError: the class map has a name that is none of the data's.
+        ValueError: the class map contains a name that is not in ``of``.
 
     >>> map_labels(("Car", "Van", "Tram"), ("person", "car"), {"Car": "car", "Van": "car"}).tolist()
     [1, 1, -1]
@@ -32,7 +32,7 @@ def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None 
 
 
 def mapped_classes(of: Sequence[str], class_map: ClassMap) -> tuple[str, ...]:
-    """The classes that a class map makes of those of the data, in their order, each once.
+    """The distinct classes after a class map, in the data's order.
 
     >>> mapped_classes(("Car", "Van", "Tram", "Misc"), {"Car": "car", "Van": "car", "Misc": None})
     ('car', 'Tram')
@@ -42,7 +42,7 @@ def mapped_classes(of: Sequence[str], class_map: ClassMap) -> tuple[str, ...]:
 
 
 def unknown_name(name: str, known: Iterable[str]) -> str:
-    """What was found and what was expected, the nearest names or all.
+    """Part of a message: the unknown name, and the nearest known names or else all of them.
 
     >>> unknown_name("trunk", ("car", "truck"))
     "got 'trunk', expected truck"
@@ -53,10 +53,10 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class MappedFrames(WrappedFrames):
-    """Frames whose labels count other classes, mapped by name; boxes of classes that are not there are left out.
+    """Frames with labels of other classes, mapped by name; boxes of other classes are left out.
 
     Raises:
-        ValueError: at construction, when no name is shared.
+        ValueError: at construction, if no name is shared.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -66,22 +66,22 @@ class MappedFrames(WrappedFrames):
     """
 
     frames: FrameSet
-    wanted: tuple[str, ...]  # the classes from now on
+    target_classes: tuple[str, ...]
     class_map: ClassMap | None = None  # translates the names of the frames' classes first
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "classes", self.wanted)
+        object.__setattr__(self, "classes", self.target_classes)
         if (self._table < 0).all():
             raise ValueError(
                 f"classes: the data have {', '.join(self.frames.classes) or 'none'}, the detector "
-                f"{', '.join(self.wanted)}, expected a name in both: choose classes of the data, or "
-                "translate their names by a class map"
+                f"{', '.join(self.classes)}, expected a name in both: choose classes of the data, or translate "
+                "their names by a class map"
             )
 
     @property
     def _table(self) -> np.ndarray:
-        return map_labels(self.frames.classes, self.wanted, self.class_map)
+        return map_labels(self.frames.classes, self.classes, self.class_map)
 
     def frame(self, index: int) -> Frame:
         return self._mapped(self.frames.frame(index))
@@ -99,7 +99,7 @@ class MappedFrames(WrappedFrames):
         return labels[labels >= 0]
 
     def left_out(self) -> dict[str, int]:
-        """Boxes that are left out, by the class that they have in the data; reads the labels of all frames."""
+        """Number of dropped boxes per class of the data; reads the labels of all frames."""
         counts = np.zeros(len(self.frames.classes), np.int64)
         for index in range(len(self.frames)):
             counts += np.bincount(self.frames.labels(index), minlength=len(counts))
@@ -107,7 +107,7 @@ class MappedFrames(WrappedFrames):
         return {self.frames.classes[i]: int(counts[i]) for i in np.flatnonzero(lost)}
 
     def fingerprint(self) -> str:
-        """That of the frames where the classes stay what they are, else a checksum of it and of the mapping."""
+        """The wrapped frames' fingerprint if the classes stay the same, else a checksum of it and the mapping."""
         source = self.frames.fingerprint()
         if self.class_map is None and self.classes == self.frames.classes:
             return source

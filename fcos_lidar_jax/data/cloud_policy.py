@@ -1,4 +1,4 @@
-"""The one policy for every cloud of a detector, in training too: what is removed, truncated and reported."""
+"""The cloud policy of training and inference: which points are removed, truncated and reported."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,26 +12,25 @@ from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
 
 MAX_INTENSITY = 65_535.0
-"""On the scale 0-255. Unscaled 16-bit counts reach this far, no measurement lies beyond; one value of 1e30 would
-leave an infinite running variance in the network."""
-MAX_TIME_LAG_S = 60.0
-"""Far more than anybody fuses: what lies beyond is a time stamp or damage, as is a negative lag."""
+"""On the scale 0-255; unscaled 16-bit counts reach it. One value of 1e30 would leave an infinite running variance
+in the network."""
+MAX_TIME_LAG_S = 60.0  # far above any fusion; larger values, like negative ones, are timestamps or damage
 
-_SEED = 0  # Which rows of a sweep are truncated.
-_MIN_ROWS = 500  # Fewer rows say nothing about the sensor.
-_NO_COORDINATE_M = 1000.0  # No LiDAR sees as far as half of its points would lie.
-_NEAR_M = 2.0  # Points on the ego vehicle say nothing either.
+_SEED = 0  # of the random choice of truncated rows
+_MIN_ROWS = 500  # too few rows say nothing about the sensor
+_MAX_COORDINATE_M = 1000.0  # a larger median is no distance in metres
+_NEAR_M = 2.0  # points on the ego vehicle say nothing about the sensor
 _MAX_BEYOND = 0.9
 _MAX_OUTSIDE = 0.3
 _MAX_DENSITY = 1.7
 _MIN_NEIGHBOURS = 0.3
-"""The four bounds of :func:`sensor_mismatch`. A sensor's own clouds have at most 0.17, 0.01 and 1.05, and at least
-0.84; of all pairs of different presets at least one figure lies clearly on the other side."""
+"""The four bounds of :func:`sensor_mismatch`. A sensor's own clouds reach at most 0.17, 0.01, 1.05, and at least
+0.84; for every pair of different presets at least one figure lies clearly on the other side."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """One cloud as a detector takes it, always of ``config.max_points`` rows.
+    """A cloud as detectors take it, padded to ``config.max_points`` rows.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -43,12 +42,12 @@ class Cloud:
 
     points: np.ndarray
     """f32[max_points, c]: x, y, z (m), intensity (0-255), time lag (s), and the laser number for sensors that need
-    it. Rows in their order, in their places unless there are more than fit; zero behind them."""
-    valid: np.ndarray  # bool[max_points]: rows that take part; False for removed rows and padding.
-    num_points: int  # Rows as given, those that the reader removed included.
-    num_close: int  # Rows on the ego vehicle, removed here or by the reader.
-    num_invalid: int  # Rows removed because they were not finite or beyond physical limits.
-    num_truncated: int  # Rows removed because there were more than ``config.max_points``.
+    it. Row order is preserved, row numbers unless rows were truncated; padding rows are zero."""
+    valid: np.ndarray  # bool[max_points]: False for removed rows and padding
+    num_points: int  # rows of the input, including rows that the reader removed
+    num_close: int  # rows on the ego vehicle, removed here or by the reader
+    num_invalid: int  # rows removed because they were not finite or beyond physical limits
+    num_truncated: int  # rows removed because there were more than ``config.max_points``
 
     @property
     def num_removed(self) -> int:
@@ -56,21 +55,21 @@ class Cloud:
 
 
 def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close: int | None = None) -> Cloud:
-    """Remove what no detector should see, and truncate or pad to ``config.max_points`` rows.
+    """Remove invalid and close points, and truncate or pad to ``config.max_points`` rows.
 
-    Where more rows than fit are left, the oldest sweeps lose theirs first; of the sweep at the boundary, which may
-    be the current one, random rows go, by a fixed seed. So no cloud is ever compiled for anew.
+    If too many rows are left, the oldest sweeps lose theirs first. The sweep at the boundary, possibly the current
+    one, loses random rows by a fixed seed. All clouds have one shape, so nothing is ever compiled again.
 
     Args:
-        points: f32[n, 3 to 6]: x, y, z, intensity (0-255), time lag (s), laser number. Intensity and lag are 0
-            where missing; columns that the sensor has no use for are left out.
-        config: ``max_points``, and which close points are removed.
-        sensor: of the points.
-        num_close: points on the ego vehicle that the reader has removed, in each sweep's own frame; None where it
-            has removed none: they are removed here, as configured.
+        points: f32[n, 3 to 6]: x, y, z, intensity (0-255), time lag (s), laser number. Missing intensities and
+            lags become 0; columns that the sensor does not use are dropped.
+        config: gives ``max_points`` and ``reading``.
+        sensor: sensor that recorded the points.
+        num_close: points on the ego vehicle that the reader removed, in each sweep's own frame; None to remove
+            them here.
 
     Raises:
-        ValueError: another number of columns.
+        ValueError: wrong number of columns.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -92,7 +91,7 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
 
 
 def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """The columns that the sensor's clouds have."""
+    """Drop or zero-pad columns to the sensor's."""
     points = np.asarray(points, np.float32)
     laser = sensor.row_source == "laser"
     if points.ndim != 2 or not (6 if laser else 3) <= points.shape[1] <= 6:
@@ -105,28 +104,28 @@ def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def usable_rows(points: np.ndarray | Array) -> np.ndarray | Array:
-    """Which rows of f32[n, 5 or 6] are finite and within physical limits, bool[n]; NumPy or JAX, as is the answer.
+    """Which rows of f32[n, 5 or 6] are finite and within physical limits: bool[n], NumPy or JAX like the input.
 
     >>> usable_rows(np.array([[1, 2, 0, 255, 0.45], [1, 2, 0, 1e30, 0], [1, np.nan, 0, 0, 0]])).tolist()
     [True, False, False]
     """
     lag, finite = points[:, 4], points.__array_namespace__().isfinite(points)
     usable = (abs(points[:, 3]) <= MAX_INTENSITY) & (lag >= 0) & (lag <= MAX_TIME_LAG_S)
-    if isinstance(points, np.ndarray) and finite.all():  # `all` by rows takes far longer
+    if isinstance(points, np.ndarray) and finite.all():  # far faster than `all` per row
         return usable
     return usable & finite.all(axis=1)
 
 
 def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarray, valid: np.ndarray) -> int:
-    """Write a cloud's rows into zeroed arrays of a fixed size, see :func:`make_cloud`.
+    """Write a cloud's rows into zeroed arrays of a fixed size; see :func:`make_cloud`.
 
     Args:
-        parts: f32[n, c] each, written one behind another.
-        kept: bool[n of all parts]; where all fits, the others stay in their places, invalid.
-        points, valid: f32[m, c] and bool[m], written to.
+        parts: f32[n, c] each, written one after another.
+        kept: bool[n of all parts]; if everything fits, the other rows are written too, as invalid.
+        points, valid: outputs f32[m, c] and bool[m].
 
     Returns:
-        how many rows were truncated.
+        number of truncated rows.
 
     >>> points, valid = np.zeros((2, 5), np.float32), np.zeros(2, bool)
     >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 0, 0]], np.float32)
@@ -145,50 +144,53 @@ def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarr
 
 
 def _newest(lags: np.ndarray, number: int) -> np.ndarray:
-    """Rows of the newest sweeps, ascending; those of the sweep at the boundary by lot."""
+    """Rows of the newest sweeps, ascending; random rows of the sweep at the boundary."""
     if len(lags) <= number:
         return np.arange(len(lags))
     boundary = np.partition(lags, number)[number]
-    chosen = lags < boundary
-    sweep = np.flatnonzero(lags == boundary)
-    drawn = np.random.default_rng(_SEED).permutation(sweep)
-    chosen[drawn[: number - np.count_nonzero(chosen)]] = True
-    return np.flatnonzero(chosen)
+    kept = lags < boundary
+    shuffled = np.random.default_rng(_SEED).permutation(np.flatnonzero(lags == boundary))
+    kept[shuffled[: number - np.count_nonzero(kept)]] = True
+    return np.flatnonzero(kept)
 
 
 def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> None:
-    """Refuse a cloud of which nothing reaches the range image: the projection dropped all of its valid rows.
+    """Refuse a cloud without a single point in the range image: the projection dropped all valid rows.
 
     Raises:
-        ValueError: naming the cloud and what became of its points.
+        ValueError: with the cloud's name and the counts of removed points.
     """
     if np.count_nonzero(cloud.valid) > num_dropped:
         return
-    low, high = sensor.limit_z_m
-    limits = f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m"
     raise ValueError(
         f"{name}: none of its {cloud.num_points} points is usable ({cloud.num_invalid} not finite or beyond "
         f"physical limits, {cloud.num_close} on the ego vehicle, the others out of range or view), expected some "
-        f"with {limits} in the field of view of {sensor.name}{_no_coordinates(cloud.points[cloud.valid])}"
+        f"with {_limits(sensor)} in the field of view of {sensor.name}"
+        f"{_coordinate_hint(cloud.points[cloud.valid])}"
     )
 
 
-def _no_coordinates(points: np.ndarray) -> str:
-    """The end of a message where one of the first three columns cannot be metres, such as a time; else nothing."""
-    middle = np.median(np.abs(points[:, :3]), axis=0) if len(points) else np.zeros(3)
-    if middle.max() < _NO_COORDINATE_M:
+def _limits(sensor: Sensor) -> str:
+    low, high = sensor.limit_z_m
+    return f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m"
+
+
+def _coordinate_hint(points: np.ndarray) -> str:
+    """The end of a message if x, y or z cannot be metres (timestamps, for example); else empty."""
+    medians = np.median(np.abs(points[:, :3]), axis=0) if len(points) else np.zeros(3)
+    if medians.max() < _MAX_COORDINATE_M:
         return ""
-    wrong = int(middle.argmax())
+    axis = int(medians.argmax())
     expected = "metres in the columns x, y, z, intensity, time lag, laser number"
-    return f"; the values of {'xyz'[wrong]} are about {middle[wrong]:.4g}, expected {expected}"
+    return f"; the values of {'xyz'[axis]} are about {medians[axis]:.4g}, expected {expected}"
 
 
 def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
-    """A line that says why a cloud is hardly of this sensor, or None.
+    """A warning that another sensor probably recorded a cloud, or None.
 
-    Judged by the current sweep: the share of points beyond the sensor's limits and outside its vertical field of
-    view, points a cell of the image, how many points have a neighbour in the next column and in the next row, and
-    the scale of the intensity.
+    Uses the current sweep: the share of points beyond the sensor's limits and outside its vertical field of view,
+    points per image cell, the share of points with a neighbour in the next column and in the next row, and the
+    scale of the intensity.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame
@@ -200,8 +202,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     points = _with_columns(points, sensor)
     points = points[usable_rows(points)]
     about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
-    if len(points) >= _MIN_ROWS and (wrong := _no_coordinates(points)):
-        return f"points hardly of {about}{wrong}; expect poor detections"
+    if len(points) >= _MIN_ROWS and (hint := _coordinate_hint(points)):
+        return f"points hardly of {about}{hint}; expect poor detections"
     points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
     points = points[~np.asarray(close_to_sensor(points, sensor, _NEAR_M))]
     if sensor.azimuth_limits_rad is not None:
@@ -210,8 +212,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
         points = points[behind < sensor.num_columns * sensor.column_rad]
     if len(points) < _MIN_ROWS:
         return None
-    finding = _mismatch(points, sensor)
-    return finding and f"points hardly of {about}: {finding}; expect poor detections"
+    reason = _mismatch(points, sensor)
+    return reason and f"points hardly of {about}: {reason}; expect poor detections"
 
 
 def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
@@ -219,9 +221,8 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     within = (np.abs(points[:, :2]) < sensor.limit_xy_m).all(axis=1) & (points[:, 2] > low) & (points[:, 2] < high)
     beyond = 1 - within.mean()
     if beyond > _MAX_BEYOND:
-        limits = f"|x|, |y| < {sensor.limit_xy_m:g} m, {low:g} < z < {high:g} m"
-        return f"{beyond:.0%} of the points lie beyond its limits, {limits}"
-    # A power of two of rows: few compilations for clouds of any length.
+        return f"{beyond:.0%} of the points lie beyond its limits, {_limits(sensor)}"
+    # Padded to a power of two, so that clouds of any length need few compilations.
     padding = (0, (1 << (len(points) - 1).bit_length()) - len(points))
     valid = np.pad(within, padding)
     cell = np.asarray(image_cells(np.pad(points, (padding, (0, 0))), valid, sensor)[0])

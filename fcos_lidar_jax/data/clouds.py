@@ -1,4 +1,4 @@
-"""Point files without boxes, as frames to detect in."""
+"""Point files without boxes, as frames for detection."""
 
 import dataclasses
 from pathlib import Path
@@ -16,15 +16,15 @@ from fcos_lidar_jax.sensors import Sensor
 
 @dataclasses.dataclass(frozen=True)
 class CloudFiles(FrameSet):
-    """Clouds of point files, or of lists of sweeps to fuse, without boxes."""
+    """Clouds without boxes, from point files or lists of sweeps."""
 
-    files: tuple[Path, ...]  # one a frame: a point file for read_points, or a .json list for read_sweeps
-    sensor: Sensor  # whose points they are
+    files: tuple[Path, ...]  # one per frame: a point file for read_points, or a .json list for read_sweeps
+    sensor: Sensor
     reading: CloudReading = CloudReading()
-    columns: int | None = None  # of a raw file of another layout
-    dtype: str | None = None  # likewise
-    max_points: int = MAX_POINTS  # of a file; a larger one is refused
-    classes: tuple[str, ...] = ()  # none: there are no boxes
+    columns: int | None = None  # of raw files in another layout
+    dtype: str | None = None  # of raw files in another layout
+    max_points: int = MAX_POINTS  # larger clouds are refused
+    classes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.files)
@@ -39,7 +39,7 @@ class CloudFiles(FrameSet):
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 
     def truth(self, index: int) -> Frame:
-        """No box; nothing is read."""
+        """A frame without boxes; reads nothing."""
         none = np.zeros(0, np.int32)
         return Frame(no_points(self.sensor), np.zeros((0, 9), np.float32), none, none)
 
@@ -56,9 +56,9 @@ class CloudFiles(FrameSet):
 
 @dataclasses.dataclass(frozen=True)
 class TurnedClouds(WrappedFrames):
-    """Clouds of a frame set, rotated about z after their close points were removed."""
+    """Clouds of a frame set, rotated about z after the removal of close points."""
 
-    yaw_rad: float  # counter-clockwise seen from above
+    yaw_rad: float  # counter-clockwise, seen from above
 
     def frame(self, index: int) -> Frame:
         frame = self.frames.frame(index)
@@ -69,19 +69,19 @@ class TurnedClouds(WrappedFrames):
 
 
 def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Point files, and those in folders, sorted within each folder; hidden files there are left out.
+    """Replace folders by their point files, sorted by name, without hidden files.
 
     Raises:
-        ValueError: a folder without a point file.
+        ValueError: a folder contains no point file.
     """
-    found: list[Path] = []
+    clouds: list[Path] = []
     for path in inputs:
         if not path.is_dir():
-            found.append(path)
+            clouds.append(path)
             continue
-        shown = (p for p in path.iterdir() if not p.name.startswith("."))
-        files = sorted(p for p in shown if p.is_file() and p.name.lower().endswith(ENDINGS))
+        visible = (p for p in path.iterdir() if not p.name.startswith("."))
+        files = sorted(p for p in visible if p.is_file() and p.name.lower().endswith(ENDINGS))
         if not files:
             raise ValueError(f"{path}: no point file in it, expected {', '.join(ENDINGS)}")
-        found += files
-    return tuple(found)
+        clouds += files
+    return tuple(clouds)

@@ -1,4 +1,4 @@
-"""Drives: the sweeps of one sensor in the order of time, with their poses where these are known."""
+"""Drives: the sweeps of one sensor in temporal order, with poses if they are known."""
 
 import dataclasses
 import itertools
@@ -17,20 +17,20 @@ from fcos_lidar_jax.data.sweeps import Sweep, find_bad_pose, read_entries
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.sensors import Sensor
 
-MAX_POSE_GAP_US = 500_000  # Poses are interpolated between neighbours that are at most so far apart.
-_LATEST_S = 1e12  # Later times are none.
-_NANOSECOND_DIGITS = range(16, 20)  # File names of so many digits are nanoseconds.
+MAX_POSE_GAP_US = 500_000  # largest distance of neighbours between which poses are interpolated
+_LATEST_S = 1e12  # larger values are not timestamps
+_NANOSECOND_DIGITS = range(16, 20)  # file names with this many digits are nanoseconds
 
 
 @dataclasses.dataclass(frozen=True)
 class Drive:
-    """Sweeps as they come. A new kind of recording is a function that returns this."""
+    """The sweeps of a recording. To support a new kind of recording, write a function that returns a Drive."""
 
-    sweeps: Iterable[Sweep]  # read as they are asked for, in the order of time
-    posed: bool = True  # False: poses are not known; the identity stands for them
-    timed: bool = True  # False: times are not known; 0, 1, ... stand for them
+    sweeps: Iterable[Sweep]  # in temporal order, read on demand
+    posed: bool = True  # False: poses are unknown and replaced by the identity
+    timed: bool = True  # False: times are unknown and replaced by 0, 1, ...
     notes: list[str] = dataclasses.field(default_factory=list)
-    """Lines on what was assumed and what was left out, the latter when the last sweep has been read."""
+    """Notes about assumptions and, once the last sweep was read, about skipped sweeps."""
 
 
 class OutsidePosesError(ValueError):
@@ -38,17 +38,17 @@ class OutsidePosesError(ValueError):
 
 
 class PoseTrack(NamedTuple):
-    """Poses of one thing over time."""
+    """Poses of one object over time."""
 
     times_us: np.ndarray  # i64[n], increasing
     rotations: np.ndarray  # f64[n, 4], quaternions w, x, y, z
     translations: np.ndarray  # f64[n, 3], metres
 
     def at(self, time_us: int, where: str) -> np.ndarray:
-        """The pose f64[4, 4] at a time: translation and rotation interpolated between the neighbours.
+        """The pose f64[4, 4] at a time, interpolated between its neighbours.
 
         Raises:
-            OutsidePosesError: naming ``where``: there is no pose before the time, or none after it.
+            OutsidePosesError: with ``where``: the time is before the first or after the last pose.
             ValueError: the neighbours are more than :data:`MAX_POSE_GAP_US` apart.
 
         >>> track = PoseTrack(np.array([0, 400_000]), np.eye(4)[[0, 0]], np.array([[0.0, 0, 0], [2.0, 0, 0]]))
@@ -84,16 +84,17 @@ def folder_drive(
     """The clouds of a folder, or one file.
 
     Args:
-        folder: point files, see :func:`read_points`; without poses in the order of their names.
+        folder: point files, see :func:`read_points`; without poses sorted by name.
+        sensor: sensor that recorded the points.
         poses: from the sensor to the world. ``.json``: a list of ``{"file", "timestamp_us", "sensor_to_world"}``
-            in the order of time, files relative to the list. Others: lines ``t x y z qx qy qz qw`` (TUM), t in
-            seconds. Where the names of the clouds are times (seconds with a decimal point, or nanoseconds), poses
-            are interpolated between neighbours at most :data:`MAX_POSE_GAP_US` apart; otherwise there must be one
-            line a cloud.
+            in temporal order, files relative to the list. Other names: lines ``t x y z qx qy qz qw`` (TUM), t in
+            seconds. If the clouds' names are times (seconds with a decimal point, or nanoseconds), poses are
+            interpolated between neighbours at most :data:`MAX_POSE_GAP_US` apart; otherwise the file must have one
+            line per cloud.
         columns, dtype, max_points: of raw files, as in :func:`read_points`.
 
     Raises:
-        ValueError: naming the file, what was found and what was expected.
+        ValueError: with the file, the found and the expected value.
     """
     files = list(find_clouds((folder,)))
     if poses is None:
@@ -112,35 +113,35 @@ def folder_drive(
 
 
 def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list[np.ndarray]]:
-    """The clouds in the order of a JSON list, with times and poses."""
+    """Clouds, times and poses in the order of a JSON list."""
     listed = read_entries(poses)
-    known = {(poses.parent / entry.file).resolve(): entry for entry in listed}
-    if len(known) < len(listed):
-        raise ValueError(f"{poses}: got {len(listed)} entries for {len(known)} clouds, expected each once")
-    by_place = {file.resolve(): file for file in files}
-    for place, file in by_place.items():
-        if place not in known:
+    entries = {(poses.parent / entry.file).resolve(): entry for entry in listed}
+    if len(entries) < len(listed):
+        raise ValueError(f"{poses}: got {len(listed)} entries for {len(entries)} clouds, expected each once")
+    clouds = {file.resolve(): file for file in files}
+    for place, file in clouds.items():
+        if place not in entries:
             raise ValueError(f"{poses}: no pose of {file}, expected an entry for every cloud")
-    entries = [(by_place[place], entry) for place, entry in known.items() if place in by_place]
-    times = [entry.timestamp_us for _, entry in entries]
-    return [file for file, _ in entries], times, [np.array(entry.sensor_to_world) for _, entry in entries]
+    ordered = [(clouds[place], entry) for place, entry in entries.items() if place in clouds]
+    times = [entry.timestamp_us for _, entry in ordered]
+    return [file for file, _ in ordered], times, [np.array(entry.sensor_to_world) for _, entry in ordered]
 
 
 def _posed(files: list[Path], path: Path) -> tuple[list[Path], list[int], list[np.ndarray]]:
-    """The clouds in the order of time, with times and poses from a file of lines."""
+    """Clouds in temporal order, with times and poses from a file of lines."""
     track = read_tum(path)
     times = [_time_of(file) for file in files]
     if any(time is None for time in times):
         if len(files) != len(track.times_us):
             raise ValueError(
-                f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one a cloud, or "
+                f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one per cloud, or "
                 f"clouds whose names are times (seconds with a decimal point, or nanoseconds)"
             )
         for before, after in itertools.pairwise(files):
             if _in_parts(before.name) > _in_parts(after.name):
                 raise ValueError(
-                    f"{path}: poses are given to clouds in the order of their names: got {before.name} before "
-                    f"{after.name}, expected numbers of one length, or FILE.json"
+                    f"{path}: poses are assigned to clouds sorted by name: got {before.name} before {after.name}, "
+                    f"expected numbers of one length, or FILE.json"
                 )
         return files, track.times_us.tolist(), list(pose_matrix(track.rotations, track.translations))
     timed = sorted((time, file) for time, file in zip(times, files, strict=True) if time is not None)
@@ -149,7 +150,7 @@ def _posed(files: list[Path], path: Path) -> tuple[list[Path], list[int], list[n
 
 
 def _in_parts(name: str) -> list[str | int]:
-    """A name by which numbers of different lengths are sorted as numbers.
+    """A sort key that compares numbers in names by value.
 
     >>> _in_parts("sweep_9.npy") < _in_parts("sweep_10.npy")
     True
@@ -158,7 +159,7 @@ def _in_parts(name: str) -> list[str | int]:
 
 
 def _time_of(file: Path) -> int | None:
-    """Microseconds, where the name is a time.
+    """Microseconds if the name is a time, else None.
 
     >>> _time_of(Path("12.5.bin")), _time_of(Path("1532402927647951000.npy")), _time_of(Path("000012.bin"))
     (12500000, 1532402927647951, None)
@@ -173,10 +174,10 @@ def _time_of(file: Path) -> int | None:
 
 
 def read_tum(path: Path) -> PoseTrack:
-    """Poses of a file of lines ``t x y z qx qy qz qw``; those that begin with # are left out.
+    """Read poses from lines ``t x y z qx qy qz qw``; lines that begin with # are skipped.
 
     Raises:
-        ValueError: naming the file, the line, what was found and what was expected.
+        ValueError: with the file, the line, the found and the expected value.
     """
     if not path.is_file():
         raise ValueError(f"{path}: no such file, expected poses")
@@ -193,11 +194,10 @@ def read_tum(path: Path) -> PoseTrack:
         where = f"{path}: line {number}"
         if len(row) != 7 or not abs(time_s) < _LATEST_S:
             raise ValueError(f"{where}: got {line[:80]!r}, expected t x y z qx qy qz qw")
-        time_us = round(Decimal(words[0]) * 1_000_000)  # a float has no microseconds of our days left
+        time_us = round(Decimal(words[0]) * 1_000_000)  # a float cannot represent today's microseconds
         if times and time_us <= times[-1]:
-            raise ValueError(
-                f"{where}: time: got {time_us / 1e6} s after {times[-1] / 1e6} s, expected a later one"
-            )
+            found = f"{time_us / 1e6} s after {times[-1] / 1e6} s"
+            raise ValueError(f"{where}: time: got {found}, expected a later one")
         if bad := find_bad_pose(np.array([row[6:] + row[3:6]]), np.array([row[:3]])):
             raise ValueError(f"{where}: {bad[1]}")
         rows.append(row)

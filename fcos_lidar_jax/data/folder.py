@@ -1,4 +1,4 @@
-"""The user's own annotated clouds: a folder of point files with boxes in JSON beside them."""
+"""Your own annotated clouds: a folder of point files with boxes in JSON files."""
 
 import dataclasses
 import os
@@ -27,16 +27,16 @@ from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.sensors import PRESETS, Sensor, sensor_from_json
 
 _SPLITS = "splits.json"
-_MAX_LAGS = 100  # Nobody fuses as many sweeps.
-_Speed = Annotated[float, msgspec.Meta(ge=-LIMITS["vx"], le=LIMITS["vx"])]  # no NaN: an unknown one is null
+_MAX_LAGS = 100  # far more sweeps than anybody fuses
+_Speed = Annotated[float, msgspec.Meta(ge=-LIMITS["vx"], le=LIMITS["vx"])]  # no NaN: unknown speeds are null
 
 
 class _Record(msgspec.Struct, forbid_unknown_fields=True):
-    """One box, in the shape that ``fcos-lidar detect`` writes."""
+    """One box, as ``fcos-lidar detect`` writes it."""
 
     label: str
     box: tuple[float, float, float, float, float, float, float, _Speed | None, _Speed | None]
-    score: float | None = None  # a detector's; a corrected prediction may keep it
+    score: float | None = None  # ignored; a corrected prediction may keep its score
 
 
 class _Annotation(msgspec.Struct, forbid_unknown_fields=True):
@@ -46,31 +46,32 @@ class _Annotation(msgspec.Struct, forbid_unknown_fields=True):
 class FolderFrames(FrameSet):
     """The frames of a folder, sorted by name: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
-    ``sensor.json`` is a sensor as :func:`~fcos_lidar_jax.sensors.sensor_from_json` reads it, or a preset's name.
-    ``clouds/NAME.EXT`` is any file that :func:`~fcos_lidar_jax.data.point_files.read_points` reads.
-    ``boxes/NAME.json`` is ``{"boxes": [{"label": CLASS, "box": [x, y, z, l, w, h, yaw, vx, vy]}]}`` in the frame
-    of the points, an unknown velocity ``null, null``; a frame without objects has an empty list.
-    ``sweeps/NAME.json``, optional, is a list as :func:`~fcos_lidar_jax.data.sweeps.read_sweeps` reads it, its
-    first entry the frame's own cloud. No file may lie outside the folder, links included.
+    ``sensor.json`` is a sensor for :func:`~fcos_lidar_jax.sensors.sensor_from_json`, or a preset's name.
+    ``clouds/NAME.EXT`` is a point file for :func:`~fcos_lidar_jax.data.point_files.read_points`.
+    ``boxes/NAME.json`` is ``{"boxes": [{"label": CLASS, "box": [x, y, z, l, w, h, yaw, vx, vy]}]}`` in the points'
+    frame, with ``null, null`` for an unknown velocity and an empty list for a frame without objects.
+    ``sweeps/NAME.json``, optional, is a list for :func:`~fcos_lidar_jax.data.sweeps.read_sweeps`; its first entry
+    is the frame's own cloud. No file may lie outside the folder, not even through a link.
 
-    The classes are the labels of all boxes, sorted, unless there is a ``classes.json``: a list of them
-    (``["car", "sign"]``; other labels are refused), or a translation of labels, null for boxes to leave out
-    (``{"lorry": "truck", "sign": null}``; the classes are then the labels after it, sorted). ``splits.json``,
+    The classes are the labels of all boxes, sorted, unless ``classes.json`` says otherwise: a list of classes
+    (``["car", "sign"]``; other labels are refused), or a translation of labels, null to drop boxes
+    (``{"lorry": "truck", "sign": null}``; the classes are then the translated labels, sorted). ``splits.json``,
     optional, is ``{"train": [NAME, ...], "val": [...]}``.
 
-    The names of all files are checked at construction, and their boxes read where the classes follow from them;
-    other contents when a frame is asked for.
+    File names, and boxes if they determine the classes, are checked at construction; other contents on reading a
+    frame.
 
     Args:
         root: the folder.
-        sensor: whose points they are; replaces ``sensor.json``.
-        split: frames and order from the splits; all frames, sorted, without it.
-        splits: JSON file with them; default: ``splits.json``.
-        reading: clouds to fuse at most, from the first of the list on, and which points are dropped.
-        follow_links: read files that lie outside the folder.
+        sensor: replaces ``sensor.json``.
+        split: take the frames and their order from a split; default: all frames, sorted.
+        splits: JSON file with the splits; default: ``splits.json``.
+        reading: maximum number of clouds to fuse, and which points are dropped.
+        follow_links: also read files outside the folder.
 
     Raises:
-        ValueError: here or on reading a frame, naming the file, the field, what was found and what was expected.
+        ValueError: at construction or on reading a frame, with the file, the field, the found and the expected
+            value.
 
     >>> import json, tempfile
     >>> root = Path(tempfile.mkdtemp())
@@ -111,7 +112,7 @@ class FolderFrames(FrameSet):
             expected = 'one for every cloud, {"boxes": []} where there is no object'
             raise ValueError(f"{self._clouds[name]}: no {root / 'boxes' / name}.json, expected {expected}")
         self.names = tuple(sorted(self._clouds))
-        """Names of the frames: of their files, without the extension."""
+        """Names of the frames: file names without extension."""
         self.sensor = _read_sensor(root, self._inside) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
@@ -121,11 +122,11 @@ class FolderFrames(FrameSet):
         return len(self.names)
 
     def frame(self, index: int) -> Frame:
-        """One frame, read anew; the points in each box are counted."""
+        """Read one frame and count the points in each box."""
         return self._frame(index, self.reading)
 
     def truth(self, index: int) -> Frame:
-        """As of any frame set; of the sweeps the current one alone is read, for its points in each box count."""
+        """:meth:`frame` without its points; reads only the current sweep, to count its points in each box."""
         return without_points(self._frame(index, dataclasses.replace(self.reading, num_sweeps=1)))
 
     def labels(self, index: int) -> np.ndarray:
@@ -135,18 +136,19 @@ class FolderFrames(FrameSet):
         return self.names[index]
 
     def pose(self, index: int) -> np.ndarray | None:
-        """Of the list of sweeps, where the frame has one."""
+        """The pose in the frame's list of sweeps, if it has one."""
         current = self._current_sweep(index)
         return None if current is None else np.array(current.sensor_to_world)
 
     def time_us(self, index: int) -> int | None:
-        """Of the list of sweeps, where the frame has one."""
+        """The time in the frame's list of sweeps, if it has one."""
         current = self._current_sweep(index)
         return None if current is None else current.timestamp_us
 
     def fingerprint(self) -> str:
         listed = (file.parent / sweep.file for file in self._sweeps.values() for sweep in read_list(file))
-        older = {*map(_normalized, listed)} - {*map(_normalized, self._clouds.values())}
+        clouds = {os.path.normpath(file) for file in self._clouds.values()}
+        older = {Path(path) for path in map(os.path.normpath, listed) if path not in clouds}
         files = [*self._clouds.values(), *self._boxes.values(), *self._sweeps.values(), *older]
         files += [file for name in ("sensor.json", "classes.json") if (file := self.root / name).exists()]
         reading = self.names, self.sensor, *dataclasses.astuple(self.reading)
@@ -196,28 +198,29 @@ class FolderFrames(FrameSet):
     def _read_classes(self) -> tuple[tuple[str, ...], dict[str, str | None]]:
         """The classes, and what labels in the files become, None for boxes to leave out."""
         file = self.root / "classes.json"
-        own: list[str] | dict[str, str | None] = {}
+        classes: list[str] | dict[str, str | None] = {}
         if os.path.lexists(file):
             _expect_file(file, self._inside, str(file))
-            own = read_json(file, list[str] | dict[str, str | None])
-        if isinstance(own, list):
-            if not own or len(set(own)) < len(own):
-                raise ValueError(f"{file}: got {len(own)} names, expected at least one, each once")
-            return tuple(own), {}
-        found = {own.get(r.label, r.label) for f in self._boxes.values() for r in read_json(f, _Annotation).boxes}
-        return tuple(sorted(name for name in found if name is not None)), own
+            classes = read_json(file, list[str] | dict[str, str | None])
+        if isinstance(classes, list):
+            if not classes or len(set(classes)) < len(classes):
+                raise ValueError(f"{file}: got {len(classes)} names, expected at least one, each once")
+            return tuple(classes), {}
+        records = (record for file in self._boxes.values() for record in read_json(file, _Annotation).boxes)
+        labels = {classes.get(record.label, record.label) for record in records}
+        return tuple(sorted(label for label in labels if label is not None)), classes
 
 
 def _expect_sweeps(lags: np.ndarray, cloud: Path) -> None:
-    """Refuse the offsets of single points in a turn: points with a time lag are of older sweeps."""
+    """Refuse time offsets of single points within a turn: they would turn points into older sweeps."""
     different = len(np.unique(lags[np.isfinite(lags)]))
     if different > _MAX_LAGS:
         found = f"got {different} different time lags, which look like offsets within a turn"
-        raise ValueError(f"{cloud}: fifth column: {found}, expected one a sweep, 0 for the current one")
+        raise ValueError(f"{cloud}: fifth column: {found}, expected one per sweep, 0 for the current one")
 
 
 def _list_files(root: Path, folder: str, endings: tuple[str, ...], inside: Path | None) -> dict[str, Path]:
-    """Name without extension -> file; hidden files are left out."""
+    """Name without extension -> file; hidden files are skipped."""
     if not (root / folder).is_dir():
         raise ValueError(f"{root / folder}: no such folder, expected one with {', '.join(endings)} files")
     files: dict[str, Path] = {}
@@ -235,12 +238,8 @@ def _list_files(root: Path, folder: str, endings: tuple[str, ...], inside: Path 
     return files
 
 
-def _normalized(file: Path) -> Path:
-    return Path(os.path.normpath(file))
-
-
 def _expect_file(file: Path, inside: Path | None, where: str) -> None:
-    """Refuse a file that is not there, or that a link or ``..`` takes out of a folder, if one is given."""
+    """Refuse a missing file, and one that a link or ``..`` leads out of the folder ``inside``."""
     if not os.path.isfile(file):
         raise ValueError(f"{where}: no such file" + ("" if where == str(file) else f": {file}"))
     real = os.path.realpath(file)
@@ -261,13 +260,12 @@ def _read_sensor(root: Path, inside: Path | None) -> Sensor:
 
 
 def find_folder_splits(root: Path, file: str | Path | None = None) -> list[str]:
-    """Names of the splits in a file, by default ``splits.json``; none where there is no such file."""
-    own = root / _SPLITS
-    return list(_read_splits(Path(file or own))) if file is not None or own.exists() else []
+    """Names of the splits in a file, by default ``splits.json``; empty if that file is missing."""
+    default = root / _SPLITS
+    return list(_read_splits(Path(file or default))) if file is not None or default.exists() else []
 
 
 def _read_splits(file: Path) -> dict[str, list[str]]:
-    """Name -> frames."""
     return read_json(file, dict[str, list[str]], what="splits")
 
 

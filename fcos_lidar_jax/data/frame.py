@@ -1,4 +1,4 @@
-"""Annotated clouds, and what a data set of them offers."""
+"""Annotated point clouds, and the protocol of data sets."""
 
 import dataclasses
 import os
@@ -23,8 +23,8 @@ class Frame:
             as a sixth column for sensors whose rows come from it.
         boxes: f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
         labels: i32[m]: index into the ``classes`` of the frame set.
-        num_points: i32[m]: LiDAR points of the current sweep inside each box, as annotated.
-        num_close: points on the ego vehicle that the reader has removed, of all sweeps.
+        num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box.
+        num_close: points on the ego vehicle that the reader removed, over all sweeps.
 
     >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
     >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
@@ -40,13 +40,13 @@ class Frame:
 
 @runtime_checkable
 class FrameSet(Protocol):
-    """Frames in a fixed order: what every reader offers to the training pipeline and the commands.
+    """Frames in a fixed order: the interface of every reader for the training pipeline and the commands.
 
-    Readers inherit from it, so that what their data do not have (poses, times, scenes) has its default.
+    Readers inherit from it and get defaults for anything that their data lack (poses, times, scenes).
 
     Attributes:
-        classes: what labels count, in their order.
-        sensor: whose points they are.
+        classes: class names, which labels index.
+        sensor: sensor that recorded the points.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -61,50 +61,46 @@ class FrameSet(Protocol):
     def __len__(self) -> int: ...
 
     def frame(self, index: int) -> Frame:
-        """One frame, read anew: sweeps fused, close points removed, all boxes of the classes."""
+        """Read one frame: sweeps fused, close points removed, all boxes of the classes."""
         ...
 
     def truth(self, index: int) -> Frame:
-        """The boxes of :meth:`frame` with their labels and numbers of points, all the same, but without the cloud.
+        """:meth:`frame` with ``num_close`` 0 and no points.
 
-        Where the set can, the points are not read. It cannot where the data do not say how many points a box
-        holds, as in KITTI and folders of own data: they are then counted.
-
-        Returns:
-            a frame of no points, from which none was removed.
+        The points are read only if the data do not tell how many of them each box contains (KITTI, folders of
+        your own data).
         """
         return without_points(self.frame(index))
 
     def labels(self, index: int) -> np.ndarray:
-        """i32[m]: labels of the frame's boxes, without those that are known to hold no point; where the set can,
-        without reading the points."""
+        """i32[m]: labels of the frame's boxes, except boxes known to be empty; avoids reading the points."""
         return self.truth(index).labels
 
     def name(self, index: int) -> str:
-        """What messages and files of results call a frame, in any letters; no two frames have the same name."""
+        """Unique name of a frame in messages and results files."""
         ...
 
     def fingerprint(self) -> str:
-        """A checksum of all that the frames follow from, as far as it can be known without reading the points."""
+        """Checksum of everything that determines the frames, as far as it is known without reading the points."""
         ...
 
     def clouds_fingerprint(self, indices: Iterable[int]) -> str:
-        """Checksum of the point files of some frames by name, size and time of their last change.
+        """Checksum of the name, size and modification time of some frames' point files.
 
-        For sets whose :meth:`fingerprint` does not see them; ``""`` where it does.
+        ``""`` if :meth:`fingerprint` includes them.
         """
         return ""
 
     def pose(self, index: int) -> np.ndarray | None:
-        """f64[4, 4] from the points' frame to the world's, None where it is not known."""
+        """f64[4, 4] from the points' frame to the world frame; None if unknown."""
         return None
 
     def time_us(self, index: int) -> int | None:
-        """When the current sweep was taken, microseconds, None where it is not known."""
+        """Time of the current sweep in microseconds; None if unknown."""
         return None
 
     def scene(self, index: int) -> str:
-        """Name of the drive that the frame is of, ``""`` where it is not known."""
+        """Name of the frame's drive; ``""`` if unknown."""
         return ""
 
 
@@ -138,7 +134,7 @@ class InMemoryFrames(FrameSet):
 
 @dataclasses.dataclass(frozen=True)
 class WrappedFrames(FrameSet):
-    """A frame set made of another, from which it has whatever it does not define itself."""
+    """Base of frame sets that change another one: everything is passed on unless a subclass overrides it."""
 
     frames: FrameSet
     classes: tuple[str, ...] = dataclasses.field(init=False)
@@ -149,7 +145,7 @@ class WrappedFrames(FrameSet):
         object.__setattr__(self, "sensor", self.frames.sensor)
 
     def _source(self, index: int) -> int:
-        """Which of the frames is meant."""
+        """Index into the wrapped frames."""
         return index
 
     def __len__(self) -> int:
@@ -185,7 +181,7 @@ class WrappedFrames(FrameSet):
 
 @dataclasses.dataclass(frozen=True)
 class SelectedFrames(WrappedFrames):
-    """Some of the frames, in any order.
+    """A selection of another set's frames, in any order.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -206,34 +202,35 @@ class SelectedFrames(WrappedFrames):
 
 
 def files_fingerprint(files: Iterable[Path], root: Path, reading: object) -> str:
-    """Checksum of files by name, size and time of their last change, and of how they are read.
+    """Checksum of the name, size and modification time of files, and of the reader's options.
 
     Args:
-        root: names are relative to it, also those of files outside, so that a data set may be moved as a whole.
+        root: names are relative to it, so that a data set may be moved as a whole.
         reading: options of the reader, distinguished by ``repr``.
     """
-    states = [(os.path.relpath(file, root), *_size_and_time(file)) for file in sorted(files)]
+    states = [(os.path.relpath(file, root), *size_and_time(file)) for file in sorted(files)]
     return checksum(repr((states, reading)).encode())
 
 
-def _size_and_time(file: Path) -> tuple[int, ...]:
-    """Bytes, and nanoseconds of the last change; nothing where there is no file."""
+def size_and_time(file: Path) -> tuple[int, ...]:
+    """Size in bytes and modification time in nanoseconds; ``()`` if the file is missing."""
     try:
-        found = file.stat()
+        stat = file.stat()
     except FileNotFoundError:
         return ()
-    return found.st_size, found.st_mtime_ns
+    return stat.st_size, stat.st_mtime_ns
 
 
 def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], where: str) -> tuple[str, ...]:
-    """Names of frames, each known and listed once, at least one.
+    """Check a list of frame names: at least one, each known and listed once.
 
     Args:
-        listed: where each is, for messages, and the name.
-        where: the list is, for messages.
+        listed: the place of each name, for messages, and the name.
+        known: names of all frames.
+        where: the place of the list, for messages.
 
     Raises:
-        ValueError: naming the place, what was found and what was expected.
+        ValueError: with the place, the found and the expected value.
     """
     names: dict[str, None] = {}
     for place, name in listed:
@@ -248,13 +245,13 @@ def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], wh
 
 
 def drop_close(points: np.ndarray, sensor: Sensor, reading: CloudReading) -> tuple[np.ndarray, int]:
-    """A cloud f32[n, c] without the points on the ego vehicle, and how many they were."""
+    """Remove the points on the ego vehicle from f32[n, c]; also returns their number."""
     kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, reading))
     return points[kept], len(points) - int(kept.sum())
 
 
 def no_points(sensor: Sensor) -> np.ndarray:
-    """A cloud without points, f32[0, c], of a sensor's columns.
+    """An empty cloud f32[0, c] with the columns of a sensor.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> no_points(TINY).shape
@@ -264,7 +261,7 @@ def no_points(sensor: Sensor) -> np.ndarray:
 
 
 def without_points(frame: Frame) -> Frame:
-    """The boxes of a frame alone; keeps nothing of the cloud in memory.
+    """Drop a frame's points, and free their memory.
 
     >>> frame = Frame(np.zeros((9, 5)), np.zeros((1, 9)), np.zeros(1, int), np.ones(1, int), num_close=4)
     >>> boxes = without_points(frame)
@@ -275,7 +272,7 @@ def without_points(frame: Frame) -> Frame:
 
 
 def without_close(frame: Frame, sensor: Sensor, reading: CloudReading) -> Frame:
-    """The frame without the points on the ego vehicle.
+    """Remove the points on the ego vehicle from a frame.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> frame = Frame(np.eye(5, dtype=np.float32) * 9, np.zeros((0, 9)), np.zeros(0), np.zeros(0))

@@ -1,4 +1,4 @@
-"""One annotated keyframe: a cloud with its boxes in a JSON file beside it."""
+"""One annotated keyframe: a point file with boxes in a JSON file beside it."""
 
 from pathlib import Path
 
@@ -13,18 +13,19 @@ from fcos_lidar_jax.sensors import Sensor
 
 
 def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
-    """A keyframe of a folder, with the boxes of the ten nuScenes classes.
+    """Read a folder's keyframe with the boxes of the ten nuScenes classes.
 
     ``boxes.json`` is ``{"lidar_file": NAME, "boxes": [{"class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy",
-    "num_lidar_pts"}]}`` in the LiDAR frame, or a list of such records, whose count may be called
-    "num_lidar_pts_at_key_frame"; an unknown velocity is null and becomes NaN; other classes are left out.
+    "num_lidar_pts"}]}`` in the LiDAR frame, or a list of such records. The count may also be called
+    "num_lidar_pts_at_key_frame". Unknown velocities are null and become NaN. Other classes are dropped.
 
     Args:
-        folder: holds ``boxes.json`` and the point file.
-        number: which record of a list.
+        folder: contains ``boxes.json`` and the point file.
+        sensor: sensor that recorded the points.
+        number: index into a list of records.
 
     Raises:
-        ValueError: naming the file and the field.
+        ValueError: with the file and the field.
     """
     file = Path(folder) / "boxes.json"
     record = read_json(file, what="the boxes of a keyframe")
@@ -32,8 +33,8 @@ def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
         record = record[number] if isinstance(record, list) else record
         rows = [b for b in record["boxes"] if b["class"] in NUSCENES_CLASSES]
         boxes = np.array([[np.nan if b[k] is None else float(b[k]) for k in LIMITS] for b in rows])
-        known = "num_lidar_pts" if all("num_lidar_pts" in b for b in rows) else "num_lidar_pts_at_key_frame"
-        counts = np.array([int(b[known]) for b in rows], np.int32)
+        count = "num_lidar_pts" if all("num_lidar_pts" in b for b in rows) else "num_lidar_pts_at_key_frame"
+        counts = np.array([int(b[count]) for b in rows], np.int32)
         cloud = file.parent / str(record["lidar_file"])
     except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{file}: a field is missing or of another kind: {error}") from None

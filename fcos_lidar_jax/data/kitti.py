@@ -13,7 +13,7 @@ from fcos_lidar_jax.data.sweeps import is_rotation
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
 CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
-"""KITTI's types of objects. ``DontCare``, which marks parts of the image, is no object."""
+"""KITTI's object types. ``DontCare`` marks image areas and is not an object."""
 
 TO_NUSCENES = {
     "Car": "car",
@@ -25,11 +25,11 @@ TO_NUSCENES = {
     "Tram": "bus",
     "Misc": None,
 }
-"""A class map of KITTI's types to the ten nuScenes classes; None is left out. A car of nuScenes may be a van, its
-bicycle includes the rider and its pedestrian may sit; a tram has no class there and looks most like a bus."""
+"""Class map from KITTI's types to the ten nuScenes classes; None drops the object. In nuScenes a car may be a van,
+a bicycle includes its rider and a pedestrian may sit; a tram has no class and looks most like a bus."""
 
 IMAGE_SIZE = (1242, 375)
-"""Pixels of KITTI's left colour image, width and height; single drives are up to 18 columns and 5 rows smaller."""
+"""Width and height of KITTI's left colour image in pixels; some drives have up to 18 columns and 5 rows less."""
 
 _FIELDS = (
     *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
@@ -43,24 +43,26 @@ class KittiFrames(FrameSet):
     """The frames of KITTI's ``training`` folder: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
     Reads ``training/velodyne/NAME.bin``, ``training/label_2/NAME.txt`` and ``training/calib/NAME.txt``. Points
-    stay in the Velodyne's frame (x forward, y left, z up, where nuScenes has x right, y forward), and the labels
-    are brought there: gravity centre, yaw counter-clockwise from +x. They are upright for the camera, so its tilt
-    against the Velodyne, about a degree, is lost. KITTI knows no velocities: NaN. Labels count :data:`CLASSES`.
+    stay in the Velodyne's frame (x forward, y left, z up; nuScenes has x right, y forward). Boxes are transformed
+    to that frame: gravity centre, yaw counter-clockwise from +x. KITTI's boxes are upright for the camera; its
+    tilt against the Velodyne, about a degree, is lost. Velocities are unknown: NaN. Labels index :data:`CLASSES`.
 
-    The labels do not say how many points a box holds, so :meth:`truth` reads the cloud, too, and counts them.
+    The labels do not tell how many points a box contains, so :meth:`truth` reads the cloud and counts them.
 
-    Only what the left colour camera sees is labelled. Points outside of its image are therefore dropped, or a
-    detector would learn that all behind the car is background.
+    Only objects in the left colour image are labelled. Points outside the image are dropped; otherwise a detector
+    would learn that everything behind the car is background.
 
     Args:
-        root: the folder that holds ``training``.
-        split: frames and order from ``ImageSets/SPLIT.txt``, a name a line; all frames, sorted, without it.
-        sensor: beam table, limits and intensity scale.
+        root: folder that contains ``training``.
+        split: take the frames and their order from ``ImageSets/SPLIT.txt``, one name per line; default: all
+            frames, sorted.
+        sensor: sensor that recorded the points.
         image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.
         reading: which points on the ego vehicle are dropped; a frame is one sweep.
 
     Raises:
-        ValueError: here or on reading a frame, naming the file, the line, the field, found and expected.
+        ValueError: at construction or on reading a frame, with the file, the line, the field, the found and the
+            expected value.
     """
 
     classes = CLASSES
@@ -77,7 +79,7 @@ class KittiFrames(FrameSet):
         self.root, self.sensor, self.image_size, self.reading = Path(root), sensor, image_size, reading
         clouds = _stems(self.root / "training" / "velodyne", ".bin")
         self.names = tuple(sorted(clouds)) if split is None else _read_split(self.root, split, clouds)
-        """Names of the frames: of their files, without the extension."""
+        """Names of the frames: file names without extension."""
         for kind in ("label_2", "calib"):
             present = _stems(self.root / "training" / kind, ".txt")
             for name in self.names:
@@ -88,7 +90,7 @@ class KittiFrames(FrameSet):
         return len(self.names)
 
     def frame(self, index: int) -> Frame:
-        """One frame, read anew; the points in each box are counted."""
+        """Read one frame and count the points in each box."""
         name = self.names[index]
         calibration = read_calibration(self._file("calib", name))
         camera_boxes, labels = read_labels(self._file("label_2", name))
@@ -119,14 +121,14 @@ class KittiFrames(FrameSet):
 
 
 def to_lidar(camera_boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
-    """Boxes in the Velodyne's frame, f64[m, 9], of labels in rectified camera coordinates.
+    """Transform labels in rectified camera coordinates to boxes f64[m, 9] in the Velodyne's frame.
 
-    The camera looks along z, with x right and y down. A label stands on its ``location``, the centre of its bottom
-    face; at ``rotation_y`` zero it heads along x, and it turns about y.
+    The camera looks along z, with x right and y down. A label's ``location`` is the centre of its bottom face. At
+    ``rotation_y`` zero the object heads along x; it rotates about y.
 
     Args:
         camera_boxes: f64[m, 7]: ``height, width, length, x, y, z, rotation_y``, metres and radians.
-        velo_to_rect: f64[4, 4], from the Velodyne's to rectified camera coordinates.
+        velo_to_rect: f64[4, 4], from Velodyne to rectified camera coordinates.
 
     >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
     >>> ahead = np.array([[1.5, 1.6, 4.0, 2.0, 1.7, 20.0, -np.pi / 2]])  # driving off on the right
@@ -143,7 +145,7 @@ def to_lidar(camera_boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:
 
 
 def in_image(points: np.ndarray, velo_to_image: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-    """Which points lie before the camera and fall into its image, bool[n].
+    """Which points lie in front of the camera and inside its image, bool[n].
 
     Args:
         points: f32[n, >= 3] in the Velodyne's frame, metres.
@@ -155,18 +157,17 @@ def in_image(points: np.ndarray, velo_to_image: np.ndarray, image_size: tuple[in
     [True, False, False]
     """
     width, height = image_size
-    with np.errstate(invalid="ignore"):  # what is not finite falls nowhere
+    with np.errstate(invalid="ignore"):  # non-finite points are outside
         u, v, depth = velo_to_image[:, :3] @ points[:, :3].T.astype(np.float64) + velo_to_image[:, 3:]
-    # Without a division by the depth, which may be zero; 0 <= u < width * depth holds before the camera alone.
+    # No division by the depth, which may be zero; 0 <= u < width * depth holds only in front of the camera.
     return (u >= 0) & (u < width * depth) & (v >= 0) & (v < height * depth)
 
 
 def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Labels of a file, as :func:`to_lidar` takes them, f64[m, 7], and their classes, i32[m],
-    which count :data:`CLASSES`.
+    """Read boxes f64[m, 7] for :func:`to_lidar` and labels i32[m], which index :data:`CLASSES`.
 
     Raises:
-        ValueError: naming the file, the line, the field, what was found and what was expected.
+        ValueError: with the file, the line, the field, the found and the expected value.
     """
     types, fields = read_objects(file)
     kept = [i for i, name in enumerate(types) if name != "DontCare"]
@@ -201,12 +202,12 @@ def read_objects(file: Path) -> tuple[list[str], np.ndarray]:
 
 
 def read_calibration(file: Path) -> dict[str, np.ndarray]:
-    """``velo_to_rect`` f64[4, 4], metres to metres, and ``P2`` f64[3, 4], on to pixels of the left colour image.
+    """Read ``velo_to_rect`` f64[4, 4], metres to metres, and ``P2`` f64[3, 4], from there to pixels.
 
     Raises:
-        ValueError: naming the file, the matrix, what was found and what was expected.
+        ValueError: with the file, the matrix, the found and the expected value.
     """
-    found = {}
+    matrices = {}
     for where, words in _lines(file):
         name = words[0].removesuffix(":")
         if name not in _SHAPES:
@@ -217,12 +218,12 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
         matrix = np.array([_number(word, f"{where}: {name}") for word in words[1:]]).reshape(rows, columns)
         if name != "P2" and not is_rotation(matrix[:, :3]):
             raise ValueError(f"{where}: {name}: got no rotation in its 3x3, expected orthonormal rows")
-        found[name] = np.eye(4)
-        found[name][:rows, :columns] = matrix
+        matrices[name] = np.eye(4)
+        matrices[name][:rows, :columns] = matrix
     for name in _SHAPES:
-        if name not in found:
+        if name not in matrices:
             raise ValueError(f"{file}: {name}: missing, expected {', '.join(_SHAPES)}")
-    return {"velo_to_rect": found["R0_rect"] @ found["Tr_velo_to_cam"], "P2": found["P2"][:3]}
+    return {"velo_to_rect": matrices["R0_rect"] @ matrices["Tr_velo_to_cam"], "P2": matrices["P2"][:3]}
 
 
 def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
@@ -243,7 +244,7 @@ def _stems(folder: Path, ending: str) -> set[str]:
 
 
 def _lines(file: Path) -> list[tuple[str, list[str]]]:
-    """Where each line is, for messages, and its words; blank lines are left out."""
+    """The place of each line, for messages, and its words; blank lines are skipped."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except OSError as error:

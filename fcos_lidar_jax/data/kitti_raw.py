@@ -22,14 +22,14 @@ def is_kitti_raw(folder: Path) -> bool:
 
 
 def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINTS) -> Drive:
-    """The sweeps of a recording, synchronised (``_sync``) or not in their numbers.
+    """The sweeps of a recording, synchronised (``_sync``) or not.
 
     Reads ``velodyne_points/data/N.bin``, line N of ``velodyne_points/timestamps.txt``, ``oxts/data/N.txt``, and
-    ``calib_imu_to_velo.txt`` in the folder or the one above. Positions are those of a Mercator map with the scale
-    of the first latitude, as in the development kit of the data set.
+    ``calib_imu_to_velo.txt`` in the folder or its parent. Positions are in a Mercator projection scaled at the
+    first latitude, as in the data set's development kit.
 
     Raises:
-        ValueError: naming the file, what was found and what was expected.
+        ValueError: with the file, the found and the expected value.
     """
     points = folder / "velodyne_points"
     files = sorted(points.joinpath("data").glob("*.bin"))
@@ -61,7 +61,7 @@ def _lines(file: Path) -> list[str]:
 
 
 def _numbers(where: Path | str, text: str, number: int) -> np.ndarray:
-    """The first numbers of a text, all of them finite."""
+    """The first numbers of a text, which must be finite."""
     words = text.split()[:number]
     try:
         values = np.array([float(word) for word in words])
@@ -83,7 +83,7 @@ def _imu_to_velodyne(file: Path) -> np.ndarray:
 
 
 def _imu_to_world(file: Path, values: np.ndarray, scale: float) -> np.ndarray:
-    """The pose f64[4, 4] of latitude, longitude (degrees), altitude (m), roll, pitch and yaw (radians)."""
+    """The pose f64[4, 4] for latitude, longitude (degrees), altitude (m), roll, pitch and yaw (radians)."""
     latitude, longitude, altitude, roll, pitch, yaw = values.tolist()
     if not abs(latitude) < 90:
         raise ValueError(f"{file}: latitude: got {latitude:g}, expected degrees between -90 and 90")

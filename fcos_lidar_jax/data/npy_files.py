@@ -1,4 +1,4 @@
-"""NumPy's files from their bytes: sizes are Python's integers, compared before anything is allocated."""
+"""Safe parsing of ``.npy`` and ``.npz`` files: sizes are Python integers and checked before any allocation."""
 
 import io
 import math
@@ -8,18 +8,18 @@ from collections.abc import Sequence
 import numpy as np
 
 _HEADER_BYTES = 2**15  # more than NumPy reads of a header
-MAX_BYTES = 2**31  # of an array from a packed archive, unless another limit is given
+MAX_BYTES = 2**31  # default limit of an unpacked array
 
 
 def parse_npy(content: bytes, *, max_rows: int | None = None) -> np.ndarray:
-    """The array of an ``.npy`` file, read-only, as a view of the bytes.
+    """The array of an ``.npy`` file, as a read-only view of the bytes.
 
     Args:
         content: the whole file.
-        max_rows: along the first axis; None for no limit.
+        max_rows: limit of the first axis; None for no limit.
 
     Raises:
-        ValueError: damaged, of pickled objects, of another size than its header says, or too long.
+        ValueError: damaged, pickled objects, a size that differs from the header's, or too many rows.
 
     >>> stream = io.BytesIO()
     >>> np.save(stream, np.arange(3))
@@ -27,16 +27,16 @@ def parse_npy(content: bytes, *, max_rows: int | None = None) -> np.ndarray:
     [0, 1, 2]
     """
     shape, fortran, dtype, offset = _read_header(content, max_rows)
-    size, found = math.prod(shape) * dtype.itemsize, len(content) - offset
-    if size != found or size == 0 < math.prod(shape) or not all(0 <= n < 2**63 for n in shape):
-        raise ValueError(f"got {found} bytes of values, expected {size} for {shape} of {dtype}")
+    size, actual = math.prod(shape) * dtype.itemsize, len(content) - offset
+    if size != actual or size == 0 < math.prod(shape) or not all(0 <= n < 2**63 for n in shape):
+        raise ValueError(f"got {actual} bytes of values, expected {size} for {shape} of {dtype}")
     if size == 0:
         return np.zeros(shape, dtype)
     return np.frombuffer(content, dtype, offset=offset).reshape(shape, order="F" if fortran else "C")
 
 
 def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...], bool, np.dtype, int]:
-    """Shape, order, type and first byte of the values, from at least the first of the file's bytes."""
+    """Shape, Fortran order, type and offset of the values, from the first bytes of a file."""
     stream = io.BytesIO(content)
     try:
         version = np.lib.format.read_magic(stream)
@@ -44,7 +44,7 @@ def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...],
         if version not in read_header:
             raise ValueError(f"version: got {version}, expected 1.0 or 2.0")
         shape, fortran, dtype = read_header[version](stream)
-    except Exception as error:  # damaged headers fail in a dozen ways, down to the tokenizer's
+    except Exception as error:  # damaged headers raise arbitrary exceptions, even the tokenizer's
         raise ValueError(" ".join(str(error).split())) from None
     if dtype.hasobject:
         raise ValueError("got pickled objects, expected an array without pickled objects")
@@ -54,7 +54,7 @@ def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...],
 
 
 def npz_names(content: bytes) -> list[str]:
-    """Names of the arrays in an ``.npz`` file; ValueError where it is none."""
+    """Names of the arrays in an ``.npz`` file; ValueError if it is damaged."""
     return list(_members(content))
 
 
@@ -65,12 +65,12 @@ def parse_npz(
 
     Args:
         content: the whole file.
-        names: which arrays.
+        names: names of the arrays to read.
         max_rows: as in :func:`parse_npy`.
-        max_bytes: of an array when it is unpacked.
+        max_bytes: limit of an unpacked array.
 
     Raises:
-        ValueError: damaged, an array is missing or too large, or as :func:`parse_npy`.
+        ValueError: damaged, an array is missing or too large, or an error of :func:`parse_npy`.
     """
     members, arrays = _members(content), {}
     for name in names:
@@ -85,9 +85,9 @@ def parse_npz(
             with zipfile.ZipFile(io.BytesIO(content)) as archive, archive.open(member) as stream:
                 head = stream.read(_HEADER_BYTES)
                 _read_header(head, max_rows)  # before the rest is unpacked
-                # A limit, for it may unpack to more than it says.
+                # Limited, since an archive may unpack to more than it says.
                 unpacked = head + stream.read(max(member.file_size + 1 - len(head), 0))
-        except Exception as error:  # likewise
+        except Exception as error:  # damaged archives raise arbitrary exceptions
             raise ValueError(" ".join(str(error).split())) from None
         arrays[name] = parse_npy(unpacked, max_rows=max_rows)
     return arrays
@@ -97,5 +97,5 @@ def _members(content: bytes) -> dict[str, zipfile.ZipInfo]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    except Exception as error:  # likewise
+    except Exception as error:  # damaged archives raise arbitrary exceptions
         raise ValueError(" ".join(str(error).split())) from None

@@ -1,4 +1,4 @@
-"""PCD files by their header: ascii, binary and binary_compressed."""
+"""PCD files: ascii, binary and binary_compressed."""
 
 import dataclasses
 import re
@@ -8,28 +8,28 @@ import numpy as np
 COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "time_lag")}
 COLUMNS["intensity"] = ("intensity", "reflectivity")
 COLUMNS["laser"] = ("laser_number", "laser", "ring", "line", "channel")
-"""Column -> the field names it goes by among drivers, the most telling first. Other fields are skipped."""
+"""Column -> its field names in various drivers, the most specific first. Other fields are skipped."""
 _KINDS = {"F": ("f", "248"), "I": ("i", "1248"), "U": ("u", "1248")}
-"""TYPE -> NumPy's letter, and the sizes it comes in."""
+"""TYPE -> NumPy's type letter and the allowed sizes."""
 _SPACE, _PART_BYTES = re.compile(rb"\s"), 2**20
-_MAX_COUNT = 1_000_000  # values a field of one point may have; more is a damaged header
-_MAX_EXPANSION = 88  # three bytes of LZF stand for 264 at most
+_MAX_COUNT = 1_000_000  # values per field of a point; more means a damaged header
+_MAX_EXPANSION = 88  # three bytes of LZF unpack to 264 at most
 
 
 def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, np.ndarray]:
-    """Named columns of a PCD file, from the whole of it.
+    """Parse a PCD file into named columns.
 
     Args:
         content: the whole file.
-        max_points: that the header may tell.
-        max_bytes: of all points, unpacked.
+        max_points: limit of the number of points.
+        max_bytes: limit of all points' unpacked size.
 
     Returns:
-        x, y, z, and of intensity, time_lag and laser those that are there; one value a point each, in the
-        file's own units and types.
+        x, y, z, and intensity, time_lag and laser if the file has them; one value per point, in the file's own
+        units and types.
 
     Raises:
-        ValueError: one line that names the header's field, what was found and what was expected.
+        ValueError: one line with the header's field, the found and the expected value.
 
     >>> header = "FIELDS x y z ring\\nSIZE 4 4 4 1\\nTYPE F F F U\\nPOINTS 1\\nDATA ascii\\n"
     >>> table = parse_pcd(header.encode() + b"5 0 -1.5 31\\n", max_points=10, max_bytes=1000)
@@ -42,27 +42,27 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
     if number == 0:
         raise ValueError("POINTS: got 0, no points in it, expected at least one")
     if number > max_points or number * _size(fields) > max_bytes:
-        found = f"{number} points of {_size(fields)} bytes"
-        raise ValueError(f"POINTS: got {found}, expected at most {max_points} and {max_bytes} bytes in all")
+        size = f"{number} points of {_size(fields)} bytes"
+        raise ValueError(f"POINTS: got {size}, expected at most {max_points} and {max_bytes} bytes in all")
     form = " ".join(header["DATA"]).lower()
     if form not in _FORMS:
         raise ValueError(f"DATA: got {form!r}, expected {', '.join(_FORMS)}")
-    chosen: dict[str, int] = {}
+    places: dict[str, int] = {}
     names = [field.name for field in fields]
     for column, aliases in COLUMNS.items():
-        found = next((a for a in aliases if a in names), None)
-        if found is not None:
-            chosen[column] = names.index(found)
-            if fields[chosen[column]].count != 1:
-                raise ValueError(f"COUNT: got {fields[chosen[column]].count} for field {found}, expected 1")
-    columns = _FORMS[form](body, fields, number, list(chosen.values()))
-    return dict(zip(chosen, columns, strict=True))
+        alias = next((a for a in aliases if a in names), None)
+        if alias is not None:
+            places[column] = names.index(alias)
+            if fields[places[column]].count != 1:
+                raise ValueError(f"COUNT: got {fields[places[column]].count} for field {alias}, expected 1")
+    columns = _FORMS[form](body, fields, number, list(places.values()))
+    return dict(zip(places, columns, strict=True))
 
 
 def _read_header(content: bytes) -> tuple[dict[str, list[str]], memoryview]:
-    """Entry -> its words, and what comes after the DATA line."""
+    """Entry -> its words, and the bytes after the DATA line."""
     header, position = dict[str, list[str]](), 0
-    while position < len(content) and len(header) <= 32:  # no header is that long: not a PCD file
+    while position < len(content) and len(header) <= 32:  # longer headers do not exist: not a PCD file
         end = content.find(b"\n", position)
         line = content[position : len(content) if end < 0 else end]
         position += len(line) + 1
@@ -76,7 +76,7 @@ def _read_header(content: bytes) -> tuple[dict[str, list[str]], memoryview]:
 
 @dataclasses.dataclass(frozen=True)
 class _Field:
-    """A field of a point: numbers of one type. Sizes are Python's integers, which a header cannot overflow."""
+    """A field of a point. Sizes are Python integers, which no header can overflow."""
 
     name: str
     dtype: np.dtype
@@ -101,7 +101,7 @@ def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
         number = len(columns.get(name, []))
         if number != len(fields):
             raise ValueError(f"{name}: got {number} entries, expected {len(fields)} as in FIELDS")
-    found = []
+    parsed = []
     for field, size, kind, count in zip(fields, columns["SIZE"], columns["TYPE"], columns["COUNT"], strict=True):
         letter, sizes = _KINDS.get(kind.upper(), ("", ""))
         if not letter or size not in tuple(sizes):
@@ -109,8 +109,8 @@ def _read_fields(header: dict[str, list[str]]) -> list[_Field]:
             raise ValueError(f"TYPE and SIZE: got {kind} {size} for field {field}, expected {expected}")
         if not count.isdecimal() or not 1 <= int(count) <= _MAX_COUNT:
             raise ValueError(f"COUNT: got {count} for field {field}, expected an integer of at least 1")
-        found.append(_Field(field, np.dtype(f"<{letter}{size}"), int(count)))
-    return found
+        parsed.append(_Field(field, np.dtype(f"<{letter}{size}"), int(count)))
+    return parsed
 
 
 def _num_points(header: dict[str, list[str]]) -> int:
@@ -129,36 +129,37 @@ def _num_points(header: dict[str, list[str]]) -> int:
     return points
 
 
-def _from_ascii(body: memoryview, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
-    width, parts, found, first = sum(field.count for field in fields), list[np.ndarray](), 0, 0
+def _from_ascii(body: memoryview, fields: list[_Field], number: int, places: list[int]) -> list[np.ndarray]:
+    width, parts, num_values, first = sum(field.count for field in fields), list[np.ndarray](), 0, 0
     while first < len(body):  # in parts, since words take many times the memory of their bytes
         cut = _SPACE.search(body, first + _PART_BYTES)
         last = cut.start() if cut else len(body)
         words = bytes(body[first:last]).split()
-        found, first = found + len(words), last
-        if found > number * width:
-            raise ValueError(f"DATA: too long: got {found} values and more, expected {number} points of {width}")
+        num_values, first = num_values + len(words), last
+        if num_values > number * width:
+            found = f"got {num_values} values and more"
+            raise ValueError(f"DATA: too long: {found}, expected {number} points of {width}")
         try:
             parts.append(np.array(words, np.float64))
         except ValueError as error:
             raise ValueError(f"DATA: {error}, expected a number") from None
-    if found < number * width:
-        raise ValueError(f"DATA: truncated: got {found} values, expected {number} points of {width}")
+    if num_values < number * width:
+        raise ValueError(f"DATA: truncated: got {num_values} values, expected {number} points of {width}")
     values = np.concatenate(parts).reshape(number, width)
-    return [values[:, sum(field.count for field in fields[:i])] for i in chosen]
+    return [values[:, sum(field.count for field in fields[:i])] for i in places]
 
 
-def _from_binary(body: memoryview, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
-    """Points stored one after the other."""
+def _from_binary(body: memoryview, fields: list[_Field], number: int, places: list[int]) -> list[np.ndarray]:
+    """Points stored one after another."""
     record = _size(fields)
     if len(body) < number * record:
         expected = f"{number * record} ({number} points of {record})"
         raise ValueError(f"DATA: truncated: got {len(body)} bytes, expected {expected}")
-    return [np.ndarray((number,), fields[i].dtype, body, _size(fields[:i]), (record,)) for i in chosen]
+    return [np.ndarray((number,), fields[i].dtype, body, _size(fields[:i]), (record,)) for i in places]
 
 
-def _from_compressed(body: memoryview, fields: list[_Field], number: int, chosen: list[int]) -> list[np.ndarray]:
-    """Points stored field by field and packed by LZF, behind the packed and the plain size."""
+def _from_compressed(body: memoryview, fields: list[_Field], number: int, places: list[int]) -> list[np.ndarray]:
+    """Compressed size, plain size, and the points field by field, compressed by LZF."""
     expected = number * _size(fields)
     packed, plain = (int(v) for v in np.frombuffer(bytes(body[:8]).ljust(8, b"\0"), "<u4"))
     if len(body) < 8 + packed:
@@ -168,14 +169,14 @@ def _from_compressed(body: memoryview, fields: list[_Field], number: int, chosen
     if plain > _MAX_EXPANSION * packed:
         raise ValueError(f"DATA: got {packed} compressed bytes, expected more: they cannot unpack to {plain}")
     content = _unpack_lzf(body[8 : 8 + packed], plain)
-    return [np.frombuffer(content, fields[i].dtype, number, number * _size(fields[:i])) for i in chosen]
+    return [np.frombuffer(content, fields[i].dtype, number, number * _size(fields[:i])) for i in places]
 
 
 _FORMS = {"ascii": _from_ascii, "binary": _from_binary, "binary_compressed": _from_compressed}
 
 
 def _unpack_lzf(packed: memoryview, size: int) -> bytearray:
-    """LZF: runs of literal bytes, and copies of what was already written."""
+    """LZF: runs of literal bytes, and copies of earlier output."""
     out, position = bytearray(), 0
     try:
         while position < len(packed) and len(out) <= size:
@@ -195,7 +196,7 @@ def _unpack_lzf(packed: memoryview, size: int) -> bytearray:
             if distance > len(out):
                 raise ValueError("DATA: the compressed bytes are damaged: a copy from before the beginning")
             start = len(out) - distance
-            # A copy longer than its distance repeats what it has just written.
+            # A copy longer than its distance repeats its own output.
             out += (out[start : start + length] * (length // distance + 1))[:length]
     except IndexError:
         raise ValueError("DATA: the compressed bytes are damaged: they end within a copy") from None

@@ -1,4 +1,4 @@
-"""The points of ROS's message PointCloud2, in the layouts of all drivers."""
+"""Points of ROS PointCloud2 messages, in the layouts of all drivers."""
 
 from typing import Any
 
@@ -10,30 +10,30 @@ from fcos_lidar_jax.sensors import Sensor
 
 _COLUMNS = {column: names for column, names in COLUMNS.items() if column != "time_lag"}
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Datatype of a field -> NumPy's name."""
+"""Datatype of a field -> NumPy's type."""
 
 
 def parse_point_cloud2(cloud: Any, where: str, sensor: Sensor, *, max_points: int) -> np.ndarray:
     """The points of a message, in the columns of :func:`~fcos_lidar_jax.data.point_files.read_points`.
 
     Args:
-        cloud: anything with the message's fields; ``data`` is u8[n].
-        where: what to call it in messages.
-        sensor: scales the intensity and says whether a laser number is needed.
-        max_points: of a cloud; a larger one is refused before it takes memory.
+        cloud: an object with the message's fields; ``data`` is u8[n].
+        where: name of the message for error messages.
+        sensor: scales the intensity and tells whether laser numbers are needed.
+        max_points: larger clouds are refused before they take memory.
 
     Raises:
-        ValueError: naming ``where``, the field, what was found and what was expected.
+        ValueError: with ``where``, the field, the found and the expected value.
     """
     width, height, step, pitch = cloud.width, cloud.height, cloud.point_step, cloud.row_step
     if width * height > max_points:
         raise ValueError(f"{where}: got {width} x {height} points, expected at most {max_points}")
-    pitch = max(pitch, width * step) if height <= 1 else pitch  # some drivers leave it out in a single row
+    pitch = max(pitch, width * step) if height <= 1 else pitch  # some drivers leave it 0 for a single row
     if pitch < width * step:
         raise ValueError(f"{where}: row_step: got {pitch}, expected {width * step}, width x point_step, or more")
     if height and width and len(cloud.data) < (needed := (height - 1) * pitch + width * step):
-        found = f"got {len(cloud.data)} bytes, expected at least {needed}"
-        raise ValueError(f"{where}: data: {found} for {height} rows of {width} points of {step}")
+        sizes = f"got {len(cloud.data)} bytes, expected at least {needed}"
+        raise ValueError(f"{where}: data: {sizes} for {height} rows of {width} points of {step}")
     columns = {}
     for column, dtype, offset in _find_columns(cloud, where):
         if width and height:
@@ -45,14 +45,14 @@ def parse_point_cloud2(cloud: Any, where: str, sensor: Sensor, *, max_points: in
 
 
 def _find_columns(cloud: Any, where: str) -> list[tuple[str, np.dtype, int]]:
-    """The columns that there are, with type and offset within a point."""
-    found, names = [], [field.name for field in cloud.fields]
+    """The message's columns, with type and offset within a point."""
+    columns, names = [], [field.name for field in cloud.fields]
     for column, aliases in _COLUMNS.items():
         name = next((alias for alias in aliases if alias in names), None)
         if name is None:
             if column in "xyz":
-                there = ", ".join(map(repr, names))[:500] or "none"
-                raise ValueError(f"{where}: fields: got {there}, expected one named {column}")
+                listed = ", ".join(map(repr, names))[:500] or "none"
+                raise ValueError(f"{where}: fields: got {listed}, expected one named {column}")
             continue
         field = cloud.fields[names.index(name)]
         if field.datatype not in _NUMBERS or field.count > 1:
@@ -62,5 +62,5 @@ def _find_columns(cloud: Any, where: str) -> list[tuple[str, np.dtype, int]]:
         if field.offset + dtype.itemsize > cloud.point_step:
             got, expected = f"{dtype.itemsize} bytes at offset {field.offset}", "a place within point_step"
             raise ValueError(f"{where}: field {name}: got {got}, expected {expected} {cloud.point_step}")
-        found.append((column, dtype, field.offset))
-    return found
+        columns.append((column, dtype, field.offset))
+    return columns

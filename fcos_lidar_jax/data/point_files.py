@@ -12,20 +12,20 @@ from fcos_lidar_jax.data.npy_files import npz_names, parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.sensors import Sensor
 
-ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # file names that are read, the longest first
+ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # supported names, the longest first
 _RAW_COLUMNS = (3, 4, 5, 6)
-MAX_POINTS = 10_000_000  # of one cloud, unless another limit is given: far more than any LiDAR's
-BYTES_A_POINT = 64  # of a cloud of so many points at most, as a file and unpacked
+MAX_POINTS = 10_000_000  # default limit of a cloud, far above any LiDAR's
+BYTES_PER_POINT = 64  # limit of a cloud's size, as a file and unpacked
 _HEADER_BYTES = 2**20
 _RAW_DTYPES = ("float16", "float32", "float64")
 
-# Criteria of whether a raw file is read with the layout it was written with.
-_REACH_M = 300.0  # no LiDAR here sees farther
-_HEIGHT_M = (-15.0, 40.0)  # between ditches and bridges; other values that slip into the third column leave it
+# Criteria for whether a raw file is read in the layout in which it was written.
+_REACH_M = 300.0  # no supported LiDAR sees farther
+_HEIGHT_M = (-15.0, 40.0)  # from ditches to bridges; other columns' values lie outside
 _FINEST_M = 1e-6  # finer than any LiDAR resolves: text, or another number type
-_MARGIN = 0.15  # how much better another layout must fit before the one in use is refused
-_INSPECTED_VALUES = 240_000  # values that are looked at; a multiple of every number of columns
-_MIN_VALUES = 200  # below this the contrast of the columns is chance
+_MARGIN = 0.15  # by how much another layout must fit better before a file is refused
+_INSPECTED_VALUES = 240_000  # a multiple of every number of columns
+_MIN_VALUES = 200  # with fewer values the contrast of the columns is chance
 
 
 def read_points(
@@ -36,29 +36,30 @@ def read_points(
     dtype: str | None = None,
     max_points: int = MAX_POINTS,
 ) -> np.ndarray:
-    """The points of a file.
+    """Read the points of a file.
 
-    ``.pcd.bin`` (nuScenes): float32 x 5, the fourth the intensity of 0-255, the fifth the ring. ``.bin`` (KITTI):
-    float32 x 4. Other raw layouts, in files of any name, by ``columns`` and ``dtype``; a fifth column is then the
-    time lag, but in a ``.pcd.bin`` it stays the ring. ``.npy`` and ``.npz`` (one array, or one named ``points``):
-    N x 3 to 6. ``.pcd``: by its header. ``.feather`` (Argoverse 2): columns x, y, z, intensity, laser_number.
+    ``.pcd.bin`` (nuScenes): float32 x 5 with the intensity (0-255) and the ring. ``.bin`` (KITTI): float32 x 4.
+    ``columns`` and ``dtype`` give another raw layout, for any file name; its fifth column is the time lag, except
+    in a ``.pcd.bin``, where it stays the ring. ``.npy`` and ``.npz`` (one array, or one named ``points``): N x 3
+    to 6. ``.pcd``: by its header. ``.feather`` (Argoverse 2): columns x, y, z, intensity, laser_number.
 
-    A size cannot tell four from five columns, so a raw file is also refused when its values do not look like
-    metres, or when another layout fits them clearly better.
+    The size of a raw file cannot distinguish four from five columns, so the file is also refused if its values do
+    not look like metres, or if another layout fits them clearly better.
 
     Args:
-        sensor: scales the intensity, but that of ``.pcd.bin``, and says whether a laser number is needed.
-        columns: values a point in a raw file, 3 to 6.
+        path: the file.
+        sensor: scales the intensity, except in ``.pcd.bin``, and tells whether laser numbers are needed.
+        columns: values per point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
-        max_points: a larger cloud is refused, by its header or its size and so before it takes memory.
+        max_points: larger clouds are refused by their header or size, before they take memory.
 
     Returns:
         f32[n, c]: x, y, z (metres, the file's frame), intensity (0-255), time lag (seconds), and the laser number
-        for sensors whose rows come from it. Missing intensity and lag are 0. Rows keep the file's order;
-        non-finite values stay, to be dropped and counted by the projection.
+        for sensors whose rows come from it. Missing intensity and lag are 0. The row order is the file's;
+        non-finite values are kept, and dropped and counted by the projection.
 
     Raises:
-        ValueError: naming the file, the field, what was found and what was expected.
+        ValueError: with the file, the field, the found and the expected value.
 
     >>> import tempfile
     >>> from fcos_lidar_jax.sensors import KITTI_HDL64E
@@ -82,7 +83,7 @@ def read_points(
     content = _read_whole(path, max_points)
     if kind == ".pcd":
         try:
-            table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_A_POINT)
+            table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_PER_POINT)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return assemble_points(path, sensor, table)
@@ -94,19 +95,20 @@ def read_points(
     rows = _read_raw(path, content, columns, dtype)
     if kind != ".pcd.bin":
         return points_from_array(rows, sensor, str(path))
-    sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # The format's intensities are 0-255, as nuScenes'.
+    sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # the format's intensities are already 0-255
     return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
 def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") -> np.ndarray:
-    """The points of an array, in the columns that :func:`read_points` returns.
+    """Convert an array to the columns that :func:`read_points` returns.
 
     Args:
         array: [n, 3 to 6]: x, y, z, intensity, time lag, laser number.
-        where: what to call the array in messages.
+        sensor: as in :func:`read_points`.
+        where: name of the array for error messages.
 
     Raises:
-        ValueError: another shape or type, or a fifth column of whole numbers above 1, which is a ring.
+        ValueError: wrong shape or type, or a fifth column of whole numbers above 1, which is a ring.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> points_from_array(np.array([[8, 1, -1]]), TINY).tolist()
@@ -129,16 +131,17 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
 
 
 def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_POINTS) -> dict[str, np.ndarray]:
-    """Columns of an Apache Feather file (version 2); needs the extra ``argoverse2``.
+    """Read columns of an Apache Feather file (version 2); needs the extra ``argoverse2``.
 
     Args:
-        kinds: column -> NumPy's letters of the types that will do: ``"fiu"`` numbers, ``"iu"`` whole ones, ``"O"``
+        path: the file.
+        kinds: column -> NumPy's letters of the allowed types: ``"fiu"`` numbers, ``"iu"`` whole numbers, ``"O"``
             texts.
-        max_rows: a longer table is refused.
+        max_rows: longer tables are refused.
 
     Raises:
-        ValueError: not such a file, a column that is missing, of another type or without a value in some row, or
-            pyarrow is not installed.
+        ValueError: not a Feather file, a column is missing, has another type or a row without a value, or pyarrow
+            is not installed.
     """
     try:
         import pyarrow
@@ -148,37 +151,35 @@ def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_PO
     content = _read_whole(path, max_rows)
     try:
         return _read_columns(pyarrow, content, kinds, max_rows)
-    except Exception as error:  # damaged files raise what Arrow likes: of its own, of the system, of texts
+    except Exception as error:  # corrupt files raise arbitrary exceptions
         raise ValueError(f"{path}: not a readable .feather file: {' '.join(str(error).split())}") from None
 
 
 def _read_columns(pyarrow: Any, content: bytes, kinds: Mapping[str, str], max_rows: int) -> dict[str, np.ndarray]:
-    reader, batches, num_rows, found = pyarrow.ipc.open_file(content), [], 0, {}
+    reader, batches, num_rows, columns = pyarrow.ipc.open_file(content), [], 0, {}
     for i in range(reader.num_record_batches):
         batches.append(reader.get_batch(i))
         num_rows += batches[-1].num_rows
         if num_rows > max_rows:
-            raise ValueError(f"got more than {max_rows} rows, expected at most as many")
+            raise ValueError(f"got more than {max_rows} rows, expected at most {max_rows}")
     table = pyarrow.Table.from_batches(batches, reader.schema)
     for name, kind in kinds.items():
         if table.column_names.count(name) != 1:
             raise ValueError(f"got columns {', '.join(table.column_names)}, expected one {name}")
         column = table.column(name)
-        column.validate(full=True)  # offsets and lengths, which a crafted file may have wrong
-        found[name] = column.to_numpy()
-        fits = found[name].dtype.kind in kind and (
-            kind != "O" or all(isinstance(text, str) for text in found[name])
-        )
+        column.validate(full=True)  # crafted files may contain wrong offsets and lengths
+        columns[name] = values = column.to_numpy()
+        fits = values.dtype.kind in kind and (kind != "O" or all(isinstance(text, str) for text in values))
         if column.null_count or not fits:
             got = f"{column.null_count} rows without a value" if column.null_count else column.type
             expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
             raise ValueError(f"{name}: got {got}, expected {expected}")
-    return found
+    return columns
 
 
 def _read_whole(path: Path, max_points: int) -> bytes:
-    """The bytes of a file that may be one cloud's."""
-    limit = max_points * BYTES_A_POINT + _HEADER_BYTES
+    """The bytes of a file, which may be at most as large as a cloud."""
+    limit = max_points * BYTES_PER_POINT + _HEADER_BYTES
     try:
         size = path.stat().st_size
         if size > limit:
@@ -192,7 +193,7 @@ def _read_whole(path: Path, max_points: int) -> bytes:
 
 
 def _kind(path: Path, *, raw: bool) -> str:
-    """What a file's name says it is; with ``raw`` any other name is that of a raw file."""
+    """The file's extension among :data:`ENDINGS`; with ``raw`` any other name counts as ``.bin``."""
     if os.path.isdir(path):
         raise ValueError(f"{path}: found a folder, expected a point file")
     if not os.path.isfile(path):
@@ -202,8 +203,8 @@ def _kind(path: Path, *, raw: bool) -> str:
             return ending
     if raw:
         return ".bin"
-    expected = f"expected {', '.join(ENDINGS)}, or the columns and dtype of a raw file"
-    raise ValueError(f"{path}: unknown extension {path.suffix!r}, {expected}")
+    expected = f"{', '.join(ENDINGS)}, or the columns and dtype of a raw file"
+    raise ValueError(f"{path}: unknown extension {path.suffix!r}, expected {expected}")
 
 
 def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarray:
@@ -212,8 +213,8 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
     hint += "" if better is None or better[1] == dtype else f" as {better[1]}"
     size, row = len(content), columns * np.dtype(dtype).itemsize
     if size % row:
-        layout = f"{row} ({columns} {dtype} values a point)"
-        cause = f"truncated, or another layout{hint}, to be named by columns and dtype"
+        layout = f"{row} ({columns} {dtype} values per point)"
+        cause = f"truncated, or another layout{hint}: name it by columns and dtype"
         raise ValueError(f"{path}: got {size} bytes, not a multiple of {layout}: {cause}")
     if better is not None or _plausible_share(content, columns, dtype) < 0.5:
         raise ValueError(
@@ -224,7 +225,7 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
 
 
 def _better_layout(content: bytes, columns: int, dtype: str) -> tuple[int, str] | None:
-    """Columns and number type that fit the content clearly better than those in use."""
+    """Columns and number type that fit the content clearly better than the given ones."""
     layouts = [(c, d) for d in _RAW_DTYPES for c in _RAW_COLUMNS if len(content) % (c * np.dtype(d).itemsize) == 0]
     divides, share, contrast = (columns, dtype) in layouts, 0.0, 0.0
     if divides:
@@ -236,7 +237,7 @@ def _better_layout(content: bytes, columns: int, dtype: str) -> tuple[int, str] 
             continue
         other_contrast = _column_contrast(content, *layout)
         clearer = other_contrast > contrast + _MARGIN
-        # Halves of misread numbers stand out as columns too: another number type must have the better metres.
+        # Halves of misread numbers also stand out as columns, so another number type must give better metres.
         if other_share > share + _MARGIN if divides and not (clearer and layout[1] == dtype) else clearer:
             better[layout] = other_share + other_contrast
     return max(better, key=better.__getitem__, default=None)
@@ -249,7 +250,7 @@ def _inspected(content: bytes, columns: int, dtype: str) -> np.ndarray:
 
 
 def _plausible_share(content: bytes, columns: int, dtype: str) -> float:
-    """Part of the finite rows whose metres and intensity look like a LiDAR's."""
+    """Share of the finite rows with plausible metres and intensity."""
     rows = _inspected(content, columns, dtype)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if not len(rows):
@@ -263,10 +264,10 @@ def _plausible_share(content: bytes, columns: int, dtype: str) -> float:
 
 
 def _column_contrast(content: bytes, columns: int, dtype: str) -> float:
-    """How much the columns differ: the part of the values' variance, or of their magnitudes', between columns.
+    """Share of the variance of the values, or of their magnitudes, that lies between columns.
 
-    Abscissa, height, intensity and ring have each their own mean or spread. Another number of columns deals the
-    values out among all columns, which then look alike: 0.3 and more turns into 0.00.
+    Coordinates, intensity and ring each have their own mean or spread. A wrong number of columns mixes all of them
+    in every column: a share of 0.3 or more drops to 0.00.
     """
     rows = _inspected(content, columns, dtype)
     if rows.size < _MIN_VALUES:
@@ -286,33 +287,33 @@ def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.nd
         if len(names) != 1 and "points" not in names:
             raise ValueError(f"got arrays {', '.join(names) or 'none'}, expected one, or one named points")
         name = "points" if "points" in names else names[0]
-        max_bytes = max_points * BYTES_A_POINT
+        max_bytes = max_points * BYTES_PER_POINT
         return parse_npz(content, [name], max_rows=max_points, max_bytes=max_bytes)[name]
     except ValueError as error:
         raise ValueError(f"{path}: not a readable {kind} file: {error}") from None
 
 
 def assemble_points(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The columns that :func:`read_points` returns from named ones: x, y, z, intensity, time_lag, laser.
+    """Combine the columns x, y, z, intensity, time_lag and laser to the array that :func:`read_points` returns.
 
     Raises:
-        ValueError: naming ``where``: no points, a negative lag, laser numbers that are missing or none.
+        ValueError: with ``where``: no points, a negative lag, or missing or invalid laser numbers.
     """
     number = len(table["x"])
     if number == 0:
         raise ValueError(f"{where}: no points in it, expected at least one")
     points = np.zeros((number, sensor.point_columns), np.float32)
-    # What is too large becomes infinite, and is dropped with the other non-finite values.
+    # Values too large for float32 become infinite, and are dropped with other non-finite values.
     with np.errstate(over="ignore", invalid="ignore"):
         for i, name in enumerate(("x", "y", "z", "intensity", "time_lag")):
             if name in table:
                 points[:, i] = table[name]
         points[:, 3] *= np.float32(sensor.intensity_scale)
-        points *= np.float32(1)  # signalling NaNs, which would make noise later, become quiet ones
+        points *= np.float32(1)  # turns signalling NaNs, which would raise warnings later, into quiet ones
     negative = np.flatnonzero(points[:, 4] < 0)
     if len(negative):
-        found = f"{points[negative[0], 4]:g} in row {negative[0]}"
-        raise ValueError(f"{where}: time_lag: got {found}, expected seconds of at least 0")
+        lag = f"{points[negative[0], 4]:g} in row {negative[0]}"
+        raise ValueError(f"{where}: time_lag: got {lag}, expected seconds of at least 0")
     if sensor.row_source == "laser":
         points[:, 5] = _laser_numbers(where, sensor, table)
     return points
@@ -325,6 +326,6 @@ def _laser_numbers(where: Path | str, sensor: Sensor, table: Mapping[str, np.nda
     laser = table["laser"].astype(np.float64)
     bad = np.flatnonzero(np.isfinite(laser) & ((laser < 0) | (laser >= sensor.num_rows) | (laser % 1 != 0)))
     if len(bad):
-        found, expected = f"{laser[bad[0]]:g} in row {bad[0]}", f"whole numbers of 0 to {sensor.num_rows - 1}"
-        raise ValueError(f"{where}: laser number: got {found}, expected {expected}")
+        expected = f"whole numbers of 0 to {sensor.num_rows - 1}"
+        raise ValueError(f"{where}: laser number: got {laser[bad[0]]:g} in row {bad[0]}, expected {expected}")
     return laser

@@ -1,7 +1,7 @@
-"""Recordings of ROS 1, ROS 2 and MCAP: the clouds of a topic, with poses of odometry or transforms.
+"""Recordings of ROS 1, ROS 2 and MCAP: the clouds of a topic, with poses from odometry or transforms.
 
-Messages are read with the definitions that rosbags brings along; those that a recording holds, which it would
-translate into Python, are left alone.
+Messages are read with the definitions of rosbags. Definitions in a recording are ignored, since rosbags would
+translate them into Python code.
 """
 
 import contextlib
@@ -23,10 +23,10 @@ from fcos_lidar_jax.sensors import Sensor
 _CLOUD = ("sensor_msgs/msg/PointCloud2",)
 _POSE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_MAX_LISTED = 20  # topics in a message
+_MAX_LISTED = 20  # topics listed in a message
 
 _PoseAt = Callable[[str, int, str], np.ndarray]
-"""(frame of a cloud, microseconds, what to call the cloud) -> sensor to world, f64[4, 4]."""
+"""(frame of a cloud, microseconds, name of the cloud for messages) -> sensor to world, f64[4, 4]."""
 
 
 def is_ros_bag(path: Path) -> bool:
@@ -47,23 +47,25 @@ def ros_bag_drive(
     poses: Path | None = None,
     max_points: int = MAX_POINTS,
 ) -> Drive:
-    """The clouds of a recording, in the order in which they were recorded; needs the extra ``ros``.
+    """The clouds of a recording, in the order of recording; needs the extra ``ros``.
 
-    The time of a sweep is its header's stamp, rounded down to whole microseconds, as are those of poses. Poses are
-    interpolated by the rule of :class:`~fcos_lidar_jax.data.drives.PoseTrack`. Sweeps are not corrected for the
-    ego vehicle's motion within them: the times of their points are not read. Clouds before the first and after the
-    last pose are left out, which a note of the drive tells.
+    Times of sweeps and poses are their headers' stamps, rounded down to microseconds. Poses are interpolated by
+    :class:`~fcos_lidar_jax.data.drives.PoseTrack`. Sweeps are not corrected for motion of the ego vehicle within
+    them. Clouds before the first or after the last pose are skipped, with a note in the drive.
 
     Args:
-        topic: of the clouds (``PointCloud2``); may be left out where there is one.
+        path: the recording.
+        sensor: as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
+        topic: topic of the clouds (``PointCloud2``); may be omitted if there is only one.
         odometry: topic of ``Odometry``, ``PoseStamped`` or ``PoseWithCovarianceStamped``; or ``"tf"``: the
-            transforms from the frame of the cloud up to ``odom``, or to the last one. Odometry of another frame
-            than the cloud's, as its child frame says, is completed by the transforms between the two.
-        poses: instead, a file of lines for :func:`~fcos_lidar_jax.data.drives.read_tum`, of the cloud's frame.
-        max_points: a larger cloud is refused.
+            transforms from the cloud's frame up to ``odom``, or to the root. If odometry is of another frame than
+            the cloud's, as its child frame tells, the transforms between the two complete it.
+        poses: instead of odometry, a file for :func:`~fcos_lidar_jax.data.drives.read_tum` of the cloud's frame.
+        max_points: larger clouds are refused.
 
     Raises:
-        ValueError: here or on reading a cloud, naming recording, topic, what was found and what was expected.
+        ValueError: at the call or on reading a cloud, with the recording, the topic, the found and the expected
+            value.
     """
     with _Bag(path) as bag:
         clouds = bag.choose(topic, _CLOUD, "topic")
@@ -86,13 +88,13 @@ def ros_bag_drive(
         if len(outside) == number:
             raise outside[0]
         if outside:
-            notes.append(f"{len(outside)} clouds before the first or after the last pose were left out")
+            notes.append(f"{len(outside)} clouds before the first or after the last pose were skipped")
 
     return Drive(read(), posed=pose_at is not None, notes=notes)
 
 
 class _Bag(contextlib.AbstractContextManager):
-    """An open recording. Whatever the library raises of a damaged one becomes a line."""
+    """An open recording; exceptions about damaged content become one-line errors."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -120,12 +122,12 @@ class _Bag(contextlib.AbstractContextManager):
     def topics(self, types: tuple[str, ...]) -> list[str]:
         return sorted({topic for topic, kind in self.counts if kind in types})
 
-    def choose(self, wanted: str | None, types: tuple[str, ...], what: str) -> str:
-        """The topic of these types that is wanted, or the only one."""
+    def choose(self, name: str | None, types: tuple[str, ...], option: str) -> str:
+        """Check that the named topic has one of the types; without a name, the only topic that has."""
         fitting = self.topics(types)
-        if wanted is not None and wanted in fitting:
-            return wanted
-        if wanted is None and len(fitting) == 1:
+        if name is not None and name in fitting:
+            return name
+        if name is None and len(fitting) == 1:
             return fitting[0]
         names = " or ".join(kind.rpartition("/")[2] for kind in types)
         listed = [
@@ -134,12 +136,12 @@ class _Bag(contextlib.AbstractContextManager):
             if not fitting or kind in types
         ]
         more = [f"{len(listed) - _MAX_LISTED} more"] if len(listed) > _MAX_LISTED else []
-        there = ", ".join(listed[:_MAX_LISTED] + more) or "none"
-        found = f"{len(fitting)} of them and none named" if wanted is None else repr(wanted)
-        raise ValueError(f"{self.path}: {what}: got {found}, expected a topic of {names}; there are: {there}")
+        topics = ", ".join(listed[:_MAX_LISTED] + more) or "none"
+        found = f"{len(fitting)} topics and no name" if name is None else repr(name)
+        raise ValueError(f"{self.path}: {option}: got {found}, expected a topic of {names} among: {topics}")
 
     def messages(self, topic: str, types: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-        """What to call each message of a topic, and the message."""
+        """The messages of a topic, each with its name for error messages."""
         connections = [one for one in self._reader.connections if one.topic == topic and one.msgtype in types]
         raw, number = self._reader.messages(connections=connections), 0
         while True:
@@ -164,7 +166,7 @@ def _typestore(is_ros1: bool) -> Any:
     if not is_ros1:
         return get_typestore(Stores.LATEST)
     types = get_typestore(Stores.ROS1_NOETIC)
-    for kind in _TRANSFORMS:  # which rosbags does not bring along
+    for kind in _TRANSFORMS:  # missing in rosbags
         types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
     return types
 
@@ -173,13 +175,13 @@ def _typestore(is_ros1: bool) -> Any:
 def _refusing(where: str) -> Iterator[None]:
     try:
         yield
-    except Exception as error:  # damaged recordings raise what rosbags, SQLite, the unpackers and YAML like
+    except Exception as error:  # damaged recordings raise arbitrary exceptions of rosbags, SQLite, YAML, ...
         kind = "" if type(error).__module__.startswith("rosbags") else f"{type(error).__name__}: "
         raise ValueError(f"{where}: cannot be read: {kind}{printable(' '.join(str(error).split()))}") from None
 
 
 def _frame(name: str) -> str:
-    return name.removeprefix("/")  # ROS 1 wrote both
+    return name.removeprefix("/")  # ROS 1 writes names with and without the slash
 
 
 def _time_us(header: Any) -> int:
@@ -187,7 +189,7 @@ def _time_us(header: Any) -> int:
 
 
 def _poses(bag: _Bag, odometry: str | None, poses: Path | None) -> tuple[_PoseAt | None, list[str]]:
-    """Where the sensor was, None where nobody asked, and lines on what was assumed."""
+    """The sensor's poses, None without odometry and poses, and notes about assumptions."""
     if poses is not None:
         track = read_tum(poses)
         return lambda frame, time_us, where: track.at(time_us, f"{poses}: {where}"), []
@@ -205,23 +207,23 @@ def _poses(bag: _Bag, odometry: str | None, poses: Path | None) -> tuple[_PoseAt
         pose = track.at(time_us, f"{where}: {name}")
         return pose @ tree.between(child, frame, time_us, where) if child else pose
 
-    assumed = f"{name} does not say of which frame its poses are: taken for those of the clouds' frame"
+    assumed = f"{name} does not name the frame of its poses: assumed to be the clouds' frame"
     return to_world, [] if child else [assumed]
 
 
 def _read_odometry(bag: _Bag, topic: str) -> tuple[PoseTrack, str]:
-    """Poses of a topic, and of which frame they are: "" where the messages do not say."""
+    """Poses of a topic and their frame, "" if the messages do not name it."""
     rows, times, child = [], [], None
     for where, message in bag.messages(topic, _POSE):
         time_us = _time_us(message.header)
         if times and time_us <= times[-1]:
             raise ValueError(f"{where}: time: got {time_us} us after {times[-1]} us, expected a later one")
-        of = _frame(getattr(message, "child_frame_id", ""))
-        child = of if child is None else child
-        if of != child:
-            got, expected = printable(of), printable(child)
+        frame = _frame(getattr(message, "child_frame_id", ""))
+        child = frame if child is None else child
+        if frame != child:
+            got, expected = printable(frame), printable(child)
             raise ValueError(f"{where}: child_frame_id: got {got!r}, expected {expected!r} as before")
-        pose = getattr(message.pose, "pose", message.pose)  # within one with covariance, as in odometry
+        pose = getattr(message.pose, "pose", message.pose)  # poses with covariance are nested
         rows.append(_numbers(pose.orientation, pose.position))
         times.append(time_us)
     return make_track(times, rows, f"{bag.path}: {printable(topic)}"), child or ""

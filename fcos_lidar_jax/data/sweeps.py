@@ -1,4 +1,4 @@
-"""Several sweeps fused into the frame of the current one."""
+"""Fusion of several sweeps in the current sweep's frame."""
 
 import dataclasses
 import itertools
@@ -25,33 +25,34 @@ _Row = tuple[_Metres, _Metres, _Metres, _Metres]
 class Sweep:
     """One turn of a sensor."""
 
-    points: np.ndarray  # f32[n, c] in its own frame: x, y, z, intensity, (anything,) and what more there is
+    points: np.ndarray  # f32[n, c] in its own frame: x, y, z, intensity, (overwritten by the lag), more columns
     sensor_to_world: np.ndarray  # f64[4, 4] from that frame
-    time_us: int  # when it was taken
-    name: str = ""  # what messages and results call it
+    time_us: int
+    name: str = ""  # in messages and results
 
 
 class ListedSweep(msgspec.Struct):
     """An entry of a list of sweeps."""
 
     file: str  # point file, relative to the list's folder
-    timestamp_us: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # when it was taken
-    sensor_to_world: tuple[_Row, _Row, _Row, _Row]  # from its own frame
+    timestamp_us: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+    sensor_to_world: tuple[_Row, _Row, _Row, _Row]  # from the sweep's own frame
 
 
 def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) -> tuple[np.ndarray, int]:
-    """Sweeps in the frame of the first, which is the current one (paper, section 4).
+    """Fuse sweeps in the frame of the first, which is the current one (paper, section 4).
 
-    Poses are composed in float64 and times subtracted as whole microseconds; only the result is float32. The
-    current sweep's coordinates stay bit-identical.
+    Composes poses in float64 and subtracts times as whole microseconds; only the result is float32. The current
+    sweep's coordinates stay bit-identical.
 
     Args:
-        sweeps: the current one, then the others by age.
-        reading: which points on the ego vehicle are dropped. All given sweeps are fused.
+        sweeps: the current sweep, then the others by age; all of them are fused.
+        sensor: sensor that recorded the points.
+        reading: which points on the ego vehicle are dropped.
 
     Returns:
-        f32[n, c] with the time lag in seconds as fifth column, exactly 0 for the current sweep; and how many
-        points were dropped.
+        f32[n, c] with the time lag in seconds as fifth column, exactly 0 for the current sweep; and the number of
+        dropped points.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> there, before = np.eye(4), np.eye(4)
@@ -72,7 +73,7 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
             now_us, world_to_current = sweep.time_us, np.linalg.inv(sweep.sensor_to_world)
         else:
             motion = world_to_current @ sweep.sensor_to_world
-            # Rows beyond what a number can hold become infinite, and are removed with those that are.
+            # Coordinates may overflow to infinity; the cloud policy removes such rows.
             with np.errstate(over="ignore", invalid="ignore"):
                 points[:, :3] = points[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
         points[:, 4] = (now_us - sweep.time_us) / 1e6
@@ -89,17 +90,17 @@ def read_sweeps(
     dtype: str | None = None,
     max_points: int = MAX_POINTS,
 ) -> tuple[np.ndarray, int]:
-    """The fused cloud of a JSON list of sweeps, as :func:`fuse_sweeps` gives it.
+    """Fuse the sweeps of a JSON list; the result is that of :func:`fuse_sweeps`.
 
     Args:
         path: the JSON file, see :func:`read_list`.
-        reading: how many of the list to read at most, from the current one on, and without which points.
-        columns, dtype, max_points: of the files, as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
+        sensor: sensor that recorded the points.
+        reading: maximum number of sweeps, from the current one on, and which points are dropped.
+        columns, dtype, max_points: of raw files, as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
 
     Raises:
-        ValueError: naming the file, the entry, the field, what was found and what was expected.
+        ValueError: with the file, the entry, the field, the found and the expected value.
     """
-
     layout: dict[str, Any] = {"columns": columns, "dtype": dtype, "max_points": max_points}
 
     def read(index: int, each: ListedSweep) -> Sweep:
@@ -114,25 +115,23 @@ def read_sweeps(
 
 
 def read_list(path: Path) -> list[ListedSweep]:
-    """The sweeps of a JSON list ``[{"file", "timestamp_us", "sensor_to_world": 4x4}, ...]``.
+    """Read a JSON list ``[{"file", "timestamp_us", "sensor_to_world": 4x4}, ...]`` of sweeps.
 
-    The first entry is the current sweep, the others follow by age, the newest first.
+    The first entry is the current sweep; the others follow by age, newest first.
 
     Raises:
-        ValueError: naming the file, the entry, the field, what was found and what was expected.
+        ValueError: with the file, the entry, the field, the found and the expected value.
     """
     sweeps = read_entries(path)
     for index, (newer, sweep) in enumerate(itertools.pairwise(sweeps), 1):
         if sweep.timestamp_us >= newer.timestamp_us:
-            expected = f"less than {newer.timestamp_us}, that of the one before: the current sweep first"
-            raise ValueError(
-                f"{path}: $[{index}].timestamp_us: got {sweep.timestamp_us}, expected {expected}, then by age"
-            )
+            expected = f"less than {newer.timestamp_us} of the entry before: the current sweep first, then by age"
+            raise ValueError(f"{path}: $[{index}].timestamp_us: got {sweep.timestamp_us}, expected {expected}")
     return sweeps
 
 
 def read_entries(path: Path) -> list[ListedSweep]:
-    """As :func:`read_list`, in any order of time."""
+    """:func:`read_list` in any temporal order."""
     sweeps = read_json(path, Annotated[list[ListedSweep], msgspec.Meta(min_length=1)], what="sweeps")
     for index, sweep in enumerate(sweeps):
         where, pose = f"{path}: $[{index}]", np.array(sweep.sensor_to_world)
@@ -154,7 +153,7 @@ def is_rotation(matrix: np.ndarray) -> bool:
 
 
 def find_bad_pose(rotation: np.ndarray, translation: np.ndarray) -> tuple[int, str] | None:
-    """The first pose that cannot be one, and what is wrong with it; None where all can be.
+    """The row of the first invalid pose and its problem; None if all poses are valid.
 
     Args:
         rotation: f64[n, 4], quaternions w, x, y, z.
@@ -164,7 +163,7 @@ def find_bad_pose(rotation: np.ndarray, translation: np.ndarray) -> tuple[int, s
     (0, 'rotation: got [2.0, 0.0, 0.0, 0.0], expected a unit quaternion w, x, y, z')
     """
     near = (np.abs(translation) <= FARTHEST_M).all(axis=1)
-    with np.errstate(over="ignore"):  # an infinite length is none of a unit
+    with np.errstate(over="ignore"):  # lengths may overflow
         unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) < 1e-3
     for name, values, good, expected in (
         ("translation", translation, near, f"finite numbers of at most {FARTHEST_M:g} m"),
@@ -177,7 +176,7 @@ def find_bad_pose(rotation: np.ndarray, translation: np.ndarray) -> tuple[int, s
 
 
 def about_z(yaw_rad: float) -> np.ndarray:
-    """A rotation about z, counter-clockwise seen from above, as a pose f64[4, 4].
+    """A pose f64[4, 4] that rotates about z, counter-clockwise seen from above.
 
     >>> about_z(np.pi / 2)[:2, :2].round().tolist()
     [[0.0, -1.0], [1.0, 0.0]]
@@ -188,7 +187,7 @@ def about_z(yaw_rad: float) -> np.ndarray:
 
 
 def sensor_before_rotation(sensor: Sensor, yaw_rad: float) -> Sensor:
-    """The sensor in the frame that becomes its own by a rotation about z.
+    """The sensor as it is in the frame before a rotation about z.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> ahead = dataclasses.replace(TINY, origin_m=(0.0, 1.0, 2.0))
@@ -202,7 +201,7 @@ def sensor_before_rotation(sensor: Sensor, yaw_rad: float) -> Sensor:
 
 
 def turned(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Points f32[n, c] rotated by a pose f64[4, 4], whose translation does not count; the other columns stay.
+    """Rotate points f32[n, c] by a pose f64[4, 4] without its translation; other columns stay.
 
     >>> turned(np.array([[1, 0, 5, 9]], np.float32), about_z(np.pi / 2)).round(3).tolist()
     [[0.0, 1.0, 5.0, 9.0]]

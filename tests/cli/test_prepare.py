@@ -117,7 +117,7 @@ def test_an_index_of_changed_tables_is_rebuilt_with_a_message(root, tmp_path, ca
     capsys.readouterr()
     command(*prepare(copy, tmp_path / "i"))
     out, err = capsys.readouterr()
-    assert "sample_annotation.json: the index was made of another one" in err
+    assert "sample_annotation.json: the index was made from another table" in err
     assert json.loads(out)["annotations"] == 16 * SCENES - 1
     command(*prepare(copy, tmp_path / "new"))
     assert contents(tmp_path / "i") == contents(tmp_path / "new")

@@ -54,7 +54,7 @@ def test_other_names_have_a_line_each(poses):
     assert [(sweep.name[-5:], sweep.time_us) for sweep in sweeps] == [("a.npy", 0), ("b.npy", 400_000)]
     assert sweeps[1].sensor_to_world[0, 3] == 3
     np.save(poses / "clouds" / "c.npy", CLOUD)
-    with refused("poses.txt: got 2 poses for 3 clouds, expected one a cloud"):
+    with refused("poses.txt: got 2 poses for 3 clouds, expected one per cloud"):
         folder_drive(poses / "clouds", TINY, poses / "poses.txt")
 
 

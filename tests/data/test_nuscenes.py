@@ -274,7 +274,7 @@ def test_an_index_is_of_the_content_of_its_tables(made, tmp_path):
     text = table.read_text()
     table.write_text(text.replace('"size": [\n1.5', '"size": [\n2.5'))
     assert table.stat().st_size == len(text)
-    with refused("sample_annotation.json: the index was made of another one"):
+    with refused("sample_annotation.json: the index was made from another table"):
         NuScenes(root, VERSION, index=tmp_path / "index")
     table.write_text(text)  # other times, and in a copy other inodes, are no other content
     NuScenes(root, VERSION, index=tmp_path / "index")
@@ -310,7 +310,7 @@ def test_bad_roots_and_indexes_get_one_line(made, tmp_path):
     for message, changes in (
         ("index.json: format_version: got 99, expected 3: run prepare again", {"format_version": 99}),
         ("index.json: format: expected 'fcos", {"format": "pickle"}),
-        ("sample.json: the index was made of another one", {"tables": other}),
+        ("sample.json: the index was made from another table", {"tables": other}),
         ("index.json: $.columns: got 3, expected object: run prepare", {"columns": 3}),
     ):
         manifest.write_text(json.dumps({**record, **changes}))
@@ -323,7 +323,7 @@ def test_bad_roots_and_indexes_get_one_line(made, tmp_path):
     content[-1] ^= 1
     header = b"\x93NUMPY\x01\x00v\x00" + b"(" * 118
     for spoiled, message in (
-        (content, "other content than index.json tells"),
+        (content, "content differs from index.json"),
         (content[:99], "cannot be read"),
         (header + content[128:], "cannot be read"),
         (content.replace(b"(8, 3)", b"(9**9)").replace(b"(32, 3)", b"(9**9,)"), "cannot be read"),

@@ -231,7 +231,7 @@ def test_a_wrong_number_type_is_refused_by_name(tmp_path, points, stored, named)
             "a.bin",
             999,
             {},
-            "not a multiple of 16 (4 float32 values a point): truncated, or another layout, 5 columns",
+            "not a multiple of 16 (4 float32 values per point): truncated, or another layout, 5 columns",
         ),
         ("a.bin", 8, {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
         ("a.bin", 8, {"dtype": "int16"}, "dtype: got int16, expected float16"),

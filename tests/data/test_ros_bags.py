@@ -158,7 +158,7 @@ def test_poses_without_a_child_frame_are_the_sensors_own(tmp_path, kind):
     bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
     drive = ros_bag_drive(bag, TINY, odometry="/pose")
     [note] = drive.notes
-    assert note.startswith("/pose does not say of which frame its poses are")
+    assert note.startswith("/pose does not name the frame of its poses")
     expect_poses(drive, lambda s: matrix(*motion(s)))
 
 
@@ -217,7 +217,7 @@ def test_clouds_outside_of_the_poses_are_left_out_and_told(tmp_path):
     bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
     drive = ros_bag_drive(bag, TINY, odometry="/odom")
     assert [sweep.name[-1] for sweep in drive.sweeps] == ["1", "2"]
-    assert drive.notes == ["2 clouds before the first or after the last pose were left out"]
+    assert drive.notes == ["2 clouds before the first or after the last pose were skipped"]
     bag = write_recording(
         tmp_path / "b", "mcap", lambda make: drive_content(make, lambda make: list(poses(make))[:1])
     )
@@ -263,7 +263,7 @@ WRONG_DRIVES = {
     "another topic of odometry": (
         {"odometry": "/odm"},
         odometry((0, (0, 0, 0), NO_TURN)),
-        ("odometry: got '/odm', expected", "there are: /odom (nav_msgs/msg/Odometry, 1 messages)"),
+        ("odometry: got '/odm', expected", "among: /odom (nav_msgs/msg/Odometry, 1 messages)"),
     ),
     "a cloud's topic": (
         {"topic": "/tf_static"},
@@ -299,14 +299,14 @@ WRONG_DRIVES = {
         {"odometry": "/odom"},
         odometry(*((round(s * 1e9), (0, 0, 0), NO_TURN, "chassis") for s in POSES_S)),
         (
-            "/points: message 0: no transform from 'lidar' to 'chassis' in the recording",
-            "those of: imu, lidar, mount",
+            "/points: message 0: no transform from 'lidar' to 'chassis', expected one in",
+            "transforms of: imu, lidar, mount",
         ),
     ),
     "nothing that moves": (
         {"odometry": "tf"},
         lambda make: (),
-        ("/points: message 0: got the frames lidar -> mount -> base_link, expected one that moves, by /tf",),
+        ("/points: message 0: got the frames lidar -> mount -> base_link, expected one that moves in /tf",),
     ),
     "a gap in transforms": (
         {"odometry": "tf"},
@@ -321,7 +321,7 @@ WRONG_DRIVES = {
     "a circle": (
         {"odometry": "tf"},
         moving(("lidar", "base_link")),
-        ("a: tf: frame 'base_link' has itself among those that it is in, expected a tree",),
+        ("a: tf: frame 'base_link' is its own ancestor, expected a tree",),
     ),
 }
 
@@ -341,11 +341,11 @@ def test_several_topics_of_clouds_are_listed(tmp_path):
         lambda make: [("/front", make.cloud(1, POINTS)), ("/rear", make.cloud(1, POINTS)), ("/a", make.text(""))],
     )
     kind = "sensor_msgs/msg/PointCloud2, 1 messages"
-    with refused("topic: got 2 of them and none named, expected", f"there are: /front ({kind}), /rear ({kind})"):
+    with refused("topic: got 2 topics and no name, expected", f"among: /front ({kind}), /rear ({kind})"):
         ros_bag_drive(bag, TINY)
     assert len(list(ros_bag_drive(bag, TINY, topic="/rear").sweeps)) == 1
     bag = write_recording(tmp_path / "b", "sqlite", lambda make: [("/a", make.text(""))])
-    with refused("topic: got 0 of them and none named", "there are: /a (std_msgs/msg/String, 1 messages)"):
+    with refused("topic: got 0 topics and no name", "among: /a (std_msgs/msg/String, 1 messages)"):
         ros_bag_drive(bag, TINY)
     with refused("odometry: got 'tf', expected a topic of TFMessage"):
         ros_bag_drive(tmp_path / "a", TINY, topic="/rear", odometry="tf")

@@ -92,10 +92,10 @@ BAD_SWEEPS = {
     "last row": ([entry(sensor_to_world=[*EYE[:3], [1, 1, 1, 1]])], "$[0].sensor_to_world: last row: got (1.0, 1"),
     "scaled": ([entry(sensor_to_world=np.diag([2, 2, 2, 1.0]).tolist())], "not a rotation"),
     "mirrored": ([entry(sensor_to_world=np.diag([-1, 1, 1, 1.0]).tolist())], "not a rotation"),
-    "future": ([entry(), entry(timestamp_us=2)], "$[1].timestamp_us: got 2, expected less than 1, that of the"),
+    "future": ([entry(), entry(timestamp_us=2)], "$[1].timestamp_us: got 2, expected less than 1 of the entry"),
     "oldest first": (
         [entry(timestamp_us=9), entry(timestamp_us=1), entry(timestamp_us=8)],
-        "$[2].timestamp_us: got 8, expected less than 1, that of the one before: the current sweep first, then by",
+        "$[2].timestamp_us: got 8, expected less than 1 of the entry before: the current sweep first, then by",
     ),
     "twice": ([entry(timestamp_us=9), *2 * [entry(timestamp_us=1)]], "$[2].timestamp_us: got 1, expected less"),
 }

@@ -1,4 +1,4 @@
-"""From the official tables to an index: read, check, join."""
+"""Read, check and join the official tables to an index."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
@@ -12,34 +12,34 @@ from fcos_lidar_jax.data.nuscenes.index import Index
 from fcos_lidar_jax.data.nuscenes.tables import R, Row, TableError, read_table
 from fcos_lidar_jax.data.sweeps import find_bad_pose
 
-CHANNEL = "LIDAR_TOP"  # the one sensor that is kept
+CHANNEL = "LIDAR_TOP"  # the only sensor that is kept
 
-Report = Callable[[str, int], None]  # called with the file that is being read and the number of rows so far
+Report = Callable[[str, int], None]  # called with the file and the number of rows read so far
 
 Columns = dict[str, np.ndarray]
-_LOST = -2  # number of a row that a token refers to and that is not there
+_DANGLING = -2  # row number for a token that no row has
 
 
 class _Tables:
-    """Access to the tables of one folder, with the checks that all of them share."""
+    """The tables of one folder, with their common checks."""
 
     def __init__(self, folder: Path, report: Report) -> None:
         self.folder, self.report = folder, report
 
     def pieces(self, kind: type[R]) -> Iterator[list[R]]:
-        seen = 0
+        num_rows = 0
         for rows in read_table(self.folder, kind):
-            seen += len(rows)
-            self.report(kind.file, seen)
+            num_rows += len(rows)
+            self.report(kind.file, num_rows)
             yield rows
 
     def read(self, kind: type[R]) -> tuple[list[R], dict[str, int]]:
-        """All rows, and the number of each by its token."""
+        """All rows, and token -> row number."""
         rows = [row for piece in self.pieces(kind) for row in piece]
         return rows, self.number(rows, {})
 
     def number(self, rows: list[R], numbers: dict[str, int]) -> dict[str, int]:
-        """Token -> number of the row, continuing what is there."""
+        """Add rows to ``numbers``: token -> row number."""
         for row in rows:
             if row.token in numbers:
                 raise self.error(type(row), row.token, "token: occurs twice")
@@ -47,17 +47,17 @@ class _Tables:
         return numbers
 
     def find(self, numbers: dict[str, int], row: Row, field: str, token: str | None = None) -> int:
-        """The number of the row that a field's token refers to."""
-        wanted: str = getattr(row, field) if token is None else token
-        if wanted not in numbers:
-            raise self.error(type(row), row.token, _dangling(field, wanted))
-        return numbers[wanted]
+        """The number of the row to which a field's token refers."""
+        target: str = getattr(row, field) if token is None else token
+        if target not in numbers:
+            raise self.error(type(row), row.token, _dangling(field, target))
+        return numbers[target]
 
     def find_all(self, numbers: dict[str, int], rows: list[R], field: str, dtype: type) -> np.ndarray:
         return np.array([self.find(numbers, row, field) for row in rows], dtype)
 
     def check_poses(self, kind: type[Row], tokens: list[str], columns: Columns) -> None:
-        """Refuse poses that cannot be; normalise rotations to the last bit."""
+        """Refuse invalid poses, and normalise rotations to the last bit."""
         rotation = columns["rotation"]
         if (bad := find_bad_pose(rotation, columns["translation"])) is not None:
             raise self.error(kind, tokens[bad[0]], bad[1])
@@ -84,7 +84,7 @@ def build_index(folder: str | Path, report: Report = lambda name, rows: None) ->
         report: called after every piece of a table.
 
     Raises:
-        TableError: naming the file, the record, the field, what was found and what was expected.
+        TableError: with the file, the record, the field, the found and the expected value.
     """
     tables = _Tables(Path(folder), report)
     if not tables.folder.is_dir():
@@ -97,7 +97,7 @@ def build_index(folder: str | Path, report: Report = lambda name, rows: None) ->
 
 
 def _keyframes(tables: _Tables) -> Columns:
-    """Samples scene by scene, in the order of time."""
+    """Samples scene by scene, in temporal order."""
     scenes, scene_numbers = tables.read(kinds.Scene)
     samples, _ = tables.read(kinds.Sample)
     scene_of = tables.find_all(scene_numbers, samples, "scene_token", np.int32)
@@ -112,7 +112,7 @@ def _keyframes(tables: _Tables) -> Columns:
 
 
 def _sweeps(tables: _Tables, samples: dict[str, int]) -> Columns:
-    """The LiDAR's files with their poses, chained."""
+    """The LiDAR's sweeps with their poses, each linked to the sweep before it."""
     sensors, sensor_numbers = tables.read(kinds.SensorRow)
     mounts, mount_numbers = tables.read(kinds.CalibratedSensor)
     channels = [sensors[tables.find(sensor_numbers, mount, "sensor_token")].channel for mount in mounts]
@@ -161,24 +161,24 @@ def _check_path(tables: _Tables, row: kinds.SampleData) -> None:
 
 
 def _ego_poses(tables: _Tables, rows: list[kinds.SampleData]) -> Columns:
-    """The poses of the sweeps; those of the other sensors are skipped."""
-    wanted: dict[str, int] = {}
-    order = [wanted.setdefault(row.ego_pose_token, len(wanted)) for row in rows]
-    rotation, translation = np.full((len(wanted), 4), np.nan), np.full((len(wanted), 3), np.nan)
+    """The poses of the LiDAR's sweeps; poses of other sensors are skipped."""
+    numbers: dict[str, int] = {}
+    order = [numbers.setdefault(row.ego_pose_token, len(numbers)) for row in rows]
+    rotation, translation = np.full((len(numbers), 4), np.nan), np.full((len(numbers), 3), np.nan)
     for piece in tables.pieces(kinds.EgoPose):
         for pose in piece:
-            if (i := wanted.get(pose.token)) is not None:
+            if (i := numbers.get(pose.token)) is not None:
                 rotation[i], translation[i] = pose.rotation, pose.translation
     for row, i in zip(rows, order, strict=True):
         if np.isnan(rotation[i, 0]):
             raise tables.error(kinds.SampleData, row.token, _dangling("ego_pose_token", row.ego_pose_token))
     columns = {"rotation": rotation, "translation": translation}
-    tables.check_poses(kinds.EgoPose, list(wanted), columns)
+    tables.check_poses(kinds.EgoPose, list(numbers), columns)
     return {name: column[np.array(order, np.int64)] for name, column in columns.items()}
 
 
 def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray) -> Columns:
-    """Annotations in the order of their samples, with velocities."""
+    """Annotations with velocities, in the order of their samples."""
     categories, category_numbers = tables.read(kinds.Category)
     attributes, attribute_numbers = tables.read(kinds.Attribute)
     instances, instance_numbers = tables.read(kinds.Instance)
@@ -214,8 +214,8 @@ def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray)
     tables.check_poses(kinds.SampleAnnotation, tokens, columns)
     neighbours = []
     for field, linked in links.items():
-        neighbours.append(np.array([numbers.get(token, _LOST) if token else -1 for token in linked], np.int64))
-        for i in np.flatnonzero(neighbours[-1] == _LOST):
+        neighbours.append(np.array([numbers.get(token, _DANGLING) if token else -1 for token in linked], np.int64))
+        for i in np.flatnonzero(neighbours[-1] == _DANGLING):
             raise tables.error(kinds.SampleAnnotation, tokens[i], _dangling(field, linked[i]))
     sample = columns.pop("sample")
     columns["velocity"] = velocities(columns["translation"], sample_time_us[sample], *neighbours)
@@ -232,16 +232,16 @@ def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray)
 def velocities(translation: np.ndarray, time_us: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Velocity of every annotation from its neighbours in time.
 
-    The central difference where there are two neighbours at most 3 s apart, the one-sided where there is one at
-    most 1.5 s away, else unknown.
+    The central difference between two neighbours at most 3 s apart, or the one-sided difference to a single
+    neighbour at most 1.5 s away; otherwise unknown.
 
     Args:
         translation: f64[n, 3], metres.
         time_us: i64[n].
-        before, after: row of the same object's annotation before and after, -1 for none.
+        before, after: row of the same object's annotation before and after, -1 if there is none.
 
     Returns:
-        f64[n, 3] in m/s, NaN where unknown.
+        f64[n, 3] in m/s, NaN if unknown.
 
     >>> where, when = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([0, 500_000])
     >>> velocities(where, when, np.array([-1, 0]), np.array([1, -1]))[:, 0].tolist()
@@ -249,7 +249,7 @@ def velocities(translation: np.ndarray, time_us: np.ndarray, before: np.ndarray,
     """
     own = np.arange(len(translation))
     first, last = np.where(before < 0, own, before), np.where(after < 0, own, after)
-    # The official rounding, 0.2 microseconds off: the benchmark's velocity errors hang on it.
+    # The official rounding, 0.2 microseconds off: the benchmark's velocity errors depend on it.
     seconds = 1e-6 * time_us[last] - 1e-6 * time_us[first]
     longest = np.where((before >= 0) & (after >= 0), 3.0, 1.5)
     known = (seconds > 0) & (seconds <= longest)

@@ -1,4 +1,4 @@
-"""The tables boiled down to what a LiDAR detector needs: columns of arrays, saved once, opened in no time."""
+"""An index of the tables: the columns that a LiDAR detector needs, as arrays that open quickly."""
 
 import dataclasses
 import hashlib
@@ -20,8 +20,8 @@ _MANIFEST = "index.json"
 class Index:
     """All keyframes, LiDAR sweeps, poses and annotations of one version.
 
-    Rotations are unit quaternions w, x, y, z; translations in metres; times in microseconds. Samples are in the
-    order of their scenes and of time, annotations in the order of their samples.
+    Rotations are unit quaternions w, x, y, z; translations are in metres, times in microseconds. Samples are
+    sorted by scene and time, annotations by sample.
     """
 
     scene_name: np.ndarray  # str[scenes], in the order of the table
@@ -31,7 +31,7 @@ class Index:
     sample_time_us: np.ndarray  # i64[samples]
     sample_scene: np.ndarray  # i32[samples]: row of the scene
     sample_sweep: np.ndarray  # i32[samples]: row of the keyframe's own sweep
-    sample_first: np.ndarray  # i64[samples + 1]: where the annotations of each sample begin, and the last end
+    sample_first: np.ndarray  # i64[samples + 1]: first annotation of each sample, and the end of the last
     sweep_file: np.ndarray  # bytes[sweeps]: path below the data root
     sweep_time_us: np.ndarray  # i64[sweeps]
     sweep_previous: np.ndarray  # i32[sweeps]: the sweep before, -1 at the start of a scene
@@ -41,7 +41,7 @@ class Index:
     sensor_rotation: np.ndarray  # f64[sensors, 4]: sensor to ego
     sensor_translation: np.ndarray  # f64[sensors, 3]
     box_token: np.ndarray  # bytes[annotations]
-    box_instance: np.ndarray  # i32[annotations]: row of the instance; the same object through a scene
+    box_instance: np.ndarray  # i32[annotations]: row of the instance, one object in a scene
     box_category: np.ndarray  # i16[annotations]: row of the category
     box_attribute: np.ndarray  # i16[annotations]: row of the attribute, -1 for none
     box_translation: np.ndarray  # f64[annotations, 3]: centre, global frame
@@ -53,17 +53,18 @@ class Index:
 
 
 def _tables(folder: str | Path) -> dict[str, Path]:
-    """The tables of a version that there are."""
+    """The existing tables of a version."""
     files = (Path(folder) / kind.file for kind in TABLES)
     return {file.name: file for file in files if file.is_file()}
 
 
 def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
-    """Write an index; the manifest comes last, so a folder with one is whole.
+    """Write an index; the manifest is written last and marks a complete index.
 
     Args:
-        folder: for the columns and the manifest.
-        tables: ``ROOT/VERSION``, of which the index was made.
+        index: the index.
+        folder: destination of the columns and the manifest.
+        tables: ``ROOT/VERSION``, from which the index was made.
     """
     folder = Path(folder)
     states = {name: FileState.of(file) for name, file in _tables(tables).items()}
@@ -78,26 +79,26 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
 
 
 def has_index(folder: str | Path) -> bool:
-    """Whether a finished index is there, of whatever version."""
+    """Whether a folder contains a finished index, of any format version."""
     return (Path(folder) / _MANIFEST).is_file()
 
 
 def open_index(folder: str | Path, *, tables: str | Path) -> Index:
-    """Read an index and verify it: format, counts, hashes, and that it is of these tables.
+    """Read an index and verify its format, counts, checksums, and that it was made from these tables.
 
     Args:
-        folder: where :func:`save_index` wrote.
+        folder: a folder that :func:`save_index` wrote.
         tables: ``ROOT/VERSION``.
 
     Raises:
-        TableError: naming the file, the field, what was found and what was expected.
+        TableError: with the file, the field, the found and the expected value.
     """
     folder = Path(folder)
     manifest = _read_manifest(folder / _MANIFEST)
-    was, now = manifest.tables, _tables(tables)
-    for name in {**now, **was}:
-        if name not in was or name not in now or not was[name].holds(now[name]):
-            problem = f"the index was made of another one than that in {tables}: run prepare again"
+    indexed, present = manifest.tables, _tables(tables)
+    for name in {**present, **indexed}:
+        if name not in indexed or name not in present or not indexed[name].holds(present[name]):
+            problem = f"the index was made from another table than the one in {tables}: run prepare again"
             raise TableError(f"{folder / _MANIFEST}: {name}: {problem}")
     columns = {}
     for field in dataclasses.fields(Index):
@@ -108,7 +109,7 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
         except (OSError, ValueError) as error:
             raise TableError(f"{file}: cannot be read ({error}): run prepare again") from None
         if manifest.columns.get(field.name) != summary:
-            raise TableError(f"{file}: other content than {_MANIFEST} tells: run prepare again")
+            raise TableError(f"{file}: content differs from {_MANIFEST}: run prepare again")
         columns[field.name] = column
     return Index(**columns)
 
@@ -127,14 +128,13 @@ def _read_manifest(file: Path) -> _Manifest:
         raise TableError(f"{error}: run prepare again") from None
     if manifest.format != _FORMAT:
         raise TableError(f"{file}: format: expected {_FORMAT!r}")
-    if manifest.format_version != _FORMAT_VERSION:
-        found = manifest.format_version
-        raise TableError(f"{file}: format_version: got {found}, expected {_FORMAT_VERSION}: run prepare again")
+    if (version := manifest.format_version) != _FORMAT_VERSION:
+        raise TableError(f"{file}: format_version: got {version}, expected {_FORMAT_VERSION}: run prepare again")
     return manifest
 
 
 def column_checksums(index: Index) -> list[tuple[str, str]]:
-    """Name and checksum of every column, as the manifest of a saved index holds them."""
+    """Name and checksum of every column, as in the manifest of a saved index."""
     return [(name, _summary(column)["blake2b"]) for name, column in vars(index).items()]
 
 

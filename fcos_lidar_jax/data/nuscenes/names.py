@@ -1,4 +1,4 @@
-"""What nuScenes calls things, and what they are to a detector."""
+"""nuScenes' categories and their detection classes."""
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 
@@ -18,13 +18,13 @@ CATEGORY_TO_CLASS = {
     "movable_object.trafficcone": "traffic_cone",
     "movable_object.barrier": "barrier",
 }
-"""Category -> class; every other category, known or not, is background."""
+"""Category -> class; all other categories are background."""
 
-BICYCLE_RACK = "static_object.bicycle_rack"  # the evaluation leaves out what stands in one
+BICYCLE_RACK = "static_object.bicycle_rack"  # the evaluation ignores boxes in a rack
 
 
 def label_of(category: str) -> int:
-    """Index into the classes, -1 for a category that is none of them.
+    """Index of a category's class, -1 for background.
 
     >>> label_of("vehicle.bus.rigid"), label_of("animal")
     (2, -1)

@@ -1,4 +1,4 @@
-"""Keyframes of nuScenes: fused sweeps and boxes in the LiDAR frame (spec of the data set's official tables)."""
+"""nuScenes: keyframes with fused sweeps and boxes in the LiDAR frame, from the official tables."""
 
 import dataclasses
 import os
@@ -28,41 +28,41 @@ _COLUMNS = 5  # x, y, z, intensity, ring: float32 each
 
 @dataclasses.dataclass(frozen=True)
 class Boxes:
-    """The boxes of one keyframe in its LiDAR frame, the ten classes only, unpadded.
+    """The boxes of one keyframe in its LiDAR frame, only the ten classes, unpadded.
 
     >>> one = Boxes(np.zeros((1, 9)), np.zeros(1, int), np.ones(1, int), attributes=("",), tokens=("a1",))
     >>> one.boxes.shape, NUSCENES_CLASSES[one.labels[0]]
     ((1, 9), 'car')
     """
 
-    boxes: np.ndarray  # f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN velocity where unknown
+    boxes: np.ndarray  # f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN for unknown velocities
     labels: np.ndarray  # i32[m]: index into NUSCENES_CLASSES
     num_lidar_pts: np.ndarray  # i32[m]: points of the current sweep inside, counted with the full rotation
-    attributes: tuple[str, ...]  # attribute name of every box, '' for none
+    attributes: tuple[str, ...]  # attribute name of every box, '' for no attribute
     tokens: tuple[str, ...]  # annotation token of every box
 
 
 def default_index(root: str | Path, version: str) -> Path:
-    """Where an index is looked for, and written, unless another place is given."""
+    """The default folder of the index."""
     return Path(root) / ".fcos_lidar" / version
 
 
 class NuScenes:
     """One version of nuScenes, or of any data set in its layout.
 
-    Opens the index that ``fcos-lidar prepare`` wrote, or reads the tables where there is none. Immutable; threads
-    and processes may share it.
+    Opens the index of ``fcos-lidar prepare``, or reads the tables if there is no index. Immutable; threads and
+    processes may share it.
 
     Args:
-        root: holds the version's folder, ``samples/`` and ``sweeps/``.
+        root: contains the version's folder, ``samples/`` and ``sweeps/``.
         version: the folder of the tables, such as ``v1.0-trainval``.
-        index: of ``prepare``; by default ``ROOT/.fcos_lidar/VERSION``.
-        allow_missing_sweeps: older sweeps whose file is missing are left out instead of refused;
-            :meth:`missing_sweeps` counts them. The current sweep is never left out, but by :meth:`drive`.
-        follow_links: read files to which links lead outside of the root.
+        index: folder of the index; default: ``ROOT/.fcos_lidar/VERSION``.
+        allow_missing_sweeps: skip older sweeps with a missing file instead of refusing them;
+            :meth:`missing_sweeps` counts them. Only :meth:`drive` ever skips the current sweep.
+        follow_links: also read files outside the root to which links lead.
 
     Raises:
-        ValueError: naming the file, the record, the field, what was found and what was expected.
+        ValueError: with the file, the record, the field, the found and the expected value.
 
     >>> import tempfile
     >>> from fcos_lidar_jax.sensors import TINY
@@ -105,26 +105,26 @@ class NuScenes:
 
     @property
     def sample_tokens(self) -> list[str]:
-        """All keyframes, scene by scene, in the order of time."""
+        """All keyframes by scene and time."""
         return list(self._sample_row)
 
     def split(self, name: str, *, file: str | Path | None = None) -> list[str]:
-        """The keyframes of a split, scene by scene, in the order of time.
+        """The keyframes of a split by scene and time.
 
         Args:
-            name: of the split.
-            file: ``{"name": ["scene", ...]}``; by default the version's ``splits.json``, or the official names.
+            name: name of the split.
+            file: ``{"name": ["scene", ...]}``; default: the version's ``splits.json``, or the official splits.
 
         Raises:
-            ValueError: no such split, a scene that this version does not have, or no keyframe.
+            ValueError: no such split, an unknown scene, or no keyframe.
         """
         row = {str(scene): i for i, scene in enumerate(self.index.scene_name)}
-        wanted = scenes_of_split(name, self.tables, file=file)
-        for scene in wanted:
+        scenes = scenes_of_split(name, self.tables, file=file)
+        for scene in scenes:
             if scene not in row:
                 raise ValueError(f"split {name!r}: {scene}: no such scene in {self.tables / 'scene.json'}")
-        chosen = np.isin(self.index.sample_scene, [row[scene] for scene in wanted])
-        tokens = [token for token, yes in zip(self._sample_row, chosen, strict=True) if yes]
+        selected = np.isin(self.index.sample_scene, [row[scene] for scene in scenes])
+        tokens = [token for token, yes in zip(self._sample_row, selected, strict=True) if yes]
         if not tokens:
             raise ValueError(f"{self.tables}: split {name!r}: got no keyframe, expected at least one")
         return tokens
@@ -134,27 +134,27 @@ class NuScenes:
         return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
 
     def sweeps(self, sample_token: str, num: int = 10) -> np.ndarray:
-        """The nearest sweeps up to a keyframe as the official devkit fuses them, in its LiDAR frame.
+        """The latest sweeps up to a keyframe, fused in its LiDAR frame like in the official devkit.
 
-        The current sweep comes first, then the others by age; fewer at the start of a scene. All sweeps lose the
-        points on the ego vehicle, ``|x|, |y| < 1`` m in their own frame. Poses are composed in float64 and times
-        subtracted as whole microseconds.
+        The current sweep comes first, then the others by age; there are fewer at the start of a scene. Points on
+        the ego vehicle, ``|x|, |y| < 1`` m in each sweep's own frame, are dropped.
 
         Args:
-            num: sweeps at most, the current one included.
+            sample_token: the keyframe.
+            num: maximum number of sweeps, including the current one.
 
         Returns:
             f32[n, 5]: x, y, z, intensity (0-255), time lag in seconds, exactly 0 for the current sweep.
 
         Raises:
-            ValueError: a file that is missing, cut, empty, or not below the data root.
+            ValueError: a file is missing, truncated, empty, or outside the data root.
         """
         return self.fuse_sweeps(sample_token, CloudReading(num, "all"))[0]
 
     def fuse_sweeps(
         self, sample_token: str, reading: CloudReading, sensor: Sensor = NUSCENES_HDL32E
     ) -> tuple[np.ndarray, int]:
-        """As :meth:`sweeps`, read in another way, and how many points on the ego vehicle were dropped."""
+        """:meth:`sweeps` with another reading; also returns the number of dropped points on the ego vehicle."""
         chain = self._chain(sample_token, reading.num_sweeps)
         if self.allow_missing_sweeps:
             chain = [row for row in chain if row == chain[0] or os.path.isfile(self._path(row))]
@@ -163,10 +163,10 @@ class NuScenes:
         return fuse_sweeps(sweeps, sensor, reading)
 
     def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
-        """The sweeps of a scene in the order of time, read as they are asked for; only keyframes if so wished.
+        """The sweeps (or only keyframes) of a scene in temporal order, read on demand.
 
         Raises:
-            ValueError: no such scene, with the names that there are.
+            ValueError: no such scene; the message lists the scenes.
         """
         rows = self._keyframe_rows(scene)
         if not keyframes:
@@ -175,23 +175,18 @@ class NuScenes:
                 rows.append(following[rows[-1]])
             rows = self._chain_of(rows[-1], len(self.index.sweep_file))[::-1]
         if self.allow_missing_sweeps:
-            there = [row for row in rows if os.path.isfile(self._path(row))]
-            if not there:
+            present = [row for row in rows if os.path.isfile(self._path(row))]
+            if not present:
                 raise ValueError(f"{self.root}: scene {scene}: found no file of {len(rows)} sweeps, expected some")
-            rows = there
+            rows = present
         times = self.index.sweep_time_us
-        poses = map(self._sensor_to_global, rows)
         return (
-            Sweep(self._read(row), pose, int(times[row]), str(self._path(row)))
-            for row, pose in zip(rows, poses, strict=True)
+            Sweep(self._read(row), self._sensor_to_global(row), int(times[row]), str(self._path(row)))
+            for row in rows
         )
 
     def keyframe_times_us(self, scene: str) -> frozenset[int]:
-        """When the keyframes of a scene were taken.
-
-        Raises:
-            ValueError: as :meth:`drive`.
-        """
+        """Times of a scene's keyframes; errors as in :meth:`drive`."""
         return frozenset(self.index.sweep_time_us[self._keyframe_rows(scene)].tolist())
 
     def _keyframe_rows(self, scene: str) -> list[int]:
@@ -204,10 +199,10 @@ class NuScenes:
         return rows
 
     def boxes(self, sample_token: str) -> Boxes:
-        """The boxes of the ten classes in the keyframe's LiDAR frame, those without points included.
+        """The boxes of the ten classes in the keyframe's LiDAR frame, including boxes without points.
 
-        Boxes are upright in the global frame and slightly tilted in the LiDAR's, where the tilt is lost: yaw is
-        the direction of the heading axis after the full rotation.
+        Boxes are upright in the global frame and slightly tilted in the LiDAR frame. The tilt is lost: yaw is the
+        direction of the heading axis after the full rotation.
         """
         index, own = self.index, self.annotations(sample_token)
         labels = self._label[index.box_category[own]]
@@ -225,35 +220,35 @@ class NuScenes:
         return Boxes(boxes, labels, index.box_lidar_points[rows], attributes, tokens)
 
     def labels(self, sample_token: str) -> np.ndarray:
-        """i32[m]: labels of a keyframe's boxes that hold a LiDAR point."""
+        """i32[m]: labels of a keyframe's boxes with at least one LiDAR point."""
         own = self.annotations(sample_token)
         labels = self._label[self.index.box_category[own]]
         return labels[(labels >= 0) & (self.index.box_lidar_points[own] > 0)]
 
     def annotations(self, sample_token: str) -> slice:
-        """Rows of a keyframe's annotations in the index, of all categories."""
+        """Rows of a keyframe's annotations of all categories in the index."""
         first, last = self.index.sample_first[self._row(sample_token) :][:2]
         return slice(int(first), int(last))
 
     def missing_sweeps(self, sample_tokens: list[str], num: int = 10) -> int:
-        """How many sweep files of these keyframes are missing, each counted once."""
+        """Number of missing sweep files of some keyframes, each counted once."""
         rows = {row for token in sample_tokens for row in self._chain(token, num)}
         return sum(not os.path.isfile(self._path(row)) for row in rows)
 
     def sweep_files(self, sample_token: str, num: int = 10) -> list[Path]:
-        """Files of the sweeps up to a keyframe, the current one first, whether they are there or not."""
+        """Files of the sweeps up to a keyframe, the current one first, even if they are missing."""
         return [self._path(row) for row in self._chain(sample_token, num)]
 
     def sensor_to_global(self, sample_token: str) -> np.ndarray:
-        """f64[4, 4]: from a keyframe's LiDAR frame to the global frame."""
+        """f64[4, 4] from a keyframe's LiDAR frame to the global frame."""
         return self._sensor_to_global(self._sweep(sample_token))
 
     def time_us(self, sample_token: str) -> int:
-        """When a keyframe's own sweep was taken, microseconds."""
+        """Time of a keyframe's own sweep in microseconds."""
         return int(self.index.sweep_time_us[self._sweep(sample_token)])
 
     def ego_translation(self, sample_token: str) -> np.ndarray:
-        """f64[3]: where the ego vehicle is, global frame."""
+        """f64[3]: position of the ego vehicle in the global frame."""
         return self.index.ego_translation[self._sweep(sample_token)]
 
     def _row(self, sample_token: str) -> int:
@@ -268,7 +263,7 @@ class NuScenes:
         return self._chain_of(self._sweep(sample_token), num)
 
     def _chain_of(self, row: int, num: int) -> list[int]:
-        """A sweep and those before it, at most so many."""
+        """A sweep and the sweeps before it, at most ``num``."""
         chain = [row]
         while len(chain) < num and (before := int(self.index.sweep_previous[chain[-1]])) >= 0:
             chain.append(before)
@@ -285,19 +280,17 @@ class NuScenes:
     def _read(self, row: int) -> np.ndarray:
         path = self._path(row)
         if not os.path.isfile(path):
-            needed = self.allow_missing_sweeps or row in self.index.sample_sweep  # Keyframes are never left out.
+            needed = self.allow_missing_sweeps or row in self.index.sample_sweep  # keyframes are never skipped
             hint = "" if needed else "; --allow-missing-sweeps continues with fewer sweeps"
             raise ValueError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
         if not self.follow_links and not path.resolve().is_relative_to(self._base):
-            found = f"resolves to {path.resolve()}, expected a file below {self._base}"
-            raise ValueError(f"{path}: {found}; --follow-links allows links that lead out")
+            problem = f"resolves to {path.resolve()}, expected a file below {self._base}"
+            raise ValueError(f"{path}: {problem}; --follow-links allows links that lead out")
         size = path.stat().st_size
         if size == 0 or size % (4 * _COLUMNS) or size > 4 * _COLUMNS * MAX_POINTS:
             found = "an empty file" if size == 0 else f"{size} bytes"
-            raise ValueError(
-                f"{path}: got {found}, expected a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_POINTS} "
-                "points"
-            )
+            expected = f"a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_POINTS} points"
+            raise ValueError(f"{path}: got {found}, expected {expected}")
         return np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
 
 
@@ -308,7 +301,7 @@ class NuScenesFrames(FrameSet):
     nuscenes: NuScenes
     tokens: tuple[str, ...]  # keyframes, in order
     reading: CloudReading = CloudReading()
-    sensor: Sensor = NUSCENES_HDL32E  # whose points they are
+    sensor: Sensor = NUSCENES_HDL32E
     classes = NUSCENES_CLASSES
 
     def __len__(self) -> int:
@@ -319,9 +312,8 @@ class NuScenesFrames(FrameSet):
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 
     def truth(self, index: int) -> Frame:
-        """As of any frame set; of the tables alone."""
-        found = self.nuscenes.boxes(self.tokens[index])
-        return Frame(no_points(self.sensor), found.boxes, found.labels, found.num_lidar_pts)
+        boxes = self.nuscenes.boxes(self.tokens[index])
+        return Frame(no_points(self.sensor), boxes.boxes, boxes.labels, boxes.num_lidar_pts)
 
     def labels(self, index: int) -> np.ndarray:
         return self.nuscenes.labels(self.tokens[index])
@@ -358,7 +350,7 @@ def open_keyframes(
     splits: str | Path | None = None,
     **options: Any,
 ) -> NuScenesFrames:
-    """The keyframes of a split, or all; ``splits`` is a file of own ones, ``options`` are of :class:`NuScenes`."""
+    """Open the keyframes of a split, or all; ``splits`` is a file of own splits, ``options`` go to NuScenes."""
     data = NuScenes(root, version, **options)
     tokens = data.sample_tokens if split is None else data.split(split, file=splits)
     return NuScenesFrames(data, tuple(tokens), reading, sensor)

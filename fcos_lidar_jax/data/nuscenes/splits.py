@@ -1,4 +1,4 @@
-"""Which scenes are trained on and which are tested."""
+"""Scenes of the training and test splits."""
 
 import ast
 import importlib.util
@@ -7,21 +7,22 @@ from pathlib import Path
 from fcos_lidar_jax.files import read_json
 
 OFFICIAL = ("train", "val", "test", "mini_train", "mini_val")
-"""Names that the official devkit defines; it lists their scenes in its source."""
+"""Splits of the official devkit, which lists their scenes in its source."""
 
 
 def scenes_of_split(split: str, tables: str | Path, *, file: str | Path | None = None) -> list[str]:
     """Scene names of a split.
 
-    Looked for in the file that is given, or else in the version's own ``splits.json``, or else, for the official
-    names, in the source of an installed devkit, which is read and never imported.
+    Reads the given file or else the version's own ``splits.json``. Official splits are also looked up in the
+    source of an installed devkit, which is parsed and never imported.
 
     Args:
+        split: name of the split.
         tables: ``ROOT/VERSION``.
         file: ``{"name": ["scene", ...]}``.
 
     Raises:
-        ValueError: there is no such split, or it has no scene.
+        ValueError: the split is unknown or has no scene.
     """
     path = Path(tables) / "splits.json" if file is None else Path(file)
     splits = own_splits(tables, file)
@@ -30,7 +31,7 @@ def scenes_of_split(split: str, tables: str | Path, *, file: str | Path | None =
         splits = _devkit_splits()
         places.insert(0, "the source of an installed nuscenes-devkit")
     if split not in splits:
-        hint = "a file {name: [scene, ...]} can be given"
+        hint = "you can pass a file {name: [scene, ...]}"
         raise ValueError(f"split {split!r}: not found in {' or in '.join(places)}; {hint}")
     if not splits[split]:
         raise ValueError(f"{path}: {split}: got no scene, expected at least one")
@@ -38,7 +39,7 @@ def scenes_of_split(split: str, tables: str | Path, *, file: str | Path | None =
 
 
 def own_splits(tables: str | Path, file: str | Path | None = None) -> dict[str, list[str]]:
-    """The splits of a file, or of the version's own ``splits.json``; none where there is no such file."""
+    """The splits in a file, by default the version's own ``splits.json``; empty if that is missing."""
     path = Path(tables) / "splits.json" if file is None else Path(file)
     if file is None and not path.is_file():
         return {}
@@ -46,9 +47,9 @@ def own_splits(tables: str | Path, file: str | Path | None = None) -> dict[str, 
 
 
 def _devkit_splits() -> dict[str, list[str]]:
-    """The lists assigned in the devkit's ``utils/splits.py``, empty where no devkit is installed."""
-    found = importlib.util.find_spec("nuscenes")
-    folders = list(found.submodule_search_locations or ()) if found else []
+    """The official splits in the devkit's ``utils/splits.py``; empty if no devkit is installed."""
+    spec = importlib.util.find_spec("nuscenes")
+    folders = list(spec.submodule_search_locations or ()) if spec else []
     files = [file for folder in folders if (file := Path(folder) / "utils" / "splits.py").is_file()]
     if not files:
         return {}

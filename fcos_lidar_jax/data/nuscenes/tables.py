@@ -1,7 +1,7 @@
 """The official JSON tables, read as streams of validated rows.
 
-Two of them have 2.6 million rows in the full data set, of which one in eight is needed: a table is decoded piece
-by piece, so that no more than a piece is ever in memory as objects.
+Two tables of the full data set have 2.6 million rows, of which one in eight is needed. Tables are decoded in
+pieces, so that only one piece at a time is in memory as objects.
 """
 
 import mmap
@@ -22,7 +22,7 @@ _BETWEEN_ROWS = re.compile(rb"\}(\s*),(\s*)\{")
 
 
 class TableError(ValueError):
-    """A table that cannot be used; the message names the file, the record and the field."""
+    """An unusable table; the message names the file, the record and the field."""
 
 
 class Row(msgspec.Struct, gc=False):
@@ -33,14 +33,14 @@ class Row(msgspec.Struct, gc=False):
 
 
 class Category(Row):
-    """What kinds of objects there are."""
+    """A kind of objects."""
 
     file = "category.json"
     name: str
 
 
 class Attribute(Row):
-    """What objects may be doing."""
+    """What an object is doing."""
 
     file = "attribute.json"
     name: str
@@ -54,7 +54,7 @@ class SensorRow(Row):
 
 
 class CalibratedSensor(Row):
-    """Where a sensor is mounted: sensor to ego."""
+    """A sensor's pose on the vehicle: sensor to ego."""
 
     file = "calibrated_sensor.json"
     sensor_token: str
@@ -78,14 +78,14 @@ class Sample(Row):
 
 
 class Instance(Row):
-    """One object through a scene."""
+    """One object in a scene."""
 
     file = "instance.json"
     category_token: str
 
 
 class EgoPose(Row):
-    """Ego to global."""
+    """A pose of the ego vehicle: ego to global."""
 
     file = "ego_pose.json"
     translation: Vector
@@ -93,7 +93,7 @@ class EgoPose(Row):
 
 
 class SampleData(Row):
-    """One file of one sensor."""
+    """A file of a sensor."""
 
     file = "sample_data.json"
     sample_token: str
@@ -106,7 +106,7 @@ class SampleData(Row):
 
 
 class SampleAnnotation(Row):
-    """One box in the global frame; size is width, length, height."""
+    """A box in the global frame; its size is width, length, height."""
 
     file = "sample_annotation.json"
     sample_token: str
@@ -124,18 +124,19 @@ class SampleAnnotation(Row):
 R = TypeVar("R", bound=Row)
 
 TABLES: tuple[type[Row], ...] = tuple(Row.__subclasses__())
-"""The tables that a LiDAR detector needs, of the thirteen."""
+"""The tables that a LiDAR detector needs, of thirteen."""
 
 
 def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) -> Iterator[list[R]]:
-    """The rows of a table in their order, a piece at a time.
+    """Read the rows of a table in order, one piece at a time.
 
     Args:
+        folder: folder of the tables.
         kind: one of :data:`TABLES`.
-        piece_bytes: a piece is the rows of about so much text.
+        piece_bytes: approximate size of a piece's text.
 
     Raises:
-        TableError: the table is missing, not JSON, or a row has not the fields of ``kind``.
+        TableError: the table is missing or not JSON, or a row lacks fields of ``kind``.
     """
     path = folder / kind.file
     if not path.is_file():
@@ -144,16 +145,16 @@ def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) 
         raise TableError(f"{path}: empty file, expected a JSON list")
     decoder = msgspec.json.Decoder(list[kind])
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text:
-        seen = 0
+        num_rows = 0
         for first, last in _pieces(text, piece_bytes):
             piece = (b"" if first == 0 else b"[") + text[first:last] + (b"" if last == len(text) else b"]")
-            rows = _decode(path, decoder, piece, seen, first - (first > 0))
-            seen += len(rows)
+            rows = _decode(path, decoder, piece, num_rows, first - (first > 0))
+            num_rows += len(rows)
             yield rows
 
 
 def _pieces(text: mmap.mmap, size: int) -> Iterator[tuple[int, int]]:
-    """Spans of whole rows: rows are flat objects, so they meet at ``}, {``."""
+    """Spans of whole rows. Rows are flat objects, so ``}, {`` separates them."""
     first = 0
     while first + size < len(text):
         between = _BETWEEN_ROWS.search(text, first + size)  # type: ignore[arg-type]
@@ -164,13 +165,13 @@ def _pieces(text: mmap.mmap, size: int) -> Iterator[tuple[int, int]]:
     yield first, len(text)
 
 
-def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, seen: int, offset: int) -> list:
-    """A piece's rows; an error tells its place in the whole file."""
+def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, first_row: int, offset: int) -> list:
+    """A piece's rows; errors name their place in the whole file."""
     try:
         return decoder.decode(piece)
     except msgspec.ValidationError as error:
         text, _, place = str(error).rpartition(" - at `")
-        place = re.sub(r"\$\[(\d+)\]", lambda match: f"$[{int(match[1]) + seen}]", place.rstrip("`"))
+        place = re.sub(r"\$\[(\d+)\]", lambda match: f"$[{int(match[1]) + first_row}]", place.rstrip("`"))
         raise TableError(f"{path}: {place or '$'}: {text or error}") from None
     except msgspec.DecodeError as error:
         at = re.search(r"byte (\d+)", str(error))
@@ -182,7 +183,7 @@ def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, seen: int, 
 
 
 def _record_at(piece: bytes, place: int) -> str:
-    """Which record and field a byte belongs to, as far as the text before it tells."""
+    """The record and field of a byte, as far as the text before it tells."""
     row = piece[piece.rfind(b"{", 0, place) + 1 : place]
     tokens = re.findall(rb'"token"\s*:\s*"([^"]*)"', row)
     fields = re.findall(rb'"(\w+)"\s*:', row)
