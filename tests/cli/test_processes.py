@@ -311,26 +311,19 @@ def test_data_that_one_process_cannot_open_end_both(root, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture(scope="module")
-def two_devices(root, tmp_path_factory) -> list[dict]:
-    """Metrics of one process with two devices."""
-    out = tmp_path_factory.mktemp("devices") / "run"
-    ((code, _, errors),) = ended([start(train(root, out), JAX_NUM_CPU_DEVICES="2")])
-    assert code == 0, errors
-    return read_metrics(out)
-
-
 _NOT_SHARED = {"seconds", "waiting_seconds", "samples_per_second"}
 _NOT_SHARED |= {"pasted_objects", "truncated_points", "truncated_boxes", "invalid_points"}  # per process
 
 
-def test_two_processes_train_like_one_with_two_devices(root, two_devices, tmp_path):
+def test_two_processes_train_like_one_with_two_devices(root, tmp_path):
+    ((code, _, errors),) = ended([start(train(root, tmp_path / "alone"), JAX_NUM_CPU_DEVICES="2")])
+    assert code == 0, errors
     first, second = ended(start_two("coordinator", *[train(root, tmp_path / "run")] * 2))
     assert (first[0], second[0]) == (0, 0), first[2] + second[2]
     metrics = read_metrics(tmp_path / "run")
     assert len(metrics) == STEPS + 1
     assert (tmp_path / "run" / "objects" / "manifest.json").is_file()
-    for line, expected in zip(metrics, two_devices, strict=True):
+    for line, expected in zip(metrics, read_metrics(tmp_path / "alone"), strict=True):
         assert line.keys() == expected.keys()
         for name in line.keys() - _NOT_SHARED:
             assert line[name] == pytest.approx(expected[name], rel=1e-4), name
