@@ -80,14 +80,7 @@ def measure(
 ) -> dict[str, Any]:
     """Times of the stages, of the whole path, and of batches.
 
-    Args:
-        detector: from a checkpoint or an exported file.
-        files: point files; empty for simulated clouds, which are not read from disk.
-        batch: batch sizes; empty for the default.
-        repeats: turns of every stage.
-
-    Raises:
-        ValueError: a file cannot be read, or an exported detector does not accept a batch size.
+    Without files the clouds are simulated, and reading is not timed. Without sizes the default sizes are timed.
     """
     sensor = detector.sensor
     read = functools.partial(read_points, sensor=sensor)

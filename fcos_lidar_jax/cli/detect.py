@@ -78,10 +78,8 @@ def run(args: Detect) -> None:
     num_sweeps = detector.config.num_sweeps
     for file, parts in inputs.items():
         if len(parts) > num_sweeps:
-            print(
-                f"{file}: fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained",
-                file=sys.stderr,
-            )
+            line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
+            print(f"{file}: {line}", file=sys.stderr)
     clouds = _clouds(args, inputs, detector)
     states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
     with _resume_log(args, detector) as log:

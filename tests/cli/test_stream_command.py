@@ -50,10 +50,10 @@ def home(tmp_path_factory):
     for name, poses in (("backwards", listed[::-1]), ("short", listed[:-1])):
         (folder / f"{name}.json").write_text(json.dumps(poses))
     invalid = {
-        "gap": f"{lines[1]}\n1800000000 0 0 0 0 0 0 1",
-        "twice": f"{lines[1]}\n{lines[1]}",
+        "gap": f"{lines[0]}\n1800000000 0 0 0 0 0 0 1",
+        "twice": f"{lines[0]}\n{lines[0]}",
         "words": "1 2 3",
-        "long": f"{lines[1]}\n1800000000 0 0 0 0 0 0 7",
+        "long": f"{lines[0]}\n1800000000 0 0 0 0 0 0 7",
         "none": "# nothing",
         "late": "1 0 0 0 0 0 0 1",
     }
