@@ -13,7 +13,7 @@ from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import assert_one_line_error, child_environment, command, in_use
+from commands import assert_one_line_error, child_environment, command, in_use, mistakes
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
@@ -91,33 +91,26 @@ def test_a_coordinator_has_a_host_and_a_port(place):
         check_processes(options)
 
 
-BAD = {
-    "half a cluster": ("--num-processes 2", "expected all or none"),
-    "no process": ("--coordinator localhost:1 --num-processes 0 --process-index 0", "--num-processes: got 0"),
-    "process": (
-        "--coordinator localhost:1 --num-processes 2 --process-index 2",
-        "--process-index: got 2, expected 0 to 2 excluded",
-    ),
-    "no launcher": ("--distributed", "--distributed: found no launcher .* expected Slurm, Open MPI or a TPU pod"),
-}
-OF_EVALUATE = {
-    "results": ("--distributed --results x", "--results: got several processes, expected one"),
-    "backend": (
-        "--distributed --backend openvino",
-        "--backend: got openvino with several processes, expected xla",
-    ),
-}
+BAD = mistakes(r"""
+--num-processes 2 => expected all or none
+--coordinator localhost:1 --num-processes 0 --process-index 0 => --num-processes: got 0
+--coordinator localhost:1 --num-processes 2 --process-index 2 => --process-index: got 2, expected 0 to 2 excluded
+--distributed => --distributed: found no launcher .* expected Slurm, Open MPI or a TPU pod
+""")
+OF_EVALUATE = mistakes(r"""
+--distributed --results x => --results: got several processes, expected one
+--distributed --backend openvino => --backend: got openvino with several processes, expected xla
+""")
 
 
-@pytest.mark.parametrize("name", [*BAD, *OF_EVALUATE])
-def test_options_that_cannot_work_get_one_line(tmp_path, capsys, name, monkeypatch):
-    line, message = (BAD | OF_EVALUATE)[name]
+@pytest.mark.parametrize(("line", "message"), [*BAD, *OF_EVALUATE])
+def test_mistakes_get_one_line(tmp_path, capsys, line, message, monkeypatch):
     # JAX is in use already in these tests, and would complain about that first.
     monkeypatch.setattr(jax.distributed, "initialize", jax._src.distributed.global_state.initialize)
     evaluate = ["evaluate", "--format", "simulated", "--out", str(tmp_path / "out"), *line.split()]
-    evaluate += [] if name == "results" else ["--checkpoint", "quickstart"]
+    evaluate += [] if "--results" in line else ["--checkpoint", "quickstart"]
     train = ["train", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out"), *line.split()]
-    for args in (evaluate,) if name in OF_EVALUATE else (evaluate, train):
+    for args in (evaluate,) if (line, message) in OF_EVALUATE else (evaluate, train):
         assert_one_line_error(capsys, args, message)
     assert list(tmp_path.iterdir()) == []
 

@@ -30,6 +30,12 @@ def page_content(path: Path) -> dict[str, Any]:
     return json.loads(match[1])
 
 
+def mistakes(table: str) -> list[tuple[str, str]]:
+    """Parameters of a test from lines ``arguments => pattern of the error message``."""
+    rows = (line.partition("=> ") for line in table.strip("\n").splitlines())
+    return [(arguments.strip(), message) for arguments, _, message in rows]
+
+
 def assert_one_line_error(capsys, args: list[str], message: str) -> None:
     """Assert that the command fails with one line on standard error, which matches a pattern."""
     capsys.readouterr()
