@@ -49,12 +49,20 @@ def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
     check_writable(out)
 
 
-def check_outside(option: str, out: Path | None, checkpoint: Path) -> None:
+def check_outside(option: str, out: Path, checkpoint: Path) -> None:
     """Reject an output inside of the checkpoint's folder, over an exported file, or with the checkpoint's name."""
-    if out is None:
-        return
     place = out.resolve()
     if find_checkpoint(checkpoint).resolve() in (place, *place.parents):
         raise ValueError(f"{option}: {out}: inside of the checkpoint, expected a path elsewhere")
     if place == checkpoint.resolve() and not checkpoint.exists():  # a later command would take it for the detector
         raise ValueError(f"{option}: {out}: the name of the checkpoint, expected another one")
+
+
+def check_outputs(checkpoint: Path, keep: Iterable[Path], **outputs: Path | None) -> None:
+    """Check output files with :func:`check_outside` and :func:`check_out_file`; all of them must differ."""
+    kept = list(keep)
+    for field, out in outputs.items():
+        if out is not None:
+            check_outside(option_name(field), out, checkpoint)
+            check_out_file(option_name(field), out, kept)
+            kept.append(out)
