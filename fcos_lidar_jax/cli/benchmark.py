@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_file, check_outside
+from fcos_lidar_jax.cli.checks import check_at_least, check_outputs
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.clouds import find_clouds
@@ -59,9 +59,7 @@ def run(args: Benchmark) -> None:
     if any(size < 1 for size in args.batch):
         raise ValueError(f"--batch: got {min(args.batch)}, expected at least 1")
     files = find_clouds(args.files)
-    if args.out is not None:
-        check_out_file("--out", args.out, keep=files)
-    check_outside("--out", args.out, args.checkpoint)
+    check_outputs(args.checkpoint, files, out=args.out)
     detector = load_detector(args.checkpoint, backend=args.backend)
     record = {
         "checkpoint": str(args.checkpoint),
@@ -80,14 +78,7 @@ def measure(
 ) -> dict[str, Any]:
     """Times of the stages, of the whole path, and of batches.
 
-    Args:
-        detector: from a checkpoint or an exported file.
-        files: point files; empty for simulated clouds, which are not read from disk.
-        batch: batch sizes; empty for the default.
-        repeats: turns of every stage.
-
-    Raises:
-        ValueError: a file cannot be read, or an exported detector does not accept a batch size.
+    Without files the clouds are simulated, and reading is not timed. Without sizes the default sizes are timed.
     """
     sensor = detector.sensor
     read = functools.partial(read_points, sensor=sensor)

@@ -1,4 +1,4 @@
-"""Checks that several commands make before they begin to work."""
+"""Checks that several commands make before they begin to work. Each raises ValueError or OSError."""
 
 import math
 from collections.abc import Iterable
@@ -19,11 +19,7 @@ def option_name(field: str) -> str:
 
 
 def check_at_least(args: object, least: int, *fields: str) -> None:
-    """Reject numbers below a bound; None passes.
-
-    Raises:
-        ValueError: naming the option, its value and the bound.
-    """
+    """Reject numbers below a bound; None passes."""
     for field in fields:
         value = getattr(args, field)
         if value is not None and value < least:
@@ -39,50 +35,34 @@ def check_score_and_angle(args: Any) -> None:
 
 
 def check_out_folder(out: Path, option: str = "--out") -> None:
-    """Reject a path that cannot be a folder to write to.
-
-    Raises:
-        ValueError: it is a file.
-        OSError: it cannot be written to.
-    """
+    """Reject a file, and a folder that cannot be written to."""
     if out.exists() and not out.is_dir():
         raise ValueError(f"{option}: {out}: found a file, expected a folder")
     check_writable(out / ".lock")
 
 
 def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
-    """Reject a path to which no file can be written.
-
-    Args:
-        option: its name as it is typed.
-        out: its value.
-        keep: other files that the command reads or writes.
-
-    Raises:
-        ValueError: the path is one of ``keep``.
-        OSError: it is a folder, a device or a link, or cannot be written.
-    """
+    """Reject an output that is one of the files to ``keep``, is not a regular file, or cannot be written."""
     for other in keep:
         if out.resolve() == other.resolve() or (out.exists() and other.exists() and out.samefile(other)):
             raise ValueError(f"{option}: {out}: the same file as {other}, expected another one")
     check_writable(out)
 
 
-def check_outside(option: str, out: Path | None, checkpoint: Path) -> None:
-    """Reject an output inside of the checkpoint's folder, over an exported file, or with the checkpoint's name.
-
-    Args:
-        option: its name as it is typed.
-        out: its value, if any.
-        checkpoint: a path or a name, see :func:`find_checkpoint`.
-
-    Raises:
-        ValueError: naming the option and the path.
-    """
-    if out is None:
-        return
+def check_outside(option: str, out: Path, checkpoint: Path) -> None:
+    """Reject an output inside of the checkpoint's folder, over an exported file, or with the checkpoint's name."""
     place = out.resolve()
     if find_checkpoint(checkpoint).resolve() in (place, *place.parents):
         raise ValueError(f"{option}: {out}: inside of the checkpoint, expected a path elsewhere")
     if place == checkpoint.resolve() and not checkpoint.exists():  # a later command would take it for the detector
         raise ValueError(f"{option}: {out}: the name of the checkpoint, expected another one")
+
+
+def check_outputs(checkpoint: Path, keep: Iterable[Path], **outputs: Path | None) -> None:
+    """Check output files with :func:`check_outside` and :func:`check_out_file`; all of them must differ."""
+    kept = list(keep)
+    for field, out in outputs.items():
+        if out is not None:
+            check_outside(option_name(field), out, checkpoint)
+            check_out_file(option_name(field), out, kept)
+            kept.append(out)

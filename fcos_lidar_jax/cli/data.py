@@ -104,11 +104,7 @@ class DataOptions:
 
 
 def read_class_map(file: Path | None) -> ClassMap | None:
-    """Read a JSON file that renames classes; None stays None.
-
-    Raises:
-        ValueError: naming the file.
-    """
+    """Read a JSON file that renames classes; None stays None."""
     return None if file is None else read_json(file, dict[str, str | None], what="a translation of class names")
 
 

@@ -17,6 +17,7 @@ from fcos_lidar_jax.cli.checks import (
     check_at_least,
     check_out_file,
     check_out_folder,
+    check_outputs,
     check_outside,
     check_score_and_angle,
 )
@@ -78,10 +79,8 @@ def run(args: Detect) -> None:
     num_sweeps = detector.config.num_sweeps
     for file, parts in inputs.items():
         if len(parts) > num_sweeps:
-            print(
-                f"{file}: fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained",
-                file=sys.stderr,
-            )
+            line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
+            print(f"{file}: {line}", file=sys.stderr)
     clouds = _clouds(args, inputs, detector)
     states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
     with _resume_log(args, detector) as log:
@@ -108,14 +107,12 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
         inputs = {args.sweeps: tuple(args.sweeps.parent / each.file for each in read_list(args.sweeps))}
     read = [*inputs, *itertools.chain.from_iterable(inputs.values())]
     log = _log_file(args)
-    check_out_file("--out", args.out, keep=read)
+    check_outputs(args.checkpoint, read, out=args.out)
     check_out_file("--out", log, keep=read)
-    if args.page is not None:
-        check_out_file("--page", args.page, keep=(*read, args.out, log))
+    check_outputs(args.checkpoint, [*read, args.out, log], page=args.page)
     if args.pictures is not None:
+        check_outside("--pictures", args.pictures, args.checkpoint)
         check_out_folder(args.pictures, "--pictures")
-    for name, out in (("--out", args.out), ("--page", args.page), ("--pictures", args.pictures)):
-        check_outside(name, out, args.checkpoint)
     return inputs
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_out_file, check_outside
+from fcos_lidar_jax.cli.checks import check_outputs
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import load_trained
@@ -39,8 +39,7 @@ class Export:
 def run(args: Export) -> None:
     """Export the detector, write the file, and print a record of it."""
     checkpoint = find_checkpoint(args.checkpoint)
-    check_out_file("--out", args.out, keep=())
-    check_outside("--out", args.out, args.checkpoint)
+    check_outputs(args.checkpoint, (), out=args.out)
     if args.network_only != (args.format == "onnx"):
         raise ValueError(
             "export: expected --network-only and --format onnx together: only the network has an ONNX form"

@@ -30,11 +30,7 @@ class ProcessOptions:
 
 
 def check_processes(options: ProcessOptions) -> None:
-    """Reject options that do not describe a process of a cluster.
-
-    Raises:
-        ValueError: naming the option, its value and what was expected.
-    """
+    """Raise ValueError for options that do not describe a process of a cluster."""
     check_at_least(options, 1, "num_processes")
     given = [value is not None for value in (options.coordinator, options.num_processes, options.process_index)]
     if any(given) and not all(given):

@@ -14,13 +14,7 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import (
-    check_at_least,
-    check_out_file,
-    check_outside,
-    check_score_and_angle,
-    option_name,
-)
+from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score_and_angle, option_name
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
@@ -165,7 +159,7 @@ class _Timing(contextlib.AbstractContextManager):
 
     def __init__(self) -> None:
         self._reading, self._to_boxes, self._writing = list[float](), list[float](), list[float]()
-        self._read, self._programs, self._until = list[float](), 0, list[int]()
+        self._read, self._programs, self._programs_by_sweep = list[float](), 0, list[int]()
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def __exit__(self, *error: object) -> None:
@@ -182,17 +176,17 @@ class _Timing(contextlib.AbstractContextManager):
             self._reading.append(sum(self._read))  # including sweeps that are only fused
             self._read.clear()
             yield found
-            self._until.append(self._programs)
+            self._programs_by_sweep.append(self._programs)
 
     def summary(self) -> str:
         """A line with the medians. The first sweep, which includes the compilation, is listed separately."""
-        number = len(self._until)
+        number = len(self._programs_by_sweep)
         if number < 2:
             return f"{number} sweeps"
         reading, to_boxes, writing = map(np.array, (self._reading, self._to_boxes, self._writing))
         stages = {"reading": reading, "detection": to_boxes - reading, "writing": writing}
         later = ", ".join(f"{np.median(s[1:]) * 1e3:.1f} ms {name}" for name, s in stages.items())
-        compilations = f"{self._until[-1] - self._until[0]} compilations"
+        compilations = f"{self._programs_by_sweep[-1] - self._programs_by_sweep[0]} compilations"
         first = f"the first, which compiles, {to_boxes[0] + writing[0]:.1f} s"
         return f"{number} sweeps: {first}; the others {later} (medians), {compilations}"
 
@@ -235,14 +229,9 @@ def _check(args: Stream) -> None:
     keep = [path for path in (args.source, args.poses) if path is not None and path.is_file()]
     if args.source is not None and args.source.is_dir():
         keep += [path for path in args.source.rglob("*") if path.name.lower().endswith(ENDINGS)]
-    for name, out in (("--out", args.out), ("--page", args.page), ("--rrd", args.rrd)):
-        check_outside(name, out, args.checkpoint)
-    check_out_file("--out", args.out, keep=keep)
-    if args.page is not None:
-        check_out_file("--page", args.page, keep=[*keep, args.out])
     if args.rrd is not None:
         check_rerun()
-        check_out_file("--rrd", args.rrd, keep=[*keep, args.out, *filter(None, [args.page])])
+    check_outputs(args.checkpoint, keep, out=args.out, page=args.page, rrd=args.rrd)
     args.out.parent.mkdir(parents=True, exist_ok=True)
 
 

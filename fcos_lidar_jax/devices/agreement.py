@@ -32,7 +32,7 @@ def agreed(failed: str) -> Iterator[None]:
         try:
             succeeded = multihost_utils.process_allgather(np.array(error is None))
             if error is None and not succeeded.all():
-                error = OSError(f"process {int(np.argmin(succeeded))}: {failed}, see what it says")
+                error = OSError(f"process {int(np.argmin(succeeded))}: {failed}, see its output")
         except Exception:  # Another process ended. The failure of this process, if any, says more.
             if error is None:
                 raise

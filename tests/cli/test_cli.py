@@ -11,7 +11,7 @@ from unittest.mock import Mock
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, page_content
+from commands import assert_one_line_error, command, mistakes, page_content
 from PIL import Image
 from tiny_run import TINY_CONFIG, bits, untrained
 
@@ -227,100 +227,66 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
 
 
 # Each with "--checkpoint HOME/checkpoint" for detect and "--out OUT" unless it says otherwise.
-BAD = {
-    "missing file": ("detect HOME/none.npy", "none.npy: no such file"),
-    "folder without clouds": ("detect HOME/nothing", "nothing: no point file in it"),
-    "empty file": ("detect HOME/empty.bin", "empty.bin: empty file"),
-    "truncated file": ("detect HOME/cut.pcd.bin", "cut.pcd.bin: .* not a multiple of 20"),
-    "angle": ("detect HOME/good.npy --yaw-deg nan", "--yaw-deg: got nan, expected an angle in degrees"),
-    "unknown extension": ("detect HOME/text.txt", "unknown extension '.txt'"),
-    "pickled array": ("detect HOME/pickled.npy", "pickled.npy: not a readable .npy"),
-    "one axis": ("detect HOME/flat.npy", "flat.npy: shape"),
-    "negative lag": ("detect HOME/future.npy", "future.npy: time_lag"),
-    "broken pcd": ("detect HOME/broken.pcd", "broken.pcd: not a PCD file"),
-    "out of range": ("detect HOME/away.npy", "away.npy: none of its .* points is usable"),
-    "nothing finite": ("detect HOME/all_nan.npy", r"all_nan.npy: none .*\(5 not finite"),
-    "good then bad": ("detect HOME/good.npy HOME/none.npy", "none.npy: no such file"),
-    "no input": ("detect", "expected either point files or --sweeps"),
-    "bad columns": ("detect HOME/empty.bin --columns 9", "columns: got 9"),
-    "columns of npy": ("detect HOME/good.npy --columns 5", "are for raw .bin files"),
-    "list of sweeps": ("detect HOME/s.json", "s.json: expected a point file, or --sweeps before a list of sweeps"),
-    "sweeps of no list": ("detect --sweeps HOME/good.npy", "good.npy: expected a file that ends in .json"),
-    "page on the log": (
-        "detect HOME/good.npy --out OUT --page OUT/../.out.resume_log",
-        "--page: .*the same file as",
-    ),
-    "missing sweeps": ("detect --sweeps HOME/s.json", "s.json: no such file"),
-    "no checkpoint": (
-        "detect HOME/good.npy --checkpoint HOME/none",
-        "none: found nothing, expected a checkpoint folder",
-    ),
-    "file for a checkpoint": (
-        "detect HOME/good.npy --checkpoint HOME/good.npy",
-        "found a file, expected a checkpoint folder",
-    ),
-    "folder without checkpoint": ("detect HOME/good.npy --checkpoint HOME", "no checkpoint.json in it"),
-    "checkpoint of another preset": (
-        "detect HOME/good.npy --checkpoint HOME/foreign",
-        r"foreign: params/.*: got \(.*\), expected \(.*\): the arrays are not",
-    ),
-    "damaged checkpoint": ("detect HOME/good.npy --checkpoint HOME/damaged", "damaged.*: damaged"),
-    "garbled description": ("detect HOME/good.npy --checkpoint HOME/garbled", "checkpoint.json: not JSON"),
-    "old format": ("detect HOME/good.npy --checkpoint HOME/old", "format: got 0, expected 3"),
-    "bad field": (
-        "detect HOME/good.npy --checkpoint HOME/fields",
-        "fields/checkpoint.json: damaged",
-    ),
-    "project missing": ("project HOME/none.bin", "none.bin: no such file"),
-    "project sensor": ("project HOME/good.npy --sensor sonar", "sonar: no such sensor"),
-    "project sensor file": ("project HOME/good.npy --sensor HOME/sensor.json", "sensor.json: .*: "),
-    "project rounds": ("project HOME/good.npy --rounds 0", "--rounds: got 0"),
-    "project away": ("project HOME/away.npy", "away.npy: none of its"),
-    "project laser": ("project HOME/good.npy --sensor argoverse2", "good.npy: no laser number"),
-    "project into a folder": ("project HOME/good.npy --out HOME", "found a folder"),
-    "detect into its input": ("detect HOME/good.npy --out HOME/good.npy", "--out: .*the same file as .*good.npy"),
-    "detect into its input by a link": ("detect HOME/good.npy --out HOME/link.json", "--out: .*the same file as"),
-    "detect into another link": ("detect HOME/none.npy --out HOME/link.json", "link.json: found a link to .*good"),
-    "detect into a device": ("detect HOME/none.npy --out /dev/null", "/dev/null: found a device or a pipe"),
-    "detect into a checkpoint": (
-        "detect HOME/none.npy --out HOME/checkpoint/boxes.json",
-        "--out: .*inside of the checkpoint",
-    ),
-    "pictures into a checkpoint": (
-        "detect HOME/none.npy --pictures HOME/checkpoint/pictures",
-        "--pictures: .*inside of the checkpoint",
-    ),
-    "synthesize for laser numbers": (
-        "synthesize --scenes 1 --sensor argoverse2",
-        "--sensor: got argoverse2, whose rows come from laser numbers",
-    ),
-    "detect below a file": (
-        "detect HOME/none.npy --out HOME/good.npy/x",
-        "good.npy: found a file, expected a fol",
-    ),
-    "pictures in a file": (
-        "detect HOME/none.npy --pictures HOME/good.npy",
-        "--pictures: .*: found a file, expect",
-    ),
-    "score beyond one": ("detect HOME/good.npy --min-score 50", "--min-score: got 50, expected a score of 0 to 1"),
-    "score that is none": ("detect HOME/good.npy --min-score nan", "--min-score: got nan, expected a score"),
-    "too many points": ("detect HOME/good.npy --max-file-points 10", r"good.npy: .*points, expected at most 10$"),
-    "picture into the image": (
-        "project HOME/good.npy --out OUT --png OUT",
-        "--png: .*out: the same file as .*out",
-    ),
-    "picture into the input": ("project HOME/good.npy --png HOME/good.npy", "--png: .*the same file as"),
-    "project too many points": ("project HOME/good.npy --max-file-points 10", "points, expected at most 10$"),
-    "demo into a file": ("demo --out HOME/good.npy", "--out: .*: found a file"),
-    "demo with fewer than no steps": ("demo --steps -1", "--steps: got -1"),
-    "demo of steps without training": ("demo --steps 5", "--steps: expected --train with it"),
-    "demo without a keyframe": ("demo --keyframes 0", "--keyframes: got 0"),
-}
+BAD = mistakes(r"""
+detect HOME/none.npy => none.npy: no such file
+detect HOME/nothing => nothing: no point file in it
+detect HOME/empty.bin => empty.bin: empty file
+detect HOME/cut.pcd.bin => cut.pcd.bin: .* not a multiple of 20
+detect HOME/good.npy --yaw-deg nan => --yaw-deg: got nan, expected an angle in degrees
+detect HOME/text.txt => unknown extension '.txt'
+detect HOME/pickled.npy => pickled.npy: not a readable .npy
+detect HOME/flat.npy => flat.npy: shape
+detect HOME/future.npy => future.npy: time_lag
+detect HOME/broken.pcd => broken.pcd: not a PCD file
+detect HOME/away.npy => away.npy: none of its .* points is usable
+detect HOME/all_nan.npy => all_nan.npy: none .*\(5 not finite
+detect HOME/good.npy HOME/none.npy => none.npy: no such file
+detect => expected either point files or --sweeps
+detect HOME/empty.bin --columns 9 => columns: got 9
+detect HOME/good.npy --columns 5 => are for raw .bin files
+detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
+detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
+detect HOME/good.npy --out OUT --page OUT/../.out.resume_log => --page: .*the same file as
+detect --sweeps HOME/s.json => s.json: no such file
+detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a checkpoint folder
+detect HOME/good.npy --checkpoint HOME/good.npy => found a file, expected a checkpoint folder
+detect HOME/good.npy --checkpoint HOME => no checkpoint.json in it
+detect HOME/good.npy --checkpoint HOME/foreign => foreign: params/.*: got \(.*\), expected \(.*\): the arrays are
+detect HOME/good.npy --checkpoint HOME/damaged => damaged.*: damaged
+detect HOME/good.npy --checkpoint HOME/garbled => checkpoint.json: not JSON
+detect HOME/good.npy --checkpoint HOME/old => format: got 0, expected 3
+detect HOME/good.npy --checkpoint HOME/fields => fields/checkpoint.json: damaged
+project HOME/none.bin => none.bin: no such file
+project HOME/good.npy --sensor sonar => sonar: no such sensor
+project HOME/good.npy --sensor HOME/sensor.json => sensor.json: .*:
+project HOME/good.npy --rounds 0 => --rounds: got 0
+project HOME/away.npy => away.npy: none of its
+project HOME/good.npy --sensor argoverse2 => good.npy: no laser number
+project HOME/good.npy --out HOME => found a folder
+detect HOME/good.npy --out HOME/good.npy => --out: .*the same file as .*good.npy
+detect HOME/good.npy --out HOME/link.json => --out: .*the same file as
+detect HOME/none.npy --out HOME/link.json => link.json: found a link to .*good
+detect HOME/none.npy --out /dev/null => /dev/null: found a device or a pipe
+detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*inside of the checkpoint
+detect HOME/none.npy --pictures HOME/checkpoint/pictures => --pictures: .*inside of the checkpoint
+synthesize --scenes 1 --sensor argoverse2 => --sensor: got argoverse2, whose rows come from laser numbers
+detect HOME/none.npy --out HOME/good.npy/x => good.npy: found a file, expected a fol
+detect HOME/none.npy --pictures HOME/good.npy => --pictures: .*: found a file, expect
+detect HOME/good.npy --min-score 50 => --min-score: got 50, expected a score of 0 to 1
+detect HOME/good.npy --min-score nan => --min-score: got nan, expected a score
+detect HOME/good.npy --max-file-points 10 => good.npy: .*points, expected at most 10$
+project HOME/good.npy --out OUT --png OUT => --png: .*out: the same file as .*out
+project HOME/good.npy --png HOME/good.npy => --png: .*the same file as
+project HOME/good.npy --max-file-points 10 => points, expected at most 10$
+demo --out HOME/good.npy => --out: .*: found a file
+demo --steps -1 => --steps: got -1
+demo --steps 5 => --steps: expected --train with it
+demo --keyframes 0 => --keyframes: got 0
+""")
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_mistakes_get_one_line_and_leave_nothing(home, tmp_path, capsys, name):
-    line, message = BAD[name]
+@pytest.mark.parametrize(("line", "message"), BAD)
+def test_mistakes_get_one_line_and_leave_nothing(home, tmp_path, capsys, line, message):
     line += "" if "--out" in line else " --out OUT"
     line += " --checkpoint HOME/checkpoint" if line.startswith("detect") and "--checkpoint" not in line else ""
     args = line.replace("HOME", str(home)).replace("OUT", str(tmp_path / "out")).split()

@@ -9,7 +9,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, in_use, page_content
+from commands import assert_one_line_error, in_use, mistakes, page_content
 from made_evaluation import SPLIT, VERSION, make_task, truth_of, write_task
 from tiny_run import TINY_CONFIG, untrained
 
@@ -245,60 +245,35 @@ def test_a_folder_in_use_is_left_alone(home, tmp_path, what):
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
-TRUTH = "--ground-truth HOME/truth.json"
-MISTAKES = {
-    "neither": ("", "expected --checkpoint or --results"),
-    "no place": ("--results HOME/results.json", "expected --data-root, or --results with --ground-truth"),
-    "no such version": ("--results HOME/results.json --data-root HOME --version v2", "v2: no such folder"),
-    "checkpoint and truth": (f"--checkpoint x {TRUTH}", "a checkpoint needs --data-root"),
-    "truth and tables": (f"--results x --split val {TRUTH}", "--ground-truth: expected no data set with it"),
-    "class map and truth": (f"--results x --class-map y {TRUTH}", "--ground-truth: expected no data set with it"),
-    "class map and results": (
-        f"--results HOME/results.json --data-root HOME --version {VERSION} --class-map y",
-        "--class-map: expected none with a results file",
-    ),
-    "checkpoint and results": (
-        f"--results HOME/results.json --data-root HOME --version {VERSION} --checkpoint HOME/checkpoint",
-        "--results: got --checkpoint too, expected one of them for nuScenes",
-    ),
-    "no such truth": ("--results x --ground-truth HOME/none.json", "none.json: no such file"),
-    "no such results": (f"--results HOME/none.json {TRUTH}", "none.json: no such file"),
-    "other samples": (
-        f"--results HOME/results.json --data-root HOME --version {VERSION} --split other",
-        "split 'other': not found",
-    ),
-    "batch": (f"--results x {TRUTH} --batch-size 0", "--batch-size: got 0, expected at least 1"),
-    "bootstrap": (f"--results x {TRUTH} --bootstrap -1", "--bootstrap: got -1, expected at least 0"),
-    "no such sensor": (f"--results x {TRUTH} --sensor sonar", "sonar: no such sensor"),
-    "truth in the place of results": (
-        "--results HOME/results.json --ground-truth HOME/results_nusc.json --out HOME",
-        "--out: .*results_nusc.json: the same file as",
-    ),
-    "out into the checkpoint": (
-        f"--data-root HOME --version {VERSION} --checkpoint HOME/checkpoint --out HOME/checkpoint/scores",
-        "--out: .*inside of the checkpoint",
-    ),
-    "out of the detector's name": (
-        f"--data-root HOME --version {VERSION} --checkpoint quickstart --out quickstart",
-        "--out: quickstart: the name of the checkpoint, expected another one",
-    ),
-    "batches of results": (f"--results x {TRUTH} --batch-size 2", "--batch-size: got 2, expected none with --res"),
-    "backend of results": (
-        f"--results x {TRUTH} --backend openvino",
-        "--backend: got openvino, expected none",
-    ),
-    "version of simulated frames": (
-        "--format simulated --checkpoint HOME/checkpoint --version v1",
-        "version: got v1, expected none: simulated is of format simulated",
-    ),
-    "file for a folder": (f"--results x {TRUTH} --out HOME/truth.json", "--out: .*found a file"),
-}
+MISTAKES = mistakes(r"""
+=> expected --checkpoint or --results
+--results HOME/results.json => expected --data-root, or --results with --ground-truth
+--results HOME/results.json --data-root HOME --version v2 => v2: no such folder
+--checkpoint x --ground-truth HOME/truth.json => a checkpoint needs --data-root
+--results x --split val --ground-truth HOME/truth.json => --ground-truth: expected no data set with it
+--results x --class-map y --ground-truth HOME/truth.json => --ground-truth: expected no data set with it
+--results HOME/results.json DATA --class-map y => --class-map: expected none with a results file
+--results HOME/results.json DATA --checkpoint HOME/checkpoint => --results: got --checkpoint too, expected one of
+--results x --ground-truth HOME/none.json => none.json: no such file
+--results HOME/none.json --ground-truth HOME/truth.json => none.json: no such file
+--results HOME/results.json DATA --split other => split 'other': not found
+--results x --ground-truth HOME/truth.json --batch-size 0 => --batch-size: got 0, expected at least 1
+--results x --ground-truth HOME/truth.json --bootstrap -1 => --bootstrap: got -1, expected at least 0
+--results x --ground-truth HOME/truth.json --sensor sonar => sonar: no such sensor
+--results HOME/results.json --ground-truth HOME/results_nusc.json --out HOME => --out: .*results_nusc.json: the
+DATA --checkpoint HOME/checkpoint --out HOME/checkpoint/scores => --out: .*inside of the checkpoint
+DATA --checkpoint quickstart --out quickstart => --out: quickstart: the name of the checkpoint, expected another
+--results x --ground-truth HOME/truth.json --batch-size 2 => --batch-size: got 2, expected none with --res
+--results x --ground-truth HOME/truth.json --backend openvino => --backend: got openvino, expected none
+--format simulated --checkpoint HOME/checkpoint --version v1 => version: got v1, expected none: simulated is of
+--results x --ground-truth HOME/truth.json --out HOME/truth.json => --out: .*found a file
+""")
 
 
-@pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_get_one_line_and_leave_nothing(home, tmp_path, capsys, name):
-    line, message = MISTAKES[name]
+@pytest.mark.parametrize(("line", "message"), MISTAKES)
+def test_mistakes_get_one_line_and_leave_nothing(home, tmp_path, capsys, line, message):
     line += "" if "--out" in line else " --out OUT"
+    line = line.replace("DATA", f"--data-root HOME --version {VERSION}")
     args = line.replace("HOME", str(home)).replace("OUT", str(tmp_path / "out")).split()
     assert_one_line_error(capsys, ["evaluate", *args], message)
     assert list(tmp_path.iterdir()) == []

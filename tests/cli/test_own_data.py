@@ -59,7 +59,7 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
 
 def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_path, capsys):
     args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
-    args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--fade-epochs", "4", "--steps", "4"]
+    args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--steps", "4"]
     args += ["--copy-paste.targets", "2", "2", "2"]
     rejected = r"--sensor: got '\w+', expected none: .*/sensor.json has 'tiny'"
     for name, sensor, message in (

@@ -63,8 +63,8 @@ for i in range(3):
     began = time.monotonic()
     os.waitpid(start(f"whole-{i}"), 0)
     whole_s = min(whole_s, time.monotonic() - began)
-for trial in range(8):
-    for _ in range(1 + trial // 6):
+for trial in range(12):
+    for _ in range(1 + trial // 8):
         child = start(trial)
         time.sleep(draw.uniform(0.1, 1) * whole_s)
         os.kill(child, signal.SIGKILL)
@@ -79,7 +79,7 @@ def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     done = run_python("-c", KILLED, tmp_path / "killed", *prepare(root, tmp_path / "none"))
     assert done.returncode == 0, done.stderr
     states = set()
-    for trial in range(8):
+    for trial in range(12):
         folder = tmp_path / f"killed-{trial}"
         states.add(tuple(contents(folder)) if folder.exists() else ())
         command(*prepare(root, folder, *(["--workers", "2"] if trial == 0 else [])))

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import assert_one_line_error, child_environment, command, in_use
+from commands import assert_one_line_error, child_environment, command, in_use, mistakes
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
@@ -91,33 +91,26 @@ def test_a_coordinator_has_a_host_and_a_port(place):
         check_processes(options)
 
 
-BAD = {
-    "half a cluster": ("--num-processes 2", "expected all or none"),
-    "no process": ("--coordinator localhost:1 --num-processes 0 --process-index 0", "--num-processes: got 0"),
-    "process": (
-        "--coordinator localhost:1 --num-processes 2 --process-index 2",
-        "--process-index: got 2, expected 0 to 2 excluded",
-    ),
-    "no launcher": ("--distributed", "--distributed: found no launcher .* expected Slurm, Open MPI or a TPU pod"),
-}
-OF_EVALUATE = {
-    "results": ("--distributed --results x", "--results: got several processes, expected one"),
-    "backend": (
-        "--distributed --backend openvino",
-        "--backend: got openvino with several processes, expected xla",
-    ),
-}
+BAD = mistakes(r"""
+--num-processes 2 => expected all or none
+--coordinator localhost:1 --num-processes 0 --process-index 0 => --num-processes: got 0
+--coordinator localhost:1 --num-processes 2 --process-index 2 => --process-index: got 2, expected 0 to 2 excluded
+--distributed => --distributed: found no launcher .* expected Slurm, Open MPI or a TPU pod
+""")
+OF_EVALUATE = mistakes(r"""
+--distributed --results x => --results: got several processes, expected one
+--distributed --backend openvino => --backend: got openvino with several processes, expected xla
+""")
 
 
-@pytest.mark.parametrize("name", [*BAD, *OF_EVALUATE])
-def test_options_that_cannot_work_get_one_line(tmp_path, capsys, name, monkeypatch):
-    line, message = (BAD | OF_EVALUATE)[name]
+@pytest.mark.parametrize(("line", "message"), [*BAD, *OF_EVALUATE])
+def test_mistakes_get_one_line(tmp_path, capsys, line, message, monkeypatch):
     # JAX is in use already in these tests, and would complain about that first.
     monkeypatch.setattr(jax.distributed, "initialize", jax._src.distributed.global_state.initialize)
     evaluate = ["evaluate", "--format", "simulated", "--out", str(tmp_path / "out"), *line.split()]
-    evaluate += [] if name == "results" else ["--checkpoint", "quickstart"]
+    evaluate += [] if "--results" in line else ["--checkpoint", "quickstart"]
     train = ["train", "quickstart", "--format", "simulated", "--out", str(tmp_path / "out"), *line.split()]
-    for args in (evaluate,) if name in OF_EVALUATE else (evaluate, train):
+    for args in (evaluate,) if (line, message) in OF_EVALUATE else (evaluate, train):
         assert_one_line_error(capsys, args, message)
     assert list(tmp_path.iterdir()) == []
 
@@ -311,26 +304,19 @@ def test_data_that_one_process_cannot_open_end_both(root, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture(scope="module")
-def two_devices(root, tmp_path_factory) -> list[dict]:
-    """Metrics of one process with two devices."""
-    out = tmp_path_factory.mktemp("devices") / "run"
-    ((code, _, errors),) = ended([start(train(root, out), JAX_NUM_CPU_DEVICES="2")])
-    assert code == 0, errors
-    return read_metrics(out)
-
-
 _NOT_SHARED = {"seconds", "waiting_seconds", "samples_per_second"}
 _NOT_SHARED |= {"pasted_objects", "truncated_points", "truncated_boxes", "invalid_points"}  # per process
 
 
-def test_two_processes_train_like_one_with_two_devices(root, two_devices, tmp_path):
+def test_two_processes_train_like_one_with_two_devices(root, tmp_path):
+    ((code, _, errors),) = ended([start(train(root, tmp_path / "alone"), JAX_NUM_CPU_DEVICES="2")])
+    assert code == 0, errors
     first, second = ended(start_two("coordinator", *[train(root, tmp_path / "run")] * 2))
     assert (first[0], second[0]) == (0, 0), first[2] + second[2]
     metrics = read_metrics(tmp_path / "run")
     assert len(metrics) == STEPS + 1
     assert (tmp_path / "run" / "objects" / "manifest.json").is_file()
-    for line, expected in zip(metrics, two_devices, strict=True):
+    for line, expected in zip(metrics, read_metrics(tmp_path / "alone"), strict=True):
         assert line.keys() == expected.keys()
         for name in line.keys() - _NOT_SHARED:
             assert line[name] == pytest.approx(expected[name], rel=1e-4), name

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, page_content
+from commands import assert_one_line_error, command, mistakes, page_content
 from made_argoverse2 import STEP_NS, make_log
 from made_bags import FORMS, structured, write_recording
 from scipy.spatial.transform import Rotation
@@ -50,10 +50,10 @@ def home(tmp_path_factory):
     for name, poses in (("backwards", listed[::-1]), ("short", listed[:-1])):
         (folder / f"{name}.json").write_text(json.dumps(poses))
     invalid = {
-        "gap": f"{lines[1]}\n1800000000 0 0 0 0 0 0 1",
-        "twice": f"{lines[1]}\n{lines[1]}",
+        "gap": f"{lines[0]}\n1800000000 0 0 0 0 0 0 1",
+        "twice": f"{lines[0]}\n{lines[0]}",
         "words": "1 2 3",
-        "long": f"{lines[1]}\n1800000000 0 0 0 0 0 0 7",
+        "long": f"{lines[0]}\n1800000000 0 0 0 0 0 0 7",
         "none": "# nothing",
         "late": "1 0 0 0 0 0 0 1",
     }
@@ -212,91 +212,51 @@ def test_a_recording_for_rerun(home, tmp_path):
     assert len(lines) == SWEEPS
 
 
-MISTAKES = {
-    "time going back": (
-        "HOME/drive --poses HOME/backwards.json",
-        r"17000000003\d+.npy: time: got 17000000003\d+ us, expected",
-    ),
-    "cloud without a pose": ("HOME/drive --poses HOME/short.json", r"short.json: no pose of .*17000000004\d+.npy"),
-    "gap": (
-        "HOME/drive --poses HOME/gap.txt",
-        r"gap.txt: .*17000000001\d+.npy: at 1700000000.1\d* s: a gap in the poses",
-    ),
-    "poses going back": (
-        "HOME/drive --poses HOME/twice.txt",
-        r"twice.txt: line 2: time: got 1700000000.\d+ s after 1700000000.\d+ s",
-    ),
-    "words": (
-        "HOME/drive --poses HOME/words.txt",
-        r"words.txt: line 1: got '1 2 3', expected t x y z qx qy qz qw",
-    ),
-    "no unit": (
-        "HOME/drive --poses HOME/long.txt",
-        r"long.txt: line 2: rotation: got .* expected a unit quaternion",
-    ),
-    "no line": ("HOME/drive --poses HOME/none.txt", "none.txt: no pose in it"),
-    "no file": ("HOME/drive --poses HOME/nothing.txt", "nothing.txt: no such file"),
-    "tracks without poses": ("HOME/drive --track", "--track: found no poses"),
-    "no source": ("", "expected either a folder of point files or a recording"),
-    "no scene": ("--data-root HOME", "--data-root and --scene together"),
-    "keyframes of a folder": ("HOME/drive --keyframes", "--keyframes: expected only with --data-root"),
-    "poses of a scene": (
-        "--data-root HOME --scene a --poses HOME/poses.txt",
-        "--poses: expected only with a folder",
-    ),
-    "no data set": ("--data-root HOME --scene a", "expected"),
-    "score": ("HOME/drive --min-score 2", "--min-score: got 2, expected"),
-    "angle": ("HOME/drive --yaw-deg nan", "--yaw-deg: got nan, expected an angle"),
-    "no folder": ("HOME/nowhere", "nowhere: no such file or folder"),
-    "out into a cloud": ("HOME/drive --out HOME/drive/1700000000000000000.npy", "--out: .*the same file as"),
-    "out into the checkpoint": (
-        "HOME/drive --out HOME/checkpoint/checkpoint.json",
-        "--out: .*inside of the checkpoint",
-    ),
-    "points of a scene": (
-        "--data-root HOME --scene a --max-file-points 5",
-        "--max-file-points: expected only with a folder or a recording",
-    ),
-    "links of a folder": ("HOME/drive --follow-links", "--follow-links: expected only with --data-root"),
-    "page into poses": (
-        "HOME/drive --poses HOME/poses.txt --page HOME/poses.txt",
-        "--page: .*the same file as .*poses.txt",
-    ),
-    "topics of a folder": ("HOME/drive --topic /points", "--topic: expected only with a ROS recording"),
-    "poses twice": (
-        "HOME/ros1.bag --odometry tf --poses HOME/poses.txt",
-        "--poses: expected only with .* without --odom",
-    ),
-    "layout of a recording": (
-        "HOME/ros1.bag --columns 4",
-        "--columns: expected only with a folder of point files",
-    ),
-    "no such topic": (
-        "HOME/ros1.bag --topic /x",
-        r"ros1.bag: topic: got '/x', .*: /points \(sensor_msgs/msg/Point",
-    ),
-    "tracks without odometry": ("HOME/ros1.bag --track", "--track: found no poses, expected .*--odometry"),
-    "no such recording": ("HOME/other.bag", "other.bag: no such file or folder"),
-    "no recording": ("HOME/poses.mcap", "poses.mcap: cannot be read: File magic is invalid"),
-    "poses of another time": (
-        "HOME/ros1.bag --poses HOME/late.txt",
-        "late.txt: .*/points: message 0: at 17.* a gap",
-    ),
-    "page into the recording": ("HOME/ros1.bag --page HOME/ros1.bag", "--page: .*the same file"),
-}
+MISTAKES = mistakes(r"""
+HOME/drive --poses HOME/backwards.json => 17000000003\d+.npy: time: got 17000000003\d+ us, expected
+HOME/drive --poses HOME/short.json => short.json: no pose of .*17000000004\d+.npy
+HOME/drive --poses HOME/gap.txt => gap.txt: .*17000000001\d+.npy: at 1700000000.1\d* s: a gap in the poses
+HOME/drive --poses HOME/twice.txt => twice.txt: line 2: time: got 1700000000.\d+ s after 1700000000.\d+ s
+HOME/drive --poses HOME/words.txt => words.txt: line 1: got '1 2 3', expected t x y z qx qy qz qw
+HOME/drive --poses HOME/long.txt => long.txt: line 2: rotation: got .* expected a unit quaternion
+HOME/drive --poses HOME/none.txt => none.txt: no pose in it
+HOME/drive --poses HOME/nothing.txt => nothing.txt: no such file
+HOME/drive --track => --track: found no poses
+=> expected either a folder of point files or a recording
+--data-root HOME => --data-root and --scene together
+HOME/drive --keyframes => --keyframes: expected only with --data-root
+--data-root HOME --scene a --poses HOME/poses.txt => --poses: expected only with a folder
+--data-root HOME --scene a => expected
+HOME/drive --min-score 2 => --min-score: got 2, expected
+HOME/drive --yaw-deg nan => --yaw-deg: got nan, expected an angle
+HOME/nowhere => nowhere: no such file or folder
+HOME/drive --out HOME/drive/1700000000000000000.npy => --out: .*the same file as
+HOME/drive --out HOME/checkpoint/checkpoint.json => --out: .*inside of the checkpoint
+--data-root HOME --scene a --max-file-points 5 => --max-file-points: expected only with a folder or a recording
+HOME/drive --follow-links => --follow-links: expected only with --data-root
+HOME/drive --poses HOME/poses.txt --page HOME/poses.txt => --page: .*the same file as .*poses.txt
+HOME/drive --topic /points => --topic: expected only with a ROS recording
+HOME/ros1.bag --odometry tf --poses HOME/poses.txt => --poses: expected only with .* without --odom
+HOME/ros1.bag --columns 4 => --columns: expected only with a folder of point files
+HOME/ros1.bag --topic /x => ros1.bag: topic: got '/x', .*: /points \(sensor_msgs/msg/Point
+HOME/ros1.bag --track => --track: found no poses, expected .*--odometry
+HOME/other.bag => other.bag: no such file or folder
+HOME/poses.mcap => poses.mcap: cannot be read: File magic is invalid
+HOME/ros1.bag --poses HOME/late.txt => late.txt: .*/points: message 0: at 17.* a gap
+HOME/ros1.bag --page HOME/ros1.bag => --page: .*the same file
+""")
 
 
-@pytest.mark.parametrize("case", MISTAKES)
-def test_mistakes_are_one_line(home, tmp_path, capsys, case):
-    text, message = MISTAKES[case]
-    args = ["stream", *text.replace("HOME", str(home)).split(), "--checkpoint", str(home / "checkpoint")]
+@pytest.mark.parametrize(("line", "message"), MISTAKES)
+def test_mistakes_get_one_line(home, tmp_path, capsys, line, message):
+    args = ["stream", *line.replace("HOME", str(home)).split(), "--checkpoint", str(home / "checkpoint")]
     out = tmp_path / "boxes.jsonl"
     out.write_text("an earlier result")
     before = {file: file.read_bytes() for file in home.rglob("*") if file.is_file()}
     assert_one_line_error(capsys, args if "--out" in args else [*args, "--out", str(out)], message)
     assert all(file.read_bytes() == content for file, content in before.items())
-    # Lost with the first line of the new one.
-    assert (out.read_text() == "an earlier result") == (case != "time going back")
+    # The first new line replaces the earlier result.
+    assert (out.read_text() == "an earlier result") == ("backwards.json" not in line)
 
 
 def test_time_going_back_is_one_line_after_what_came_before(home, tmp_path, capsys):

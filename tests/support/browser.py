@@ -1,4 +1,4 @@
-"""A headless Chromium or Chrome, driven by its DevTools protocol over a pipe: no driver, no package, no port."""
+"""A headless Chromium or Chrome, driven over a pipe by the DevTools protocol, without a driver or a port."""
 
 import base64
 import contextlib
@@ -18,26 +18,20 @@ from typing import Any
 import numpy as np
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-_OPTIONS = (
-    *(
-        "--headless=new",
-        "--no-sandbox",
-        "--no-first-run",
-        "--disable-background-networking",
-        "--disable-dev-shm-usage",
-    ),
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-pipe"),  # software rendering
-)
+_OPTIONS = """
+    --headless=new --no-sandbox --no-first-run --disable-background-networking --disable-dev-shm-usage
+    --use-angle=swiftshader --enable-unsafe-swiftshader --remote-debugging-pipe
+""".split()  # noqa: SIM905
 
 
 def find_browser() -> str | None:
-    """Path of the browser, None where there is none."""
+    """Path of an installed browser, or None."""
     return next(filter(None, map(shutil.which, _NAMES)), None)
 
 
 @dataclasses.dataclass
 class Browser:
-    """The browser's ends of the pipe, and what it has told."""
+    """The pipe to a browser, and the events it has sent."""
 
     to_browser: int
     from_browser: int
@@ -47,11 +41,10 @@ class Browser:
     _number: int = 0
 
     def call(self, method: str, session: str | None = None, **params: Any) -> dict[str, Any]:
-        """Ask for something and wait for the answer."""
+        """Call a method and wait for its result."""
         self._number += 1
-        message = {"id": self._number, "method": method, "params": params} | (
-            {"sessionId": session} if session else {}
-        )
+        message = {"id": self._number, "method": method, "params": params}
+        message |= {"sessionId": session} if session else {}
         os.write(self.to_browser, json.dumps(message).encode() + b"\0")
         while (answer := self._read()).get("id") != self._number:
             self.events.append(answer)
@@ -60,7 +53,7 @@ class Browser:
         return answer["result"]
 
     def wait_for(self, event: str, session: str) -> None:
-        """Wait for an event that has not come yet, or already has."""
+        """Wait until an event has arrived, now or earlier."""
         while not any(e.get("method") == event and e.get("sessionId") == session for e in self.events):
             self.events.append(self._read())
 
@@ -78,9 +71,9 @@ class Browser:
 
 @contextlib.contextmanager
 def start_browser(path: str, *, timeout_s: float = 120) -> Iterator[Browser]:
-    """A running browser with software rendering, which ends with the context."""
+    """Start a browser with software rendering, which ends with the context."""
     ends = [*os.pipe(), *os.pipe()]
-    # The child gets them as 3 and 4; moved upwards first, so that none is overwritten.
+    # The child gets two ends as 3 and 4. All are moved upwards first, so that none is overwritten.
     high = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in ends]
     for end in ends:
         os.close(end)
@@ -113,20 +106,15 @@ class Tab:
     session: str
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """As :meth:`Browser.call`, in this page."""
         return self.browser.call(method, self.session, **params)
 
     def events(self, method: str) -> list[dict[str, Any]]:
-        """Parameters of the events of this page so far."""
+        """Parameters of this page's events so far."""
         own = (e for e in self.browser.events if e.get("sessionId") == self.session)
         return [e["params"] for e in own if e["method"] == method]
 
     def run(self, script: str) -> Any:
-        """The value of an expression, awaited.
-
-        Raises:
-            RuntimeError: what the script threw.
-        """
+        """Evaluate an expression and await its value; raises RuntimeError if the script throws."""
         options = {"awaitPromise": True, "returnByValue": True}
         answer = self.call("Runtime.evaluate", expression=script, **options)
         if "exceptionDetails" in answer:
@@ -134,7 +122,7 @@ class Tab:
         return answer["result"].get("value")
 
     def settle(self) -> None:
-        """Wait until what was asked for is drawn."""
+        """Wait until pending changes are drawn."""
         self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def picture(self) -> np.ndarray:
@@ -146,7 +134,7 @@ class Tab:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
     def press(self, key: str) -> None:
-        """Press and release a key, by its name (``ArrowRight``, ``b``)."""
+        """Press and release a key by its name, such as ``ArrowRight`` or ``b``."""
         text = {"text": key} if len(key) == 1 else {}
         code = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}.get(key, 0)
         self.call("Input.dispatchKeyEvent", type="keyDown", key=key, windowsVirtualKeyCode=code, **text)
@@ -158,7 +146,7 @@ class Tab:
 def open_tab(
     browser: Browser, url: str, *, width: int = 1280, height: int = 800, dark: bool = False
 ) -> Iterator[Tab]:
-    """Load a page, at a size in pixels, in the light or the dark scheme, with touch where it is narrow."""
+    """Load a page at a size in pixels. Narrow pages have a touch screen."""
     target = browser.call("Target.createTarget", url="about:blank")["targetId"]
     session = browser.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
     tab = Tab(browser, session)

@@ -1,4 +1,4 @@
-"""Commands of ``fcos-lidar``, in this process and in others."""
+"""Run commands of ``fcos-lidar`` in this process and in others."""
 
 import contextlib
 import json
@@ -19,19 +19,25 @@ from fcos_lidar_jax.files import folder_lock
 
 
 def command(*args: object) -> None:
-    """Run a command that must succeed; each argument a word, or several with spaces between."""
+    """Run a command that must succeed. Strings are split at spaces; other arguments are one word each."""
     assert main([word for arg in args for word in (arg.split() if isinstance(arg, str) else [str(arg)])]) == 0
 
 
 def page_content(path: Path) -> dict[str, Any]:
-    """What a page of ``visualization/page.py`` holds."""
-    found = re.search(r'<script type="application/json" id="drive">(.*?)</script>', path.read_text(), re.DOTALL)
-    assert found is not None
-    return json.loads(found[1])
+    """The data in a page of ``visualization/page.py``."""
+    match = re.search(r'<script type="application/json" id="drive">(.*?)</script>', path.read_text(), re.DOTALL)
+    assert match is not None
+    return json.loads(match[1])
+
+
+def mistakes(table: str) -> list[tuple[str, str]]:
+    """Parameters of a test from lines ``arguments => pattern of the error message``."""
+    rows = (line.partition("=> ") for line in table.strip("\n").splitlines())
+    return [(arguments.strip(), message) for arguments, _, message in rows]
 
 
 def assert_one_line_error(capsys, args: list[str], message: str) -> None:
-    """The command fails, and one line on standard error, which matches the pattern, says why."""
+    """Assert that the command fails with one line on standard error, which matches a pattern."""
     capsys.readouterr()
     assert main(args) == 1
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("fcos-lidar: error: ")]
@@ -41,7 +47,7 @@ def assert_one_line_error(capsys, args: list[str], message: str) -> None:
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Another thread works in a folder, which is to commands what another process is."""
+    """Lock a folder from another thread, which looks like another process to commands."""
     with ThreadPoolExecutor(1) as other:
         lock = folder_lock(folder, "at work")
         other.submit(lock.__enter__).result()
@@ -52,14 +58,14 @@ def in_use(folder: Path) -> Iterator[None]:
 
 
 def run_python(*words: object, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Another Python process, which may fail."""
+    """Run another Python process, which may fail."""
     command_line = [sys.executable, *map(str, words)]
     environment = child_environment(**variables)
     return subprocess.run(command_line, env=environment, capture_output=True, text=True, check=False)
 
 
 def child_environment(**more: str) -> dict[str, str]:
-    """Of a Python process that finds the tests' modules, compiles as they do and shares their cache."""
+    """Environment of a Python process that imports the tests' modules and shares their compilation cache."""
     shared = {
         "PYTHONPATH": os.pathsep.join(sys.path),
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,

@@ -1,4 +1,4 @@
-"""Small logs in Argoverse 2's official layout, from simulated streets, and the tables of its files."""
+"""Small simulated logs in the official layout of Argoverse 2."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ CATEGORIES = (
     *("REGULAR_VEHICLE", "BOX_TRUCK", "BUS", "VEHICULAR_TRAILER", "LARGE_VEHICLE", "PEDESTRIAN", "MOTORCYCLE"),
     *("BICYCLE", "CONSTRUCTION_CONE", "BOLLARD"),
 )
-"""Of the simulated classes, in their order."""
+"""Categories of the simulated classes, in their order."""
 
 
 def write_table(file: Path, columns: dict[str, Any]) -> None:
@@ -29,7 +29,7 @@ def write_table(file: Path, columns: dict[str, Any]) -> None:
 
 
 def write_sweep(log: Path, time_ns: int, points: np.ndarray) -> None:
-    """A file of points ``x, y, z, intensity, laser``: half floats and bytes, as published."""
+    """Write points ``x, y, z, intensity, laser`` as half floats and bytes, like the published files."""
     columns = {name: points[:, i].astype(np.float16) for i, name in enumerate("xyz")}
     columns |= {"intensity": points[:, 3].astype(np.uint8), "laser_number": points[:, 4].astype(np.uint8)}
     columns["offset_ns"] = np.linspace(0, STEP_NS, len(points)).astype(np.int32)
@@ -47,7 +47,7 @@ def write_poses(log: Path, time_ns: np.ndarray, matrices: np.ndarray) -> None:
 
 
 def write_boxes(log: Path, rows: list[dict[str, Any]]) -> None:
-    """Rows with ``time_ns``, ``track``, ``category``, ``box`` (x, y, z, l, w, h, yaw) and ``count``."""
+    """Write rows with ``time_ns``, ``track``, ``category``, ``box`` (x, y, z, l, w, h, yaw) and ``count``."""
     boxes = np.array([row["box"] for row in rows], np.float64).reshape(-1, 7)
     matrices = np.tile(np.eye(4), (len(boxes), 1, 1))
     matrices[:, :3, :3] = Rotation.from_euler("z", boxes[:, 6:7]).as_matrix()
@@ -97,7 +97,7 @@ def make_log(log: Path, seed: int, *, sweeps: int = 4, sensor: Sensor = ARGOVERS
 def make_argoverse2(
     root: Path, *, train: int = 1, val: int = 1, sweeps: int = 4, sensor: Sensor = ARGOVERSE2, first_seed: int = 0
 ) -> Path:
-    """Splits ``train`` and ``val`` of so many logs; the sensor may have fewer columns."""
+    """Write logs in the splits ``train`` and ``val``."""
     for split, first, number in (("train", first_seed, train), ("val", first_seed + train, val)):
         for seed in range(first, first + number):
             make_log(root / split / f"log-{seed:04d}", seed, sweeps=sweeps, sensor=sensor)

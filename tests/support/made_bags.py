@@ -26,7 +26,7 @@ def _store(is_ros1: bool):
 
 
 class Messages:
-    """Messages of a version of ROS. Poses are a translation and a quaternion x, y, z, w."""
+    """Messages of ROS 1 or ROS 2. Poses are a translation and a quaternion x, y, z, w."""
 
     def __init__(self, is_ros1: bool) -> None:
         self._is_ros1 = is_ros1
@@ -88,23 +88,19 @@ class Messages:
 def write_recording(
     place: Path, form: str, content: Callable[[Messages], Iterable[Recorded]], *, compression: str = ""
 ) -> Path:
-    """Write a recording of one of the :data:`FORMS`; a message was recorded a microsecond after the one before.
+    """Write a recording in one of the :data:`FORMS`, with a microsecond between messages; returns its path.
 
-    Args:
-        compression: of ROS 1: ``LZ4`` or ``BZ2``; of ROS 2: what zstd compresses, ``FILE``, ``MESSAGE`` or, in
-            MCAP, ``STORAGE``.
-
-    Returns:
-        what to read: the place with an ending, or the file in its folder.
+    ``compression`` is ``LZ4`` or ``BZ2`` for ROS 1. For ROS 2 it names what zstd compresses: ``FILE``, ``MESSAGE``
+    or, in MCAP, ``STORAGE``.
     """
     is_ros1 = form == "ros1"
-    store, plugins = _store(is_ros1), rosbag2.StoragePlugin
+    store = _store(is_ros1)
     if is_ros1:
         place = place.with_suffix(".bag")
         writer: Any = rosbag1.Writer(place)
     else:
-        plugin = plugins.SQLITE3 if form == "sqlite" else plugins.MCAP
-        writer = rosbag2.Writer(place, version=9, storage_plugin=plugin)
+        plugin = "SQLITE3" if form == "sqlite" else "MCAP"
+        writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
     if compression and is_ros1:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
     elif compression:
@@ -121,5 +117,5 @@ def write_recording(
 
 
 def structured(points: np.ndarray, names: tuple[str, ...] = ("x", "y", "z", "intensity")) -> np.ndarray:
-    """Columns of an array as a structured array of their type."""
+    """Convert columns of an array to a structured array."""
     return np.rec.fromarrays(list(points.T[: len(names)]), names=list(names))

@@ -1,4 +1,4 @@
-"""Random evaluation tasks: official tables, a results file and the truth, with every case that matters."""
+"""Random evaluation tasks: official tables, a results file and the truth, with all special cases."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ SCENES = ("scene-0103", "scene-0916")
 CATEGORIES = {name: category for category, name in CATEGORY_TO_CLASS.items()} | {RACK: RACK, "animal": "animal"}
 GROWING = ("scene", "sample", "sample_data", "ego_pose", "instance", "sample_annotation")
 DATA = {"calibrated_sensor_token": "mount", "fileformat": "pcd", "is_key_frame": True, "height": 0, "width": 0}
-"""What all rows of ``sample_data`` have in common."""
+"""Fields shared by all rows of ``sample_data``."""
 
 Rows = list[dict[str, Any]]
 Tables = dict[str, Rows]
@@ -44,14 +44,14 @@ def make_task(
     noise: float = 0.8,
     empty: float = 0.15,
 ) -> tuple[Tables, dict[str, Any]]:
-    """Tables and a results file.
+    """Make tables and a results file.
 
     Args:
         samples: keyframes of each of the two scenes.
         objects: tracks of each scene.
-        absent: classes without truth; they are predicted all the same.
+        absent: classes without truth, which are still predicted.
         ties: round the scores, so that many are equal.
-        noise: of the predictions, metres.
+        noise: standard deviation of predicted centres, metres.
         empty: share of samples without predictions.
     """
     rng = np.random.default_rng(seed)
@@ -101,10 +101,10 @@ def make_task(
 def _add_track(
     tables: Tables, rng: np.random.Generator, name: str, kind: str, s: int, egos: np.ndarray, times: np.ndarray
 ) -> None:
-    """One object through some of the keyframes; there only once, or after a gap, its velocity is unknown."""
+    """Add an object to some keyframes. If it is in only one, or after a gap, its velocity is unknown."""
     ends = {"nbr_annotations": 0, "first_annotation_token": "", "last_annotation_token": ""}
     tables["instance"].append({"token": name, "category_token": f"c-{kind}", **ends})
-    # From near to beyond the range of the class.
+    # At distances within and beyond the range of the class.
     distance, angle = rng.uniform(5, 60), rng.uniform(-np.pi, np.pi)
     start = egos[0] + [distance * np.cos(angle), distance * np.sin(angle), rng.normal()]
     speed = np.append(rng.choice([0.0, 3.0]) * rng.normal(0, 1, 2), 0)
@@ -165,7 +165,7 @@ def _predictions(
 
 
 def write_task(root: Path, tables: Tables, results: dict[str, Any]) -> Path:
-    """The data root on disk, and ``results.json`` beside it."""
+    """Write the tables and ``results.json``; returns the data root."""
     files = {f"{VERSION}/{name}.json": rows for name, rows in tables.items()}
     files |= {f"{VERSION}/splits.json": {SPLIT: list(SCENES)}, "results.json": results}
     (root / VERSION).mkdir(parents=True)
@@ -187,7 +187,7 @@ def devkit_summary(data: Any, results: Path, split: str, out: Path) -> dict[str,
 
 
 def truth_of(tables: Tables) -> dict[str, Any]:
-    """The truth of the tables in the form that ``evaluate_detections`` takes, by plain loops."""
+    """Convert the tables to ground truth for ``evaluate_detections``, with plain loops."""
     rows = {name: {row["token"]: row for row in table} for name, table in tables.items()}
     kinds = _kinds(tables)
     truth: dict[str, Any] = {}
@@ -212,7 +212,7 @@ def truth_of(tables: Tables) -> dict[str, Any]:
 def _velocity(row: dict[str, Any], rows: dict[str, dict[str, Any]]) -> list[float] | None:
     first = rows["sample_annotation"][row["prev"] or row["token"]]
     last = rows["sample_annotation"][row["next"] or row["token"]]
-    # In the official rounding.
+    # Rounded like the devkit does.
     seconds = 1e-6 * rows["sample"][last["sample_token"]]["timestamp"]
     seconds -= 1e-6 * rows["sample"][first["sample_token"]]["timestamp"]
     if first is last or seconds > (3.0 if row["prev"] and row["next"] else 1.5):

@@ -1,4 +1,4 @@
-"""A small folder of annotated clouds with three classes of its own, from simulated streets."""
+"""A small folder of simulated clouds, annotated with its own three classes."""
 
 import json
 from pathlib import Path
@@ -10,11 +10,11 @@ from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
 CLASSES = ("person", "post", "vehicle")
 _OWN = {"pedestrian": "person", "traffic_cone": "post", "barrier": "post", "bicycle": None, "motorcycle": None}
-"""Of the simulated classes; the others are vehicles."""
+"""New names of simulated classes, None for none; all other classes are vehicles."""
 
 
 def make_folder(root: Path, *, train: int = 4, val: int = 2, sensor: Sensor = TINY, first_seed: int = 0) -> Path:
-    """The frames ``000``, ``001`` ... with splits ``train`` and ``val``; velocities of persons are unknown."""
+    """Write frames ``000``, ``001`` ... with splits ``train`` and ``val``. Persons have no velocity."""
     frames = SimulatedFrames(sensor, train + val, first_seed)
     for name in ("clouds", "boxes"):
         (root / name).mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""A small data set in KITTI's layout, from simulated streets, and the texts of its files."""
+"""A small simulated data set in the layout of KITTI, and the texts of its files."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def calibration_text(mounted=MOUNTED, rectified=RECTIFIED) -> str:
 
 
 def label_text(box, kind="Car", mounted=MOUNTED, rectified=RECTIFIED) -> str:
-    """A line of a label file, found from where the box's centre, nose and extents lie for the camera."""
+    """Line of a label file, computed from the centre and nose of the box in camera coordinates."""
 
     def seen(xyz):
         return rectified @ (mounted @ np.asarray(xyz) + SHIFT)
@@ -49,9 +49,9 @@ def write(path: Path, text: str) -> None:
 def make_kitti(
     root: Path, *, train: int = 4, val: int = 2, sensor: Sensor = KITTI_HDL64E, first_seed: int = 0
 ) -> Path:
-    """The frames ``000000``, ``000001`` ... with splits ``train`` and ``val``; x forward, y left.
+    """Write frames ``000000``, ``000001`` ... with splits ``train`` and ``val``; x forward, y left.
 
-    Labelled is what the camera sees with five points or more.
+    Objects with at least five points in the image are labelled.
     """
     frames = SimulatedFrames(sensor, train + val, first_seed, num_objects=30, reach_m=15.0)
     names = [f"{i:06d}" for i in range(len(frames))]

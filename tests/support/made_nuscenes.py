@@ -1,4 +1,4 @@
-"""A small data set in the official layout, made by hand: random poses, points that stand still in the world."""
+"""A small data set in the nuScenes layout: random poses, and points that are static in the world."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ VERSION = "v1.0-made"
 KEYFRAMES, BETWEEN = 4, 3
 STEP_US = 50_000
 FAR = np.array([1000.0, 2000, 0])
-"""Where the scenes are in the global frame."""
+"""Position of the scenes in the global frame."""
 SENSORS = (("lidar", "LIDAR_TOP", "mount"), ("camera", "CAM_FRONT", "eye"))
 
 
@@ -24,7 +24,7 @@ def pose(rotation: Rotation, translation: np.ndarray) -> dict[str, Any]:
 
 
 def make_tables(scenes: int = 2, seed: int = 0) -> tuple[dict[str, list[dict[str, Any]]], dict[str, np.ndarray]]:
-    """All tables, and the points of every file."""
+    """Make all tables, and the points of every file."""
     rng = np.random.default_rng(seed)
     mount = Rotation.random(random_state=seed), rng.normal(0, 1, 3)
     names = ["vehicle.car", "human.pedestrian.adult", "animal", "static_object.bicycle_rack"]
@@ -91,7 +91,7 @@ def make_tables(scenes: int = 2, seed: int = 0) -> tuple[dict[str, list[dict[str
 
 
 def write(root: Path, tables: dict[str, Any], clouds: dict[str, np.ndarray]) -> Path:
-    """The data root on disk, with a split of every scene and one of all."""
+    """Write the data root, with a split per scene and a split of all scenes."""
     folder = root / VERSION
     folder.mkdir(parents=True)
     for name, rows in tables.items():

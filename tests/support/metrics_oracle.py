@@ -1,4 +1,4 @@
-"""The detection metric by plain loops over boxes, from its description: nothing shared with the package."""
+"""The detection metric as plain loops over boxes, written from its description without the package."""
 
 import itertools
 import math
@@ -63,7 +63,7 @@ def errors_of(found, true):
 
 
 def curve(points, x):
-    """The line through points of rising x, first value before them, zero behind them."""
+    """Interpolate between points of rising x; the first value before them, zero after them."""
     if x < points[0][0]:
         return points[0][1]
     for (x0, y0), (x1, y1) in itertools.pairwise(points):
@@ -76,7 +76,7 @@ def score_class(name, truth, found, distance_m):
     """AP and errors of one class."""
     total = sum(box["detection_name"] == name for boxes in truth.values() for box in boxes)
     ranked = [(token, box) for token, boxes in found.items() for box in boxes if box["detection_name"] == name]
-    # Of equal scores the later one first.
+    # The last of equal scores comes first.
     ranked = sorted(reversed(ranked), key=lambda entry: -entry[1]["detection_score"])
     free = {token: [box for box in boxes if box["detection_name"] == name] for token, boxes in truth.items()}
     hits, pairs = [], []
@@ -109,14 +109,14 @@ def error_of(error, pairs, confidence, last):
         means.append(sum(so_far) / len(so_far) if so_far else 0.0)
     if last < 11 or not so_far:
         return 1.0
-    # Over rising score; before the lowest and behind the highest the outermost mean.
+    # Interpolated over rising score; constant outside.
     rising = [(score, mean) for (score, _), mean in zip(pairs, means, strict=True)][::-1]
     values = [rising[-1][1] if c >= rising[-1][0] else curve(rising, c) for c in confidence[11 : last + 1]]
     return sum(values) / len(values)
 
 
 def summarise(found, truth, ranges, *, benchmark):
-    """The summary of boxes that count, by sample."""
+    """The summary of the given boxes by sample."""
     aps, errors = {}, {}
     for name in ranges:
         own = [box for boxes in truth.values() for box in boxes if box["detection_name"] == name]
@@ -146,7 +146,7 @@ def summarise(found, truth, ranges, *, benchmark):
 
 
 def score(results, ground_truth):
-    """The numbers of the official summary."""
+    """The values of the official summary."""
     truth, found = {}, {}
     for token, boxes in results.items():
         ego, there = ground_truth[token]["ego_translation"], ground_truth[token]["boxes"]
@@ -157,20 +157,20 @@ def score(results, ground_truth):
 
 
 def score_frames(found, truth, ranges):
-    """The numbers of the summary by centre distance: boxes by frame, in the sensor's own frame."""
+    """The values of the summary by centre distance, for boxes by frame in sensor coordinates."""
     found, truth = ({i: kept(boxes, (0, 0), [], ranges) for i, boxes in part.items()} for part in (found, truth))
     return summarise(found, truth, ranges, benchmark=False)
 
 
 def leaves(value, path=()):
-    """Everything that is no dictionary, by its path of keys."""
+    """All values of nested dictionaries, by path of keys."""
     if isinstance(value, dict):
         return {name: leaf for key, part in value.items() for name, leaf in leaves(part, (*path, key)).items()}
     return {path: value}
 
 
 def assert_numbers(ours, theirs, tolerance=1e-12):
-    """All that ``theirs`` holds is in ``ours``, numbers within the tolerance, NaN where it has NaN."""
+    """Assert that ``ours`` has all values of ``theirs``, floats within a tolerance and NaN equal to NaN."""
     ours = leaves(ours)
     for path, value in leaves(theirs).items():
         if isinstance(value, float):

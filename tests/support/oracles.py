@@ -1,11 +1,11 @@
-"""Slow references in NumPy and Shapely, written from the definitions and not from the code under test."""
+"""Slow references in NumPy and Shapely, written from the definitions and not from the tested code."""
 
 import numpy as np
 from shapely import area, intersection, polygons
 
 
 def project(cell, older, range_m, num_cells, num_rounds):
-    """Round by round: per cell the best remaining point by (older, range, index); i32[cells, rounds]."""
+    """Index of the point of each cell and round, i32[cells, rounds]: points sorted by (older, range, index)."""
     out = np.full((num_cells, num_rounds), -1, np.int32)
     waiting = {}
     for i, c in enumerate(cell):
@@ -24,14 +24,14 @@ def turns(yaw):
 
 
 def corners(boxes):
-    """Of boxes x, y, z, l, w, h, yaw: four bottom ones, counter-clockwise from the front right, then the top."""
+    """Corners of boxes x, y, z, l, w, h, yaw: bottom, counter-clockwise from the front right, then top."""
     boxes = np.asarray(boxes, np.float64)
     signs = np.array([(*xy, z) for z in (-1, 1) for xy in ((1, -1), (1, 1), (-1, 1), (-1, -1))])
     return boxes[:, None, :3] + np.einsum("nij,ncj->nci", turns(boxes[:, 6]), signs * boxes[:, None, 3:6] / 2)
 
 
 def rectangles(boxes):
-    """Polygons of boxes in the ground plane."""
+    """Footprints of boxes as polygons."""
     return polygons(corners(boxes)[:, :4, :2])
 
 
@@ -50,7 +50,7 @@ def iou(a, b, *, vertical):
 
 
 def nms(boxes, scores, valid, labels, threshold, max_outputs, *, vertical=False):
-    """Greedy suppression, best first, equal scores by index; the kept indices."""
+    """Indices kept by greedy suppression, in order of score, then index."""
     order = [i for i in np.argsort(-scores, kind="stable") if valid[i] and not np.isnan(scores[i])]
     kept = []
     for i in order:
@@ -66,7 +66,7 @@ def nms(boxes, scores, valid, labels, threshold, max_outputs, *, vertical=False)
 
 
 def inside(point, box):
-    """Whether a point lies in an upright box, boundary included."""
+    """Whether a point is in an upright box, including its boundary."""
     dx, dy, dz = point - box[:3]
     c, s = np.cos(box[6]), np.sin(box[6])
     along, across = c * dx + s * dy, c * dy - s * dx
@@ -74,7 +74,7 @@ def inside(point, box):
 
 
 def owner(point, boxes, valid):
-    """The smallest box that holds a point, -1 for none."""
+    """Index of the smallest box that contains a point, -1 for none."""
     best, least = -1, np.inf
     for m, box in enumerate(boxes):
         if valid[m] and inside(point, box) and box[3] * box[4] * box[5] < least:
@@ -83,7 +83,7 @@ def owner(point, boxes, valid):
 
 
 def assign(owners, classification, ious, num_boxes, top_q):
-    """Dynamic K by a matrix of boxes and locations: positives and K."""
+    """Positive locations and K of each box, by dynamic K."""
     positive, ks = np.zeros(len(owners), bool), np.zeros(num_boxes, int)
     for m in range(num_boxes):
         mine = np.flatnonzero(owners == m)
@@ -93,14 +93,14 @@ def assign(owners, classification, ious, num_boxes, top_q):
         k = min(max(int(np.floor(total + 0.5)), 1), len(mine))
         cost = classification[mine] + 1 - ious[mine]
         cost = np.where(np.isnan(cost), np.inf, cost)
-        chosen = sorted(range(len(mine)), key=lambda i: (cost[i], mine[i]))[:k]
-        positive[mine[chosen]] = True
+        cheapest = sorted(range(len(mine)), key=lambda i: (cost[i], mine[i]))[:k]
+        positive[mine[cheapest]] = True
         ks[m] = k
     return positive, ks
 
 
 def random_boxes(rng, number, spread=3.0):
-    """Boxes x, y, z, l, w, h, yaw that often overlap."""
+    """Boxes x, y, z, l, w, h, yaw, many of which overlap."""
     boxes = np.zeros((number, 7))
     boxes[:, :2] = rng.normal(0, spread, (number, 2))
     boxes[:, 2] = rng.normal(0, 0.5, number)

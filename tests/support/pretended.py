@@ -1,4 +1,4 @@
-"""A scale of the paper's tables that trains nothing."""
+"""A scale of the paper's tables that does not train."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from fcos_lidar_jax.training import NonFiniteLossError
 
 @dataclasses.dataclass
 class Pretended:
-    """A scale that trains nothing and counts how often it is asked."""
+    """Returns made-up scores and counts the calls."""
 
     name: str = "pretended"
     base: object = QUICKSTART

@@ -1,4 +1,4 @@
-"""Programs compiled in a third of the time, for tests whose question is what a run does and not how it rounds."""
+"""Compile programs in a third of the time, for tests that do not depend on rounding."""
 
 import functools
 import os
@@ -12,22 +12,21 @@ _compile_options = compiler.get_compile_options
 
 
 def compile_quickly(quick: bool) -> None:
-    """Choose for all programs that this process compiles from now on."""
+    """Turn quick compilation on or off for all later programs of this process."""
     if is_quick() == quick:
         return
     jax.config.update("jax_disable_most_optimizations", quick)
-    # JAX offers options for all programs only in the environment, which a process reads once.
+    # JAX reads compiler options for all programs only from the environment, once per process.
     compiler.get_compile_options = _quick_compile_options if quick else _compile_options
     jax.clear_caches()
 
 
 def is_quick() -> bool:
-    """What was chosen last."""
     return jax.config.read("jax_disable_most_optimizations")
 
 
 def environment(quick: bool) -> dict[str, str]:
-    """Variables with which another process compiles one way or the other."""
+    """Environment variables that turn quick compilation on or off in another process."""
     flags = [f"--{name}={str(value).lower()}" for name, value in _known_options().items()] if quick else []
     return {
         "JAX_DISABLE_MOST_OPTIMIZATIONS": str(int(quick)),
@@ -42,7 +41,7 @@ def _quick_compile_options(*args, env_options_overrides=None, **kwargs):
 
 @functools.cache
 def _known_options() -> dict[str, Any]:
-    """Those that this XLA has; in the environment an unknown one would end the process."""
+    """The options that this XLA has; unknown options in the environment would end the process."""
 
     def known(option: dict[str, Any]) -> bool:
         lowered = jax.jit(lambda x: x + 1).lower(0.0)
@@ -52,7 +51,7 @@ def _known_options() -> dict[str, Any]:
             return False
         return True
 
-    compiler.get_compile_options, chosen = _compile_options, compiler.get_compile_options
+    compiler.get_compile_options, current = _compile_options, compiler.get_compile_options
     options = {name: value for name, value in _OPTIONS.items() if known({name: value})}
-    compiler.get_compile_options = chosen
+    compiler.get_compile_options = current
     return options

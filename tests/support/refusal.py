@@ -1,4 +1,4 @@
-"""What all refusals of bad input have in common."""
+"""Assertions on error messages."""
 
 import contextlib
 import re
@@ -9,7 +9,7 @@ import pytest
 
 @contextlib.contextmanager
 def refused(*fragments: object) -> Iterator[None]:
-    """Within it a ``ValueError`` is raised, whose message is one line that holds all the fragments."""
+    """Expect a ``ValueError`` whose message is one line that contains all fragments."""
     with pytest.raises(ValueError, match=re.escape(str(fragments[0]))) as caught:
         yield
     message = str(caught.value)

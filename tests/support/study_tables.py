@@ -1,4 +1,4 @@
-"""The tables of all studies."""
+"""Find the tables of all studies."""
 
 import importlib
 import pkgutil

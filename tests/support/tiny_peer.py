@@ -1,4 +1,4 @@
-"""CenterPoint so small that its step compiles in seconds."""
+"""A CenterPoint so small that its step compiles in seconds."""
 
 from tiny_run import CONFIG as OURS
 from tiny_run import FRAMES
@@ -28,7 +28,7 @@ NETWORK_OPTIONS = """
     --pillars.point-channels 8 8 --pillars.backbone-blocks 1 1 1 --pillars.backbone-widths 8 8 8
     --pillars.neck-channels 8 --pillars.output-stride 2 --pillars.head-channels 8
 """.split()  # noqa: SIM905
-"""The options of ``fcos-lidar train`` that make a preset of CenterPoint this network."""
+"""Options of ``fcos-lidar train`` that reduce a CenterPoint preset to this network."""
 
 
 def host_batch() -> Batch:

@@ -1,4 +1,4 @@
-"""A run so small that its step compiles in seconds; every test that trains shares it, and so its program."""
+"""A run so small that its step compiles in seconds. Tests share it, and its compiled program."""
 
 import dataclasses
 import functools
@@ -45,15 +45,15 @@ NETWORK_OPTIONS = """
     --model.stem.num-convs 1 --model.backbone-blocks 1 1 1 1 --model.backbone-widths 8 8 8 8
     --model.fpn-channels 8 --model.head-channels 8 --model.head-convs 1 --model.tied-heads
 """.split()  # noqa: SIM905
-"""The options of ``fcos-lidar train`` that make a preset this network."""
+"""Options of ``fcos-lidar train`` that reduce a preset to this network."""
 FRAMES = SimulatedFrames(SENSOR, 12)
 TESTS = SimulatedFrames(SENSOR, 2, 1000)
 TINY_CONFIG = dataclasses.replace(CONFIG, max_points=4096)
-"""For whole clouds of the sensor TINY."""
+"""The configuration for complete clouds of the sensor TINY."""
 
 
 def images_of(features: jax.Array) -> RangeImage:
-    """Range images of which nothing but the features is known, which is what the network sees."""
+    """Range images with features only, which is all that the network uses."""
     batch, rows, columns, _, rounds = features.shape
     index = jnp.zeros((batch, rows, columns, rounds), jnp.int32)
     return RangeImage(jnp.asarray(features), index, jnp.zeros(batch, jnp.int32))
@@ -61,7 +61,7 @@ def images_of(features: jax.Array) -> RangeImage:
 
 @functools.cache
 def weights():
-    """Random ones, made without compiling anything."""
+    """Random weights, made without compiling."""
     shapes = jax.eval_shape(build_detector(CONFIG, SENSOR).init, jax.random.key(0))
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda leaf: rng.normal(0, 0.3, leaf.shape).astype(leaf.dtype), shapes["params"])
@@ -70,14 +70,14 @@ def weights():
 
 
 def untrained(config: Config, sensor: Sensor):
-    """Random kernels that keep the size of what they get, without a bias towards the background: what the network
-    says differs from place to place, and there are boxes everywhere."""
+    """Random kernels that preserve the scale of their input, without a bias towards the background, so that the
+    network predicts different boxes everywhere."""
 
     def fill(path, leaf):
         rng = np.random.default_rng(leaf.size)
         if leaf.ndim > 1:
             return rng.normal(0, (2 / np.prod(leaf.shape[:-1])) ** 0.5, leaf.shape).astype(leaf.dtype)
-        # No two alike: XLA moves a constant factor into a kernel that is constant, which rounds otherwise.
+        # All different, because XLA folds a constant factor into the kernel, which changes the rounding.
         centre = float(path[-1].key in ("scale", "var"))
         return rng.uniform(centre - 0.1, centre + 0.1, leaf.shape).astype(leaf.dtype)
 
@@ -86,7 +86,7 @@ def untrained(config: Config, sensor: Sensor):
 
 
 def train_tiny(folder: Path, *, save: int = 1, evaluate: int = 100, **options) -> TrainState:
-    """A run of four steps on simulated frames, that saves after each."""
+    """Run four steps on simulated frames, saving after each step."""
     options = {"config": CONFIG, "frames": FRAMES, "steps": STEPS, **options}
     return train(out=folder, schedule=Schedule(save, evaluate), threads=0, **options)
 
@@ -101,7 +101,7 @@ def host_batch(step: int = 0) -> Batch:
 
 
 def bits(tree) -> list[bytes]:
-    """All leaves, to compare bit by bit; random keys as numbers."""
+    """Bytes of all leaves, for comparison; random keys as numbers."""
     key, leaves = jax.dtypes.prng_key, jax.tree.leaves(tree)
     raw = [jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, key) else x for x in leaves]
     return [np.asarray(leaf).tobytes() for leaf in raw]

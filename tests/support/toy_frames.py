@@ -1,7 +1,6 @@
-"""Small hand-made frame sets, importable by worker processes."""
+"""Small frame sets that worker processes can import."""
 
 import dataclasses
-import time
 
 import numpy as np
 
@@ -37,14 +36,12 @@ class ToyFrames(FrameSet):
     """Frames of :func:`toy_frame`."""
 
     size: int = 7
-    seconds_each: float = 0.0
     classes, sensor = NUSCENES_CLASSES, NUSCENES_HDL32E
 
     def __len__(self) -> int:
         return self.size
 
     def frame(self, index: int) -> Frame:
-        time.sleep(self.seconds_each)
         return toy_frame(index)
 
     def labels(self, index: int) -> np.ndarray:
@@ -59,7 +56,7 @@ class ToyFrames(FrameSet):
 
 @dataclasses.dataclass(frozen=True)
 class SceneFrames(WrappedFrames):
-    """Given frames by scene."""
+    """Frames grouped into scenes."""
 
     scenes: tuple[tuple[str, tuple[int, ...]], ...]
     source: str = "f"
@@ -78,7 +75,7 @@ class SceneFrames(WrappedFrames):
 
 
 class ListedFrames(InMemoryFrames):
-    """Given frames, labelled by the ten classes."""
+    """Given frames with the ten nuScenes classes."""
 
     def __init__(self, frames: tuple[Frame, ...]) -> None:
         super().__init__(frames, NUSCENES_HDL32E, NUSCENES_CLASSES)

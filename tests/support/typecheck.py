@@ -1,4 +1,4 @@
-"""The run-time checker of the signatures: an int is a float, as everywhere in Python's type system."""
+"""The run-time checker of signatures; as in static typing, an int is accepted as a float."""
 
 from beartype import BeartypeConf, beartype
 
