@@ -76,7 +76,9 @@ class CachedFrames(WrappedFrames):
     def truth(self, index: int) -> Frame:
         """:meth:`frame` without its points; makes and writes the whole frame if there is no file yet."""
         arrays = self._read(index, _TRUTH)
-        return without_points(self.frame(index)) if arrays is None else Frame(no_points(self.sensor), **arrays)
+        if arrays is None:
+            return without_points(self.frame(index))
+        return Frame(no_points(self.sensor), *(arrays[name] for name in _TRUTH))
 
     labels = FrameSet.labels
 

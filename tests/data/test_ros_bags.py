@@ -364,32 +364,21 @@ WRONG_CLOUDS = {
     "narrow step": ({"point_step": 10}, "field z: got 4 bytes at offset 8, expected a place within point_step 10"),
     "no points": ({"width": 0}, "no points in it, expected at least one"),
     "no fields": ({"fields": []}, "fields: got none, expected one named x"),
+    "no datatype": (("x", 0, 9, 1), "field x: got 1 of datatype 9, expected one number of datatype 1 to 8"),
+    "several numbers": (("x", 0, 7, 3), "field x: got 3 of datatype 7"),
+    "far field": (("x", 2**32 - 1, 7, 1), "field x: got 4 bytes at offset 4294967295, expected a place within"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG_CLOUDS)
 def test_wrong_clouds_are_one_line(tmp_path, case):
     changed, message = WRONG_CLOUDS[case]
-    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS, **changed))])
-    with refused(f"{bag}: /p: message 0: ", message):
-        list(ros_bag_drive(bag, TINY).sweeps)
 
-
-@pytest.mark.parametrize(
-    ("field", "message"),
-    [
-        (("x", 0, 9, 1), "field x: got 1 of datatype 9, expected one number of datatype 1 to 8"),
-        (("x", 0, 7, 3), "field x: got 3 of datatype 7"),
-        (
-            ("x", 2**32 - 1, 7, 1),
-            "field x: got 4 bytes at offset 4294967295, expected a place within point_step 16",
-        ),
-    ],
-)
-def test_wrong_fields_are_one_line(tmp_path, field, message):
     def content(make):
+        if isinstance(changed, dict):
+            return [("/p", make.cloud(1, POINTS, **changed))]
         cloud = make.cloud(1, POINTS)
-        cloud.fields[0] = make.make("sensor_msgs/PointField", *field)
+        cloud.fields[0] = make.make("sensor_msgs/PointField", *changed)
         return [("/p", cloud)]
 
     bag = write_recording(tmp_path / "a", "sqlite", content)

@@ -1,4 +1,4 @@
-"""What is fuzzed: sound files, and the reader of each with what its result must be."""
+"""The targets: valid files, and the reader of each with checks of its result."""
 
 import contextlib
 import dataclasses
@@ -74,11 +74,11 @@ SPEC = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=F
 
 Files = Mapping[str, bytes]
 Read = Callable[[Path, str], None]
-"""Called with a folder and the name of the file in it that was changed. Raises InvalidError for a wrong result."""
+"""Reads a folder, given the name of the changed file in it; raises InvalidError for an invalid result."""
 
 
 class InvalidError(Exception):
-    """What was read is not what the reader promises."""
+    """A reader returned something that it does not promise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,13 +86,13 @@ class Target:
     """A kind of file."""
 
     name: str
-    files: Files  # below a folder
+    files: Files  # path below the folder -> content
     read: Read
-    changed: tuple[str, ...] = ()  # those of the files that are mutated; none stands for all
+    changed: tuple[str, ...] = ()  # files to mutate; () for all
     mutate: Callable[[str, bytes, Random], bytes] = mutate
-    seal: Callable[[Path, str], None] | None = None  # makes checksums fit, for half of the inputs
+    seal: Callable[[Path, str], None] | None = None  # corrects checksums, for half of the inputs
     share: float = 1.0  # of the inputs, relative to the others
-    alone: bool = False  # messages name the file itself, not only the folder
+    alone: bool = False  # messages must name the file, not only the folder
 
     @property
     def mutable(self) -> tuple[str, ...]:
@@ -153,7 +153,7 @@ def _json(value: object) -> bytes:
 
 
 def _files(write: Callable[[Path], object]) -> dict[str, bytes]:
-    """What a function writes into a folder."""
+    """The files that a function writes into a folder."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder))
         found = sorted(file for file in Path(folder).rglob("*") if file.is_file())
@@ -390,7 +390,7 @@ def _exported() -> bytes:
 
 
 def _mutate_exported(name: str, content: bytes, rng: Random) -> bytes:
-    """The line of JSON, or anything."""
+    """Change the line of JSON, or any bytes."""
     first, line, program = content.split(b"\n", 2)
     if rng.random() < 0.5:
         return mutate_bytes(content, rng)

@@ -361,7 +361,7 @@ def test_another_ground_truth_database_is_refused(begun, tmp_path):
 def test_frames_whose_boxes_have_no_point_are_refused(tmp_path):
     frames = [FRAMES.frame(index) for index in range(3)]
     empty = tuple(dataclasses.replace(frame, num_points=0 * frame.num_points) for frame in frames)
-    with pytest.raises(ValueError, match=r"^frame 'frame 0': box 0: got 0 points, as for all boxes of 3 frames"):
+    with pytest.raises(ValueError, match=r"^frame 'frame 0': box 0: got 0 points, like all boxes of 3 frames"):
         train_tiny(tmp_path / "run", frames=InMemoryFrames(empty, FRAMES.sensor, FRAMES.classes))
     assert not (tmp_path / "run").exists()
 
