@@ -78,7 +78,8 @@ class CachedFrames(WrappedFrames):
         arrays = self._read(index, _TRUTH)
         if arrays is None:
             return without_points(self.frame(index))
-        return Frame(no_points(self.sensor), *(arrays[name] for name in _TRUTH))
+        boxes, labels, num_points = (arrays[name] for name in _TRUTH)
+        return Frame(no_points(self.sensor), boxes, labels, num_points)
 
     labels = FrameSet.labels
 
