@@ -76,7 +76,10 @@ class CachedFrames(WrappedFrames):
     def truth(self, index: int) -> Frame:
         """:meth:`frame` without its points; makes and writes the whole frame if there is no file yet."""
         arrays = self._read(index, _TRUTH)
-        return without_points(self.frame(index)) if arrays is None else Frame(no_points(self.sensor), **arrays)
+        if arrays is None:
+            return without_points(self.frame(index))
+        boxes, labels, num_points = (arrays[name] for name in _TRUTH)
+        return Frame(no_points(self.sensor), boxes, labels, num_points)
 
     labels = FrameSet.labels
 

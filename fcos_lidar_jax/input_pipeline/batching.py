@@ -1,4 +1,4 @@
-"""Frames to batches of a fixed size."""
+"""Padding of frames to batches of a fixed size."""
 
 from collections.abc import Sequence
 from typing import Any, cast
@@ -10,11 +10,11 @@ from fcos_lidar_jax.data.cloud_policy import usable_rows, write_points
 from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.types import Batch
 
-_INSPECTED = 20  # Frames whose counts of points are looked at.
+_NUM_INSPECTED = 20  # frames in which check_counts looks for points
 
 
 def empty_batch(size: int, *, max_points: int, max_boxes: int, columns: int) -> Batch:
-    """NumPy arrays of a batch in which nothing is valid yet, all zero.
+    """A batch of zeroed NumPy arrays, without valid rows.
 
     >>> empty_batch(2, max_points=8, max_boxes=4, columns=5).points.shape
     (2, 8, 5)
@@ -34,17 +34,18 @@ def fill_row(
 ) -> dict[str, int]:
     """Write one sample into a row of a batch of NumPy arrays.
 
-    Points follow the one policy of :mod:`fcos_lidar_jax.data.cloud_policy`. Where there are too many boxes, those
-    with the fewest points go, among equals the last; the others keep their order.
+    Points follow the policy of :mod:`fcos_lidar_jax.data.cloud_policy`. If there are too many boxes, those
+    with the fewest points are dropped, the last ones first on ties; the order is preserved.
 
     Args:
-        batch, row: from :func:`empty_batch`, and which sample.
-        parts: the frame, and what is pasted into it.
-        removed: i64[k], rows of points to leave out, counted through the parts.
+        batch: batch from :func:`empty_batch`.
+        row: index of the sample in the batch.
+        parts: the frame, and objects pasted into it.
+        removed: i64[k], rows of points to drop, counted through the parts.
 
     Returns:
-        ``truncated_points``, ``truncated_boxes``, and ``invalid_points``, which are not finite or beyond physical
-        limits.
+        the numbers ``truncated_points``, ``truncated_boxes`` and ``invalid_points`` (not finite or beyond physical
+        limits).
 
     >>> batch = empty_batch(1, max_points=2, max_boxes=1, columns=5)
     >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 1e30, 0]], np.float32)
@@ -61,19 +62,19 @@ def fill_row(
     kept[np.asarray(removed, np.int64)] = False
     truncated = write_points([part.points for part in parts], kept, points, valid)
     num_points = np.concatenate([part.num_points for part in parts])
-    most = np.sort(np.argsort(-num_points, kind="stable")[: len(boxes)])
-    boxes[: len(most)] = np.concatenate([part.boxes for part in parts])[most]
-    labels[: len(most)] = np.concatenate([part.labels for part in parts])[most]
-    box_valid[: len(most)] = True
-    num_lost = len(num_points) - len(most)
+    fullest = np.sort(np.argsort(-num_points, kind="stable")[: len(boxes)])
+    boxes[: len(fullest)] = np.concatenate([part.boxes for part in parts])[fullest]
+    labels[: len(fullest)] = np.concatenate([part.labels for part in parts])[fullest]
+    box_valid[: len(fullest)] = True
+    num_lost = len(num_points) - len(fullest)
     return {"truncated_points": truncated, "truncated_boxes": num_lost, "invalid_points": num_invalid}
 
 
 def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> Batch:
-    """Pad frames, at least one, of the same point columns, to one shape and stack them.
+    """Pad at least one frame to a common shape and stack them; all have the same point columns.
 
     Raises:
-        ValueError: when a frame is larger; nothing is truncated.
+        ValueError: a frame is too large; nothing is truncated.
     """
     columns = frames[0].points.shape[1]
     batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
@@ -86,31 +87,31 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
 
 
 def check_boxes(boxes: np.ndarray, name: str) -> None:
-    """Refuse boxes, f32[m, 9] of one frame, that no loss can be computed from: one would make all weights NaN.
+    """Refuse implausible boxes f32[m, 9] of a frame, since a single one would make all weights NaN.
 
     Raises:
-        ValueError: naming the frame and the first such box; NaN velocities are fine, they are unknown ones.
+        ValueError: with the frame and the first such box; NaN velocities are allowed and mean unknown.
     """
     if (bad := find_bad_box(boxes)) is not None:
         raise ValueError(f"frame {name!r}: box {bad[0]}: {bad[1]}")
 
 
 def check_counts(frames: FrameSet) -> None:
-    """Refuse frames whose boxes are all without points: training would see no object.
+    """Refuse frames with boxes but without a single point in them: training would see no object.
 
-    Some frames are read, the first alone where it has a box with a point.
+    Reads a sample of the frames, until one has a box with a point.
 
     Raises:
-        ValueError: naming the first frame with a box.
+        ValueError: with the first frame that has a box.
     """
-    empty = None
-    for index in np.unique(np.linspace(0, max(len(frames) - 1, 0), _INSPECTED).round().astype(int))[: len(frames)]:
+    empty, last = None, max(len(frames) - 1, 0)
+    for index in np.unique(np.linspace(0, last, _NUM_INSPECTED).round().astype(int))[: len(frames)]:
         frame = frames.frame(int(index))
         if (frame.num_points >= 1).any():
             return
         empty = frames.name(int(index)) if empty is None and len(frame.boxes) else empty
     if empty is not None:
         raise ValueError(
-            f"frame {empty!r}: box 0: got 0 points, as for all boxes of {min(_INSPECTED, len(frames))} frames, "
+            f"frame {empty!r}: box 0: got 0 points, like all boxes of {min(_NUM_INSPECTED, len(frames))} frames, "
             "expected some with points: are points and boxes in the same frame?"
         )

@@ -1,4 +1,4 @@
-"""Copy-paste augmentation: objects of other frames, at their original pose (paper, section 4; after SECOND)."""
+"""Copy-paste augmentation: objects from other frames at their original pose (paper, section 4; after SECOND)."""
 
 from collections.abc import Callable
 
@@ -14,21 +14,21 @@ MakePaste = Callable[[Frame, np.random.Generator], tuple[Frame, np.ndarray]]
 
 
 def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
-    """How to choose the objects for a frame.
+    """Make the function that samples objects for a frame.
 
-    In the order of the classes, as many objects are drawn as the class has too few of, counting the frame's boxes
-    with at least one point, without replacement. A drawn object that overlaps any box of the frame, or an object
-    pasted before, is left out and not replaced by another.
+    For each class in order, samples without replacement as many objects as the frame lacks, counting the frame's
+    boxes with at least one point. An object that overlaps a box of the frame or an object pasted before is dropped
+    and not replaced.
 
     Args:
-        objects: to draw from, classes matched by name: those with ``min_points`` points to paste, at least one of
-            the current sweep.
-        config: counts by class; a model of k sweeps gets the points of the newest k sweeps of an object's frame.
+        objects: source of the objects, matched by class name; objects need ``min_points`` points to paste, at
+            least one of them from the current sweep.
+        config: target counts per class; a model of k sweeps gets the points of the newest k sweeps.
 
     Returns:
-        ``(frame, rng) -> (pasted, removed)``: the objects, one behind another, their points of the current sweep
-        counted, and i64[p], rows of the frame's points inside a pasted box, ascending. The frame's labels index
-        ``config.classes``. The same frame and generator give the same objects.
+        ``(frame, rng) -> (pasted, removed)``: the objects, with their numbers of points of the current sweep, and
+        i64[p], the ascending rows of the frame's points inside pasted boxes. The frame's labels index
+        ``config.classes``. The result is deterministic in the frame and the generator.
 
     Raises:
         ValueError: the database has a higher ``min_points`` than the configuration, or shares no class with it.
@@ -41,8 +41,8 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
         )
     of_class = map_labels(manifest.classes, config.classes)
     if (of_class < 0).all():
-        found, wanted = ", ".join(manifest.classes), ", ".join(config.classes)
-        raise ValueError(f"{objects.folder}: classes: got {found}, expected some of {wanted}")
+        got, expected = ", ".join(manifest.classes), ", ".join(config.classes)
+        raise ValueError(f"{objects.folder}: classes: got {got}, expected some of {expected}")
     boxes, labels = objects.table["box"], of_class[objects.table["label"]]
     current, pasted = objects.num_points(1), objects.num_points(config.num_sweeps)
     usable = (pasted >= min_points) & (current >= 1)
@@ -56,25 +56,25 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
             )
         present = np.bincount(frame.labels[frame.num_points >= 1], minlength=len(pools))
         missing = np.maximum(np.array(targets) - present, 0)
-        drawn = [
+        sampled = [
             rng.choice(pool, min(count, len(pool)), replace=False)
             for pool, count in zip(pools, missing, strict=True)
             if count and len(pool)
         ]
-        candidates = np.concatenate([np.zeros(0, np.int64), *drawn])
-        chosen = candidates[_free(boxes[candidates], frame.boxes)]
-        clouds = [objects.points(index)[: pasted[index]] for index in chosen]
+        candidates = np.concatenate([np.zeros(0, np.int64), *sampled])
+        rows = candidates[_without_overlap(boxes[candidates], frame.boxes)]
+        clouds = [objects.points(row)[: pasted[row]] for row in rows]
         points = np.concatenate([frame.points[:0], *clouds])
         inside = np.zeros(len(frame.points), bool)
-        for rows in points_in_boxes(frame.points, boxes[chosen]):
-            inside[rows] = True
-        return Frame(points, boxes[chosen], labels[chosen], current[chosen]), np.flatnonzero(inside)
+        for covered in points_in_boxes(frame.points, boxes[rows]):
+            inside[covered] = True
+        return Frame(points, boxes[rows], labels[rows], current[rows]), np.flatnonzero(inside)
 
     return paste
 
 
-def _free(candidates: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Which candidates, taken one after another, overlap nothing present and none taken before, bool[k]."""
+def _without_overlap(candidates: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Which candidates, accepted in order, overlap neither present boxes nor accepted candidates, bool[k]."""
     free = np.asarray(~footprints_overlap(candidates[:, None], present).any(axis=1))
     clash = footprints_overlap(candidates[:, None], candidates)
     for i in range(len(free)):

@@ -1,10 +1,9 @@
 """The ground-truth database for copy-paste: points of single objects, cut from annotated clouds.
 
-A folder of shards, one a scene, and a manifest. A shard is two files: ``NAME.points.f32``, the points of its
-objects one behind another as plain float32, and ``NAME.objects.npz``, a table that says where each object's points
-are and holds their checksum. ``manifest.json``, written last, holds the checksum of every table. So opening reads
-the small tables alone and sees every altered table and every cut-off file; an altered point is seen when its
-object is read.
+A folder with one shard per scene and a manifest. A shard has two files: ``NAME.points.f32``, the points of all
+objects as plain float32, and ``NAME.objects.npz``, a table with the place and checksum of each object's points.
+``manifest.json`` is written last and contains the checksum of every table. Opening therefore reads only the small
+tables, and detects altered tables and truncated files; altered points are detected when their object is read.
 """
 
 import dataclasses
@@ -30,7 +29,7 @@ from fcos_lidar_jax.files import atomic_write, checksum
 from fcos_lidar_jax.input_pipeline.batching import check_boxes
 from fcos_lidar_jax.workers import end_with_parent
 
-MAX_SWEEPS = 20  # Sweeps by which an object's points are distinguished.
+MAX_SWEEPS = 20  # number of sweeps for which an object's points are counted
 
 _FORMAT, _VERSION = "fcos_lidar_jax objects", 2
 _MANIFEST = "manifest.json"
@@ -40,17 +39,17 @@ _ROW = np.dtype(
         ("label", "<i4"),  # index into the manifest's classes
         ("frame", "<i4"),  # index of the frame it was cut from
         ("start", "<i8"),  # its first row in the shard's points
-        ("count", "<i4"),  # its rows, of all sweeps, in the order of their age
-        ("newest", "<i4", (MAX_SWEEPS,)),  # those of the newest 1, 2, ... sweeps of the frame
+        ("count", "<i4"),  # its rows of all sweeps, sorted by age
+        ("newest", "<i4", (MAX_SWEEPS,)),  # rows of the newest 1, 2, ... sweeps of the frame
         ("crc32", "<u4"),  # of the rows' bytes
     ]
 )
 """One object in a shard's table."""
-_BLOCK = 100  # Frames of a shard where the data know no scenes.
+_BLOCK = 100  # frames per shard if the data have no scenes
 
 
 class DatabaseError(ValueError):
-    """The database cannot be used; the message names the file, what was found and what was expected."""
+    """An unusable database; the message names the file, the found and the expected value."""
 
 
 class Shard(msgspec.Struct, forbid_unknown_fields=True):
@@ -68,7 +67,7 @@ class _Header(msgspec.Struct):
 
 
 class Manifest(_Header, forbid_unknown_fields=True):
-    """The last file to be written: without it a database is not finished."""
+    """Marks a finished database: it is written last."""
 
     source: str
     classes: list[str]
@@ -78,8 +77,8 @@ class Manifest(_Header, forbid_unknown_fields=True):
 
 
 class _Table(NamedTuple):
-    rows: np.ndarray  # _ROW, one an object
-    recipe: str  # checksum of all that the shard's bytes follow from
+    rows: np.ndarray  # _ROW, one per object
+    recipe: str  # checksum of everything that determines the shard's bytes
     blake2b: str  # checksum of the file
     num_points: int  # of all objects
 
@@ -91,30 +90,30 @@ class GroundTruthDatabase:
     folder: Path
     manifest: Manifest
     table: np.ndarray
-    """One row an object, all shards one behind another: ``box``, ``label`` (index into the manifest's classes),
-    ``frame``, and what says where its points are."""
-    shard: np.ndarray  # i32: which shard of the manifest holds each object.
+    """One row per object of all shards: ``box``, ``label`` (index into the manifest's classes), ``frame``, and the
+    place of its points."""
+    shard: np.ndarray  # i32: index of each object's shard in the manifest
 
     def __len__(self) -> int:
         return len(self.table)
 
     def fingerprint(self) -> str:
-        """Checksum of all objects, by the table, which holds the checksum of every object's points."""
+        """Checksum of all objects; the table contains the checksums of their points."""
         return checksum(repr((self.manifest.classes, self.manifest.columns)).encode() + self.table.tobytes())
 
     def num_points(self, num_sweeps: int) -> np.ndarray:
-        """Points of every object in the newest sweeps, at most :data:`MAX_SWEEPS`, of its frame, i32[n]."""
+        """i32[n]: points of every object in the newest sweeps (at most :data:`MAX_SWEEPS`) of its frame."""
         if not 1 <= num_sweeps <= MAX_SWEEPS:
             raise ValueError(f"num_sweeps: got {num_sweeps}, expected 1 to {MAX_SWEEPS} for copy-paste")
         return self.table["newest"][:, num_sweeps - 1]
 
     def points(self, index: int) -> np.ndarray:
-        """The points of one object at their original pose, f32[n, c], read anew, in the order of their age.
+        """Read one object's points f32[n, c] at their original pose, sorted by age.
 
-        Files are opened for each object, not mapped: a thousand maps would exhaust the open files of a process.
+        Opens the file for each object instead of mapping it: a thousand maps would exhaust a process's open files.
 
         Raises:
-            DatabaseError: when the bytes are not those that were written.
+            DatabaseError: the points were altered.
         """
         row, columns = self.table[index], self.manifest.columns
         file, _ = _files(self.folder, self.manifest.shards[self.shard[index]].name)
@@ -131,11 +130,11 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
     """Open and check a finished ground-truth database.
 
     Args:
-        folder: where :func:`prepare_database` wrote.
-        fingerprint: of the frames that it must have been built from; None to take any.
+        folder: a folder that :func:`prepare_database` wrote.
+        fingerprint: expected fingerprint of the source frames; None accepts any.
 
     Raises:
-        DatabaseError: missing, unfinished, of another format version or other data, altered or cut off.
+        DatabaseError: missing, unfinished, altered, truncated, or of another format version or other data.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -162,12 +161,12 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
 
 
 def cut_reading(num_sweeps: int) -> CloudReading:
-    """How the frames are read that objects are cut from."""
+    """The reading of the frames from which objects are cut."""
     return CloudReading(num_sweeps, "all")
 
 
 def objects_folder(index: Path, split: str | None) -> Path:
-    """Where the objects of a split are, apart from those of others, which must not get into its training."""
+    """The database folder of a split; splits are separate, so that no validation object enters the training."""
     name = split or "all_frames"
     if name in (".", "..") or "/" in name or "\0" in name:
         raise ValueError(f"split: got {name!r}, expected a name that a folder can have")
@@ -175,7 +174,7 @@ def objects_folder(index: Path, split: str | None) -> Path:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a finished database; errors as of :func:`open_database`."""
+    """Read a finished database's manifest; errors as in :func:`open_database`."""
     file = folder / _MANIFEST
     if not file.is_file():
         raise DatabaseError(f"{file}: no such file, expected a finished ground-truth database")
@@ -204,33 +203,33 @@ def prepare_database(
     workers: int = 1,
     report: Callable[[int, int], None] | None = None,
 ) -> GroundTruthDatabase:
-    """Cut the points of every box of at least ``min_points`` points out of the frames, a shard a scene.
+    """Cut the points of every box with at least ``min_points`` points, one shard per scene.
 
-    Each shard is written beside its place and renamed, its table last, so a kill at any moment loses the shards in
-    work at most; the next call does the rest. The files are the same bytes whatever the number of workers
-    and however often it was stopped. Shards of frames with another fingerprint are replaced.
+    Each shard is written atomically, its table last. A killed build loses only the shards in progress, and
+    the next call completes it. The files are bit-identical for any number of workers and interruptions. Shards of
+    frames with another fingerprint are replaced.
 
     Args:
-        frames: of any classes; picklable where there are several workers.
-        folder: of the database alone; made if missing.
-        min_points: points, of all sweeps, an object needs.
-        workers: processes; 1 works in this one.
-        report: called with (frames done, frames in all) at the beginning, frames of an earlier run counted as
-            done, and after every shard.
+        frames: frames of any classes; must be picklable for several workers.
+        folder: contains only the database; created if missing.
+        min_points: minimum number of points of an object, over all sweeps.
+        workers: number of processes; 1 works in this process.
+        report: called with (frames done, total) at the start, including frames of an earlier run, and after every
+            shard.
 
     Returns:
         the finished database, checked and opened.
 
     Raises:
-        ValueError: a frame with other columns than its sensor's, or a box without a size.
-        OSError: what the file system raises, or a worker that died.
+        ValueError: a frame has other columns than its sensor, or an implausible box.
+        OSError: an error of the file system, or a worker died.
     """
     folder = Path(folder)
     if workers < 1:
         raise ValueError(f"workers: got {workers}, expected at least 1")
     shards, source, columns = shards_by_scene(frames), frames.fingerprint(), frames.sensor.point_columns
     folder.mkdir(parents=True, exist_ok=True)
-    for file in folder.iterdir():  # left half-written by a killed run, or of scenes that the frames no longer have
+    for file in folder.iterdir():  # partial files of a killed run, and shards of scenes that are gone
         shard = re.sub(r"\.(points\.f32|objects\.npz)$", "", file.name)
         left_over = re.fullmatch(r"\.[0-9a-f]{12}\.(f32|npz|json)", file.name)
         if left_over or (shard != file.name and shard not in shards):
@@ -261,7 +260,7 @@ def prepare_database(
 
 
 def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
-    """Shard, named for a scene, or for its first frame where the data know no scenes -> indices of its frames.
+    """Shard -> indices of its frames; named after the scene, or the first frame if the data have no scenes.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -292,7 +291,7 @@ def _files(folder: Path, shard: str) -> tuple[Path, Path]:
 
 
 def _finished(job: _Job) -> bool:
-    """Whether an earlier run left the whole shard, every point of it."""
+    """Whether an earlier run completed the shard, including every point."""
     try:
         table = _read_shard(job.folder, job.name, job.columns)
     except DatabaseError:
@@ -301,19 +300,19 @@ def _finished(job: _Job) -> bool:
         return False
     data, size = memoryview(_files(job.folder, job.name)[0].read_bytes()), 4 * job.columns
     starts, counts = (table.rows[field].tolist() for field in ("start", "count"))
-    found = [zlib.crc32(data[size * i : size * (i + n)]) for i, n in zip(starts, counts, strict=True)]
-    return found == table.rows["crc32"].tolist()
+    checksums = [zlib.crc32(data[size * i : size * (i + n)]) for i, n in zip(starts, counts, strict=True)]
+    return checksums == table.rows["crc32"].tolist()
 
 
 def _cut_shard(frames: FrameSet, job: _Job) -> int:
-    """Write one shard; returns how many frames it has."""
+    """Write one shard and return its number of frames."""
     rows: list[tuple] = []
     parts: list[np.ndarray] = []
     start = 0
     for index in job.indices:
         frame = frames.frame(index)
-        if (found := frame.points.shape[1]) != job.columns:
-            raise ValueError(f"frame {index}: points: got {found} columns, expected {job.columns} of the sensor")
+        if (columns := frame.points.shape[1]) != job.columns:
+            raise ValueError(f"frame {index}: points: got {columns} columns, expected {job.columns} of the sensor")
         check_boxes(frame.boxes, frames.name(index))
         cloud = frame.points[usable_rows(frame.points)]
         lags = np.unique(np.append(cloud[:, 4], np.float32(0)))[:MAX_SWEEPS]
@@ -330,7 +329,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     table = {"rows": np.array(rows, _ROW), "recipe": np.array(job.recipe)}
     points = np.concatenate([np.zeros((0, job.columns), "<f4"), *parts])
     points_file, table_file = _files(job.folder, job.name)
-    atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # tofile's errors have no number
+    atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # errors of tofile lack their errno
     atomic_write(table_file, lambda path: np.savez(path, allow_pickle=False, **table))
     return len(job.indices)
 
@@ -339,7 +338,7 @@ def _pooled(frames: FrameSet, jobs: Sequence[_Job], workers: int) -> Iterator[in
     number, context = min(workers, max(len(jobs), 1)), multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(number, mp_context=context, initializer=_begin_worker, initargs=(frames,))
     try:
-        # The workers inherit the mask: what ends a job is this process's to answer.
+        # The workers inherit the mask, so that only this process answers signals.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         try:
             futures = [pool.submit(_work, job) for job in jobs]
@@ -348,8 +347,8 @@ def _pooled(frames: FrameSet, jobs: Sequence[_Job], workers: int) -> Iterator[in
         for future in as_completed(futures):
             yield future.result()
     except BrokenProcessPool:
-        raise OSError("a worker died, perhaps for want of memory: try fewer workers") from None
-    finally:  # after an interruption too: the shards in work are finished, no other is begun
+        raise OSError("a worker died, perhaps out of memory: try fewer workers") from None
+    finally:  # even after an interruption, finish the shards in progress and start no other
         pool.shutdown(wait=True, cancel_futures=True)
 
 
@@ -368,11 +367,11 @@ def _work(job: _Job) -> int:
 
 
 def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None = None) -> _Table:
-    """A shard's table, its points being as many as it says; ``expected`` is the table's checksum."""
+    """Read and check a shard's table and the size of its points; ``expected`` is the table's checksum."""
     points_file, file = _files(folder, name)
     data = _read(file)
-    found = checksum(data)
-    if expected is not None and found != expected:
+    digest = checksum(data)
+    if expected is not None and digest != expected:
         raise DatabaseError(f"{file}: checksum differs from the manifest's; build it anew")
     try:
         arrays = parse_npz(data, ["rows", "recipe"])
@@ -385,8 +384,8 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
     newest = rows["newest"]
     placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)
     if not (placed & (newest >= 0).all(axis=1) & (newest <= rows["count"][:, None]).all(axis=1)).all():
-        raise DatabaseError(f"{file}: got objects whose points lie outside of the shard's; build it anew")
-    table = _Table(rows, recipe, found, int(ends[-1]) if len(ends) else 0)
+        raise DatabaseError(f"{file}: got objects with points outside the shard; build it anew")
+    table = _Table(rows, recipe, digest, int(ends[-1]) if len(ends) else 0)
     size = 4 * columns * table.num_points
     found = f"{points_file.stat().st_size} bytes" if points_file.is_file() else "no file"
     if found != f"{size} bytes":

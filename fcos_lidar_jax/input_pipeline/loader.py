@@ -1,9 +1,8 @@
-"""The training pipeline: batches of raw points whose content is a function of the step alone.
+"""The training pipeline: batches of raw points that depend only on the step.
 
-The stream of samples has a global position p: batch ``step`` holds positions step * B to (step + 1) * B - 1.
-Position p shows a frame by the shuffled order of its epoch, and draws objects to paste from a generator seeded by
-(seed, p). So a batch does not depend on where the run began, on threads or worker processes, or on how many hosts
-share it.
+Batch ``step`` contains the positions step * B to (step + 1) * B - 1 of the stream of samples. Position p takes its
+frame from the shuffled order of its epoch, and pasted objects from a generator seeded by (seed, p). A batch is
+therefore independent of the run's first step, threads, worker processes, and the number of hosts that share it.
 """
 
 import contextlib
@@ -31,22 +30,21 @@ from fcos_lidar_jax.types import Batch, HostBatch
 from fcos_lidar_jax.workers import end_with_parent
 
 _MAX_COLUMNS = 6
-_CLASS_BALANCE = 0xCB65  # Keeps these draws apart from others of the same seed.
-_MAX_THREADS = 16  # Each has a batch in work, which is large.
-_INSPECTED = 5  # Frames whose points choose the packing.
+_CLASS_BALANCE = 0xCB65  # separates these random numbers from others of the same seed
+_MAX_THREADS = 16  # each holds a large batch
+_NUM_INSPECTED = 5  # frames from which the packing is chosen
 
 
 class SampleOrder:
-    """Which frame every position of the stream of samples shows: epochs of equal length, each shuffled anew.
+    """The frame of every position in the stream of samples: epochs of equal length, each shuffled anew.
 
-    Without class balance an epoch is every frame once. With it (CBGS, Zhu et al. 2019), every class is drawn for
-    equally often, anew in each epoch: with n_c frames that show class c, N their sum over the classes and C
-    classes that occur at all, floor(N / C) frames are drawn for every class, with replacement and equal chances,
-    from the n_c. Frames without any box are then never drawn. A position's frame follows from the seed and the
-    position alone.
+    Without class balance an epoch contains every frame once. With class balance (CBGS, Zhu et al. 2019) an epoch
+    samples equally often for each class: with n_c frames that show class c, N the sum of n_c and C the number of
+    classes that occur, it samples floor(N / C) frames per class, uniformly and with replacement from the n_c.
+    Frames without boxes are then never sampled. A position's frame depends only on the seed and the position.
 
     Raises:
-        ValueError: no frames, or none that shows an object.
+        ValueError: no frames, or no frame shows an object.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import TINY
@@ -86,29 +84,29 @@ class SampleOrder:
 
 
 def steps_per_epoch(frames: FrameSet, config: Config) -> int:
-    """Steps until every sample of an epoch was seen; the last batch reaches into the next epoch."""
+    """Steps per epoch, rounded up: the last batch reaches into the next epoch."""
     return -(-SampleOrder(frames, config, seed=0).epoch_size // config.optimizer.batch_size)
 
 
 @dataclasses.dataclass(frozen=True)
 class _BatchOf:
-    """The batch of a step, as a function of the step alone."""
+    """Maps a step to its batch."""
 
     frames: FrameSet
     config: Config
     seed: int
     order: SampleOrder
-    rows: range  # Of the global batch, those of this process.
-    fade_step: int  # From which on nothing is pasted.
+    rows: range  # this process's rows of the global batch
+    fade_step: int  # first step without pasted objects
     paste: MakePaste | None
     packing: Packing | None
-    alone: bool  # No other process runs the program.
-    misfits: list[str] = dataclasses.field(default_factory=list)  # Found in this process.
+    alone: bool  # no other process runs the program
+    misfits: list[str] = dataclasses.field(default_factory=list)  # samples that did not fit the packing
 
     def __call__(self, step: int) -> HostBatch:
         if self.packing is None:
             return self._plain(step)
-        # Packing sample by sample is faster, but what does not fit is then prepared again: no more than once.
+        # Packing sample by sample is faster, but a misfit is prepared twice. After the first, pack whole batches.
         plain = self._plain(step) if self.misfits else None
         try:
             if plain is None:
@@ -117,13 +115,13 @@ class _BatchOf:
             return dataclasses.replace(plain, batch=pack(plain.batch, self.packing))
         except MisfitError as error:
             name = self._names(step)[error.row]
-            found = f"frame {name!r}: {error}, as in the frames that were looked at first"
+            misfit = f"frame {name!r}: {error}, as in the frames inspected first"
         if not self.alone:
             raise ValueError(
-                f"{found}; several processes pack all batches alike: use --no-packing, in Python packing=False"
+                f"{misfit}; several processes pack all batches alike: use --no-packing, in Python packing=False"
             )
-        self.misfits.append(found)
-        return dataclasses.replace(plain or self._plain(step), misfit=found)
+        self.misfits.append(misfit)
+        return dataclasses.replace(plain or self._plain(step), misfit=misfit)
 
     def _plain(self, step: int) -> HostBatch:
         batch, counts = empty_batch(len(self.rows), **self._sizes()), Counter[str]()
@@ -133,7 +131,7 @@ class _BatchOf:
 
     def _packed(self, step: int, packing: Packing) -> HostBatch:
         batch, counts = empty_packed(len(self.rows), packing, **self._sizes()), Counter[str]()
-        # One memory for all samples, which stays in the processor's cache. Of its points only valid rows are read.
+        # Reused for all samples, so that it stays in the cache. Only valid rows of its points are read.
         sample: Any = empty_batch(1, **self._sizes())
         for row, position in enumerate(self._positions(step)):
             for array in (sample.valid, sample.boxes, sample.labels, sample.box_valid):
@@ -183,36 +181,37 @@ def make_batches(
     lend: bool = False,
     order: SampleOrder | None = None,
 ) -> Iterator[Iterator[HostBatch]]:
-    """The batches of a run from some step on, prepared ahead; leaving the context stops all that prepares them.
+    """Context manager that yields a run's batches, prepared ahead; leaving it stops threads and workers.
 
-    A sample is a fused cloud with its boxes of at least one point and the objects pasted into it; augmentation and
-    projection are the device's work. Points and boxes beyond the fixed sizes are truncated, and points that no
-    sensor measures are removed, both counted, see :func:`fcos_lidar_jax.input_pipeline.batching.fill_row`.
+    A sample is a fused cloud with its boxes of at least one point, and pasted objects; the device augments and
+    projects. Points and boxes beyond the fixed sizes are truncated, invalid points removed, and both counted, see
+    :func:`fcos_lidar_jax.input_pipeline.batching.fill_row`.
 
     Args:
-        frames: training set, whose labels index ``config.classes``; picklable where there are workers.
+        frames: training set with labels that index ``config.classes``; must be picklable for workers.
         config: batch size, padded sizes, class balance, copy-paste and its end.
-        seed: of class balance, order and pasted objects.
-        num_steps, first_step: of the whole run, and where a resumed one starts.
-        objects: to paste; needed unless ``config.copy_paste`` is None.
-        process_index: of this process among those that share each global batch.
-        num_processes: process i gets rows i * B / n to (i + 1) * B / n, so the parts in order are the whole.
-        threads: that prepare batches, in each worker where there are workers; 0 prepares on demand. Default: see
-            :func:`default_threads`. One batch more than there are threads is in work or waits.
+        seed: seed of class balance, order and pasted objects.
+        num_steps: number of steps of the whole run.
+        first_step: step at which a resumed run starts.
+        objects: database for copy-paste; required unless ``config.copy_paste`` is None.
+        process_index: index of this process among those that share each global batch.
+        num_processes: process i gets the rows i * B / n to (i + 1) * B / n.
+        threads: threads per process that prepare batches, 0 to prepare on demand; default: see
+            :func:`default_threads`. At most one batch more than threads is in progress or waiting.
         workers: processes that prepare batches; 0 for none.
-        packing: by which batches are packed, see :func:`packing_for`; None for plain ones. A batch that does not
-            fit comes plain, and a line on standard error says why, once.
-        lend: leave batches of workers in the memory through which they came, and save a copy. Keep none of their
-            arrays then: they fill memory that the workers need, and must be gone before the process ends.
-        order: of the samples, where it is known already.
+        packing: packing of the batches, see :func:`packing_for`; None for plain batches. A batch that does not fit
+            stays plain, with one line on standard error for the first.
+        lend: leave batches of workers in shared memory instead of copying them. Do not keep their arrays then:
+            the workers need the memory, and it must be released before the process ends.
+        order: order of the samples, if already known.
 
     Yields:
-        an iterator over :class:`fcos_lidar_jax.types.HostBatch`, of this process's rows.
+        an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows.
 
     Raises:
-        ValueError: sizes that do not divide, or no frames; :func:`check_loader_options` refuses the rest. From the
-            iterator: a frame that cannot be read, or one that does not fit the packing where there are several
-            processes, for all of them must run the same program.
+        ValueError: sizes that do not divide, or no frames; :func:`check_loader_options` checks the rest. From the
+            iterator: a frame is unreadable, or, with several processes, which must all run the same program, does
+            not fit the packing.
     """
     import grain
     from absl import flags
@@ -238,25 +237,25 @@ def make_batches(
         alone=num_processes == 1,
     )
     steps = grain.MapDataset.range(first_step, num_steps).map(batch_of)
-    # Batches are large: one waits ready beside those in work, no more.
+    # Batches are large, so that only one waits beside the batches in progress.
     stream = steps.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads + 1))
     if workers:
-        if not flags.FLAGS.is_parsed():  # which grain's worker processes read
+        if not flags.FLAGS.is_parsed():  # read by grain's worker processes
             flags.FLAGS.mark_as_parsed()
         stream = stream.mp_prefetch(
             grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1), _leave_signals
         )
     prepared: Any = iter(stream)
-    handed_on = _HandedOn(prepared, copied=workers > 0 and not lend)
-    with contextlib.closing(prepared), contextlib.closing(handed_on) as batches:
+    owned = _OwnedBatches(prepared, copied=workers > 0 and not lend)
+    with contextlib.closing(prepared), contextlib.closing(owned) as batches:
         yield batches
 
 
 def default_threads(workers: int = 0) -> int:
-    """Threads that prepare batches where nobody says how many, in each of ``workers`` processes if there are any.
+    """Default number of threads per process that prepare batches.
 
-    In all as many as this process may use cores, less one for the main thread where there are more than two; at
-    least 1 and at most 16.
+    All processes together get as many threads as this process may use cores, minus one for the main thread if
+    there are more than two; at least 1 each and at most 16.
 
     >>> 1 <= default_threads() <= 16
     True
@@ -267,8 +266,9 @@ def default_threads(workers: int = 0) -> int:
 
 
 def packing_for(frames: FrameSet, config: Config) -> Packing:
-    """The packing of a run's batches, from the points of some frames, spread over the set: the first, the last and
-    three between. The same frames give the same in every process.
+    """Choose the packing of a run's batches from five frames, spread evenly over the set.
+
+    The result is the same in every process.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import TINY
@@ -276,7 +276,7 @@ def packing_for(frames: FrameSet, config: Config) -> Packing:
     >>> packing_for(SimulatedFrames(TINY, 3), QUICKSTART).num_lags > 0
     True
     """
-    indices = np.unique(np.linspace(0, len(frames) - 1, _INSPECTED).round().astype(int))
+    indices = np.unique(np.linspace(0, len(frames) - 1, _NUM_INSPECTED).round().astype(int))
     clouds = (frames.frame(int(index)).points for index in indices)
     usable = (points[usable_rows(points)] for points in clouds)
     return choose_packing(usable, num_sweeps=config.num_sweeps, num_pasted=sum(config.paste_targets))
@@ -290,7 +290,7 @@ def check_loader_options(
     workers: int,
     num_processes: int = 1,
 ) -> None:
-    """Refuse what :func:`make_batches` cannot prepare batches with, before there is a run; arguments as there."""
+    """Check the options of :func:`make_batches` before a run begins."""
     for name, value in (("threads", threads), ("workers", workers)):
         if value is not None and value < 0:
             raise ValueError(f"{name}: got {value}, expected at least 0")
@@ -301,38 +301,30 @@ def check_loader_options(
 
 
 def _leave_signals(worker: int, workers: int) -> None:
-    """Ctrl-C and SIGTERM reach all processes of a job: they are the main process's to answer."""
+    """Ignore Ctrl-C and SIGTERM, which reach all processes of a job: the main process answers them."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
 
 
 def _check_shared_memory(config: Config, workers: int, num_processes: int) -> None:
-    """A full one would kill the workers without a word; containers often have 64 MiB."""
+    """Refuse too little shared memory, which would kill workers silently; containers often have 64 MiB."""
     row = config.max_points * (4 * _MAX_COLUMNS + 1) + config.max_boxes * 41
-    # Each worker has a batch waiting and one in work; one more is on its way out.
+    # Each worker has one batch waiting and one in progress; one more is being copied.
     needed = (2 * workers + 1) * row * config.optimizer.batch_size // num_processes
     folder = Path("/dev/shm")
     free = shutil.disk_usage(folder).free if folder.is_dir() else needed
     if free < needed:
         raise ValueError(
             f"workers: got {workers}, for which {folder} has {free >> 20} MiB free, expected {needed >> 20} MiB; "
-            f"threads need none"
+            f"threads need no shared memory"
         )
 
 
-def _owned(host: HostBatch) -> HostBatch:
-    """A batch copied out of the shared memory in which the workers pass it.
+class _OwnedBatches:
+    """Copies batches out of the workers' shared memory, and reports the first that does not fit the packing.
 
-    Before it is handed on: grain frees the memory in a thread of its own, in which it needs some time.
-    """
-    return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch))
-
-
-class _HandedOn:
-    """Batches that the caller alone keeps, and a line about the first that does not fit the packing.
-
-    No generator, for it is closed while a thread may still be waiting in it for a batch.
+    Not a generator, because it is closed while a thread may still be waiting in it for a batch.
     """
 
     def __init__(self, batches: Iterator[HostBatch], *, copied: bool) -> None:
@@ -345,11 +337,11 @@ class _HandedOn:
     def __next__(self) -> HostBatch:
         host = next(self._batches)
         if host.misfit is not None and not self._told:
-            line = f"{host.misfit}: such batches go unpacked, for which the step is compiled once more"
+            line = f"{host.misfit}: such batches stay unpacked, which compiles the step once more"
             print(line, file=sys.stderr, flush=True)
             self._told = True
-        return _owned(host) if self._copied else host
+        return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch)) if self._copied else host
 
     def close(self) -> None:
-        """Let go of what prepares them; there are none any more."""
+        """Drop the reference to the source."""
         self._batches = iter(())

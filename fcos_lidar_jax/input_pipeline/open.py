@@ -1,4 +1,4 @@
-"""One way to open any data set: one row per format says how it is recognised and read."""
+"""One function to open any data set; a table has one row per format."""
 
 import dataclasses
 from collections.abc import Callable
@@ -25,8 +25,8 @@ class Reader:
 
     Attributes:
         name: one of :data:`Format`.
-        marks: patterns; a folder where one of them matches is of this format. ``()``: the frames are not on disk.
-        sensor: whose points the frames hold unless told otherwise; None where the data say it.
+        marks: glob patterns; a folder that matches one has this format. ``()``: the frames are not on disk.
+        sensor: default sensor; None if the data name it.
         splits: ``(data set, file of own splits) -> names of the splits``.
         open: ``(data set, split, sensor, reading, **options) -> frames``.
         options: further options of :func:`open_frames` that this format takes.
@@ -102,20 +102,20 @@ class DataSet:
 
     @property
     def index(self) -> Path:
-        """Where ``prepare`` writes by default, and where its index is looked for."""
+        """The default folder of ``prepare``'s output."""
         return self.root / ".fcos_lidar" / self.version
 
 
 def find_data_set(root: str | Path | None, format: str | None = None, version: str | None = None) -> DataSet:
-    """The format of the data set that a folder holds.
+    """Recognise the format of the data set in a folder.
 
     Args:
         root: the folder; None for simulated frames.
-        format: one of :data:`Format`; recognised by default.
-        version: of nuScenes, which other formats have not; may be left out where there is one.
+        format: one of :data:`Format`; default: recognised.
+        version: version of nuScenes; may be omitted if there is only one.
 
     Raises:
-        ValueError: not one format's or version's, naming the folder and what was looked for.
+        ValueError: no or several formats or versions match; the message names the folder and the patterns.
     """
     if format is not None and format not in (names := [reader.name for reader in READERS]):
         raise ValueError(f"format: {unknown_name(format, names)}")
@@ -134,10 +134,10 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
     if "version" not in data.reader.options:
         _refuse(data, version=version)
         return data
-    there = [version] if version else sorted(file.parent.name for file in data.root.glob("*/sample.json"))
-    if len(there) != 1:
-        raise ValueError(f"{root}: got versions {', '.join(there) or '(none)'}, expected one: name it")
-    return dataclasses.replace(data, version=there[0])
+    versions = [version] if version else sorted(file.parent.name for file in data.root.glob("*/sample.json"))
+    if len(versions) != 1:
+        raise ValueError(f"{root}: got versions {', '.join(versions) or '(none)'}, expected one: name it")
+    return dataclasses.replace(data, version=versions[0])
 
 
 def _recognise(root: Path) -> Reader:
@@ -160,22 +160,19 @@ def _refuse(data: DataSet, **options: object) -> None:
 def default_split(
     data: DataSet, purpose: Literal["train", "val"], *, required: bool, splits: str | Path | None = None
 ) -> str | None:
-    """The split that is meant unless another is named: ``train`` or ``val``.
-
-    For nuScenes versions that end in mini: ``mini_train`` or ``mini_val``.
+    """The default split for a purpose: ``train`` or ``val``; ``mini_train`` or ``mini_val`` for nuScenes mini.
 
     Args:
         data: the data set.
-        purpose: what it is for.
-        required: where the data have only one other split, take that, unless it is for the other purpose by its
-            name; where they have several, refuse to choose.
+        purpose: the purpose of the split.
+        required: if that split is missing, take the only other split, unless its name tells the other purpose.
         splits: JSON file of own splits.
 
     Returns:
-        a name, or None where the data have no splits, and, if it is not required, where they have no such split.
+        a name, or None if the data have no splits or, unless it is required, if that split is missing.
 
     Raises:
-        ValueError: one is required, and the splits are several or for the other purpose.
+        ValueError: a split is required, and there are several others or only one for the other purpose.
     """
     name = f"mini_{purpose}" if data.version.endswith("mini") else purpose
     names = data.reader.splits(data, splits)
@@ -203,29 +200,29 @@ def open_frames(
     allow_missing_sweeps: bool = False,
     follow_links: bool = False,
 ) -> FrameSet:
-    """The frames of a data set in any format that there is a reader for.
+    """Open a data set in any supported format.
 
     Args:
         root: the folder; None for simulated frames.
-        format: ``"nuscenes"``, ``"kitti"``, ``"argoverse2"``, ``"folder"`` or ``"simulated"``; by default
+        format: ``"nuscenes"``, ``"kitti"``, ``"argoverse2"``, ``"folder"`` or ``"simulated"``; default:
             recognised.
-        version: of nuScenes; may be left out where there is one.
-        split: name of the part that is wanted; all frames by default, see also :func:`default_split`.
-        sensor: whose points they are; by default the format's own.
-        num_sweeps: sweeps fused at most, the current one included; default: as in ``reading``.
-        reading: which points are read, such as ``config.reading``; default: ``CloudReading()``.
-        class_map: the data's name -> another, None for objects to leave out; other names stay.
-        index: of nuScenes, where ``prepare`` has put it.
-        splits: JSON file of own splits, ``{"name": [scene, ...]}`` for nuScenes, of frames for a folder.
-        allow_missing_sweeps: of nuScenes: continue without older sweeps whose file is missing.
-        follow_links: of nuScenes and folders: read files to which links lead outside of the root.
+        version: version of nuScenes; may be omitted if there is only one.
+        split: name of a split; default: all frames. See also :func:`default_split`.
+        sensor: sensor that recorded the points; default: the format's.
+        num_sweeps: maximum number of sweeps to fuse, including the current one; default: ``reading``'s.
+        reading: how clouds are read, such as ``config.reading``; default: ``CloudReading()``.
+        class_map: name in the data -> name to use instead; None drops objects, other names stay.
+        index: folder of the index that ``prepare`` wrote (nuScenes).
+        splits: JSON file of own splits, ``{"name": [...]}`` of scenes (nuScenes) or frames (folder).
+        allow_missing_sweeps: skip older sweeps with a missing file (nuScenes).
+        follow_links: also read files outside the root to which links lead (nuScenes, folder).
 
     Returns:
-        frames with labels of their own classes; :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames` brings
-        them to those of a detector.
+        frames with labels of their own classes; :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames` maps them
+        to a detector's classes.
 
     Raises:
-        ValueError: in one line, what was found and what was expected.
+        ValueError: one line with the found and the expected value.
 
     >>> import tempfile
     >>> open_frames(tempfile.mkdtemp())  # doctest: +ELLIPSIS

@@ -215,7 +215,7 @@ def test_an_unreadable_cloud_ends_both_processes_and_keeps_finished_frames(root,
     both = [evaluate(data, tmp_path / "both") for data in (root, other)]
     first, second = ended(start_two("coordinator", *both))
     assert (first[0], second[0]) == (1, 1)
-    line = "fcos-lidar: error: process 1: cannot read its frames, see what it says"
+    line = "fcos-lidar: error: process 1: cannot read its frames, see its output"
     assert error_lines(first[2]) == [line]
     (line,) = error_lines(second[2])
     assert f"{file}: got {len(whole) - 1} bytes" in line
@@ -238,7 +238,7 @@ def test_processes_with_different_detectors_are_refused(root, tmp_path):
 
 def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
     """The folder is in use; then a folder stands in the place of a file."""
-    out, line = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see what it says"
+    out, line = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see its output"
     with in_use(out):
         first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
     assert (first[0], second[0]) == (1, 1)
@@ -248,7 +248,7 @@ def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
     first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
     assert (first[0], second[0]) == (1, 1)
     assert "results_nusc.resume_log" in error_lines(first[2])[0]
-    assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see what it says"]
+    assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see its output"]
 
 
 def start_one(args: list[str]) -> list[subprocess.Popen[str]]:
@@ -299,7 +299,7 @@ def test_data_that_one_process_cannot_open_end_both(root, tmp_path):
     both = [train(root, tmp_path / "run"), [*train(root, tmp_path / "run"), "--data-root", str(tmp_path / "gone")]]
     first, second = ended(start_two("coordinator", *both))
     assert (first[0], second[0]) == (1, 1)
-    assert error_lines(first[2]) == ["fcos-lidar: error: process 1: cannot train, see what it says"]
+    assert error_lines(first[2]) == ["fcos-lidar: error: process 1: cannot train, see its output"]
     assert "gone: no such folder" in error_lines(second[2])[0]
     assert list(tmp_path.iterdir()) == []
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from made_argoverse2 import START_NS, make_argoverse2, make_log, write_boxes, write_poses, write_sweep, write_table
+from made_argoverse2 import START_NS, make_argoverse2, write_boxes, write_poses, write_sweep, write_table
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
@@ -253,10 +253,3 @@ def test_without_pyarrow_one_line_says_what_to_install(root, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with refused("pyarrow is not installed", "pip install 'fcos-lidar-jax[argoverse2]'"):
         Argoverse2Frames(root).frame(0)
-
-
-def test_make_log_is_deterministic(tmp_path):
-    sensor = dataclasses.replace(ARGOVERSE2, num_columns=64)
-    logs = [make_log(tmp_path / name, 3, sweeps=1, sensor=sensor) for name in "ab"]
-    a, b = ([f.read_bytes() for f in sorted(log.rglob("*.feather"))] for log in logs)
-    assert a == b

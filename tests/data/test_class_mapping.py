@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from fcos_lidar_jax.data.class_mapping import MappedFrames, map_labels, mapped_classes
+from fcos_lidar_jax.data.class_mapping import MappedFrames, map_labels
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames, SelectedFrames
 from fcos_lidar_jax.sensors import TINY
 
@@ -32,11 +32,6 @@ def make(labels=LABELS) -> InMemoryFrames:
 )
 def test_labels_map_by_name(to, class_map, expected):
     assert map_labels(OWN, to, class_map).tolist() == expected
-
-
-def test_a_class_map_gives_classes_in_the_datas_order_once():
-    names = mapped_classes(OWN, {"ant": "insect", "cow": None, "dog": "insect"})
-    assert names == ("insect", "bee")
 
 
 def test_boxes_of_other_classes_are_left_out_and_counted():

@@ -71,11 +71,15 @@ def test_the_sensor_may_be_a_preset_or_an_argument(root):
 
 def test_own_labels_are_translated_or_left_out(root):
     write(root / "classes.json", {"lorry": "truck", "sign": None, "car": "bus"})
-    records = [{**CAR, "label": label} for label in ("sign", "lorry", "car", "barrier")]
+    box = [*CAR["box"][:6], 0.25 + 4 * np.pi, None, None]  # two turns too many, and an unknown velocity
+    records = [{"label": label, "box": box} for label in ("sign", "lorry", "car", "barrier")]
     write(root / "boxes" / "b.json", {"boxes": records})
     frames = FolderFrames(root, reading=ALL)
     assert frames.classes == ("barrier", "bus", "truck")
     assert [frames.classes[i] for i in frames.frame(1).labels] == ["truck", "bus", "barrier"]
+    boxes = frames.frame(1).boxes
+    assert np.isnan(boxes[:, 7:]).all()
+    np.testing.assert_allclose(boxes[:, 6], 0.25, atol=1e-6)
 
 
 def test_classes_are_the_labels_of_all_frames_or_a_list(root):
@@ -107,14 +111,6 @@ def test_splits_give_frames_and_order_but_not_classes(root):
         write(root / "splits.json", splits)
         with refused(message):
             FolderFrames(root, split="train")
-
-
-def test_unknown_velocity_is_nan_and_yaw_may_turn_over(root):
-    box = [*CAR["box"][:6], 0.25 + 4 * np.pi, None, None]
-    write(root / "boxes" / "b.json", {"boxes": [{**CAR, "box": box}]})
-    boxes = FolderFrames(root, reading=ALL).frame(1).boxes
-    assert np.isnan(boxes[0, 7:]).all()
-    assert boxes[0, 6] == pytest.approx(0.25, abs=1e-6)
 
 
 def test_predictions_are_labels(root):
@@ -225,6 +221,11 @@ BAD = {
     "link to itself": (lambda r: link(r, "c.npy"), "clouds/c.npy", "no such file"),
     "empty": (lambda r: [file.unlink() for file in (r / "clouds").iterdir()], "clouds", "no point file in it"),
     "no folder": (lambda r: (r / "boxes").rename(r / "box"), "boxes", "no such folder"),
+    "sensor": (
+        lambda r: write(r / "sensor.json", {"name": "mine", "num_columns": 8}),
+        "sensor.json",
+        "inclinations_rad: missing",
+    ),
     "no sensor": (lambda r: (r / "sensor.json").unlink(), "sensor.json", "no such file"),
     "preset": (lambda r: write(r / "sensor.json", '"tinny"'), "sensor.json", "got 'tinny', expected tiny"),
     "class": (lambda r: write(r / "classes.json", ["carr"]), B, "$.boxes[0].label: got 'car', expected carr"),
@@ -268,12 +269,6 @@ def test_offsets_within_a_turn_are_no_time_lags(root):
         FolderFrames(root, reading=ALL).frame(1)
     np.save(root / "clouds" / "b.npy", np.column_stack([points, np.repeat([0, 0.05, 0.1, np.nan], 40)]))
     assert len(FolderFrames(root, reading=WHOLE_SWEEP).frame(1).points) == 160
-
-
-def test_bad_arguments_and_sensor_files_are_named(root):
-    write(root / "sensor.json", {"name": "mine", "num_columns": 8})
-    with refused(f"{root}/sensor.json: inclinations_rad: missing"):
-        FolderFrames(root, reading=ALL)
 
 
 @pytest.mark.real_data

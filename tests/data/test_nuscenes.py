@@ -45,20 +45,6 @@ def test_what_stands_still_in_the_world_is_at_one_place_from_every_sweep(made):
     assert sizes == [50 * min(1 + k * BETWEEN, 10) for k in range(KEYFRAMES)]
 
 
-def test_close_points_are_judged_in_their_own_sweep(tmp_path):
-    tables, clouds = make_tables(1)
-    for points in clouds.values():
-        points[:5, :2] = 0.999, -0.999
-        points[5:8, :2] = 1.0, 0.5
-    data = NuScenes(write(tmp_path, tables, clouds), VERSION)
-    sample = token("sample", 0, 2)
-    sizes = {mode: len(data.fuse_sweeps(sample, CloudReading(3, mode))[0]) for mode in ("none", "sweeps", "all")}
-    assert sizes == {"none": 150, "sweeps": 140, "all": 135}
-    assert len(data.fuse_sweeps(sample, CloudReading(3, "all", 1.01))[0]) == 126
-    with refused("remove_close: got 'some'"):
-        CloudReading(3, "some")  # pyright: ignore[reportArgumentType]
-
-
 def test_boxes_in_the_lidar_frame_by_explicit_matrices(made):
     data, (tables, _) = NuScenes(made, VERSION), make_tables()
     sample = token("sample", 1, 2)

@@ -78,31 +78,14 @@ def test_the_laser_number_is_the_ring_or_the_sixth_column_where_the_sensor_has_o
     np.testing.assert_array_equal(read_points(save(tmp_path / "a.npy", rows), ARGOVERSE2)[:, 5], rows[:, 5])
 
 
-@pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.npz"])
-def test_every_intensity_is_scaled(tmp_path, points, name):
-    rows = points[:, :4] / np.array([1, 1, 1, 255], np.float32)
+@pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.npz", "a.pcd.bin"])
+def test_every_intensity_is_scaled_except_in_nuscenes_files(tmp_path, points, name):
+    rows = nuscenes_rows(points)
+    if name != "a.pcd.bin":
+        rows = points[:, :4] / np.array([1, 1, 1, 255], np.float32)
     read = read_points(save(tmp_path / name, rows), KITTI_HDL64E)
     np.testing.assert_allclose(read[:, 3], points[:, 3], rtol=1e-5)
     np.testing.assert_array_equal(read[:, :3], points[:, :3])
-
-
-def test_the_intensities_of_nuscenes_files_are_never_scaled(tmp_path, points):
-    rows = nuscenes_rows(points)
-    read = read_points(save(tmp_path / "a.pcd.bin", rows), KITTI_HDL64E)
-    np.testing.assert_array_equal(read[:, :4], rows[:, :4])
-
-
-def test_a_ring_is_noticed_beside_missing_returns(tmp_path, points):
-    rows = nuscenes_rows(points)
-    rows[7] = np.nan
-    with refused("a.npy: fifth column: got whole numbers up to 31, which look"):
-        read_points(save(tmp_path / "a.npy", rows), NUSCENES_HDL32E)
-
-
-def test_a_pcd_file_may_call_its_intensity_reflectivity(tmp_path):
-    head = pcd_header("ascii", 1, "x y z reflectivity line", "F F F F U", "4 4 4 4 1", "1 1 1 1 1")
-    path = save(tmp_path / "a.pcd", head + b"8 1 -1 30 5\n")
-    assert read_points(path, ARGOVERSE2).tolist() == [[8, 1, -1, 30, 0, 5]]
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5])
@@ -334,6 +317,10 @@ BAD = {
     "complex.npy": (np.zeros((5, 4), complex), "dtype: got complex128"),
     "truth.npy": (np.zeros((5, 4), bool), "dtype: got bool"),
     "no_rows.npy": (np.zeros((0, 4), np.float32), "no points"),
+    "ring.npy": (
+        np.array([[8, 1, -1, 3, 31], [np.nan] * 5], np.float32),
+        "fifth column: got whole numbers up to 31, which look",
+    ),
     "future.npy": (np.full((5, 5), -0.1, np.float32), "time_lag: got -0.1 in row 0"),
     "several.npz": ({"a": np.zeros((3, 4)), "b": np.zeros((3, 4))}, "got arrays a, b"),
     "none.npz": ({}, "got arrays none"),

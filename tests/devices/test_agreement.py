@@ -37,7 +37,7 @@ def test_the_failure_of_another_process_stops_this_one(of_three):
     with agreed("cannot read"):
         pass
     others[1] = False
-    with pytest.raises(OSError, match=r"^process 2: cannot read, see what it says$"), agreed("cannot read"):
+    with pytest.raises(OSError, match=r"^process 2: cannot read, see its output$"), agreed("cannot read"):
         pass
     assert [bool(own) for own in sent] == [True, True]
 

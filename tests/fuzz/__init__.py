@@ -1,1 +1,1 @@
-"""Seeded fuzzing of everything that reads a file: ``python -m tests.fuzz``."""
+"""Seeded fuzzing of all file readers: ``python -m tests.fuzz``."""

@@ -1,12 +1,12 @@
-"""Do all readers of files refuse what is wrong in one line, and return sound data else?
+"""Does every file reader either refuse its input in one line or return valid data?
 
     python -m tests.fuzz --inputs 1000000 --out experiments/results/fuzz.json
     python -m tests.fuzz --only kitti --inputs 3000  # seconds
 
-Files of every kind that is read are mutated by their structure, by a seed, and read in processes of a thousand
-inputs each, with Python's debugging allocator, a limit on memory and one on time. Expected of each input: sound
-data, or a ``ValueError`` of one line that names the file; no warning, no other exception, nothing that takes long,
-no process that ends. Ten minutes for a million on a core.
+Valid files of every kind are mutated according to their structure, seeded, and read in processes of a thousand
+inputs each, with Python's debugging allocator and limits of memory and time. Every input must give valid data, or
+a ``ValueError`` of one line that names the file; no warning, no other exception, no slow input, no crash. A
+million inputs take ten minutes on a core.
 """
 
 import dataclasses
@@ -26,44 +26,44 @@ from .targets import make_targets
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """How much, of what, and where to."""
+    """Options of a fuzzing run."""
 
     inputs: int = 1_000_000
-    """Of all targets together."""
+    """Number of inputs over all targets."""
     seed: int = 0
-    """Another seed gives other inputs."""
+    """Seed of the mutations."""
     only: tuple[str, ...] = ()
     """Names of targets; default: all."""
     workers: int = os.cpu_count() or 1
-    """Processes at once."""
+    """Number of concurrent processes."""
     memory_mib: int = 2048
-    """Address space of a process beyond what it began with."""
+    """Address space that a process may add, in MiB."""
     seconds: float = 10.0
-    """The longest that an input may take."""
+    """Time limit per input."""
     out: Path = Path("outputs/fuzz.json")
-    """Where the figures go."""
+    """Destination of the figures."""
 
 
 def main(args: Args) -> None:
-    """Fuzz, print and write."""
+    """Fuzz the targets, print and write the figures."""
     targets = [target for target in make_targets() if not args.only or target.name in args.only]
     if len(targets) < len(args.only):
         raise ValueError(f"--only: got {args.only}, expected some of {', '.join(t.name for t in make_targets())}")
-    began = shown = time.monotonic()
+    began = reported = time.monotonic()
 
     def report(done: int) -> None:
-        nonlocal shown
+        nonlocal reported
         now = time.monotonic()
-        if now - shown > 10:
-            shown = now
-            print(f"{done} inputs, {done / (now - began):.0f} a second", file=sys.stderr, flush=True)
+        if now - reported > 10:
+            reported = now
+            print(f"{done} inputs, {done / (now - began):.0f} per second", file=sys.stderr, flush=True)
 
     limits = Limits(args.memory_mib, args.seconds)
     counts, failures = fuzz(
         targets, args.inputs, seed=args.seed, workers=args.workers, limits=limits, report=report
     )
     seconds, total = time.monotonic() - began, sum(count.inputs for count in counts.values())
-    causes = [(failure, number) for failure, number in summed(failures)]
+    causes = list(summed(failures))
     record = {
         **{"inputs": total, "seed": args.seed, "failures": len(failures), "seconds": round(seconds, 1)},
         **{"limits": dataclasses.asdict(limits), "python_malloc": os.environ.get("PYTHONMALLOC")},

@@ -1,4 +1,8 @@
-"""Mutated inputs by the thousand, each thousand in a process of its own with little memory and time."""
+"""Runs mutated inputs, a thousand per process, with limits of memory and time.
+
+hypothesis could drive the mutators (``st.randoms``), at about two thirds of the speed, but can neither limit
+memory and time nor survive a crash, and its shrinking adds nothing to inputs with one to four mutations.
+"""
 
 import dataclasses
 import faulthandler
@@ -21,29 +25,29 @@ from random import Random
 
 from .targets import InvalidError, Target
 
-CHUNK = 1000  # inputs a process
-LONGEST_MESSAGE = 20_000  # characters beside the file's name: a few of the longest values
-_STATE = struct.Struct("<5q")  # number of the input in work, and the counts until then
+CHUNK = 1000  # inputs per process
+LONGEST_MESSAGE = 20_000  # characters, not counting the file's name: room for a few of the longest values
+_STATE = struct.Struct("<5q")  # number of the current input, and the counts before it
 
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Of a process."""
+    """Limits of a process."""
 
-    memory_mib: int  # address space beyond what it began with
-    seconds: float  # an input
+    memory_mib: int  # address space that it may add
+    seconds: float  # per input
 
 
 @dataclasses.dataclass
 class Counts:
-    """What became of the inputs of a target."""
+    """Results of a target's inputs."""
 
     inputs: int = 0
     accepted: int = 0
     refused: int = 0
     failed: int = 0
     slowest_ms: float = 0.0
-    peak_mib: float = 0.0  # resident memory of a process beyond what it began with
+    peak_mib: float = 0.0  # resident memory that a process added
     cpu_s: float = 0.0
 
     def add(self, other: "Counts") -> None:
@@ -54,17 +58,17 @@ class Counts:
 
 @dataclasses.dataclass(frozen=True)
 class Failure:
-    """An input that broke the promise; seed, target and number make it again, see :func:`make_input`."""
+    """A mistreated input; :func:`make_input` reproduces it from seed, target and number."""
 
     target: str
     number: int
     file: str
-    problem: str  # in a line, the same for the same cause
+    problem: str  # one line, equal for equal causes
     details: str
 
 
 def make_input(target: Target, seed: int, number: int) -> tuple[str, bytes, bool]:
-    """Name and content of a mutated file, and whether its checksums are made to fit."""
+    """Name and content of a mutated file, and whether its checksums are corrected."""
     rng = Random(f"{seed} {target.name} {number}")
     name = rng.choice(target.mutable)
     return name, target.mutate(name, target.files[name], rng), target.seal is not None and rng.random() < 0.5
@@ -77,14 +81,14 @@ def write_files(target: Target, folder: Path) -> None:
 
 
 def try_input(target: Target, folder: Path, seed: int, number: int) -> tuple[bool, Failure | None]:
-    """Whether an input is accepted, and what is wrong with how it is treated."""
+    """Whether an input is accepted, and how it is mistreated."""
     name, content, sealed = make_input(target, seed, number)
     file = folder / name
     file.write_bytes(content)
     if sealed and target.seal is not None:
         try:
             target.seal(folder, name)
-        except (ValueError, RecursionError):  # not even JSON any more
+        except (ValueError, RecursionError):  # no longer JSON
             file.write_bytes(content)
     problem = details = ""
     accepted = False
@@ -105,7 +109,7 @@ def try_input(target: Target, folder: Path, seed: int, number: int) -> tuple[boo
 
 
 def judge(message: str, where: str) -> str:
-    """What is wrong with the message of a refusal, which must be one short line that names the file."""
+    """The fault of a refusal's message, which must be one short line that names the file; "" if there is none."""
     if where not in message:
         return "a message that does not name the file"
     if message.splitlines() != [message]:
@@ -130,7 +134,7 @@ class _Job:
 
 
 class _Worker:
-    """A process with its inputs."""
+    """A process that tries the inputs of a job."""
 
     def __init__(self, job: _Job, seed: int, limits: Limits, scratch: Path) -> None:
         self.job, self.failures, self.counts = job, list[Failure](), Counts()
@@ -141,12 +145,12 @@ class _Worker:
         args = (job, seed, limits, self.folder, self.state, sender)
         self.process: BaseProcess = multiprocessing.get_context("fork").Process(target=_work, args=args)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # JAX warns of forks; its threads are not begun
+            warnings.simplefilter("ignore", RuntimeWarning)  # JAX warns about forks; its threads have not started
             self.process.start()
         sender.close()
 
     def receive(self) -> bool:
-        """Take a message; whether there may be more."""
+        """Receive a message; False if the process has ended."""
         try:
             message = self.receiver.recv()
         except EOFError:
@@ -159,7 +163,7 @@ class _Worker:
         return True
 
     def left(self) -> _Job | None:
-        """What is left to do where it died, which is then a failure."""
+        """The rest of the job after a crash, which is recorded as a failure."""
         number, *done = _STATE.unpack(self.state)
         if not self.counts.inputs:
             self.counts = Counts(*done)
@@ -179,7 +183,7 @@ class _Worker:
 def _work(job: _Job, seed: int, limits: Limits, folder: Path, state: mmap.mmap, sender: Connection) -> None:
     faults = (folder / "faults").open("w")
     faulthandler.enable(faults)
-    faulthandler.register(signal.SIGALRM, faults, chain=True)  # which then ends the process
+    faulthandler.register(signal.SIGALRM, faults, chain=True)  # then ends the process
     warnings.simplefilter("error")
     files = folder / "files"
     files.mkdir()
@@ -206,7 +210,7 @@ def _work(job: _Job, seed: int, limits: Limits, folder: Path, state: mmap.mmap, 
     counts.peak_mib = (after.ru_maxrss - before.ru_maxrss) / 1024
     counts.cpu_s = after.ru_utime + after.ru_stime
     sender.send(counts)
-    os._exit(0)  # without finalising everything that was shared, page by page
+    os._exit(0)  # skips finalisation, which would copy every shared page
 
 
 def fuzz(
@@ -218,19 +222,19 @@ def fuzz(
     limits: Limits,
     report: Callable[[int], None] = lambda done: None,
 ) -> tuple[dict[str, Counts], list[Failure]]:
-    """Try so many inputs, shared out among the targets.
+    """Try inputs, distributed over the targets.
 
     Args:
-        workers: processes at once.
-        report: called with the number of inputs that are done.
+        workers: number of concurrent processes.
+        report: called with the number of finished inputs.
 
     Returns:
-        counts by target, and everything that went wrong.
+        counts per target, and all failures.
     """
     jobs = _share_out(targets, inputs)
     counts, failures = {target.name: Counts() for target in targets}, list[Failure]()
     gc.collect()
-    gc.freeze()  # so that the processes share what is there
+    gc.freeze()  # so that the processes share the existing objects
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as scratch:
         running: dict[Connection, _Worker] = {}
@@ -262,7 +266,7 @@ def _share_out(targets: Sequence[Target], inputs: int) -> list[_Job]:
 
 
 def summed(failures: Sequence[Failure]) -> Iterator[tuple[Failure, int]]:
-    """The first failure of each cause, and how many there are."""
+    """The first failure of each cause, and the number of failures."""
     causes: dict[tuple[str, str], list[Failure]] = {}
     for failure in failures:
         causes.setdefault((failure.target, failure.problem), []).append(failure)

@@ -1,4 +1,4 @@
-"""Files changed at random, by their structure: bytes, words, JSON values, headers of point files, columns."""
+"""Random changes of files according to their structure: bytes, words, JSON values, headers, columns."""
 
 import copy
 import io
@@ -14,21 +14,8 @@ INTEGERS = (-1, 0, 1, 2, 3, 5, 127, 255, 65_536, 2**31 - 1, 2**31, 2**32 - 1, 2*
 WORDS = (
     *(str(number).encode() for number in INTEGERS),
     *(b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e999", b"1e-320", b"0.5", b"-0", b"0x10", b"1_0", b"+3"),
-    *(
-        b"",
-        b"a",
-        b"\0",
-        b"\xff\xfe",
-        b"\xd9\xa3",
-        b"a" * 300,
-        b"9" * 5000,
-        b"%s",
-        b"$a$",
-        b"../..",
-        b"/",
-        b"#",
-        b"\r",
-    ),
+    *(b"", b"a", b"\0", b"\xff\xfe", b"\xd9\xa3", b"a" * 300, b"9" * 5000),
+    *(b"%s", b"$a$", b"../..", b"/", b"#", b"\r"),
 )
 VALUES = (
     *(None, True, False, *INTEGERS, 10**400, 0.5, -1.5, -0.0, 1e308, -1e308, 1e-320),
@@ -38,11 +25,11 @@ VALUES = (
 )
 DEEP = (b"[" * 100_000, b'{"a":' * 100_000, b"[" * 5000 + b"]" * 5000)
 NUMBER = struct.Struct("<Q")
-LARGEST = 1 << 16  # bytes of a file, beyond which it is not made larger
+LARGEST = 1 << 16  # bytes; larger files are not extended
 
 
 def mutate(name: str, content: bytes, rng: Random) -> bytes:
-    """The content of a file of this name, changed in at least one place."""
+    """Change a file's content in at least one place."""
     ending = name.rpartition(".")[2]
     if rng.random() < 0.2:
         return mutate_bytes(content, rng)
@@ -78,7 +65,7 @@ _WORD = re.compile(rb"[\w.+-]+")
 
 
 def mutate_words(content: bytes, rng: Random) -> bytes:
-    """Words replaced, removed and repeated; lines likewise."""
+    """Replace, remove and repeat words and lines."""
     for _ in range(rng.choice((1, 1, 2, 3))):
         if rng.random() < 0.7:
             words = [match.span() for match in _WORD.finditer(content)] or [(0, 0)]
@@ -110,7 +97,7 @@ def mutate_json(content: bytes, rng: Random) -> bytes:
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         mutate_value(root, rng)
     text = json.dumps(root.get(""))
-    if kind < 0.15:  # a key that occurs twice, or a value that is too deep
+    if kind < 0.15:  # a duplicate key, or deep nesting
         text = text.replace(",", rng.choice((',"a":0,"a":1,', "," + DEEP[2].decode() + ",")), 1)
     return text.encode()
 
@@ -146,7 +133,7 @@ def mutate_value(root: dict[str, Any], rng: Random) -> None:
 
 
 def mutate_lines(content: bytes, rng: Random) -> bytes:
-    """A line of JSON, or the order of the lines."""
+    """Change one line of JSON, or words and the order of lines."""
     lines = content.splitlines()
     if rng.random() < 0.3:
         return mutate_words(content, rng)
@@ -159,26 +146,14 @@ def mutate_lines(content: bytes, rng: Random) -> bytes:
 
 
 _DTYPES = (
-    "<f4",
-    "<f8",
-    "<f2",
-    ">f4",
-    "<i8",
-    "<u1",
-    "|b1",
-    "|O",
-    "<c8",
-    "<U3",
-    "|V4",
-    "<M8[s]",
-    "f4,(2,3)i4",
-    "<f16",
+    *("<f4", "<f8", "<f2", ">f4", "<i8", "<u1", "|b1", "|O"),
+    *("<c8", "<U3", "|V4", "<M8[s]", "f4,(2,3)i4", "<f16"),
 )
 _SHAPES = ("()", "(0,)", "(-1, 5)", "(3,)", "(0, 5)", "(5, 0)", "(2, 5)", "(4611686018427387904, 4)", "(1, 1, 10)")
 
 
 def mutate_npy(content: bytes, rng: Random) -> bytes:
-    """The text of the header, with the length that fits it or another, and the values."""
+    """Change the header, its length or the values."""
     size = int.from_bytes(content[8:10], "little")
     magic, header, values = content[:8], content[10 : 10 + size], content[10 + size :]
     match rng.randrange(5):
@@ -229,7 +204,7 @@ def mutate_pcd(content: bytes, rng: Random) -> bytes:
     match rng.randrange(4):
         case 0:
             body = mutate_bytes(body, rng)
-        case 1:  # points that are as many as the header says
+        case 1:  # header fields of another length or type
             line = rng.choice((b"SIZE", b"TYPE", b"COUNT", b"FIELDS", b"POINTS", b"WIDTH", b"HEIGHT"))
             words = rng.choice(
                 (b"1 2 4 8", b"F F F F", b"I U F F", b"x y z t", b"x x y z", b"1 1 1 1000000", *WORDS)
@@ -255,10 +230,9 @@ def mutate_feather(content: bytes, rng: Random) -> bytes:
         case 1:
             table = table.append_column(rng.choice((name, "a")), column)
         case 2:
-            others = [
-                [value] * rows for value in (None, True, "a", b"a", 0.5, [1], {"a": 1}, 2**63 - 1, float("nan"))
-            ]
-            table = table.set_column(i, name, pa.array(rng.choice((*others, [None, *column.to_pylist()[1:]]))))
+            values = None, True, "a", b"a", 0.5, [1], {"a": 1}, 2**63 - 1, float("nan")
+            others = [[value] * rows for value in values] + [[None, *column.to_pylist()[1:]]]
+            table = table.set_column(i, name, pa.array(rng.choice(others)))
         case 3:
             values = column.to_pylist()
             values[rng.randrange(rows)] = rng.choice((None, type(values[0])(), values[-1], values[0] * 2))

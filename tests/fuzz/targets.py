@@ -1,4 +1,4 @@
-"""What is fuzzed: sound files, and the reader of each with what its result must be."""
+"""The targets: valid files, and the reader of each with checks of its result."""
 
 import contextlib
 import dataclasses
@@ -74,11 +74,11 @@ SPEC = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=F
 
 Files = Mapping[str, bytes]
 Read = Callable[[Path, str], None]
-"""Called with a folder and the name of the file in it that was changed. Raises InvalidError for a wrong result."""
+"""Reads a folder, given the name of the changed file in it; raises InvalidError for an invalid result."""
 
 
 class InvalidError(Exception):
-    """What was read is not what the reader promises."""
+    """A reader returned something that it does not promise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,13 +86,13 @@ class Target:
     """A kind of file."""
 
     name: str
-    files: Files  # below a folder
+    files: Files  # path below the folder -> content
     read: Read
-    changed: tuple[str, ...] = ()  # those of the files that are mutated; none stands for all
+    changed: tuple[str, ...] = ()  # files to mutate; () for all
     mutate: Callable[[str, bytes, Random], bytes] = mutate
-    seal: Callable[[Path, str], None] | None = None  # makes checksums fit, for half of the inputs
+    seal: Callable[[Path, str], None] | None = None  # corrects checksums, for half of the inputs
     share: float = 1.0  # of the inputs, relative to the others
-    alone: bool = False  # messages name the file itself, not only the folder
+    alone: bool = False  # messages must name the file, not only the folder
 
     @property
     def mutable(self) -> tuple[str, ...]:
@@ -153,7 +153,7 @@ def _json(value: object) -> bytes:
 
 
 def _files(write: Callable[[Path], object]) -> dict[str, bytes]:
-    """What a function writes into a folder."""
+    """The files that a function writes into a folder."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder))
         found = sorted(file for file in Path(folder).rglob("*") if file.is_file())
@@ -390,7 +390,7 @@ def _exported() -> bytes:
 
 
 def _mutate_exported(name: str, content: bytes, rng: Random) -> bytes:
-    """The line of JSON, or anything."""
+    """Change the line of JSON, or any bytes."""
     first, line, program = content.split(b"\n", 2)
     if rng.random() < 0.5:
         return mutate_bytes(content, rng)
@@ -508,13 +508,14 @@ def make_targets() -> list[Target]:
     }
     records = tuple(name for name in synthesized if name.startswith(".synthesize/"))
     is_column = [name for name in index if name.startswith("index/")]
+    file_target = functools.partial(Target, alone=True)
     return [
-        Target("raw points", raw, _cloud(NUSCENES_HDL32E, **layouts), alone=True),
-        Target("raw points of KITTI", {"a.bin": _raw("f4", POINTS[:, 3] / 100)}, _cloud(KITTI_HDL64E), alone=True),
-        Target("npy", arrays, _cloud(NUSCENES_HDL32E), alone=True, share=2),
-        Target("npz", archives, _cloud(NUSCENES_HDL32E), alone=True, share=2),
-        Target("pcd", _pcd_files(), _cloud(NUSCENES_HDL32E), alone=True, share=4),
-        Target("feather", {"a.feather": next(iter(sweep.values()))}, _cloud(ARGOVERSE2), alone=True, share=2),
+        file_target("raw points", raw, _cloud(NUSCENES_HDL32E, **layouts)),
+        file_target("raw points of KITTI", {"a.bin": _raw("f4", POINTS[:, 3] / 100)}, _cloud(KITTI_HDL64E)),
+        file_target("npy", arrays, _cloud(NUSCENES_HDL32E), share=2),
+        file_target("npz", archives, _cloud(NUSCENES_HDL32E), share=2),
+        file_target("pcd", _pcd_files(), _cloud(NUSCENES_HDL32E), share=4),
+        file_target("feather", {"a.feather": next(iter(sweep.values()))}, _cloud(ARGOVERSE2), share=2),
         Target("Argoverse 2", drive, _read_argoverse2, share=0.5),
         Target("KITTI", _kitti_files(), _read_kitti),
         Target("folder", _folder_files(), _read_folder),
@@ -526,44 +527,35 @@ def make_targets() -> list[Target]:
             {"boxes.json": _json({"lidar_file": "a.npy", "boxes": boxes}), "a.npy": arrays["a.npy"]},
             _read_keyframe,
         ),
-        Target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor, alone=True),
-        Target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses, alone=True),
+        file_target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor),
+        file_target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),
         Target("recordings of ROS", _files(_recordings), _read_recording, share=0.25),  # 25 ms each
-        Target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map, alone=True),
-        Target("results", {"a.json": _json({"meta": LIDAR_META, "results": found})}, _read_results, alone=True),
-        Target("ground truth", {"a.json": _json(truth)}, _read_truth, alone=True),
-        Target(
-            "detections",
-            {"a.json": _json({"classes": ["car", "sign"], "frames": frames})},
-            _read_detections,
-            alone=True,
+        file_target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map),
+        file_target("results", {"a.json": _json({"meta": LIDAR_META, "results": found})}, _read_results),
+        file_target("ground truth", {"a.json": _json(truth)}, _read_truth),
+        file_target(
+            "detections", {"a.json": _json({"classes": ["car", "sign"], "frames": frames})}, _read_detections
         ),
-        Target("run.json", {"run.json": _json(RUN_SPEC)}, _read_run, alone=True),
-        Target(
-            "metrics.jsonl",
-            {"metrics.jsonl": b"".join(_json(line) + b"\n" for line in lines)},
-            _read_metrics,
-            alone=True,
+        file_target("run.json", {"run.json": _json(RUN_SPEC)}, _read_run),
+        file_target(
+            "metrics.jsonl", {"metrics.jsonl": b"".join(_json(line) + b"\n" for line in lines)}, _read_metrics
         ),
-        Target("resume log", _files(_resume_log), _read_resume_log, alone=True),
+        file_target("resume log", _files(_resume_log), _read_resume_log),
         Target(
             "checkpoint.json",
             {"checkpoint.json": _json(_description())},
             _read_description,
             seal=_seal_description,
         ),
-        Target(
+        file_target(
             "exported detector",
             {"a.fcos": _exported()},
             _read_exported,
             mutate=_mutate_exported,
             seal=_seal_exported,
-            alone=True,
         ),
         Target(
-            "ground-truth database",
-            _files(lambda folder: prepare_database(OneFrame(), folder)),
-            _read_database,
+            "ground-truth database", _files(lambda folder: prepare_database(OneFrame(), folder)), _read_database
         ),
         Target(
             "cached frames",

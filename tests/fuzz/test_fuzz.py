@@ -1,4 +1,4 @@
-"""The fuzzing in its short form, and that it notices what it looks for."""
+"""The short form of the fuzzing, and a test that it notices every kind of failure."""
 
 import json
 from typing import get_args
@@ -8,15 +8,15 @@ from commands import run_python
 from fcos_lidar_jax.input_pipeline.open import Format
 
 
-def test_every_reader_refuses_in_one_line_or_returns_sound_data(tmp_path):
+def test_every_reader_refuses_in_one_line_or_returns_valid_data(tmp_path):
     out = tmp_path / "fuzz.json"
-    done = run_python("-m", "tests.fuzz", "--inputs", 20_000, "--workers", 1, "--memory-mib", 512, "--out", out)
+    done = run_python("-m", "tests.fuzz", "--inputs", 10_000, "--workers", 1, "--memory-mib", 512, "--out", out)
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
     record = json.loads(out.read_text())
     assert (record["failures"], record["python_malloc"]) == (0, "debug")
-    assert record["inputs"] >= 19_900
+    assert record["inputs"] >= 9_900
     accepted, refused = ({n for n, c in record["targets"].items() if c[what]} for what in ("accepted", "refused"))
-    # What is damaged in the logs is left out; a run that differs in anything is another run.
+    # Logs skip damaged lines; a run spec that differs in anything is of another run.
     assert record["targets"].keys() - refused == {"metrics.jsonl", "resume log"}
     assert record["targets"].keys() - accepted <= {"run.json"}
     fuzzed = {name.lower().replace(" ", "") for name in record["targets"]}
@@ -57,7 +57,7 @@ print(json.dumps([{n: vars(c) for n, c in counts.items()}, {f.target: f.problem 
 """
 
 
-def test_whatever_a_reader_does_wrong_is_noticed():
+def test_every_kind_of_failure_is_noticed():
     done = run_python("-c", MISTREATED)
     assert done.returncode == 0, done.stderr
     counts, problems = json.loads(done.stdout)

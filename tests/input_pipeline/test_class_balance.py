@@ -55,16 +55,12 @@ def test_classes_that_share_their_frames_have_draws_of_their_own():
     assert (counts % 2).any()
 
 
-def test_epochs_are_redrawn_and_shuffled():
-    order = order_of(SHOWS)
-    epochs = [epoch_of(order, epoch) for epoch in range(4)]
-    assert len({tuple(sorted(epoch)) for epoch in epochs}) == 4
-    assert all(epoch != sorted(epoch) for epoch in epochs)
-
-
 def test_the_seed_and_the_position_decide():
     a, b, c = (order_of(SHOWS, seed=s) for s in (5, 5, 6))
     assert epoch_of(a, 1) == epoch_of(b, 1) != epoch_of(c, 1)
+    epochs = [epoch_of(a, epoch) for epoch in range(4)]
+    assert len({tuple(sorted(epoch)) for epoch in epochs}) == 4  # sampled anew
+    assert all(epoch != sorted(epoch) for epoch in epochs)  # shuffled
     backwards = [b[position] for position in reversed(range(a.epoch_size, 2 * a.epoch_size))]
     assert backwards[::-1] == epoch_of(a, 1)
 

@@ -99,7 +99,7 @@ def test_a_crafted_table_is_refused(tmp_path, field, value):
     entry = next(shard for shard in manifest["shards"] if shard["name"] == "scene-a")
     entry["table_blake2b"] = checksum(file.read_bytes())
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(DatabaseError, match=r"scene-a\.objects\.npz: got objects whose points lie outside"):
+    with pytest.raises(DatabaseError, match=r"scene-a\.objects\.npz: got objects with points outside"):
         open_database(tmp_path)
 
 
@@ -199,28 +199,28 @@ import sys
 from fcos_lidar_jax.input_pipeline.database import prepare_database
 from toy_frames import SceneFrames, ToyFrames
 if __name__ == "__main__":
-    scenes = tuple((f"scene-{i}", (i, i + 1)) for i in range(99))
-    prepare_database(SceneFrames(ToyFrames(99, 0.03), scenes), sys.argv[1], workers=int(sys.argv[2]))
+    scenes = tuple((f"scene-{i}", (i, i + 1)) for i in range(60))
+    prepare_database(SceneFrames(ToyFrames(61, 0.03), scenes), sys.argv[1], workers=2)
 """
 
 
-MANY_SCENES = tuple((f"scene-{i}", (i, i + 1)) for i in range(99))
+MANY_SCENES = tuple((f"scene-{i}", (i, i + 1)) for i in range(60))
 
 
 @pytest.fixture(scope="module")
 def whole_of_many(tmp_path_factory):
     folder = tmp_path_factory.mktemp("many")
-    build(folder, ToyFrames(99), scenes=MANY_SCENES)
+    build(folder, ToyFrames(61), scenes=MANY_SCENES)
     return contents(folder)
 
 
-@pytest.mark.parametrize(("workers", "sent"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGINT)])
-def test_a_killed_build_goes_on_to_the_same_bytes(tmp_path, whole_of_many, workers, sent):
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_build_goes_on_to_the_same_bytes(tmp_path, whole_of_many, sent):
     script = tmp_path / "build.py"
     script.write_text(KILLED)
     folder = tmp_path / "objects"
     process = subprocess.Popen(
-        [sys.executable, script, folder, str(workers)],
+        [sys.executable, script, folder],
         env=child_environment(),
         start_new_session=True,
         stderr=subprocess.PIPE,
@@ -234,11 +234,11 @@ def test_a_killed_build_goes_on_to_the_same_bytes(tmp_path, whole_of_many, worke
     else:
         process.send_signal(sent)
     error = process.communicate(timeout=60)[1]
-    assert 4 <= len(list(folder.glob("*.npz"))) < 99
+    assert 4 <= len(list(folder.glob("*.npz"))) < 60
     assert not (folder / "manifest.json").exists()
     assert error.count("Traceback") <= 1  # the workers say nothing
     assert ends(process.pid)
-    build(folder, ToyFrames(99), scenes=MANY_SCENES)
+    build(folder, ToyFrames(61), scenes=MANY_SCENES)
     assert contents(folder) == whole_of_many
 
 

@@ -83,20 +83,14 @@ def alone(objects):
 @pytest.mark.parametrize(
     "how",
     [
-        *({"threads": n} for n in (1, 2, 4)),
+        *({"threads": n} for n in (1, 4)),
         {"workers": 1, "first_step": 3},
         {"workers": 2, "threads": 2},
-        {"workers": 4, "first_step": 1},
-        *({"first_step": step, "threads": step % 3} for step in range(STEPS + 1)),
+        *({"first_step": step, "threads": step % 3} for step in (1, 4, STEPS)),
     ],
 )
 def test_threads_workers_and_resuming_do_not_change_a_bit(objects, alone, how):
     assert_same(run(config=CONFIG, objects=objects, **how), alone[how.get("first_step", 0) :])
-
-
-def test_threads_do_not_change_a_bit_of_balanced_classes(objects):
-    config = dataclasses.replace(CONFIG, class_balanced=True)
-    assert_same(run(config=config, objects=objects, threads=2), run(config=config, objects=objects))
 
 
 @pytest.mark.parametrize("num_processes", [2, 4])
@@ -152,7 +146,7 @@ def test_what_does_not_fit_the_packing_comes_plain_and_a_line_says_why(capfd, wo
     odd = ["frame 1" in host.names for host in found]
     assert [isinstance(host.batch, Batch) for host in found] == odd
     assert 1 < sum(odd) < len(odd)
-    told = "frame 'frame 1': intensity: got 12.5, expected whole numbers from 0 to 255, as in the frames that were"
+    told = "frame 'frame 1': intensity: got 12.5, expected whole numbers from 0 to 255, as in the frames inspected"
     (line,) = [line for line in capfd.readouterr().err.splitlines() if "frame" in line]
     assert line.startswith(told)
     plain = [dataclasses.replace(host, misfit=None) if out else unpacked(host) for host, out in zip(found, odd)]  # noqa: B905
