@@ -427,7 +427,7 @@ EMPTY = InMemoryFrames(tuple(map(without_points, range(3))), FRAMES.sensor, FRAM
         ({"threads": -1}, "threads: got -1, expected at least 0"),
         ({"workers": -1}, "workers: got -1, expected at least 0"),
         ({"frames": UNREADABLE}, "clouds/0.npy: empty file"),
-        ({"frames": EMPTY}, "frame 'frame 0': box 0: got 0 points, as for all boxes of 3 frames"),
+        ({"frames": EMPTY}, "frame 'frame 0': box 0: got 0 points, like all boxes of 3 frames"),
     ],
 )
 def test_invalid_arguments_are_refused_before_the_run_starts(tmp_path, options, message):
