@@ -168,7 +168,7 @@ def test_no_command_overwrites_its_detector(home, capsys, command_line):
     content = (home / "detector.fcos").read_bytes()
     words = command_line.replace("HOME", str(home)).split()
     detector = str(home / "detector.fcos")
-    message = "--out: .* found a place in the checkpoint"
+    message = "--out: .* inside of the checkpoint, expected a path elsewhere"
     assert_one_line_error(capsys, [*words, "--checkpoint", detector, "--out", detector], message)
     assert (home / "detector.fcos").read_bytes() == content
 
@@ -176,7 +176,7 @@ def test_no_command_overwrites_its_detector(home, capsys, command_line):
 WRONG = {
     "--points 0": "points: got 0, expected at least 1, or any",
     "--batch 0": "batch: got 0, expected at least 1, or any",
-    "--out HOME/checkpoint/a": "--out: .* found a place in the checkpoint",
+    "--out HOME/checkpoint/a": "--out: .* inside of the checkpoint, expected a path elsewhere",
     "--out HOME": "found a folder",
     "--checkpoint HOME/detector.fcos": "found a file, expected a checkpoint folder",
 }
