@@ -50,25 +50,31 @@ def test_prints_a_record_and_a_second_run_changes_nothing(root, tmp_path, capsys
 
 
 KILLED = """
-import os, random, signal, sys, time
-from fcos_lidar_jax.cli import commands, main
-index, command, draw = sys.argv[1], sys.argv[2:], random.Random(0)
-def start(name):
+import os, signal, sys
+from fcos_lidar_jax.cli import main
+index, command = sys.argv[1], sys.argv[2:]
+def killed_at(step, folder):
+    # Ends the process without any cleaning up before its step-th change of the file system.
+    steps = 0
+    def hook(event, arguments):
+        nonlocal steps
+        changes = event in ("os.mkdir", "os.rename", "os.remove")
+        if changes or event == "open" and isinstance(arguments[1], str) and set("wxa+") & set(arguments[1]):
+            steps += 1
+            if steps == step:
+                os.kill(os.getpid(), signal.SIGKILL)
     child = os.fork()
     if not child:
-        os._exit(main([*command, "--index", f"{index}-{name}"]))
-    return child
-whole_s = 9.0
-for i in range(3):
-    began = time.monotonic()
-    os.waitpid(start(f"whole-{i}"), 0)
-    whole_s = min(whole_s, time.monotonic() - began)
-for trial in range(12):
-    for _ in range(1 + trial // 8):
-        child = start(trial)
-        time.sleep(draw.uniform(0.1, 1) * whole_s)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        sys.addaudithook(hook)
+        main([*command, "--index", folder])
+        os.write(pipe[1], steps.to_bytes(4, "little"))
+        os._exit(0)
+    return os.waitpid(child, 0)[1]
+pipe = os.pipe()
+assert killed_at(0, f"{index}-whole") == 0
+whole = int.from_bytes(os.read(pipe[0], 4), "little")
+for trial in range(8):
+    assert killed_at(1 + whole * trial // 8, f"{index}-{trial}") == signal.SIGKILL
 """
 
 
@@ -79,12 +85,12 @@ def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     done = run_python("-c", KILLED, tmp_path / "killed", *prepare(root, tmp_path / "none"))
     assert done.returncode == 0, done.stderr
     states = set()
-    for trial in range(12):
+    for trial in range(8):
         folder = tmp_path / f"killed-{trial}"
         states.add(tuple(contents(folder)) if folder.exists() else ())
         command(*prepare(root, folder, *(["--workers", "2"] if trial == 0 else [])))
         assert contents(folder) == expected
-    assert len(states - {(), tuple(expected)}) >= 3  # kills at different stages
+    assert len(states - {(), tuple(expected)}) >= 6  # kills at different stages
 
 
 def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
