@@ -178,15 +178,29 @@ ARGOVERSE2 = Sensor(
 )
 """Argoverse 2: two stacked 32-beam sensors with overlapping inclinations; the row is the laser number 0-63."""
 
+VLP16 = Sensor("vlp16", even_inclinations(-15.0, 15.0, 16), 1800)
+"""Velodyne VLP-16 (Puck) at 10 Hz: 2 degrees between beams, 0.2 degrees between columns (data sheet)."""
+
+OS1_64 = Sensor("os1_64", even_inclinations(-16.6, 16.6, 64), 1024)
+"""Ouster OS1-64 in mode 1024x10: field of view of 33.2 degrees, nominal (data sheet of the first generation).
+Intensity is the reflectivity, 0-255, not the signal."""
+
+OS1_128 = Sensor("os1_128", even_inclinations(-22.5, 22.5, 128), 1024)
+"""Ouster OS1-128 in mode 1024x10: field of view of 45 degrees, nominal (data sheet). Intensity as for OS1-64."""
+
+# Every sixth of a degree from 2 to -6 degrees, coarser above and below.
+_PANDAR64_DEG = [15, 11, 8, 5, 3, *(2 - np.arange(49) / 6), *range(-7, -15, -1), -19, -25]
+PANDAR64 = Sensor("pandar64", tuple(float(v) for v in np.radians(_PANDAR64_DEG)), 1800)
+"""Hesai Pandar64 at 10 Hz: nominal channel distribution, 0.2 degrees between columns (user manual)."""
+
 TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, limit_xy_m=25.0)
 """A 16-beam sensor with a short reach, for tests."""
 
 SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 128, limit_xy_m=25.0)
 """The quickstart's sensor: 32 beams, few columns, for short range."""
 
-PRESETS: dict[str, Sensor] = {
-    s.name: s for s in (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, TINY, SHORT_RANGE)
-}
+_REAL = (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, VLP16, OS1_64, OS1_128, PANDAR64)
+PRESETS: dict[str, Sensor] = {s.name: s for s in (*_REAL, TINY, SHORT_RANGE)}
 """Sensors by name."""
 
 

@@ -31,6 +31,28 @@ def test_presets_match_the_paper_and_the_data_sheets():
     assert PRESETS["kitti_hdl64e"].even_step_rad is None
 
 
+@pytest.mark.parametrize(
+    ("name", "beams", "highest", "lowest", "finest", "columns"),
+    [
+        ("vlp16", 16, 15.0, -15.0, 2.0, 1800),
+        ("os1_64", 64, 16.6, -16.6, 33.2 / 63, 1024),
+        ("os1_128", 128, 22.5, -22.5, 45 / 127, 1024),
+        ("pandar64", 64, 15.0, -25.0, 1 / 6, 1800),
+    ],
+)
+def test_sensors_of_data_sheets(name, beams, highest, lowest, finest, columns):
+    degrees = np.degrees(PRESETS[name].inclinations_rad)
+    assert (len(degrees), PRESETS[name].num_columns) == (beams, columns)
+    np.testing.assert_allclose([degrees[0], degrees[-1], -np.diff(degrees).max()], [highest, lowest, finest])
+
+
+def test_pandar64_is_within_a_fifth_of_a_degree_of_a_calibrated_unit():
+    # Some channels of a unit's angle correction file, as the manufacturer's SDK ships it.
+    unit = {1: 14.838, 4: 5.017, 6: 1.999, 18: -0.024, 30: -2.058, 42: -4.094, 54: -6.109, 55: -7.097, 64: -24.883}
+    degrees = np.degrees(PRESETS["pandar64"].inclinations_rad)
+    np.testing.assert_allclose([degrees[channel - 1] for channel in unit], list(unit.values()), atol=0.2)
+
+
 def test_row_edges_are_midpoints_and_extend_half_a_row_outwards():
     sensor = Sensor("three", (0.3, 0.1, 0.0), 8)
     np.testing.assert_allclose(sensor.row_edges_rad, [0.4, 0.2, 0.05, -0.05])
