@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.changes import Change, change
+from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
 from experiments.statistics import interval
@@ -95,6 +96,7 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
         "AP": {k: round(v, 3) for k, v in summary["mean_dist_aps"].items() if v > 0.001},
         "step_s": round(statistics.median(seconds), 3),
         "parameters": count_parameters(detector.variables["params"])["total"],
+        "git": hardware()["git"],
     }
 
 
@@ -128,7 +130,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         scores.setdefault((row["steps"], row["trial"]), {})[row["seed"]] = row["mAP"]
     for (steps, name), own in sorted(scores.items()):
-        last = next(r for r in rows if (r["steps"], r["trial"]) == (steps, name))
+        all_of = [r for r in rows if (r["steps"], r["trial"]) == (steps, name)]
+        step_s = min(r["step_s"] for r in all_of)  # of the seed that was least disturbed
         base = scores.get((steps, "base"), {})
         seeds = sorted(own.keys() & base.keys())
         difference, ratio = "", ""
@@ -139,7 +142,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         each, mean = ", ".join(f"{own[s]:.4f}" for s in sorted(own)), statistics.mean(own.values())
         lines.append(
             f"| {name} | {steps:,} | {each} | {mean:.4f} "
-            f"| {difference} | {ratio} | {last['step_s']:.2f} | {last['parameters']:,} |"
+            f"| {difference} | {ratio} | {step_s:.2f} | {all_of[0]['parameters']:,} |"
         )
     return "\n".join(lines)
 

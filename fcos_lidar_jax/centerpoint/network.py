@@ -10,6 +10,7 @@ from jaxtyping import Array
 from fcos_lidar_jax.centerpoint.config import PillarConfig
 from fcos_lidar_jax.centerpoint.pillars import cell_maxima
 from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
+from fcos_lidar_jax.collectives import sum_over_devices
 from fcos_lidar_jax.models.convolution import FULL
 from fcos_lidar_jax.models.heads import Predictions
 from fcos_lidar_jax.models.layers import BatchNorm, Conv, ConvNorm, Image, pieces
@@ -30,7 +31,9 @@ class PointLayers(nn.Module):
     def __call__(self, pillars: Pillars, *, train: bool) -> Image:
         x, cell, number = pillars.features[:, :, None], pillars.cell, self.side * self.side
         inside = (cell < number)[:, :, None, None]
-        where = inside | ~inside.any()  # Without any point, the statistics are of zeros, not NaN.
+        where = inside | (
+            sum_over_devices(inside.sum()) == 0
+        )  # Without any point, the statistics are of zeros, not NaN.
         maxima = x[:, :, 0]
         for i, wide in enumerate(self.channels):
             last = i == len(self.channels) - 1

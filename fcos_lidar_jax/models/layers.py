@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from fcos_lidar_jax.collectives import mean_over_devices
 from fcos_lidar_jax.models.convolution import Image, convolve
 
 EPSILON = 1e-5  # Added to the variance in both norms.
@@ -83,11 +84,11 @@ class BatchNorm(nn.Module):
         mean, var = running_mean.value, running_var.value
         input_dtype, parts = parts[0].dtype, [at_least_float32(part) for part in parts]
         if train:
-            mean = jnp.concatenate([part.mean((0, 1, 2), where=where) for part in parts])
+            mean = jnp.concatenate([mean_over_devices(part, (0, 1, 2), where) for part in parts])
             # The derivative of the variance by the mean is zero; omitting it saves one read of the image.
             fixed = lax.stop_gradient(mean)
             squares = [jnp.square(part - fixed[cut]) for part, cut in zip(parts, cuts, strict=True)]
-            var = jnp.concatenate([square.mean((0, 1, 2), where=where) for square in squares])
+            var = jnp.concatenate([mean_over_devices(square, (0, 1, 2), where) for square in squares])
             if not self.is_initializing():
                 running_mean.value = self.momentum * running_mean.value + (1 - self.momentum) * mean
                 running_var.value = self.momentum * running_var.value + (1 - self.momentum) * var

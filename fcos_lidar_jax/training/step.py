@@ -11,6 +11,7 @@ import optax
 from jax import lax
 
 from fcos_lidar_jax.augment import augment, sample_key
+from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
 from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.packing import unpack
 from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
@@ -80,6 +81,7 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
             grads = {name: pull_back(zero | {name: jnp.ones_like(t)})[0] for name, t in totals.items()}
             return batch_stats, (grads, sums)
 
+        params = varying(params)
         if num_micro == 1:
             batch_stats, (grads, sums) = visit(batch_stats, batch)
         else:
@@ -94,6 +96,8 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
             shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
             zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
             (batch_stats, (grads, sums)), _ = lax.scan(add, (batch_stats, zeros), micros)
+
+        grads, sums = sum_over_devices((grads, sums))
 
         def divided(name: str) -> Any:
             scale = 1 / jnp.maximum(sums.counts[name], 1)
@@ -132,7 +136,8 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         if config.augment is None:
             return batch
         augment_one = functools.partial(augment, config=config.augment, origin_m=sensor.origin_m)
-        index = jnp.arange(batch.points.shape[0], dtype=jnp.int32)
+        size = batch.points.shape[0]
+        index = device_index() * size + jnp.arange(size, dtype=jnp.int32)
         keys = jax.vmap(lambda i: sample_key(state.key, state.step, i))(index)
         points, boxes = jax.vmap(augment_one)(keys, batch.points, batch.boxes)
         return dataclasses.replace(batch, points=points, boxes=boxes)

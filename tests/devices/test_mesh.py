@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from commands import run_python
 
+from fcos_lidar_jax.collectives import sum_over_devices
 from fcos_lidar_jax.devices.mesh import check_batch_size, jit_step, make_mesh, pmap_step, replicate, shard_batch
 
 
@@ -21,9 +22,9 @@ def tree():
 def toy_step(state, batch):
     """Sums over the whole batch; the state keeps its structure."""
     noise = jax.random.uniform(jax.random.fold_in(state["key"], state["step"]))
-    total = batch["x"].sum(axis=0) + noise
-    new = {"w": state["w"] + total, "step": state["step"] + 1, "key": state["key"]}
-    return new, {"total": batch["x"].sum(), "per_level": batch["x"].sum(axis=0).astype(jnp.int32)}
+    columns = sum_over_devices(batch["x"].sum(axis=0))
+    new = {"w": state["w"] + columns + noise, "step": state["step"] + 1, "key": state["key"]}
+    return new, {"total": columns.sum(), "per_level": columns.astype(jnp.int32)}
 
 
 def test_the_mesh_has_one_axis_over_the_given_devices(mesh):
