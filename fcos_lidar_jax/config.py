@@ -194,6 +194,8 @@ class InferenceConfig:
     max_detections: int = 500  # Maximum number of boxes per cloud.
     candidates_per_level: int = 1000  # Reading: (location, class) pairs of each level that enter NMS.
     nms_overlap: Literal["bev", "3d"] = "bev"  # Reading: rotated IoU in the ground plane, or in 3D.
+    nms_across_classes: bool = False
+    """Not in the paper: NMS also removes boxes that overlap a better box of another class."""
     iou_exponent: float = 1.0
     """Exponent of the predicted IoU, which multiplies the class probability: 1 in the paper; other values as in
     CIA-SSD (Zheng et al., AAAI 2021); 0 ignores the predicted IoU."""

@@ -32,7 +32,7 @@ _OLD_FORMAT = 2
 LATER_FIELDS = {
     "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False},
     "loss": {"quality": "iou", "centreness_m": 0.75},
-    "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
+    "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none", "nms_across_classes": False},
 }
 """Configuration fields added to format 3 later, and their values in checkpoints without them."""
 GONE_FIELDS = {"model": {"meta_kernel": False}}

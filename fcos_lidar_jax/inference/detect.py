@@ -22,25 +22,27 @@ _MIRRORS = {"none": ("",), "x": ("", "x"), "y": ("", "y"), "xy": ("", "x", "y", 
 def suppress(
     boxes: Array, scores: Array, labels: Array, valid: Array, config: InferenceConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """Apply class-wise rotated NMS to the candidates of one cloud.
+    """Apply rotated NMS, per class unless ``config.nms_across_classes``, to the candidates of one cloud.
 
     Returns:
         boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
     """
-    options: dict[str, Any] = {"labels": labels, "overlap": config.nms_overlap}
+    options: dict[str, Any] = {"overlap": config.nms_overlap}
     with jax.named_scope("nms"):
         index, used = rotated_nms(
             boxes,
             scores,
             valid,
             **options,
+            labels=None if config.nms_across_classes else labels,
             iou_threshold=config.iou_threshold,
             max_outputs=config.max_detections,
         )
     if config.merge_iou is None:
         best_boxes = jnp.where(used[:, None], boxes[index], 0.0)
     else:
-        best_boxes = merge_boxes(boxes, scores, valid, index, used, **options, iou_threshold=config.merge_iou)
+        options |= {"labels": labels, "iou_threshold": config.merge_iou}
+        best_boxes = merge_boxes(boxes, scores, valid, index, used, **options)
     return best_boxes, jnp.where(used, scores[index], 0.0), jnp.where(used, labels[index], 0), used
 
 

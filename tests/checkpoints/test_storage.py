@@ -97,7 +97,7 @@ def test_a_checkpoint_of_an_older_version_is_converted(copy, written, version):
     later = {
         "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False},
         "loss": {"quality": "iou", "centreness_m": 0.75},
-        "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none"},
+        "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none", "nms_across_classes": False},
     }
 
     def make_older(description):

@@ -76,12 +76,15 @@ def test_candidates_are_the_best_pairs_of_each_level(scene, iou_exponent, axes):
     assert not scores[~valid].any()
 
 
-def test_postprocessing_is_class_wise_greedy_nms(scene):
+@pytest.mark.parametrize("across", [False, True])
+def test_postprocessing_is_greedy_nms_within_or_across_classes(scene, across):
     outputs, locations = scene
-    config = InferenceConfig(min_probability=0.2, candidates_per_level=60, max_detections=40)
+    config = InferenceConfig(
+        min_probability=0.2, candidates_per_level=60, max_detections=40, nms_across_classes=across
+    )
     candidates = select_candidates(outputs, locations, config=config, layout=LAYOUT, axes="lidar")
     boxes, scores, labels, valid = map(np.asarray, candidates)
-    expected = oracles.nms(boxes, scores, valid, labels, 0.2, 40)
+    expected = oracles.nms(boxes, scores, valid, np.zeros_like(labels) if across else labels, 0.2, 40)
     *best, used = map(np.asarray, suppress(*candidates, config))
     assert used.sum() == len(expected)
     for array, candidate in zip(best, (boxes, scores, labels), strict=True):
