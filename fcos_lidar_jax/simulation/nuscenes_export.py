@@ -74,7 +74,6 @@ def _write_rest(spec: DatasetSpec, root: Path, workers: int, report: Callable[[i
 def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
     """Specification of the data set as JSON; rejects a folder with other contents."""
     order = {"format": _FORMAT, **dataclasses.asdict(spec), "sensor": sensor_to_json(spec.sensor)}
-    order = json.loads(json.dumps(order))
     if root.exists() and not root.is_dir():
         raise ValueError(f"{root}: found a file, expected a folder")
     file = root / _ORDER
@@ -82,17 +81,22 @@ def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
         if root.is_dir() and any(p.name != _WORK for p in root.iterdir()):
             raise ValueError(f"{root}: found other files, expected an empty folder or a data set of this command")
         return order
-    previous = read_json(file, dict[str, Any])
-    for name, value in order.items():
-        before = previous.get(name)
-        if isinstance(value, dict) and isinstance(before, dict):
-            fields = ("name", *sorted(value.keys() | before.keys()))
-            field = next((field for field in fields if value.get(field) != before.get(field)), "name")
-            name = name if field == "name" else f"{name}.{field}"
-            value, before = value.get(field), before.get(field)
+    own, begun = _by_field(json.loads(json.dumps(order))), _by_field(read_json(file, dict[str, Any]))
+    for name in own | begun:
+        value, before = own.get(name), begun.get(name)
         if before != value:
             raise ValueError(f"{root}: {name}: got {value}, expected {before} as in the data set begun there")
     return order
+
+
+def _by_field(order: dict[str, Any]) -> dict[str, Any]:
+    """Values by path; the name of the sensor or of the streets comes first and stands for the whole."""
+    found = {}
+    for name, value in order.items():
+        fields = dict(value) if isinstance(value, dict) else {"name": value}
+        found[name] = fields.pop("name", None)
+        found |= {f"{name}.{field}": v for field, v in fields.items()}
+    return found
 
 
 def _finished(spec: DatasetSpec, root: Path) -> bool:

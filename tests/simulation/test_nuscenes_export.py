@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_python
+from kills import killed_twice
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax import cli
@@ -243,38 +244,13 @@ def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, 
     assert line.endswith(" is synthesizing, expected no other process")
 
 
-KILLED = """
-import os, signal, sys, time
-from pathlib import Path
-from fcos_lidar_jax.cli import commands, main
-out, command = sys.argv[1], sys.argv[2:]
-def written(root):
-    folders = [Path(root, kind, "LIDAR_TOP") for kind in ("samples", "sweeps")]
-    return sum(len(os.listdir(folder)) for folder in folders if folder.is_dir())
-for trial, moments in enumerate([(1, 14), (8, 22), (33, 33)]):
-    for moment in moments:  # number of files at which the process is killed
-        child = os.fork()
-        if not child:
-            os._exit(main([*command, "--out", f"{out}-{trial}"]))
-        while written(f"{out}-{trial}") < moment:
-            time.sleep(0.001)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-"""
-
-
 def test_killed_runs_resume_to_the_same_bytes(made, tmp_path):
-    expected = contents(made)
-    # Fork from a process that has imported everything, so that the kills hit the actual work.
-    killed = [sys.executable, "-c", KILLED, str(tmp_path / "killed"), *command(tmp_path / "none")]
-    subprocess.run(killed, check=True, capture_output=True)
-    states = set()
-    for trial in range(3):
-        root = tmp_path / f"killed-{trial}"
+    expected, states = contents(made), set()
+    for root in killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", "--workers", "1")):
         states.add(len(list(root.rglob("*.bin"))))
         assert not (root / VERSION).is_dir() or contents(root) == expected  # tables appear last
         assert contents(synthesize(root)) == expected
-    assert len(states) == 3  # the kills hit different states
+    assert len(states) >= 6  # kills at different stages
 
 
 def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, tmp_path):
