@@ -23,9 +23,9 @@ from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cells import changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
 from experiments.paper_tables.tables import Row, Table
-from experiments.script import run_script
+from experiments.script import run_script, write_text
 from experiments.statistics import interval
-from fcos_lidar_jax.files import atomic_write, read_json
+from fcos_lidar_jax.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
@@ -256,8 +256,7 @@ def main(args: Args) -> None:
     ledger = as_markdown(args.results)
     print(ledger, end="", flush=True)
     if args.write:
-        text = with_ledger(README.read_text(encoding="utf-8"), ledger)
-        atomic_write(README, lambda path: path.write_text(text, encoding="utf-8"))
+        write_text(README, with_ledger(README.read_text(encoding="utf-8"), ledger))
 
 
 if __name__ == "__main__":

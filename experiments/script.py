@@ -56,7 +56,12 @@ def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> N
     written = compact_json({**record, **hardware()})
     print(text or written, flush=True)
     file = out or Path("outputs", f"{Path(sys.argv[0]).stem}.json")
-    atomic_write(file, lambda path: path.write_text(written + "\n", encoding="utf-8"))
+    write_text(file, written + "\n")
+
+
+def write_text(file: Path, text: str) -> None:
+    """Replace a file by a text, atomically."""
+    atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
 
 
 def compact_json(value: Any, depth: int = 2) -> str:
