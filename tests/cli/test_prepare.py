@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, in_use, run_python
+from commands import assert_one_line_error, command, contents, in_use, run_python
 from kills import killed_twice
 from made_nuscenes import VERSION, make_tables, write
 
@@ -30,10 +30,6 @@ def root(tmp_path_factory) -> Path:
 def prepare(root: Path, index: Path, *more: str) -> list[str]:
     where = ["--data-root", str(root), "--version", VERSION, "--index", str(index)]
     return ["prepare", *where, "--train-split", "all", "--num-sweeps", "2", *more]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
 def test_prints_a_record_and_a_second_run_changes_nothing(root, tmp_path, capsys):
