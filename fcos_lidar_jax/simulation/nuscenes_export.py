@@ -46,15 +46,17 @@ def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callab
         OSError: a file cannot be written, or another process writes to the folder.
     """
     _check_order(spec, root)  # reject before writing anything
-    if _finished(spec, root):
+    if _finished(spec, root) and not _shards(spec, root):
         return False
     with folder_lock(root / _WORK, "synthesizing"):
         order = _check_order(spec, root)
-        if _finished(spec, root):  # another process finished it meanwhile
-            return False
-        atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
-        _write_rest(spec, root, workers, report)
-    return True
+        finished = _finished(spec, root)  # by another process meanwhile, or killed while it removed the shards
+        if not finished:
+            atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
+            _write_rest(spec, root, workers, report)
+        for shard in _shards(spec, root):
+            shutil.rmtree(shard, ignore_errors=True)
+    return not finished
 
 
 def _write_rest(spec: DatasetSpec, root: Path, workers: int, report: Callable[[int], object]) -> None:
@@ -123,6 +125,10 @@ def _finished(spec: DatasetSpec, root: Path) -> bool:
 def _shard(root: Path, index: int) -> Path:
     """Folder with the rows of a finished scene."""
     return root / _WORK / scene_name(index)
+
+
+def _shards(spec: DatasetSpec, root: Path) -> list[Path]:
+    return [shard for index in range(spec.scenes) if (shard := _shard(root, index)).is_dir()]
 
 
 @contextlib.contextmanager
@@ -204,8 +210,6 @@ def _write_tables(spec: DatasetSpec, root: Path) -> None:
         atomic_write(root / _TABLES, lambda path: _write_text(path, json.dumps(written, indent=1) + "\n"))
         (root / MAP_FILE).parent.mkdir(exist_ok=True)
         _write_text(root / MAP_FILE, "")
-    for index in range(spec.scenes):
-        shutil.rmtree(_shard(root, index), ignore_errors=True)
 
 
 def splits(scenes: int) -> dict[str, list[str]]:

@@ -31,13 +31,15 @@ assert killed_at(0, f"{{out}}-whole") == 0
 whole = int.from_bytes(os.read(pipe[0], 4), "little")
 for trial in range({TRIALS}):
     step = whole * trial // {TRIALS}
-    for again in (step, (whole - step) // 2):  # the second kill hits the resumed work
-        assert killed_at(1 + again, f"{{out}}-{{trial}}") == signal.SIGKILL
+    assert killed_at(1 + step, f"{{out}}-{{trial}}") == signal.SIGKILL
+    killed_at(1 + (whole - step) // 2, f"{{out}}-{{trial}}")  # the resumed work, if that takes so many steps
 """
 
 
 def killed_twice(out: Path, option: str, command: list[str]) -> list[Path]:
-    """Run a command in folders ``OUT-0``, ``OUT-1`` ..., given by an option, and kill it twice in each of them.
+    """Run a command in folders ``OUT-0``, ``OUT-1`` ..., given by an option, and kill it in each of them.
+
+    It is killed again if enough work is left.
 
     The kills are spread over the steps of the whole work, so that they hit all of its stages. The processes are
     forked after all imports.
