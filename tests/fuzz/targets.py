@@ -19,6 +19,7 @@ from made_bags import Messages, structured, write_recording
 from made_kitti import calibration_text, label_text
 from made_nuscenes import VERSION, make_tables
 from made_nuscenes import write as write_nuscenes
+from toy_frames import ToyFrames
 
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -30,7 +31,7 @@ from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.drives import read_tum
 from fcos_lidar_jax.data.folder import FolderFrames
-from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames
+from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -410,10 +411,8 @@ def _seal_description(folder: Path, name: str) -> None:
         (folder / name).write_text(json.dumps(description))
 
 
-_BOXES = np.array([[0, 0, 0, 30, 30, 9, 0, 0, 0], [5, 5, 0, 20, 20, 9, 1, 0, 0]], np.float32)
-_LAGGED = np.column_stack([POINTS, np.zeros(60)]).astype(np.float32)
-FRAME = Frame(_LAGGED, _BOXES, np.zeros(2, np.int32), np.full(2, 9, np.int32))
-FRAMES = InMemoryFrames((FRAME,), TINY, ("car",))
+FRAMES = ToyFrames(1)
+FRAME = FRAMES.frame(0)
 
 
 def _read_database(folder: Path, name: str) -> None:

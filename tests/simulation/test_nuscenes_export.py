@@ -247,7 +247,8 @@ def test_killed_runs_resume_to_the_same_bytes(made, tmp_path):
     expected, states = contents(made), set()
     for root in killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", "--workers", "1")):
         states.add(len(list(root.rglob("*.bin"))))
-        assert not (root / VERSION).is_dir() or expected.items() <= contents(root).items()  # tables appear last
+        if (root / VERSION).is_dir():  # tables appear last
+            assert contents(root / VERSION) == contents(made / VERSION)
         assert contents(synthesize(root)) == expected
     assert len(states) >= 6  # kills at different stages
 
