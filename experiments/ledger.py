@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.benchmarks.latency import PAPER_STAGES
 from experiments.paper import PAPER
 from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cells import changes_of, read_cells
@@ -68,8 +69,7 @@ def _stem(variant: str) -> Callable[[Any], float]:
 
 
 def _overall(d: Any, setting: str) -> float:
-    stages = ("MRV", "Backbone (stem and backbone)", "Heads (pyramid and heads)")
-    return sum(d["times"][setting][stage]["median_ms"] for stage in stages)
+    return sum(d["times"][setting][stage]["median_ms"] for stage in PAPER_STAGES)
 
 
 def _paper_ratio(table: str, row: str, reference: str) -> float:
