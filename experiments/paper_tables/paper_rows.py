@@ -33,7 +33,7 @@ def _points_and_times(args: Args) -> dict[str, Any]:
                 column["MRV, ms, paper"] = measured["paper_times"][r]["median_ms"]
             if here:
                 column["points kept, %, this scale"] = here["prioritized"]["percent"][r]
-    return {"columns": columns, "lines": [TIMES_NOTE]}
+    return {"columns": columns, "lines": [f"Measured on a {measured['cloud']}.", TIMES_NOTE]}
 
 
 def _current_points(args: Args) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _stage_times(args: Args) -> dict[str, Any]:
         columns[f"{setting}-frame"] = column = {f"{stage}, ms": ms["median_ms"] for stage, ms in times.items()}
         paper = measured["paper"][setting]
         column |= {f"{stage}, ms, paper": paper[name] for stage, name in latency.PAPER_STAGES.items()}
-    return {"columns": columns, "lines": [TIMES_NOTE]}
+    return {"columns": columns, "lines": [f"Measured on a {measured['cloud']}.", TIMES_NOTE]}
 
 
 PAPER_TABLES = (
