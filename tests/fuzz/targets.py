@@ -427,7 +427,9 @@ def _read_database(folder: Path, name: str) -> None:
 def _read_cached(folder: Path, name: str) -> None:
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
         found = CachedFrames(FRAMES, folder).frame(0)
-    expect(all(np.array_equal(getattr(found, f), v) for f, v in vars(FRAME).items()), "another frame")
+    expect(
+        all(np.array_equal(getattr(found, f), v, equal_nan=True) for f, v in vars(FRAME).items()), "another frame"
+    )
 
 
 def _synthesize(folder: Path, name: str = "") -> None:
