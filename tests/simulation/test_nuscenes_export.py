@@ -243,13 +243,15 @@ def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, 
     assert line.endswith(" is synthesizing, expected no other process")
 
 
-def test_killed_runs_resume_to_the_same_bytes(made, tmp_path):
-    expected, states = contents(made), set()
-    for root in killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", "--workers", "1")):
+def test_killed_runs_resume_to_the_same_bytes(tmp_path):
+    quick = ["--streets", "plain", "--no-rolling-shutter", "--workers", "1"]
+    killed = killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", *quick))
+    whole, states = tmp_path / "killed-whole", set()
+    for root in killed:
         states.add(tuple(contents(root)))
         if (root / VERSION).is_dir():  # tables appear last
-            assert contents(root / VERSION) == contents(made / VERSION)
-        assert contents(synthesize(root)) == expected
+            assert contents(root / VERSION) == contents(whole / VERSION)
+        assert contents(synthesize(root, *quick)) == contents(whole)
     assert len(states) >= 6  # kills at different stages
 
 

@@ -6,9 +6,10 @@ from commands import run_python
 
 TRIALS = 8
 _KILLED = f"""
-import os, signal, sys
+import importlib, os, signal, sys
 from fcos_lidar_jax.cli import main
 option, out, *command = sys.argv[1:]
+importlib.import_module("fcos_lidar_jax.cli." + command[0])
 def killed_at(step, folder):
     # Ends the process without any cleaning up before its step-th change of the file system.
     steps = 0
@@ -39,7 +40,7 @@ for trial in range({TRIALS}):
 def killed_twice(out: Path, option: str, command: list[str]) -> list[Path]:
     """Run a command in folders ``OUT-0``, ``OUT-1`` ..., given by an option, and kill it in each of them.
 
-    It is killed again if enough work is left.
+    It is killed again if enough work is left. ``OUT-whole`` has the result of a run that is not killed.
 
     The kills are spread over the steps of the whole work, so that they hit all of its stages. The processes are
     forked after all imports.
