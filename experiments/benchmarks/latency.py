@@ -149,7 +149,6 @@ def measure(args: Args) -> dict[str, Any]:
         "repeats": args.repeats,
         "times": {setting: {name: ms for (of, name), ms in found.items() if of == setting} for setting in clouds},
         "paper": {"hardware": PAPER["times"], **{s: rows[f"FCOS-LiDAR, {s}"] for s in clouds}},
-        "comparable": args.preset != "quickstart" and "3090" in jax.devices()[0].device_kind,
     }
 
 
