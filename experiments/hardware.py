@@ -15,9 +15,3 @@ def hardware() -> dict[str, Any]:
     git = ["git", "-C", str(Path(fcos_lidar_jax.__file__).parent), "describe", "--always", "--dirty"]
     described = subprocess.run(git, capture_output=True, text=True, check=False)
     return {**machine(), "git": described.stdout.strip() or "unknown"}
-
-
-def hardware_line() -> str:
-    """Describe device, processor and cores in one line."""
-    here = hardware()
-    return f"{here['device']} ({here['processor']}, {here['cores']} cores)"

@@ -18,14 +18,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.benchmarks.latency import PAPER_STAGES
 from experiments.paper import PAPER
 from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cells import changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
 from experiments.paper_tables.tables import Row, Table
-from experiments.script import run_script
+from experiments.script import run_script, write_text
 from experiments.statistics import interval
-from fcos_lidar_jax.files import atomic_write, read_json
+from fcos_lidar_jax.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
@@ -68,8 +69,7 @@ def _stem(variant: str) -> Callable[[Any], float]:
 
 
 def _overall(d: Any, setting: str) -> float:
-    stages = ("MRV", "Backbone (stem and backbone)", "Heads (pyramid and heads)")
-    return sum(d["times"][setting][stage]["median_ms"] for stage in stages)
+    return sum(d["times"][setting][stage]["median_ms"] for stage in PAPER_STAGES)
 
 
 def _paper_ratio(table: str, row: str, reference: str) -> float:
@@ -256,8 +256,7 @@ def main(args: Args) -> None:
     ledger = as_markdown(args.results)
     print(ledger, end="", flush=True)
     if args.write:
-        text = with_ledger(README.read_text(encoding="utf-8"), ledger)
-        atomic_write(README, lambda path: path.write_text(text, encoding="utf-8"))
+        write_text(README, with_ledger(README.read_text(encoding="utf-8"), ledger))
 
 
 if __name__ == "__main__":

@@ -11,42 +11,15 @@ from experiments.script import real_data
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames
+from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, SelectedFrames, without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
-from fcos_lidar_jax.files import checksum
-from fcos_lidar_jax.projection import close_to_sensor
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E as SENSOR
 from fcos_lidar_jax.types import Detections
 
 SPANS_M = ((0, 20), (20, 40))
-
-
-@dataclasses.dataclass(frozen=True)
-class Keyframes(FrameSet):
-    """Annotated keyframes of a folder, without points close to the sensor."""
-
-    folder: Path
-    number: int
-    close_m: float
-    sensor: Sensor = NUSCENES_HDL32E
-    classes = NUSCENES_CLASSES
-
-    def __len__(self) -> int:
-        return self.number
-
-    def frame(self, index: int) -> Frame:
-        frame = read_keyframe(self.folder, self.sensor, index)
-        close = close_to_sensor(frame.points, self.sensor, self.close_m)
-        return dataclasses.replace(frame, points=frame.points[~close], num_close=int(close.sum()))
-
-    def fingerprint(self) -> str:
-        return checksum((self.folder / "boxes.json").read_bytes())
-
-    def name(self, index: int) -> str:
-        return f"{self.folder.name} {index}"
 
 
 def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]:
@@ -62,7 +35,9 @@ def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]
         "scene-0523, odd": SelectedFrames(scene, tuple(range(1, len(scene), 2))),
     }
     for number, frames in (("0103", 2), ("0061", 1)):
-        sets[f"scene-{number}"] = Keyframes(real_data(data, f"nuscenes_scene{number}"), frames, reading.close_m)
+        folder = real_data(data, f"nuscenes_scene{number}")
+        read = (without_close(read_keyframe(folder, SENSOR, i), SENSOR, reading) for i in range(frames))
+        sets[f"scene-{number}"] = InMemoryFrames(tuple(read), SENSOR, NUSCENES_CLASSES)
     return sets
 
 

@@ -40,15 +40,9 @@ def run_measurement(
     measure: Callable[[OptionsT], dict[str, Any]],
     options: type[OptionsT],
     description: str | None,
-    as_text: Callable[[dict[str, Any]], str] | None = None,
 ) -> NoReturn:
-    """Like :func:`run_script`, for work whose record is printed, optionally as text, and saved."""
-
-    def work(args: OptionsT) -> None:
-        record = measure(args)
-        save(record, args.out, as_text(record) if as_text else None)
-
-    run_script(work, options, description)
+    """Like :func:`run_script`, for work whose record is printed and saved."""
+    run_script(lambda args: save(measure(args), args.out), options, description)
 
 
 def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> None:
@@ -56,7 +50,12 @@ def save(record: dict[str, Any], out: Path | None, text: str | None = None) -> N
     written = compact_json({**record, **hardware()})
     print(text or written, flush=True)
     file = out or Path("outputs", f"{Path(sys.argv[0]).stem}.json")
-    atomic_write(file, lambda path: path.write_text(written + "\n", encoding="utf-8"))
+    write_text(file, written + "\n")
+
+
+def write_text(file: Path, text: str) -> None:
+    """Replace a file by a text, atomically."""
+    atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
 
 
 def compact_json(value: Any, depth: int = 2) -> str:

@@ -47,7 +47,7 @@ class Args(Options):
 def _make_files(root: Path, samples: int) -> None:
     names = scenes_of_split(SPLIT, root / VERSION)
     keyframes = [len(part) for part in np.array_split(np.arange(samples), len(names))]
-    write_tables(root / VERSION, dict(zip(names, keyframes, strict=True)), {"LIDAR_TOP": 1}, objects=TRUTHS)
+    write_tables(root / VERSION, dict(zip(names, keyframes, strict=True)), objects=TRUTHS)
     rng = np.random.default_rng(0)
     with (root / "results.json").open("w") as stream:
         stream.write(f'{{"meta": {json.dumps(LIDAR_META)}, "results": {{')

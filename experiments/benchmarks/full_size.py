@@ -1,38 +1,30 @@
-"""Cost of the paper's preset: parameters, memory, and times of all stages and of one training step.
+"""Cost of training the paper's preset: parameters, memory, and time of a step of one frame.
 
     python -m experiments.benchmarks.full_size --data FOLDER  # on the real keyframe of scene-0061
     python -m experiments.benchmarks.full_size  # on a simulated frame
     python -m experiments.benchmarks.full_size --memory-only --out experiments/results/training_memory.json
 
-Cost: about five minutes on two CPU cores and 10 GB. Expected: 10.66 M parameters; the network takes 99 % of the
-time.
+``latency.py`` times the detection. Cost: about three minutes on two CPU cores and 10 GB. Expected: 10.66 M
+parameters.
 """
 
 import dataclasses
 import functools
-import json
 import resource
-import time
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
-from fcos_lidar_jax.inference import make_detect, make_stages
-from fcos_lidar_jax.inference.timing import Call, interleaved
-from fcos_lidar_jax.input_pipeline.batching import make_batch
+from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.database import cut_reading
-from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters
-from fcos_lidar_jax.models.detector import network_parts
-from fcos_lidar_jax.models.objective import sample_losses
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -48,7 +40,7 @@ class Args(Options):
     preset: Literal["nuscenes", "nuscenes_single", "quickstart"] = "nuscenes"  # Configuration preset.
     data: Path | None = None
     """Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated frame."""
-    repeats: int = 15  # Timed calls, for the median.
+    repeats: int = 5  # Timed steps, for the median.
     memory_only: bool = False
     """Only compute the memory of a training step, without and with ``model.remat``, and run nothing."""
 
@@ -89,57 +81,20 @@ def measure(args: Args) -> dict[str, Any]:
     if args.memory_only:
         return {"preset": config.name, "training_gib": training_memory(config)}
     sensor = load_sensor(config.sensor)
-    layout = image_layout(sensor, config.model)
     folder = find_real_data(args.data, "nuscenes_scene0061") if sensor == NUSCENES_HDL32E else None
     frame = read_keyframe(folder, sensor) if folder else make_frame(0, sensor)
     frame = without_close(frame, sensor, cut_reading(1))
-    batch = jax.device_put(make_batch([frame], max_points=config.max_points, max_boxes=config.max_boxes))
-    detector = build_detector(config, sensor)
-    variables = detector.init(jax.random.key(0))
-    record: dict[str, Any] = {"preset": config.name, "frame": "scene-0061, real" if folder else "simulated"}
-    record |= {"parameters": count_parameters(variables["params"]), "locations": layout.num_locations}
-    record["boxes"] = len(frame.boxes)
-    print(json.dumps(record), flush=True)
-
-    parts = network_parts(config, sensor)
-    prepare, network, _, postprocess = map(jax.jit, make_stages(detector))
-    image = prepare(batch.points[0], batch.valid[0])
-    seen = parts.preprocess(image.features[None])
-    after_stem = parts.stem(variables, seen)
-    levels = parts.backbone(variables, after_stem)
-    pyramid = parts.fpn(variables, levels)
-    outputs = network(variables, image)
-    truth = batch.boxes[0], batch.labels[0], batch.box_valid[0]
-    axes = config.model.regression_axes
-    objective = functools.partial(sample_losses, config=config.loss, layout=layout, axes=axes)
-    losses, assignment = (jax.jit(lambda o, i, part=part: objective(o, i, *truth)[part]) for part in (0, 1))
-    # The worst case for NMS: unlike a trained detector, many candidates above the threshold.
-    eager = dataclasses.replace(outputs, logits=outputs.logits.at[:, -1].add(-4.0))
-    detect = jax.jit(make_detect(detector))
-    forward, images = jax.jit(lambda v, i: detector.apply(v, i)[0]), jax.tree.map(lambda leaf: leaf[None], image)
-    calls: dict[str, Call] = {
-        "mrv": lambda: prepare(batch.points[0], batch.valid[0]),
-        "stem": lambda: parts.stem(variables, seen),
-        "backbone": lambda: parts.backbone(variables, after_stem),
-        "fpn": lambda: parts.fpn(variables, levels),
-        "heads": lambda: parts.heads(variables, pyramid),
-        "assignment": lambda: assignment(outputs, image),
-        "assignment and losses": lambda: losses(outputs, image),
-        "candidates and nms": lambda: postprocess(eager, image),
-        "forward": lambda: forward(variables, images),
-        "points to boxes": lambda: detect(variables, batch.points[0], batch.valid[0]),
+    shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
+    times = interleaved({"train step": training_steps(config, sensor, [frame])}, args.repeats)
+    return {
+        "preset": config.name,
+        "frame": "scene-0061, real" if folder else "simulated",
+        "parameters": count_parameters(shapes["params"]),
+        "boxes": len(frame.boxes),
+        "milliseconds": {name: ms["median_ms"] for name, ms in times.items()},
+        "peak_memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+        "training_gib": training_memory(config),
     }
-    times = interleaved(calls, args.repeats)
-    record["milliseconds"] = {name: times[name]["median_ms"] for name in calls}
-    step = training_steps(config, sensor, [frame])
-    jax.block_until_ready(step())
-    began = time.perf_counter()
-    metrics = jax.block_until_ready(step())
-    record["milliseconds"]["train step"] = round(1e3 * (time.perf_counter() - began), 1)
-    record["train_metrics"] = {name: np.asarray(value).tolist() for name, value in metrics.items()}
-    record["peak_memory_gib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
-    record["training_gib"] = training_memory(config)
-    return record
 
 
 if __name__ == "__main__":

@@ -27,52 +27,58 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
+import tyro
+from jax.experimental import topologies
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxlib import _jax  # type: ignore[attr-defined]
+
+from experiments.changes import change
 from experiments.script import Options, run_script, save
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.inference.detect import make_detect
+from fcos_lidar_jax.inference.export import export_detector, load_exported
+from fcos_lidar_jax.inference.load import load_trained
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.packing import Packing, empty_packed
+from fcos_lidar_jax.presets import PRESETS
+from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 
 Card = Literal["h100", "a100"]
-_CARDS = {  # major, cores, shared memory per core and per block, bandwidth, L2, clock, memory, name
-    "h100": (9, 132, 233472, 232448, 3352320000000, 52428800, 1.98, 84929347584, "NVIDIA H100 80GB HBM3"),
-    "a100": (8, 108, 167936, 166912, 2039000000000, 41943040, 1.41, 84929347584, "NVIDIA A100-SXM4-80GB"),
+_CARDS = {  # compute capability, cores, shared memory per core and per block, bandwidth, L2, clock, name
+    "h100": (9, 132, 233472, 232448, 3352320000000, 52428800, 1.98, "NVIDIA H100 80GB HBM3"),
+    "a100": (8, 108, 167936, 166912, 2039000000000, 41943040, 1.41, "NVIDIA A100-SXM4-80GB"),
 }
 _TARGET = """
 gpu_device_info {{
   threads_per_block_limit: 1024
   threads_per_warp: 32
   shared_memory_per_block: 49152
-  shared_memory_per_core: {shared}
+  shared_memory_per_core: {2}
   threads_per_core_limit: 2048
-  core_count: {cores}
+  core_count: {1}
   fpus_per_core: 128
   block_dim_limit_x: 2147483647
   block_dim_limit_y: 65535
   block_dim_limit_z: 65535
-  memory_bandwidth: {bandwidth}
-  l2_cache_size: {cache}
-  clock_rate_ghz: {clock}
-  device_memory_size: {memory}
-  shared_memory_per_block_optin: {optin}
-  cuda_compute_capability {{ major: {major} }}
+  memory_bandwidth: {4}
+  l2_cache_size: {5}
+  clock_rate_ghz: {6}
+  device_memory_size: 84929347584
+  shared_memory_per_block_optin: {3}
+  cuda_compute_capability {{ major: {0} }}
   registers_per_core_limit: 65536
   registers_per_block_limit: 65536
 }}
 platform_name: "CUDA"
 dnn_version_info {{ major: 9 minor: 10 }}
 runtime_version {{ major: 12 minor: 9 patch: 0 }}
-device_description_str: "{name}"
+device_description_str: "{7}"
 """
 _NUM_LAGS = 410  # Distinct time lags of ten sweeps and pasted objects, with the preset ``nuscenes``.
-_NO_KERNEL = {
-    "parameter",
-    "constant",
-    "tuple",
-    "get-tuple-element",
-    "bitcast",
-    "while",
-    "conditional",
-    "call",
-    "iota",
-}
+_NO_KERNEL = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "iota"}
 _EXCHANGES = ("all-gather", "all-to-all", "collective-permute", "reduce-scatter")
 
 
@@ -109,8 +115,6 @@ PROGRAMS = {
 
 def all_programs() -> dict[str, Program]:
     """List the default programs, and training and detection of all presets in both precisions."""
-    from fcos_lidar_jax.presets import PRESETS
-
     programs = dict(PROGRAMS)
     for name, config in PRESETS.items():
         for precision in ("float32", "bfloat16") if type(config) is Config else ("float32",):
@@ -129,7 +133,6 @@ class Args(Options):
     all: bool = False  # Also compile all presets.
     limit_s: int = 900  # Time limit per program, seconds.
     one: str | None = None  # Compile one program in this process and print its record (internal).
-    text: Path | None = None  # With --one: write the compiled program here.
 
 
 def measure(args: Args) -> dict[str, Any]:
@@ -191,9 +194,8 @@ def _line(name: str, record: dict[str, Any]) -> str:
     if "failed" in record:
         return f"{name:30} FAILED: {record['failed']}"
     loops = " ".join(f"{trips or '?'}x{kernels}" for trips, kernels in record["loops"]) or "none"
-    stages = "".join(f" {stage} {gflop:.0f}" for stage, gflop in record.get("stage_gflop", {}).items())
     return (
-        f"{name:30} {record['seconds']:4.0f} s  {record['gflop_per_frame']:6.0f} GFLOP per frame{stages}  "
+        f"{name:30} {record['seconds']:4.0f} s  {record['gflop_per_frame']:6.0f} GFLOP per frame  "
         f"{record['temporary_mib']:6} MiB  {record['kernels']:5} kernels  loops {loops}"
         + (f"  slow {record['slow']}" if record["slow"] else "")
         + (f"  exchanges {record['exchanges']}" if record.get("exchanges") else "")
@@ -201,18 +203,14 @@ def _line(name: str, record: dict[str, Any]) -> str:
     )
 
 
-def compile_program(program: Program, text: Path | None = None) -> dict[str, Any]:
+def compile_program(program: Program) -> dict[str, Any]:
     """Compile in this process, in the environment set by :func:`measure`."""
-    import jax
-    from jax.experimental import topologies
-    from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
-
     jax.devices()  # Finds the plugin too.
-    names = ("major", "cores", "shared", "optin", "bandwidth", "cache", "clock", "memory", "name")
-    target = _TARGET.format(**dict(zip(names, _CARDS[program.card], strict=True)))
-    shape = f"{program.devices}x1x1" if program.devices > 1 else "1x1x1"
     topology = topologies.get_topology_desc(
-        platform="cuda", topology_name="", target_config=target, topology=shape
+        platform="cuda",
+        topology_name="",
+        target_config=_TARGET.format(*_CARDS[program.card]),
+        topology=f"{program.devices}x1x1",
     )
     mesh = Mesh(topology.devices, ("data",), axis_types=(AxisType.Auto,))
     everywhere, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("data"))
@@ -223,16 +221,18 @@ def compile_program(program: Program, text: Path | None = None) -> dict[str, Any
     lowered = jitted.lower(*given)
     compiled = lowered.compile()
     seconds = time.monotonic() - began
+    hlo: Any = lowered.compiler_ir("hlo")
+    flops = _jax.hlo_module_cost_analysis(jax.devices()[0].client, hlo.get_hlo_module())[
+        "flops"
+    ]  # before optimisation
     module = str(compiled.as_text())
     memory: Any = compiled.memory_analysis()
-    if text is not None:
-        text.write_text(module)
     kernels, loops = count_kernels(module)
     found = re.findall(r" (all-reduce|" + "|".join(_EXCHANGES) + r")(?:-start)?\(", module)
     record = {
         **dataclasses.asdict(program),
         "seconds": round(seconds),
-        "gflop_per_frame": round(gflop(lowered) / program.batch, 1),
+        "gflop_per_frame": round(flops / program.batch / 1e9, 1),
         "temporary_mib": memory.temp_size_in_bytes >> 20,
         "kernels": kernels,
         "loops": loops,
@@ -243,48 +243,19 @@ def compile_program(program: Program, text: Path | None = None) -> dict[str, Any
         counts = collections.Counter(found)
         record["all_reduces"] = counts.pop("all-reduce", 0)
         record["exchanges"] = dict(counts)
-    if program.kind == "detect":
-        record["stage_gflop"] = _stage_gflop(program, everywhere)
     return record
-
-
-def gflop(lowered: Any) -> float:
-    """Count the operations of a lowered program before optimisation, in 10^9."""
-    import jax
-    from jaxlib import _jax  # type: ignore[attr-defined]
-
-    module = lowered.compiler_ir("hlo").get_hlo_module()
-    return _jax.hlo_module_cost_analysis(jax.devices()[0].client, module)["flops"] / 1e9
-
-
-def _configured(program: Program) -> Any:
-    from fcos_lidar_jax.presets import PRESETS
-
-    config = PRESETS[program.preset]
-    model = config.model
-    if type(config) is Config:
-        model = dataclasses.replace(model, precision=program.precision, remat=program.remat)
-    optimizer = dataclasses.replace(config.optimizer, batch_size=program.batch)
-    return dataclasses.replace(config, model=model, optimizer=optimizer)
 
 
 def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...], tuple[int, ...]]:
     """Return a function, its arguments' shapes, which of them are split over devices, and which are donated."""
-    import jax
-    import jax.numpy as jnp
-
-    from fcos_lidar_jax.inference.detect import make_detect
-    from fcos_lidar_jax.inference.export import export_detector, load_exported
-    from fcos_lidar_jax.inference.load import load_trained
-    from fcos_lidar_jax.models import build_detector
-    from fcos_lidar_jax.packing import Packing, empty_packed
-    from fcos_lidar_jax.sensors import load_sensor
-    from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 
     def spec(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, dtype)
 
-    config = _configured(program)
+    config = PRESETS[program.preset]
+    if type(config) is Config:
+        config = change(model__precision=program.precision, model__remat=program.remat)(config)
+    config = change(optimizer__batch_size=program.batch)(config)
     sensor = load_sensor(config.sensor)
     b, n, m, c = program.batch, config.max_points, config.max_boxes, sensor.point_columns
     if program.kind == "export":
@@ -305,37 +276,6 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
     packed = empty_packed(b, packing, max_points=n, max_boxes=m, columns=c)
     batch = jax.tree.map(lambda leaf: spec(*leaf.shape, dtype=leaf.dtype), packed)
     return make_train_step(detector, optimizer), (state, batch), (False, True), (0,)
-
-
-def _stage_gflop(program: Program, sharding: Any) -> dict[str, float]:
-    """Count the GFLOP of each stage of the range view's network for one frame."""
-    import jax
-
-    from fcos_lidar_jax.models import build_detector
-    from fcos_lidar_jax.models.detector import network_parts
-    from fcos_lidar_jax.sensors import load_sensor
-
-    config = _configured(program)
-    if type(config) is not Config:
-        return {}
-    sensor = load_sensor(config.sensor)
-    parts, found = network_parts(config, sensor), {}
-    variables = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
-    shape = jax.ShapeDtypeStruct(
-        (1, sensor.num_rows, sensor.num_columns, 9, config.projection.num_rounds), "float32"
-    )
-    if config.model.circular_width:
-        from fcos_lidar_jax.locations import image_sensor
-
-        columns = image_sensor(sensor, config.model).num_columns
-        shape = jax.ShapeDtypeStruct((*shape.shape[:2], columns, *shape.shape[3:]), "float32")
-    x = jax.eval_shape(parts.preprocess, shape)
-    for name in ("stem", "backbone", "fpn", "heads"):
-        stage = getattr(parts, name)
-        lowered = jax.jit(stage, in_shardings=sharding, out_shardings=sharding).lower(variables, x)
-        found[name] = round(gflop(lowered), 1)
-        x = jax.eval_shape(stage, variables, x)
-    return found
 
 
 def count_kernels(module: str) -> tuple[int, list[tuple[int | None, int]]]:
@@ -399,9 +339,6 @@ def _computations(module: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
 
 if __name__ == "__main__":
     if "--one" in sys.argv:
-        import tyro
-
-        options = tyro.cli(Args)
-        print(json.dumps(compile_program(all_programs()[str(options.one)], options.text)))
+        print(json.dumps(compile_program(all_programs()[str(tyro.cli(Args).one)])))
     else:
         run_script(check, Args, __doc__)

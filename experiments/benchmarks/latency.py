@@ -17,7 +17,7 @@ import contextlib
 import dataclasses
 import functools
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +25,6 @@ import jax
 import numpy as np
 
 from experiments.changes import change
-from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import CloudReading, Config
@@ -42,7 +41,12 @@ from fcos_lidar_jax.simulation.render import DatasetSpec
 
 ROWS = {"single": NUSCENES_SINGLE.max_points, "multi": NUSCENES.max_points}
 """Setting of table 7 -> rows to which clouds are padded."""
-_WHOLE = "points to boxes, one program"
+PAPER_STAGES = {
+    "MRV": "projection_ms",
+    "Backbone (stem and backbone)": "backbone_ms",
+    "Heads (pyramid and heads)": "heads_ms",
+}
+"""Stage -> column of the paper's table 7; "overall_ms" is their sum."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +114,7 @@ def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Clou
         "pyramid alone": lambda: parts.fpn(variables, levels),
         "heads alone": lambda: parts.heads(variables, pyramid),
         "post-processing": lambda: postprocess(outputs, image),
-        _WHOLE: lambda: detect(variables, points, valid),
+        "points to boxes, one program": lambda: detect(variables, points, valid),
     }
 
 
@@ -145,45 +149,8 @@ def measure(args: Args) -> dict[str, Any]:
         "repeats": args.repeats,
         "times": {setting: {name: ms for (of, name), ms in found.items() if of == setting} for setting in clouds},
         "paper": {"hardware": PAPER["times"], **{s: rows[f"FCOS-LiDAR, {s}"] for s in clouds}},
-        "comparable": args.preset != "quickstart" and "3090" in jax.devices()[0].device_kind,
     }
 
 
-_PAPER_COLUMN = {
-    "MRV": "projection_ms",
-    "Backbone (stem and backbone)": "backbone_ms",
-    "Heads (pyramid and heads)": "heads_ms",
-}
-
-
-def as_text(record: dict[str, Any]) -> str:
-    """Format the table with our times beside the paper's."""
-    (single, multi), paper = (record["times"][setting] for setting in ROWS), record["paper"]
-    note = "" if record["comparable"] else "; other hardware or another network, not comparable"
-    lines = [
-        f"{hardware_line()}, {record['precision']}, "
-        f"{record['cloud']}; ms, median and 99th percentile of {record['repeats']} turns",
-        f"paper: {paper['hardware']}{note}",
-        f"{'':32s}{'one sweep':>20s}{'ten sweeps':>22s}{'paper, one':>14s}{'ten':>8s}",
-    ]
-
-    def line(name: str, ours: list[str], column: str | None) -> str:
-        one, ten = (paper[setting][column] if column else "" for setting in ROWS)
-        return f"{name:30s}{''.join(ours)}{one!s:>12s}{ten!s:>8s}"
-
-    for name in single:
-        ours = [f"{t[name]['median_ms']:12.2f}{t[name]['p99_ms']:10.2f}" for t in (single, multi)]
-        lines.append(line(name, ours, _PAPER_COLUMN.get(name)))
-    sums: tuple[tuple[str, Iterable[str], str | None], ...] = (
-        ("sum: MRV, Backbone, Heads", _PAPER_COLUMN, "overall_ms"),
-        ("sum: Backbone and pyramid", ("Backbone (stem and backbone)", "pyramid alone"), None),
-        ("sum: sweep files to boxes", ("loading (host)", "transfer", _WHOLE), None),
-    )
-    for name, parts, column in sums:
-        ours = [f"{sum(t[part]['median_ms'] for part in parts):12.2f}{'':10s}" for t in (single, multi)]
-        lines.append(line(name, ours, column))
-    return "\n".join(lines)
-
-
 if __name__ == "__main__":
-    run_measurement(measure, Args, __doc__, as_text)
+    run_measurement(measure, Args, __doc__)

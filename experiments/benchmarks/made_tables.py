@@ -10,7 +10,7 @@ import numpy as np
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
 from fcos_lidar_jax.evaluation.boxes import CLASS_ATTRIBUTES
-from fcos_lidar_jax.simulation.nuscenes_tables import fixed_tables
+from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL, fixed_tables
 from fcos_lidar_jax.simulation.nuscenes_tables import token as name_token
 
 Row = dict[str, Any]
@@ -20,37 +20,44 @@ MOUNT = {"translation": [0.9, 0.0, 1.8], "rotation": [1.0, 0.0, 0.0, 0.0]}
 _CATEGORIES = {name: category for category, name in reversed(CATEGORY_TO_CLASS.items())}
 
 
-def write_tables(folder: Path, scenes: Mapping[str, int], files: Mapping[str, int], *, objects: int) -> None:
+def write_tables(folder: Path, scenes: Mapping[str, int], *, objects: int) -> None:
     """Write all tables into a new version folder.
 
-    ``scenes`` maps names to numbers of keyframes, ``files`` maps channels to files per keyframe, of which the
-    first is the keyframe's. All of a scene's ``objects`` occur in all of its keyframes.
+    ``scenes`` maps names to numbers of keyframes. All of a scene's ``objects`` occur in all of its keyframes.
     """
     folder.mkdir(parents=True)
-    channels, numbers = list(files), list(scenes.values())
+    numbers = list(scenes.values())
+    keyframes = [(s, k, number) for s, number in enumerate(numbers) for k in range(number)]
+    mount = {"token": "mount", "sensor_token": name_token("sensor", CHANNEL), "camera_intrinsic": [], **MOUNT}
     tables: dict[str, Any] = {
         **fixed_tables([]),
-        "sensor": ({"token": _token("e", c), "channel": n, "modality": "lidar"} for c, n in enumerate(channels)),
         "log": [],
         "map": [{"token": "map", "log_tokens": [], "category": "semantic_prior", "filename": "map.png"}],
-        "calibrated_sensor": (
-            {"token": _token("m", s, c), "sensor_token": _token("e", c), "camera_intrinsic": [], **MOUNT}
-            for s in range(len(scenes))
-            for c in range(len(channels))
-        ),
+        "calibrated_sensor": [mount],
         "scene": (
             {"token": _token("n", s), "name": name, "log_token": "", "first_sample_token": _token("s", s, 0)}
             for s, name in enumerate(scenes)
         ),
         "sample": (
             {**_link("s", s, k, of=number), "timestamp": _time_us(s, k), "scene_token": _token("n", s)}
-            for s, number in enumerate(numbers)
-            for k in range(number)
+            for s, k, number in keyframes
         ),
-        "sample_data": _sample_data(numbers, files),
-        "ego_pose": (
-            {"token": row["token"], "timestamp": row["timestamp"], **EGO} for row in _sample_data(numbers, files)
+        "sample_data": (
+            {
+                **_link("d", s, k, of=number),
+                "sample_token": _token("s", s, k),
+                "ego_pose_token": _token("d", s, k),
+                "calibrated_sensor_token": "mount",
+                "timestamp": _time_us(s, k),
+                "fileformat": "pcd",
+                "is_key_frame": True,
+                "height": 0,
+                "width": 0,
+                "filename": f"samples/{CHANNEL}/n000-2018-01-01-00-00-00-0400__{CHANNEL}__{s:08}{k:08}.bin",
+            }
+            for s, k, number in keyframes
         ),
+        "ego_pose": ({"token": _token("d", s, k), "timestamp": _time_us(s, k), **EGO} for s, k, _ in keyframes),
         "instance": (
             {"token": _token("i", s, o), "category_token": name_token("category", _CATEGORIES[class_of(s, o)])}
             for s in range(len(scenes))
@@ -96,24 +103,6 @@ def annotations(scene: int, number: int, keyframes: int) -> Iterator[Row]:
         }
 
 
-def _sample_data(keyframes: list[int], files: Mapping[str, int]) -> Iterator[Row]:
-    for s, number in enumerate(keyframes):
-        for c, (channel, each) in enumerate(files.items()):
-            for i in range(number * each):
-                yield {
-                    **_link("d", s, c, i, of=number * each),
-                    "sample_token": _token("s", s, i // each),
-                    "ego_pose_token": _token("d", s, c, i),
-                    "calibrated_sensor_token": _token("m", s, c),
-                    "timestamp": _time_us(s, i / each),
-                    "fileformat": "pcd",
-                    "is_key_frame": i % each == 0,
-                    "height": 0,
-                    "width": 0,
-                    "filename": f"sweeps/{channel}/n000-2018-01-01-00-00-00-0400__{channel}__{s:08}{i:08}.bin",
-                }
-
-
 def _token(kind: str, *numbers: int) -> str:
     """Token of 32 characters, like real tokens."""
     return (kind.encode().hex() + "".join(f"{n:06x}" for n in numbers)).ljust(32, "0")
@@ -129,5 +118,5 @@ def _link(kind: str, *numbers: int, of: int) -> Row:
     }
 
 
-def _time_us(scene: int, keyframe: float) -> int:
-    return 1_500_000_000_000_000 + scene * 10**8 + int(keyframe * 500_000)
+def _time_us(scene: int, keyframe: int) -> int:
+    return 1_500_000_000_000_000 + scene * 10**8 + keyframe * 500_000

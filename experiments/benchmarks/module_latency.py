@@ -16,8 +16,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from experiments.hardware import hardware_line
-from experiments.paper import PAPER
+from experiments.paper import PAPER, TIMES_NOTE
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.inference.timing import Call, interleaved
@@ -150,26 +149,6 @@ def measure(args: Args) -> dict[str, Any]:
     return {"variants": records, "precision": args.precision, "repeats": args.repeats}
 
 
-def as_text(record: dict[str, Any]) -> str:
-    """Format the table with our times beside the paper's."""
-    lines = [
-        f"stem alone, {'x'.join(map(str, SHAPE[1:]))}, {record['precision']}, {record['repeats']} turns, "
-        f"{hardware_line()}",
-        f"{'':24s}{'form':>8s}{'ms':>10s}{'p99':>10s}{'ratio':>7s}{'needed':>9s}{'executed':>10s}{'GFLOP/s':>9s}"
-        f"   paper, ms (ratio)",
-    ]
-    for name, r in record["variants"].items():
-        theirs = ", ".join(f"{where}: {p['time_ms']} ({p['ratio']:.2f})" for where, p in r["paper"].items())
-        lines.append(
-            f"{name:24s}{r['form']:>8s}{r['median_ms']:10.2f}{r['p99_ms']:10.2f}{r['ratio']:7.2f}"
-            f"{r['needed_gflop']:9.1f}{r['executed_gflop']:10.1f}{r['executed_gflop_per_s']:9.0f}"
-            f"   {theirs or '-'}"
-        )
-    lines.append("needed, executed: GFLOP; GFLOP/s of the executed")
-    lines.append(f"paper: {PAPER['times']}: compare the ratios, not the times")
-    return "\n".join(lines)
-
-
 def figures(names: Mapping[str, str], args: Args) -> dict[str, Any]:
     """Measure figures for a table of the paper; ``names`` maps the labels of its rows to variants."""
     measured = measure(dataclasses.replace(args, only=tuple(names.values())))
@@ -179,8 +158,8 @@ def figures(names: Mapping[str, str], args: Args) -> dict[str, Any]:
         theirs = next(iter(ours["paper"].values()))
         columns[label] = {"module, ms": ours["median_ms"], "ratio": ours["ratio"]}
         columns[label] |= {"module, ms, paper": theirs["time_ms"], "ratio, paper": theirs["ratio"]}
-    return {"columns": columns, "lines": ["```", as_text(measured), "```"]}
+    return {"columns": columns, "lines": [TIMES_NOTE]}
 
 
 if __name__ == "__main__":
-    run_measurement(measure, Args, __doc__, as_text)
+    run_measurement(measure, Args, __doc__)

@@ -20,7 +20,6 @@ import jax
 import numpy as np
 
 from experiments.benchmarks.latency import ROWS, fused_cloud, padded
-from experiments.hardware import hardware_line
 from experiments.paper import PAPER
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import CloudReading
@@ -121,35 +120,6 @@ def mrv_times(
     return record
 
 
-def as_text(record: dict[str, Any]) -> str:
-    """Format all figures as tables."""
-    text = PAPER["text"]
-    lines = [f"{record['cloud']}, {record['points']} points; paper: {text['fused_points']['printed']}"]
-    for name, found in record["kept"].items():
-        lines += ["", f"{name}: {found['in_range']} points in range, {found['in_view']} of them in view"]
-        lines.append(f"{'rounds':>8s}{'kept':>10s}{'%':>8s}{'current, prioritized':>24s}{'not prioritized':>18s}")
-        first, second = found["prioritized"], found["not prioritized"]
-        lines += [
-            f"{r:>8s}{first['kept'][r]:10d}{first['percent'][r]:8.1f}{now:24d}{second['current'][r]:18d}"
-            for r, now in first["current"].items()
-        ]
-    lines += [
-        f"paper: {text['points_kept_by_one_round']['value']} by 1 round, "
-        f"more than {100 * text['share_kept_by_five_rounds']['value']:.0f} % by 5",
-        "",
-        f"projection, ms (ratio to 1 round), {record['repeats']} turns, {hardware_line()}",
-        f"{'rounds':>8s}{'one sweep':>26s}{'ten sweeps':>26s}{'paper':>18s}",
-    ]
-    for r, theirs in record["paper_times"].items():
-        ours = "".join(
-            f"{t['median_ms']:10.2f} p99{t['p99_ms']:7.2f}{'(' + format(t['ratio'], '.2f') + ')':>8s}"
-            for t in (record["times"][setting][r] for setting in ROWS)
-        )
-        lines.append(f"{r:>8s}{ours}{theirs['median_ms']:11.2f} ({theirs['ratio']:.2f})")
-    lines.append(f"paper's times: {PAPER['times']}; elsewhere only the ratios can be compared")
-    return "\n".join(lines)
-
-
 def measure(args: Args) -> dict[str, Any]:
     """Measure counts and times, beside the times of table 1."""
     rows, sensor = PAPER["tables"]["table1"]["rows"], NUSCENES_HDL32E
@@ -170,4 +140,4 @@ def measure(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_measurement(measure, Args, __doc__, as_text)
+    run_measurement(measure, Args, __doc__)

@@ -13,10 +13,16 @@ peer's time when slim, 1.25 at full size, 2 when reduced.
 
 import dataclasses
 import json
+import os
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from experiments.benchmarks.peers import turn_by_turn
+import jax
+
 from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.script import Options, run_measurement
@@ -29,6 +35,19 @@ from fcos_lidar_jax.simulation.frames import make_frame
 
 Size = Literal["reduced", "slim", "full_64", "full"]
 _PEER = Path(__file__).with_name("torch_net.py")
+_PEER_LOOP = """
+import os, runpy, sys, time
+real = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)
+sys.path.insert(0, os.path.dirname(sys.argv[1]))
+run = runpy.run_path(sys.argv[1])["FNS"]["train"]
+run()
+print("ready", file=real, flush=True)
+for _ in sys.stdin:
+    began = time.perf_counter()
+    run()
+    print(time.perf_counter() - began, file=real, flush=True)
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +87,37 @@ def of_size(size: dict[str, Any]) -> tuple[Config, Sensor]:
     return config, dataclasses.replace(NUSCENES_HDL32E, num_columns=min(size["WIDTH"], 1086))
 
 
+def turn_by_turn(
+    ours: Callable[[], Any], repeats: int, *, peer: Path, environment: Mapping[str, object], python: Path
+) -> dict[str, float]:
+    """Time our call and a peer's training in turns, because the speed of a machine drifts.
+
+    The peer runs in a separate process with its own interpreter and environment.
+
+    Returns:
+        medians in seconds after one run of each, and their ratio.
+    """
+    variables = {**os.environ, **{key: str(value) for key, value in environment.items()}}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    times: dict[str, list[float]] = {"ours": [], "peer": []}
+    with subprocess.Popen(
+        [python, "-c", _PEER_LOOP, peer.absolute()], env=variables, bufsize=1, **pipes
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        if process.stdout.readline() != "ready\n":
+            raise ValueError(f'--peer: {peer}: got no FNS["train"] that runs')
+        jax.block_until_ready(ours())
+        for _ in range(repeats):
+            began = time.perf_counter()
+            jax.block_until_ready(ours())
+            times["ours"].append(time.perf_counter() - began)
+            process.stdin.write("go\n")
+            times["peer"].append(float(process.stdout.readline()))
+    medians = {name: round(statistics.median(values), 4) for name, values in times.items()}
+    return {**medians, "ratio": round(medians["ours"] / medians["peer"], 3), "repeats": repeats}
+
+
 def measure(args: Args) -> dict[str, Any]:
     """Compare at the selected sizes."""
     record: dict[str, Any] = {"peer": args.peer.name}
@@ -78,7 +128,7 @@ def measure(args: Args) -> dict[str, Any]:
         over = 64 // size["STEM"]
         others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
         sizes = {**size, **others, "TRAIN": 1, "CL": 1}  # Other peers use other names.
-        peer = {"peer": args.peer, "name": "train", "environment": sizes, "python": args.torch_python}
+        peer = {"peer": args.peer, "environment": sizes, "python": args.torch_python}
         repeats = args.repeats * (10 if name == "reduced" else 1)
         record[name] = turn_by_turn(training_steps(config, sensor, frames), repeats, **peer)
         print(f"{name}: {json.dumps(record[name])}", flush=True)

@@ -16,10 +16,10 @@ from typing import Any
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from experiments.paper_tables.scales import Scale
-from experiments.script import compact_json
+from experiments.script import compact_json, write_text
 from fcos_lidar_jax.checkpoints.storage import LATER_FIELDS
 from fcos_lidar_jax.config import Config, config_to_json
-from fcos_lidar_jax.files import atomic_write, file_lock, read_json
+from fcos_lidar_jax.files import file_lock, read_json
 
 Cell = dict[str, Any]  # ``changes``, ``seed``, ``scores`` or ``diverged``, and hardware.
 _CELLS, _SCALE, _LOCK = "cells.csv", "scale.json", "cells.lock"
@@ -80,13 +80,9 @@ def add_cell(folder: Path, scale: Scale, cell: Cell, *, locks: Path) -> Cell:
         writer.writeheader()
         writer.writerows(rows)
         if not (folder / _SCALE).is_file():
-            _write(folder / _SCALE, compact_json(_shared(scale)) + "\n")
-        _write(folder / _CELLS, text.getvalue())
+            write_text(folder / _SCALE, compact_json(_shared(scale)) + "\n")
+        write_text(folder / _CELLS, text.getvalue())
     return read_cells(folder, scale)[cell["changes"], cell["seed"]]
-
-
-def _write(file: Path, text: str) -> None:
-    atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
 
 
 def _row(cell: Cell) -> dict[str, str]:

@@ -5,6 +5,7 @@ from typing import Any
 
 from experiments.benchmarks import latency, mrv_figures
 from experiments.changes import change
+from experiments.paper import TIMES_NOTE
 from experiments.paper_tables.tables import Args, Row, Table, simulated_scale, stem_times
 
 _SWEEPS = {"single": 1, "multi": 10}  # Setting -> fused sweeps.
@@ -32,7 +33,7 @@ def _points_and_times(args: Args) -> dict[str, Any]:
                 column["MRV, ms, paper"] = measured["paper_times"][r]["median_ms"]
             if here:
                 column["points kept, %, this scale"] = here["prioritized"]["percent"][r]
-    return {"columns": columns, "lines": ["```", mrv_figures.as_text(measured), "```"]}
+    return {"columns": columns, "lines": [f"Measured on a {measured['cloud']}.", TIMES_NOTE]}
 
 
 def _current_points(args: Args) -> dict[str, Any]:
@@ -52,11 +53,12 @@ def _stage_times(args: Args) -> dict[str, Any]:
     measured = latency.measure(
         latency.Args(preset=preset, precision=args.nuscenes.precision, data=args.data, repeats=repeats)
     )
-    columns = {
-        f"{setting}-frame": {f"{stage}, ms": times["median_ms"] for stage, times in of_setting.items()}
-        for setting, of_setting in measured["times"].items()
-    }
-    return {"columns": columns, "lines": ["```", latency.as_text(measured), "```"]}
+    columns = {}
+    for setting, times in measured["times"].items():
+        columns[f"{setting}-frame"] = column = {f"{stage}, ms": ms["median_ms"] for stage, ms in times.items()}
+        paper = measured["paper"][setting]
+        column |= {f"{stage}, ms, paper": paper[name] for stage, name in latency.PAPER_STAGES.items()}
+    return {"columns": columns, "lines": [f"Measured on a {measured['cloud']}.", TIMES_NOTE]}
 
 
 PAPER_TABLES = (

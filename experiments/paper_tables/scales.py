@@ -159,8 +159,11 @@ class Simulated:
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
-    """Options of --scale nuscenes."""
+class NuScenesLayout:
+    """A data set in the nuScenes layout, prepared by ``fcos-lidar prepare``; used like :class:`Simulated`.
+
+    The fields are the options of --scale nuscenes. Call :meth:`checked` before the rest.
+    """
 
     data_root: Path | None = None  # Folder of a data set in the nuScenes layout, after fcos-lidar prepare.
     version: str = "v1.0-trainval"  # Folder of its tables.
@@ -178,72 +181,57 @@ class Layout:
     threads: int = 2  # Threads that prepare batches.
     workers: int = 0  # Additional processes that prepare batches.
 
+    @property
+    def name(self) -> str:
+        return "nuscenes"
 
-@dataclasses.dataclass(frozen=True)
-class NuScenesLayout:
-    """A data set in the nuScenes layout, prepared by ``fcos-lidar prepare``; used like :class:`Simulated`.
+    def checked(self) -> "NuScenesLayout":
+        """Fill in the defaults.
 
-    Raises:
-        ValueError: at construction, if data, index or splits are missing.
-    """
-
-    layout: Layout
-    name: str = "nuscenes"
-
-    def __post_init__(self) -> None:
-        if self.layout.data_root is None:
+        Raises:
+            ValueError: data, index or splits are missing.
+        """
+        if self.data_root is None:
             raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")
-        if self.layout.test_version is not None:
-            tables = self.data_root / self.layout.test_version
+        if self.test_version is not None:
+            tables = self.data_root / self.test_version
             if not tables.is_dir():
                 raise ValueError(f"--test-version: {tables}: no such folder, expected the version's tables")
-        if (self.data_root / self.layout.version).is_dir() and not has_index(self.index):
-            raise ValueError(f"{self.index}: no index here, expected one: run fcos-lidar prepare")
-        self.describe()
-
-    @property
-    def data_root(self) -> Path:
-        assert self.layout.data_root is not None
-        return self.layout.data_root
-
-    @property
-    def splits(self) -> tuple[str, str]:
-        """Splits for training and evaluation."""
-        layout = self.layout
-        train, val = ("mini_train", "mini_val") if layout.version.endswith("mini") else ("train", "val")
-        return layout.train_split or train, layout.val_split or val
+        index = self.index or default_index(self.data_root, self.version)
+        if (self.data_root / self.version).is_dir() and not has_index(index):
+            raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
+        mini = "mini_" if self.version.endswith("mini") else ""
+        splits = {"train_split": self.train_split or f"{mini}train", "val_split": self.val_split or f"{mini}val"}
+        whole = dataclasses.replace(self, index=index, **splits)
+        whole.describe()
+        return whole
 
     @property
     def base(self) -> Config:
-        layout = self.layout
-        return change(model__precision=layout.precision, optimizer__accumulate=layout.accumulate)(NUSCENES)
-
-    @property
-    def index(self) -> Path:
-        """Folder of the index that fcos-lidar prepare writes."""
-        return self.layout.index or default_index(self.data_root, self.layout.version)
+        return change(model__precision=self.precision, optimizer__accumulate=self.accumulate)(NUSCENES)
 
     @functools.cache  # noqa: B019 - few scales per process
     def _data(self, version: str) -> NuScenes:
-        index = self.index if version == self.layout.version else None
-        missing = self.layout.allow_missing_sweeps
-        return NuScenes(self.data_root, version, index=index, allow_missing_sweeps=missing)
+        index = self.index if version == self.version else None
+        assert self.data_root is not None
+        return NuScenes(self.data_root, version, index=index, allow_missing_sweeps=self.allow_missing_sweeps)
 
-    def frames(self, split: str, config: Config, version: str | None = None) -> NuScenesFrames:
+    def frames(self, split: str | None, config: Config, version: str | None = None) -> NuScenesFrames:
         """Keyframes of a split, of the layout's version or another, read according to a configuration."""
-        data = self._data(version or self.layout.version)
-        return NuScenesFrames(data, tuple(data.split(split, file=self.layout.splits)), config.reading)
+        assert split is not None
+        data = self._data(version or self.version)
+        return NuScenesFrames(data, tuple(data.split(split, file=self.splits)), config.reading)
 
     @functools.cache  # noqa: B019
     def describe(self) -> dict[str, Any]:
-        layout = self.layout
+        splits = [self.train_split, self.val_split]
         return {
             "scale": self.name,
-            "version": layout.version,
-            "splits": list(self.splits),
-            "fingerprints": [self.frames(split, NUSCENES).fingerprint() for split in self.splits],
-            "steps": layout.steps,
-            "allow_missing_sweeps": layout.allow_missing_sweeps,
+            "version": self.version,
+            "splits": splits,
+            "fingerprints": [self.frames(split, NUSCENES).fingerprint() for split in splits],
+            "steps": self.steps,
+            "allow_missing_sweeps": self.allow_missing_sweeps,
         }
 
     def objects(self, frames: NuScenesFrames) -> GroundTruthDatabase:
@@ -252,26 +240,26 @@ class NuScenesLayout:
         Raises:
             ValueError: there is no such database.
         """
-        folder = database.objects_folder(self.index, self.splits[0])
+        assert self.index is not None
+        folder = database.objects_folder(self.index, str(self.train_split))
         if not folder.is_dir():
             raise ValueError(f"{folder}: no objects here, expected some: run fcos-lidar prepare")
         objects = database.open_database(folder)
         sweeps = range(frames.reading.num_sweeps, NUSCENES.num_sweeps + 1)
         sources = [dataclasses.replace(frames, reading=database.cut_reading(n)).fingerprint() for n in sweeps]
         if objects.manifest.source not in sources:
-            origin = f"cut from other frames than {self.splits[0]}"
+            origin = f"cut from other frames than {self.train_split}"
             raise ValueError(f"{folder}: {origin}: run fcos-lidar prepare again")
         return objects
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
         """Train and evaluate like the benchmark; the results file stays in the folder."""
-        layout, (train_split, val_split) = self.layout, self.splits
-        frames, tests = self.frames(train_split, config), self.frames(val_split, config)
-        steps = layout.steps or config.optimizer.epochs * steps_per_epoch(frames, config)
+        frames, tests = self.frames(self.train_split, config), self.frames(self.val_split, config)
+        steps = self.steps or config.optimizer.epochs * steps_per_epoch(frames, config)
         objects = None if config.copy_paste is None else self.objects(frames)
-        options = {"devices": jax.devices(), "threads": layout.threads, "workers": layout.workers}
+        options = {"devices": jax.devices(), "threads": self.threads, "workers": self.workers}
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
-        file = folder / f"results_{val_split}.json"
+        file = folder / f"results_{self.val_split}.json"
         write_submission(detector, tests, file)
         truth = split_truth(tests.nuscenes, list(tests.tokens))
         return _scores(evaluate(read_results(file, truth.tokens).boxes, truth).summary)

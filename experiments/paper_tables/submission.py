@@ -63,9 +63,9 @@ def submission(args: Args) -> list[str]:
     if not finished(run):
         return [f"No results file: no finished run in {run}, the cell was trained elsewhere."]
     if isinstance(scale, NuScenesLayout):
-        if scale.layout.test_version is None:
+        if scale.test_version is None:
             return ["No results file: no --test-version."]
-        frames = scale.frames("test", config, scale.layout.test_version)
+        frames = scale.frames("test", config, scale.test_version)
     else:
         root, version = args.runs / "frames" / f"{scale.sensor.name}_submission", "v1.0-synthetic"
         spec = DatasetSpec(2, 0, 3, scale.sensor, scale.streets.rolling_shutter, version, scale.streets)

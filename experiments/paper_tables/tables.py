@@ -1,7 +1,6 @@
 """Tables: rows, training of their cells, record, Markdown and pictures."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -16,12 +15,12 @@ from experiments.hardware import hardware
 from experiments.paper import PAPER
 from experiments.paper_tables.cells import Cell
 from experiments.paper_tables.grid import run_cells
-from experiments.paper_tables.scales import Layout, NuScenesLayout, Scale, Simulated, quarter, smoke
-from experiments.script import compact_json
+from experiments.paper_tables.scales import NuScenesLayout, Scale, Simulated, quarter, smoke
+from experiments.script import compact_json, write_text
 from experiments.statistics import interval
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import config_to_json
-from fcos_lidar_jax.files import atomic_write, file_lock
+from fcos_lidar_jax.files import file_lock
 
 SCORES = ("mAP", "NDS")
 _SMOKE_NOTE = "the scores mean nothing"
@@ -42,7 +41,7 @@ class Args:
     """Folder with ten_sweep_cloud/ for figures of a real cloud; default: the environment's FCOS_LIDAR_REAL_DATA,
     otherwise a simulated cloud."""
     only_figures: bool = False  # Only measure what needs no training, into separate files.
-    nuscenes: tyro.conf.OmitArgPrefixes[Layout] = dataclasses.field(default_factory=Layout)
+    nuscenes: tyro.conf.OmitArgPrefixes[NuScenesLayout] = dataclasses.field(default_factory=NuScenesLayout)
     """Options of --scale nuscenes."""
 
 
@@ -115,7 +114,7 @@ def simulated_scale(args: Args) -> Simulated | None:
 
 def make_scale(args: Args) -> Simulated | NuScenesLayout:
     """Create the selected scale."""
-    return simulated_scale(args) or NuScenesLayout(args.nuscenes)
+    return simulated_scale(args) or args.nuscenes.checked()
 
 
 def stem_times(variants: dict[str, str], args: Args) -> dict[str, Any]:
@@ -143,9 +142,8 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
         # Scores and training data are in the files of the cells.
         rows = [{name: value for name, value in row.items() if name != "scores"} for row in record["rows"]]
         written = {**{name: value for name, value in record.items() if name != "trained_on"}, "rows": rows, **here}
-        for suffix, content in ((".json", compact_json(written, 3) + "\n"), (".md", text)):
-            write = functools.partial(Path.write_text, data=content, encoding="utf-8")
-            atomic_write(file.with_suffix(suffix), write)
+        write_text(file.with_suffix(".json"), compact_json(written, 3) + "\n")
+        write_text(file.with_suffix(".md"), text)
         picture = file.with_suffix(".png")
         if len(seeds) > 1 and cells:
             draw(table, record, picture)
@@ -177,8 +175,8 @@ def _check(args: Args) -> None:
             raise ValueError(f"--seeds: got {args.seeds}, expected different seeds of at least 0")
     real_cloud(args.data)
     if args.scale != "nuscenes":
-        for field in dataclasses.fields(Layout):
-            if getattr(args.nuscenes, field.name) != getattr(Layout(), field.name):
+        for field in dataclasses.fields(NuScenesLayout):
+            if getattr(args.nuscenes, field.name) != field.default:
                 option = field.name.replace("_", "-")
                 raise ValueError(f"--{option}: only for --scale nuscenes, got --scale {args.scale}")
 

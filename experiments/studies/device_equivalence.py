@@ -13,7 +13,6 @@ compilation.
 
 import dataclasses
 import functools
-import json
 import multiprocessing
 import socket
 import tempfile
@@ -179,4 +178,4 @@ def measure_all(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_measurement(measure_all, Args, __doc__, lambda record: "\n".join(map(json.dumps, record["meshes"])))
+    run_measurement(measure_all, Args, __doc__)

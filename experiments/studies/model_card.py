@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 
 import fcos_lidar_jax
-from experiments.script import run_script
+from experiments.script import run_script, write_text
 from fcos_lidar_jax.checkpoints.storage import read_description
-from fcos_lidar_jax.files import atomic_write, read_json
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.models.detector import count_parameters
 
@@ -57,7 +57,7 @@ def write_card(name: str, results: Path, training: Mapping[str, Any] | None = No
         raise ValueError(f"{file}: hash: got {record['hash']}, expected the hash of the weights: {weights}")
     lines = [*_about(name, record), *_figures(results / "transfer.json", weights), *_training(name, record)]
     path = folder / "README.md"
-    atomic_write(path, lambda file: file.write_text("\n".join(lines) + "\n", encoding="utf-8"))
+    write_text(path, "\n".join(lines) + "\n")
     return path
 
 

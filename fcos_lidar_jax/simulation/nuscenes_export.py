@@ -46,15 +46,17 @@ def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callab
         OSError: a file cannot be written, or another process writes to the folder.
     """
     _check_order(spec, root)  # reject before writing anything
-    if _finished(spec, root):
+    if _finished(spec, root) and not _shards(spec, root):
         return False
     with folder_lock(root / _WORK, "synthesizing"):
         order = _check_order(spec, root)
-        if _finished(spec, root):  # another process finished it meanwhile
-            return False
-        atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
-        _write_rest(spec, root, workers, report)
-    return True
+        finished = _finished(spec, root)  # by another process meanwhile, or killed while it removed the shards
+        if not finished:
+            atomic_write(root / _ORDER, lambda path: _write_text(path, json.dumps(order, indent=1) + "\n"))
+            _write_rest(spec, root, workers, report)
+        for shard in _shards(spec, root):
+            shutil.rmtree(shard, ignore_errors=True)
+    return not finished
 
 
 def _write_rest(spec: DatasetSpec, root: Path, workers: int, report: Callable[[int], object]) -> None:
@@ -74,7 +76,6 @@ def _write_rest(spec: DatasetSpec, root: Path, workers: int, report: Callable[[i
 def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
     """Specification of the data set as JSON; rejects a folder with other contents."""
     order = {"format": _FORMAT, **dataclasses.asdict(spec), "sensor": sensor_to_json(spec.sensor)}
-    order = json.loads(json.dumps(order))
     if root.exists() and not root.is_dir():
         raise ValueError(f"{root}: found a file, expected a folder")
     file = root / _ORDER
@@ -82,17 +83,22 @@ def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
         if root.is_dir() and any(p.name != _WORK for p in root.iterdir()):
             raise ValueError(f"{root}: found other files, expected an empty folder or a data set of this command")
         return order
-    previous = read_json(file, dict[str, Any])
-    for name, value in order.items():
-        before = previous.get(name)
-        if isinstance(value, dict) and isinstance(before, dict):
-            fields = ("name", *sorted(value.keys() | before.keys()))
-            field = next((field for field in fields if value.get(field) != before.get(field)), "name")
-            name = name if field == "name" else f"{name}.{field}"
-            value, before = value.get(field), before.get(field)
+    own, begun = _by_field(json.loads(json.dumps(order))), _by_field(read_json(file, dict[str, Any]))
+    for name in own | begun:
+        value, before = own.get(name), begun.get(name)
         if before != value:
             raise ValueError(f"{root}: {name}: got {value}, expected {before} as in the data set begun there")
     return order
+
+
+def _by_field(order: dict[str, Any]) -> dict[str, Any]:
+    """Values by path; the name of the sensor or of the streets comes first and stands for the whole."""
+    found = {}
+    for name, value in order.items():
+        fields = dict(value) if isinstance(value, dict) else {"name": value}
+        found[name] = fields.pop("name", None)
+        found |= {f"{name}.{field}": v for field, v in fields.items()}
+    return found
 
 
 def _finished(spec: DatasetSpec, root: Path) -> bool:
@@ -119,6 +125,10 @@ def _finished(spec: DatasetSpec, root: Path) -> bool:
 def _shard(root: Path, index: int) -> Path:
     """Folder with the rows of a finished scene."""
     return root / _WORK / scene_name(index)
+
+
+def _shards(spec: DatasetSpec, root: Path) -> list[Path]:
+    return [shard for index in range(spec.scenes) if (shard := _shard(root, index)).is_dir()]
 
 
 @contextlib.contextmanager
@@ -200,8 +210,6 @@ def _write_tables(spec: DatasetSpec, root: Path) -> None:
         atomic_write(root / _TABLES, lambda path: _write_text(path, json.dumps(written, indent=1) + "\n"))
         (root / MAP_FILE).parent.mkdir(exist_ok=True)
         _write_text(root / MAP_FILE, "")
-    for index in range(spec.scenes):
-        shutil.rmtree(_shard(root, index), ignore_errors=True)
 
 
 def splits(scenes: int) -> dict[str, list[str]]:

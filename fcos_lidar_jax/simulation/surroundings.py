@@ -45,22 +45,42 @@ class Side:
         return self.ground.crossing_half_width if self.along else self.ground.half_width
 
     @property
+    def back_m(self) -> float:
+        """Distance of the back of the pavement from the middle of the street."""
+        return self.edge_m + self.ground.pavement
+
+    @property
     def length_m(self) -> float:
         return self.span[1] - self.span[0]
 
-    def poses(self, s: np.ndarray, beyond: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses ``x, y, 0, yaw`` that face the street, off the carriageways by ``clear``; and their indices."""
-        beside = self.side * (self.edge_m + beyond)
-        x, y = (s, beside) if self.along == 0 else (self.ground.crossing_x + beside, s)
-        free = np.flatnonzero(~self.ground.on_road(x, y, clear))
-        x, y = x[free], y[free]
-        facing = -self.side * np.pi / 2 if self.along == 0 else (1 + self.side) * np.pi / 2
-        return np.stack([x, y, np.zeros(len(x)), np.full(len(x), facing)], axis=1), free
+    @property
+    def yaw(self) -> float:
+        """Direction of the street, radians."""
+        return np.pi / 2 * self.along
 
-    def grounded(self, poses: np.ndarray) -> np.ndarray:
-        """Set the height of poses from :meth:`poses` to the ground, in place."""
-        poses[:, 2] = self.ground.height(poses[:, 0], poses[:, 1])
-        return poses
+    @property
+    def facing(self) -> float:
+        """Direction from the side to the street, radians."""
+        return (1 + self.side) * np.pi / 2 if self.along else -self.side * np.pi / 2
+
+    def free(
+        self, s: np.ndarray, away: np.ndarray | float, clear: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions ``x, y`` at ``s`` along and ``away`` from the middle of the street; and their indices.
+
+        Positions on carriageways or closer to them than ``clear`` are omitted.
+        """
+        beside = self.side * away + np.zeros(len(s))
+        x, y = (self.ground.crossing_x + beside, s) if self.along else (s, beside)
+        free = np.flatnonzero(~self.ground.on_road(x, y, clear))
+        return x[free], y[free], free
+
+    def positions(
+        self, s: np.ndarray, away: np.ndarray | float, clear: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Like :meth:`free`, on the ground: positions f64[k, 3], and their indices."""
+        x, y, free = self.free(s, away, clear)
+        return np.stack([x, y, self.ground.height(x, y)], axis=1), free
 
 
 def sample_surroundings(rng: Generator, side: Side, streets: Streets, setting: str) -> np.ndarray:
@@ -93,10 +113,10 @@ def _buildings(rng: Generator, side: Side, setback: float, built: float) -> list
             continue
         depth, storeys = rng.uniform(7, 15), int(rng.integers(1, 7))
         front = side.ground.pavement + max(setback + rng.choice([0.0, 0.0, rng.normal(0, 1.5)]), 0.2)
-        where = np.array([here]), np.array([front])
-        pose, free = side.poses(*where, np.array([max(width / 2, 1.0) + 1]))
-        if len(free):
-            parts.append(place_solids(_building(rng, width, depth, storeys * _STOREY_M), side.grounded(pose)[0]))
+        center, _ = side.positions(np.array([here]), side.edge_m + front, max(width / 2, 1.0) + 1)
+        for position in center:  # at most one
+            building = _building(rng, width, depth, storeys * _STOREY_M)
+            parts.append(place_solids(building, np.append(position, side.facing)))
     return parts
 
 
@@ -160,8 +180,8 @@ def _trees(rng: Generator, side: Side, density: float) -> list[np.ndarray]:
     s = rng.uniform(*side.span, number)
     behind = side.ground.pavement + rng.uniform(0.5, 25, number)
     beyond = np.where(rng.random(number) < 0.45, rng.uniform(0.5, 1.2), behind)
-    pose, free = side.poses(s, beyond, np.full(number, 0.3))
-    number, center = len(free), side.grounded(pose)[:, :3]
+    center, free = side.positions(s, side.edge_m + beyond, 0.3)
+    number = len(free)
     trunk, clear = rng.uniform(0.07, 0.35, number), rng.uniform(1.6, 4.0, number)
     radius, tall = rng.uniform(1.0, 3.8, number), rng.uniform(1.0, 3.6, number)
     middle, half = center + clear[:, None] / 2 * (0, 0, 1), np.stack([trunk, trunk, clear / 2 + 0.8], axis=1)
@@ -194,41 +214,42 @@ def _clutter(rng: Generator, side: Side, density: float, setback: float) -> list
             if not group:
                 break
             left -= group
-            things.append(_Group(models[model], *_sample_group(rng, side, models[model], group, beyond[place])))
+            things.append(_sample_group(rng, side, models[model], group, beyond[place]))
             if place == "open":
-                things[-1].poses[:, 3] += rng.uniform(-np.pi, np.pi)
-    return [_vary(rng, side, things)] if things else []
+                things[-1].poses[2] += rng.uniform(-np.pi, np.pi)
+    return [_vary(rng, side.ground, things)] if things else []
 
 
 class _Group(NamedTuple):
     model: ObjectModel
     size_m: np.ndarray  # f64[3]
-    poses: np.ndarray  # f64[k, 4]
+    poses: np.ndarray  # f64[3, k]: x, y, yaw
 
 
 def _sample_group(
     rng: Generator, side: Side, model: ObjectModel, number: int, beyond: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the size and poses of equal things in line along the street."""
+) -> _Group:
+    """Sample equal things in line along the street."""
     size = np.maximum(sample_size(rng, model), 0.4 * np.array(model.size_m))
     s = rng.uniform(*side.span) + np.arange(number) * (size[1] + rng.uniform(0.1, 3)) + rng.normal(0, 0.1, number)
     away = rng.uniform(*beyond) + size[0] / 2 + rng.normal(0, 0.05, number)
-    poses, _ = side.poses(s, away, np.full(number, size[0] / 2))
-    poses[:, 3] += rng.normal(0, 0.06) + rng.normal(0, 0.03, len(poses))
-    return size, poses
+    x, y, free = side.free(s, side.edge_m + away, size[0] / 2)
+    turn = rng.normal(0, 0.06) + rng.normal(0, 0.03, len(free))
+    return _Group(model, size, np.stack([x, y, side.facing + turn]))
 
 
-def _vary(rng: Generator, side: Side, groups: list[_Group]) -> np.ndarray:
+def _vary(rng: Generator, ground: Ground, groups: list[_Group]) -> np.ndarray:
     """Solids of all groups, with an individual shape, albedo and density per thing."""
     solids = [object_solids(group.model, group.size_m, sample_paint(rng, group.model)) for group in groups]
-    each = [len(group.poses) for group in groups]
+    each = [group.poses.shape[1] for group in groups]
     parts = np.concatenate([np.tile(thing, number) for thing, number in zip(solids, each, strict=True)])
     num_parts = np.repeat([len(thing) for thing in solids], each)
     sizes = np.repeat([group.size_m for group in groups], each, axis=0)
     vary_shape(rng, parts, np.repeat(sizes, num_parts, axis=0), _VARIED)
     parts["albedo"] *= np.repeat(np.exp(0.3 * rng.standard_normal(len(num_parts))), num_parts)
     parts["density"] *= np.repeat(np.exp(0.5 * rng.standard_normal(len(num_parts))), num_parts)
-    poses = side.grounded(np.concatenate([group.poses for group in groups]))
+    x, y, yaw = np.concatenate([group.poses for group in groups], axis=1)
+    poses = np.stack([x, y, ground.height(x, y), yaw], axis=1)
     return place_solids(parts, np.repeat(poses, num_parts, axis=0))
 
 
@@ -237,9 +258,7 @@ def _wires(rng: Generator, side: Side) -> list[np.ndarray]:
     if rng.random() > 0.3:
         return []
     number = int(rng.integers(1, 4))
-    middle, half = sum(side.span) / 2, side.length_m / 2
-    pose, free = side.poses(np.full(number, middle), rng.uniform(0.3, 2.0, number), np.full(number, -1e3))
-    center = side.grounded(pose)[:, :3] + np.stack(
-        [np.zeros(len(free))] * 2 + [rng.uniform(4.5, 8, len(free))], axis=1
-    )
-    return [make_solids(BOX, center, [0.02, half, 0.02], yaw=pose[:, 3], albedo=0.1, density=30.0)]
+    middle, half = np.full(number, sum(side.span) / 2), [0.02, side.length_m / 2, 0.02]
+    center, _ = side.positions(middle, side.edge_m + rng.uniform(0.3, 2.0, number), -1e3)
+    center[:, 2] += rng.uniform(4.5, 8, len(center))
+    return [make_solids(BOX, center, half, yaw=side.facing, albedo=0.1, density=30.0)]

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, in_use, run_python
+from commands import assert_one_line_error, command, contents, in_use, run_python
+from kills import killed_twice
 from made_nuscenes import VERSION, make_tables, write
 
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -31,10 +32,6 @@ def prepare(root: Path, index: Path, *more: str) -> list[str]:
     return ["prepare", *where, "--train-split", "all", "--num-sweeps", "2", *more]
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
-
-
 def test_prints_a_record_and_a_second_run_changes_nothing(root, tmp_path, capsys):
     command(*prepare(root, tmp_path / "i"))
     record = json.loads(capsys.readouterr().out)
@@ -49,44 +46,11 @@ def test_prints_a_record_and_a_second_run_changes_nothing(root, tmp_path, capsys
     assert all(f.stat().st_mtime_ns == stamp for f, stamp in stamps.items())
 
 
-KILLED = """
-import os, signal, sys
-from fcos_lidar_jax.cli import main
-index, command = sys.argv[1], sys.argv[2:]
-def killed_at(step, folder):
-    # Ends the process without any cleaning up before its step-th change of the file system.
-    steps = 0
-    def hook(event, arguments):
-        nonlocal steps
-        changes = event in ("os.mkdir", "os.rename", "os.remove")
-        if changes or event == "open" and isinstance(arguments[1], str) and set("wxa+") & set(arguments[1]):
-            steps += 1
-            if steps == step:
-                os.kill(os.getpid(), signal.SIGKILL)
-    child = os.fork()
-    if not child:
-        sys.addaudithook(hook)
-        main([*command, "--index", folder])
-        os.write(pipe[1], steps.to_bytes(4, "little"))
-        os._exit(0)
-    return os.waitpid(child, 0)[1]
-pipe = os.pipe()
-assert killed_at(0, f"{index}-whole") == 0
-whole = int.from_bytes(os.read(pipe[0], 4), "little")
-for trial in range(8):
-    assert killed_at(1 + whole * trial // 8, f"{index}-{trial}") == signal.SIGKILL
-"""
-
-
 def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     command(*prepare(root, tmp_path / "whole"))
     expected = contents(tmp_path / "whole")
-    # Forked after all imports, so that the kills hit the work.
-    done = run_python("-c", KILLED, tmp_path / "killed", *prepare(root, tmp_path / "none"))
-    assert done.returncode == 0, done.stderr
     states = set()
-    for trial in range(8):
-        folder = tmp_path / f"killed-{trial}"
+    for trial, folder in enumerate(killed_twice(tmp_path / "killed", "--index", prepare(root, tmp_path / "none"))):
         states.add(tuple(contents(folder)) if folder.exists() else ())
         command(*prepare(root, folder, *(["--workers", "2"] if trial == 0 else [])))
         assert contents(folder) == expected

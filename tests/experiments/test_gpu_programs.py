@@ -82,7 +82,7 @@ def test_programs_are_those_of_the_package(name):
 def test_a_program_that_kills_the_compiler_is_told_in_its_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "nvidia/cuda_nvcc").mkdir(parents=True)
     good = {**dataclasses.asdict(PROGRAMS["detect-compact"]), "seconds": 3, "gflop_per_frame": 2.0, "slow": 0}
-    good |= {"temporary_mib": 5, "kernels": 7, "loops": [[5, 2], [None, 4]], "stage_gflop": {"stem": 1.0}}
+    good |= {"temporary_mib": 5, "kernels": 7, "loops": [[5, 2], [None, 4]]}
     runs = iter([(0, json.dumps(good), ""), (-6, "", "one\nF 1 x.cc:627] Check failed: a == b (1 vs. 2)\nstack")])
     environments = []
 
@@ -96,7 +96,7 @@ def test_a_program_that_kills_the_compiler_is_told_in_its_line(tmp_path, monkeyp
     with pytest.raises(ValueError, match=r"not as they should be: train-compact$"):
         check(args)
     first, second, last = capsys.readouterr().out.splitlines()
-    assert "2 GFLOP per frame stem 1" in first
+    assert "2 GFLOP per frame" in first
     assert "loops 5x2 ?x4" in first
     assert second.endswith("FAILED: exit code -6: F 1 x.cc:627] Check failed: a == b (1 vs. 2)")
     assert last == "1 of 2 programs compile as they should"

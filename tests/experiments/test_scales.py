@@ -9,7 +9,7 @@ import pytest
 from experiments.changes import change
 from experiments.paper_tables import scales
 from experiments.paper_tables.paper_rows import PAPER_TABLES
-from experiments.paper_tables.scales import Layout, NuScenesLayout, quarter, smoke
+from experiments.paper_tables.scales import NuScenesLayout, quarter, smoke
 from fcos_lidar_jax.cli import prepare
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.evaluation.results import write_results
@@ -81,8 +81,8 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
     monkeypatch.setattr(scales, "trained", trained)
     monkeypatch.setattr(scales, "write_submission", write_submission)
     options = {"steps": 5, "accumulate": 4, "workers": 2, "precision": "bfloat16"}
-    layout = Layout(tmp_path / "one", "v1.0-mini", splits=splits, **options)
-    scale = NuScenesLayout(layout)
+    layout = NuScenesLayout(tmp_path / "one", "v1.0-mini", splits=splits, **options)
+    scale = layout.checked()
     assert (scale.base.optimizer.accumulate, scale.base.model.precision) == (4, "bfloat16")
     config = change(num_sweeps=3)(scale.base)
     scores = scale.score(config, 3, tmp_path / "run")
@@ -95,9 +95,9 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
     assert (frames.reading.num_sweeps, tests.reading.num_sweeps) == (3, 3)
     assert len(options["objects"]) > 0, "those that prepare has cut from ten sweeps"
     # Another data set of the same version is another scale, and has other objects.
-    other = NuScenesLayout(dataclasses.replace(layout, data_root=tmp_path / "two"))
+    other = dataclasses.replace(layout, data_root=tmp_path / "two").checked()
     assert other.describe()["fingerprints"] != scale.describe()["fingerprints"]
     with pytest.raises(ValueError, match="cut from other frames"):
         other.objects(frames)
     with pytest.raises(ValueError, match="wrong"):
-        NuScenesLayout(dataclasses.replace(layout, val_split="wrong"))
+        dataclasses.replace(layout, val_split="wrong").checked()

@@ -19,6 +19,7 @@ from made_bags import Messages, structured, write_recording
 from made_kitti import calibration_text, label_text
 from made_nuscenes import VERSION, make_tables
 from made_nuscenes import write as write_nuscenes
+from toy_frames import ToyFrames
 
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -123,6 +124,10 @@ def check_frame(frame: Frame, frames: FrameSet) -> None:
     expect((frame.num_points >= 0).all(), "a negative number of points")
 
 
+def check_first(frames: FrameSet) -> None:
+    check_frame(frames.frame(0), frames)
+
+
 def check_columns(boxes: BoxColumns) -> None:
     for name in ("translation", "size", "yaw", "score"):
         expect(np.isfinite(getattr(boxes, name)).all(), f"{name} that is not finite")
@@ -205,11 +210,6 @@ def _kitti_files() -> dict[str, bytes]:
     }
 
 
-def _read_kitti(folder: Path, name: str) -> None:
-    frames = KittiFrames(folder, "train")
-    check_frame(frames.frame(0), frames)
-
-
 def _folder_files() -> dict[str, bytes]:
     box = {"label": "car", "box": [8, 1, -1, 4, 2, 1.5, 0.3, None, None]}
     listed = [
@@ -228,7 +228,7 @@ def _folder_files() -> dict[str, bytes]:
 
 def _read_folder(folder: Path, name: str) -> None:
     frames = FolderFrames(folder, split="train", reading=CloudReading(2))
-    check_frame(frames.frame(0), frames)
+    check_first(frames)
     frames.fingerprint()
 
 
@@ -294,11 +294,6 @@ def _box(**more: object) -> dict[str, object]:
     return {**plain, "detection_name": "car", "attribute_name": "vehicle.moving", **more}
 
 
-def _read_results(folder: Path, name: str) -> None:
-    results = read_results(folder / name, ("a", "b"))
-    check_columns(results.boxes)
-
-
 def _read_truth(folder: Path, name: str) -> None:
     truth = read_truth(folder / name)
     check_columns(truth.boxes)
@@ -311,11 +306,6 @@ def _read_detections(folder: Path, name: str) -> None:
         expect(np.isfinite(boxes[:, :7]).all() and not np.isinf(boxes).any(), "boxes that are not finite")
         expect((boxes[:, 3:6] > 0).all(), "sizes that are not positive")
         expect(np.isfinite(found.scores).all() and (found.scores >= 0).all(), "a score that is none")
-
-
-def _read_keyframe(folder: Path, name: str) -> None:
-    frame = read_keyframe(folder, NUSCENES_HDL32E)
-    check_boxes(frame.boxes, "frame")
 
 
 def _read_sweeps(folder: Path, name: str) -> None:
@@ -421,27 +411,8 @@ def _seal_description(folder: Path, name: str) -> None:
         (folder / name).write_text(json.dumps(description))
 
 
-@dataclasses.dataclass(frozen=True)
-class OneFrame(FrameSet):
-    """A single frame, made from numbers."""
-
-    points: int = 60
-    classes = ("car",)
-    sensor = TINY
-
-    def __len__(self) -> int:
-        return 1
-
-    def frame(self, index: int) -> Frame:
-        points = np.column_stack([POINTS, np.zeros(60)]).astype(np.float32)
-        boxes = np.array([[0, 0, 0, 30, 30, 9, 0, 0, 0], [5, 5, 0, 20, 20, 9, 1, 0, 0]], np.float32)
-        return Frame(points, boxes, np.zeros(2, np.int32), np.full(2, 9, np.int32))
-
-    def name(self, index: int) -> str:
-        return "a"
-
-    def fingerprint(self) -> str:
-        return "one"
+FRAMES = ToyFrames(1)
+FRAME = FRAMES.frame(0)
 
 
 def _read_database(folder: Path, name: str) -> None:
@@ -455,12 +426,13 @@ def _read_database(folder: Path, name: str) -> None:
 
 def _read_cached(folder: Path, name: str) -> None:
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
-        frames = CachedFrames(OneFrame(), folder)
-        found, wanted = frames.frame(0), OneFrame().frame(0)
-    expect(all(np.array_equal(getattr(found, f), v) for f, v in vars(wanted).items()), "another frame")
+        found = CachedFrames(FRAMES, folder).frame(0)
+    expect(
+        all(np.array_equal(getattr(found, f), v, equal_nan=True) for f, v in vars(FRAME).items()), "another frame"
+    )
 
 
-def _read_order(folder: Path, name: str) -> None:
+def _synthesize(folder: Path, name: str = "") -> None:
     write_dataset(SPEC, folder, workers=1, report=lambda done: None)
 
 
@@ -488,7 +460,7 @@ def make_targets() -> list[Target]:
     tables = _files(lambda folder: write_nuscenes(folder, *make_tables(1)))
     index = _files(_index_files)
     _column_checksums()  # once for all processes
-    synthesized = _files(lambda folder: write_dataset(SPEC, folder, workers=1, report=lambda done: None))
+    synthesized = _files(_synthesize)
     listed = [{"file": f"{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("a", 5))]
     boxes = [
         {"class": "car", **dict(zip(("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy"), range(1, 10), strict=True))}
@@ -517,7 +489,7 @@ def make_targets() -> list[Target]:
         file_target("pcd", _pcd_files(), _cloud(NUSCENES_HDL32E), share=4),
         file_target("feather", {"a.feather": next(iter(sweep.values()))}, _cloud(ARGOVERSE2), share=2),
         Target("Argoverse 2", drive, _read_argoverse2, share=0.5),
-        Target("KITTI", _kitti_files(), _read_kitti),
+        Target("KITTI", _kitti_files(), lambda folder, _: check_first(KittiFrames(folder, "train"))),
         Target("folder", _folder_files(), _read_folder),
         Target("nuScenes", tables, _read_nuscenes, share=0.5),
         Target("nuScenes index", index, _read_index, tuple(is_column), share=0.5),
@@ -525,13 +497,17 @@ def make_targets() -> list[Target]:
         Target(
             "keyframe",
             {"boxes.json": _json({"lidar_file": "a.npy", "boxes": boxes}), "a.npy": arrays["a.npy"]},
-            _read_keyframe,
+            lambda folder, _: check_boxes(read_keyframe(folder, NUSCENES_HDL32E).boxes, "frame"),
         ),
         file_target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor),
         file_target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),
         Target("recordings of ROS", _files(_recordings), _read_recording, share=0.25),  # 25 ms each
         file_target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map),
-        file_target("results", {"a.json": _json({"meta": LIDAR_META, "results": found})}, _read_results),
+        file_target(
+            "results",
+            {"a.json": _json({"meta": LIDAR_META, "results": found})},
+            lambda folder, name: check_columns(read_results(folder / name, ("a", "b")).boxes),
+        ),
         file_target("ground truth", {"a.json": _json(truth)}, _read_truth),
         file_target(
             "detections", {"a.json": _json({"classes": ["car", "sign"], "frames": frames})}, _read_detections
@@ -554,15 +530,13 @@ def make_targets() -> list[Target]:
             mutate=_mutate_exported,
             seal=_seal_exported,
         ),
-        Target(
-            "ground-truth database", _files(lambda folder: prepare_database(OneFrame(), folder)), _read_database
-        ),
+        Target("ground-truth database", _files(lambda folder: prepare_database(FRAMES, folder)), _read_database),
         Target(
             "cached frames",
-            _files(lambda folder: CachedFrames(OneFrame(), folder).frame(0)),
+            _files(lambda folder: CachedFrames(FRAMES, folder).frame(0)),
             _read_cached,
             mutate=lambda _, content, rng: mutate_bytes(content, rng),
             share=0.5,
         ),
-        Target("records of synthesize", synthesized, _read_order, records),
+        Target("records of synthesize", synthesized, _synthesize, records),
     ]

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run_python
+from commands import contents, run_python
+from kills import killed_twice
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax import cli
@@ -51,10 +52,6 @@ def command(out: Path, *more: str) -> list[str]:
 def synthesize(out: Path, *more: str) -> Path:
     assert cli.main(command(out, *more)) == 0
     return out
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
 def tables(root: Path) -> dict[str, list[dict]]:
@@ -115,7 +112,7 @@ def test_tokens_and_chains_refer_to_existing_rows(made):
 
 
 def test_annotated_point_counts_are_exact(street):
-    """Counts points in the global frame with the quaternions of the files."""
+    """Counts points of a rolling shutter in the global frame with the quaternions of the files."""
     found, data = tables(street), NuScenes(street, VERSION)
     counted = 0
     for sample in data.sample_tokens:
@@ -195,7 +192,7 @@ def test_old_points_stay_in_boxes_of_static_objects_and_leave_boxes_of_moving_ob
     assert np.median(moves) < 0.4 * np.median(stands), moves
 
 
-def test_bytes_depend_on_the_seed_but_not_on_workers_or_the_number_of_scenes(made, tmp_path):
+def test_bytes_depend_on_seed_and_shutter_but_not_on_workers_or_the_number_of_scenes(made, tmp_path):
     expected = contents(made)
     assert contents(synthesize(tmp_path / "again", "--workers", "2")) == expected
     other = contents(synthesize(tmp_path / "other", "--seed", "5"))
@@ -205,6 +202,9 @@ def test_bytes_depend_on_the_seed_but_not_on_workers_or_the_number_of_scenes(mad
     points = {name: data for name, data in alone.items() if name.endswith(".bin")}
     assert len(points) == 11
     assert points.items() <= expected.items()
+    still = contents(synthesize(tmp_path / "still", "--scenes", "1", "--no-rolling-shutter"))
+    assert still.keys() == alone.keys()
+    assert all(still[name] != points[name] for name in points)
 
 
 def test_a_second_run_reports_that_the_data_set_is_complete(made, capsys):
@@ -243,38 +243,16 @@ def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, 
     assert line.endswith(" is synthesizing, expected no other process")
 
 
-KILLED = """
-import os, signal, sys, time
-from pathlib import Path
-from fcos_lidar_jax.cli import commands, main
-out, command = sys.argv[1], sys.argv[2:]
-def written(root):
-    folders = [Path(root, kind, "LIDAR_TOP") for kind in ("samples", "sweeps")]
-    return sum(len(os.listdir(folder)) for folder in folders if folder.is_dir())
-for trial, moments in enumerate([(1, 14), (8, 22), (33, 33)]):
-    for moment in moments:  # number of files at which the process is killed
-        child = os.fork()
-        if not child:
-            os._exit(main([*command, "--out", f"{out}-{trial}"]))
-        while written(f"{out}-{trial}") < moment:
-            time.sleep(0.001)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-"""
-
-
-def test_killed_runs_resume_to_the_same_bytes(made, tmp_path):
-    expected = contents(made)
-    # Fork from a process that has imported everything, so that the kills hit the actual work.
-    killed = [sys.executable, "-c", KILLED, str(tmp_path / "killed"), *command(tmp_path / "none")]
-    subprocess.run(killed, check=True, capture_output=True)
-    states = set()
-    for trial in range(3):
-        root = tmp_path / f"killed-{trial}"
-        states.add(len(list(root.rglob("*.bin"))))
-        assert not (root / VERSION).is_dir() or contents(root) == expected  # tables appear last
-        assert contents(synthesize(root)) == expected
-    assert len(states) == 3  # the kills hit different states
+def test_killed_runs_resume_to_the_same_bytes(tmp_path):
+    quick = ["--streets", "plain", "--no-rolling-shutter", "--workers", "1"]
+    killed = killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", *quick))
+    whole, states = tmp_path / "killed-whole", set()
+    for root in killed:
+        states.add(tuple(contents(root)))
+        if (root / VERSION).is_dir():  # tables appear last
+            assert contents(root / VERSION) == contents(whole / VERSION)
+        assert contents(synthesize(root, *quick)) == contents(whole)
+    assert len(states) >= 6  # kills at different stages
 
 
 def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, tmp_path):
@@ -364,16 +342,3 @@ def test_a_full_disk_gets_one_line_and_a_later_run_completes_the_work(made, tmp_
     assert last.startswith("fcos-lidar: error: ")
     assert "No space left on device" in last
     assert whole == contents(made)
-
-
-def test_a_rolling_shutter_changes_points_and_keeps_counts_exact(tmp_path):
-    still = contents(synthesize(tmp_path / "still", "--scenes", "1", "--no-rolling-shutter"))
-    rolling = contents(synthesize(tmp_path / "rolling", "--scenes", "1"))
-    assert still.keys() == rolling.keys()
-    assert all(still[name] != rolling[name] for name in still if name.endswith(".bin"))
-    data = NuScenes(tmp_path / "rolling", VERSION)
-    sample = data.sample_tokens[-1]
-    counts = {row["token"]: row["num_lidar_pts"] for row in tables(tmp_path / "rolling")["sample_annotation"]}
-    boxes = data.boxes(sample)
-    assert [counts[t] for t in boxes.tokens] == boxes.num_lidar_pts.tolist()
-    assert boxes.num_lidar_pts.sum() > 50

@@ -229,29 +229,19 @@ def test_fronts_of_buildings_have_depth():
     assert max(depths) < 4
 
 
-@pytest.fixture(scope="module")
-def frames() -> list:
-    return [city_frames(SENSOR, 10_000).frame(i) for i in range(16)]
-
-
-def test_city_frames_do_not_depend_on_the_order_of_access(frames):
+def test_city_frames_are_reproducible_and_vary_in_density():
+    frames = [city_frames(SENSOR, 10_000).frame(i) for i in range(16)]
     again = city_frames(SENSOR, 10_000).frame(3)
     for field in ("points", "boxes", "labels", "num_points"):
         np.testing.assert_array_equal(getattr(again, field), getattr(frames[3], field))
-
-
-def test_all_annotated_objects_of_a_city_have_points(frames):
     for frame in frames:
         assert (frame.num_points >= 1).all()
         assert np.isfinite(frame.points).all()
         assert (frame.points[:, 3] <= 255).all()
-
-
-def test_cities_vary_in_density_and_most_points_are_background(frames):
     numbers = [len(frame.labels) for frame in frames]
     assert max(numbers) > 2 * min(numbers)
     shares = [frame.num_points.sum() / len(frame.points) for frame in frames]
-    assert np.mean(shares) < 0.2  # 3 to 10 % in nuScenes
+    assert np.mean(shares) < 0.2  # most points are background; 3 to 10 % in nuScenes
 
 
 def test_class_frequencies_match_the_shares():

@@ -23,6 +23,11 @@ def command(*args: object) -> None:
     assert main([word for arg in args for word in (arg.split() if isinstance(arg, str) else [str(arg)])]) == 0
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files below a folder, by relative path."""
+    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
 def page_content(path: Path) -> dict[str, Any]:
     """The data in a page of ``visualization/page.py``."""
     match = re.search(r'<script type="application/json" id="drive">(.*?)</script>', path.read_text(), re.DOTALL)
