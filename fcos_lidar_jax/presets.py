@@ -121,8 +121,9 @@ relative to this preset). Layers at stride 1 cost most, so they are narrow: head
 with four convolutions 1.17, a stem with 8 channels per type 1.30, a first stage of width 32 1.17. The later stages
 of the backbone cost least, so they are deep: the quickstart's blocks take 0.92, its whole network 0.83. Doubled
 rows take 1.95 and contain the same points. Tied heads only save parameters: 1.02. The image wraps around, so there
-is no seam behind the vehicle. NMS at 0.1, weighted NMS, the IoU exponent and the regression axes are not in the
-paper; ``experiments/LOG.md`` (2026-11-24) says what each adds.
+is no seam behind the vehicle. NMS at 0.1, weighted NMS and the IoU exponent are not in the paper;
+``python -m experiments.studies.post_processing`` measures what each adds. The regression axes are not in the paper
+either; ``experiments/LOG.md`` compares them with the paper's.
 """
 
 CENTERPOINT_PILLARS = CenterPointConfig.of(
