@@ -41,6 +41,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "NMS at 0.1, weighted": {"iou_threshold": 0.1, "merge_iou": 0.1},
     "square root of the IoU": {"iou_exponent": 0.5},
     "as in compact": _COMPACT,
+    "as in compact, across classes": {**_COMPACT, "nms_across_classes": True},
     "mirrored view": {"flips": "x"},
     "as in compact, mirrored view": {**_COMPACT, "flips": "x"},
 }
