@@ -24,7 +24,6 @@ from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
 from fcos_lidar_jax.simulation.render import DatasetSpec
-from fcos_lidar_jax.training.plan import check_numbers
 from fcos_lidar_jax.visualization.drive import Scene, draw_drive
 from fcos_lidar_jax.visualization.evaluation_report import make_examples, write_evaluation_report
 from fcos_lidar_jax.visualization.page import page_frame, write_page
@@ -59,8 +58,7 @@ class Demo:
 def run(args: Demo) -> None:
     """Simulate, detect, evaluate and draw; with ``--train`` also train."""
     check_at_least(args, 1, "keyframes", "test_frames")
-    check_at_least(args, 0, "steps", "drive")
-    check_numbers(1, args.seed)
+    check_at_least(args, 0, "steps", "drive", "seed")
     check_out_folder(args.out)
     for name in () if args.train else ("steps", "test_frames", "seed"):
         if getattr(args, name) != getattr(Demo, name):
