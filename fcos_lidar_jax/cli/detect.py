@@ -27,7 +27,7 @@ from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import about_z, read_list, sensor_before_rotation, turned
-from fcos_lidar_jax.evaluation.records import as_records, confident
+from fcos_lidar_jax.evaluation.records import cloud_record, confident
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.files import atomic_write, file_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
@@ -180,13 +180,11 @@ def _detect(
         expect_points(file, cloud, int(detections.num_dropped), detector.sensor)
         if (picture := pictures[index]) is not None:
             _draw(picture, points, detections, detector, max(args.min_score, _MIN_PICTURE_SCORE))
-        records = as_records(detections, detector.classes, min_score=args.min_score)
-        dropped = int(detections.num_dropped) + cloud.num_removed
-        record = {"file": str(file), "num_points": cloud.num_points, "num_dropped": dropped}
-        record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
-        log.add(states[index], [record | {"boxes": records}])
-        clear = sum(box["score"] >= _CLEAR_SCORE for box in records)
-        progress.show(number, f"{file}: {len(records)} boxes, {clear} of score {_CLEAR_SCORE} and more")
+        record = cloud_record(detections, cloud, detector.classes, min_score=args.min_score)
+        log.add(states[index], [{"file": str(file), **record}])
+        scores = [box["score"] for box in record["boxes"]]
+        clear = sum(score >= _CLEAR_SCORE for score in scores)
+        progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {_CLEAR_SCORE} and more")
 
 
 def _draw(

@@ -5,7 +5,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,23 +16,25 @@ import tyro
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score_and_angle, option_name
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
-from fcos_lidar_jax.data.drives import Drive, folder_drive
-from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
-from fcos_lidar_jax.data.nuscenes.reader import NuScenes
+from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
-from fcos_lidar_jax.evaluation.records import as_records, confident
+from fcos_lidar_jax.evaluation.records import cloud_record, confident
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
-from fcos_lidar_jax.input_pipeline.open import find_data_set
-from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, Recording, find_recording
 from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
+
+_OPTIONS = {
+    **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype")},
+    **{name: name for name in ("version", "index", "keyframes", "allow_missing_sweeps", "follow_links")},
+    "max_file_points": "max_points",
+}
+"""Options that not every kind of drive takes, and the names that their functions give them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,13 +82,9 @@ class Stream:
 
 def run(args: Stream) -> None:
     """Detect, write one line per sweep, and the page at the end."""
-    _check(args)
+    kind = _find(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
-    drive, at_us = _open(args, detector)
-    if args.track and not drive.posed:
-        raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
-    if not drive.posed:
-        print("no poses: every sweep is detected on its own, without earlier sweeps", file=sys.stderr)
+    drive = _open(args, kind, detector)
     _tell(drive.notes)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
@@ -96,7 +94,7 @@ def run(args: Stream) -> None:
         _Timing() as timing,
     ):
         sweeps = timing.read(_announcing(drive.sweeps))
-        how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": at_us}
+        how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": drive.at_us}
         if not drive.posed:
             how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
         for found in timing.detect(detect_stream(sweeps, detector, **how)):
@@ -202,7 +200,8 @@ def _timed(items: Iterable[Any], within: list[float], between: list[float]) -> I
         between.append(began - ready)
 
 
-def _check(args: Stream) -> None:
+def _find(args: Stream) -> Recording:
+    """The kind of the drive; rejects options that do not fit it, and outputs that would replace inputs."""
     check_at_least(args, 1, "max_file_points")
     check_score_and_angle(args)
     if args.source is not None and not args.source.exists():
@@ -211,21 +210,13 @@ def _check(args: Stream) -> None:
         raise ValueError("stream: expected either a folder of point files or a recording, or --data-root")
     if (args.data_root is None) != (args.scene is None):
         raise ValueError("stream: expected --data-root and --scene together")
-    is_ros = args.source is not None and is_ros_bag(args.source)
-    foreign: dict[str, str] = {}  # options that do not fit the source, and what they are for
-    if args.source is not None:
-        of_scenes = "version", "index", "keyframes", "allow_missing_sweeps", "follow_links"
-        foreign |= dict.fromkeys(of_scenes, "--data-root")
-    elif args.max_file_points != MAX_POINTS:
-        raise ValueError("--max-file-points: expected only with a folder or a recording")
-    if args.source is None or is_ros or _is_log(args):
-        foreign |= dict.fromkeys(("columns", "dtype"), "a folder of point files")
-    if not is_ros:
-        foreign |= dict.fromkeys(("topic", "odometry"), "a ROS recording (.bag, .mcap, .db3, metadata.yaml)")
-    if args.source is None or args.odometry is not None:
-        foreign["poses"] = "a folder of point files, or with a ROS recording without --odometry"
-    if given := [name for name in foreign if getattr(args, name)]:
-        raise ValueError(f"{option_name(given[0])}: expected only with {foreign[given[0]]}")
+    kind = find_recording(args.source or Path(), scene=args.scene, poses=args.poses)
+    for field, name in _OPTIONS.items():
+        if getattr(args, field) != getattr(Stream, field) and name not in kind.options:
+            fitting = " or ".join(each.title for each in RECORDINGS if name in each.options)
+            raise ValueError(f"{option_name(field)}: expected only with {fitting}")
+    if args.poses is not None and args.odometry is not None:
+        raise ValueError(f"--poses: expected only with {FOLDER.title}, or with a ROS recording without --odometry")
     keep = [path for path in (args.source, args.poses) if path is not None and path.is_file()]
     if args.source is not None and args.source.is_dir():
         keep += [path for path in args.source.rglob("*") if path.name.lower().endswith(ENDINGS)]
@@ -233,46 +224,27 @@ def _check(args: Stream) -> None:
         check_rerun()
     check_outputs(args.checkpoint, keep, out=args.out, page=args.page, rrd=args.rrd)
     args.out.parent.mkdir(parents=True, exist_ok=True)
+    return kind
 
 
-def _is_log(args: Stream) -> bool:
-    """Whether the source is a KITTI raw drive or an Argoverse 2 log, which define their poses and file layout."""
-    source = args.source
-    return args.poses is None and source is not None and (is_kitti_raw(source) or is_argoverse2_log(source))
-
-
-def _open(args: Stream, detector: CloudDetector) -> tuple[Drive, Collection[int] | None]:
-    """Open the drive; also returns the times of the sweeps to detect in, None for all."""
-    if args.source is not None:
-        return _open_source(args, args.source, detector.sensor), None
-    assert args.data_root is not None
-    assert args.scene is not None
-    version = find_data_set(args.data_root, "nuscenes", args.version).version
-    allowed = {"allow_missing_sweeps": args.allow_missing_sweeps, "follow_links": args.follow_links}
-    data = NuScenes(args.data_root, version, index=args.index, **allowed)
-    only_keyframes = args.keyframes and detector.config.num_sweeps == 1
-    at_us = data.keyframe_times_us(args.scene) if args.keyframes else None
-    return Drive(data.drive(args.scene, keyframes=only_keyframes)), at_us
-
-
-def _open_source(args: Stream, source: Path, sensor: Sensor) -> Drive:
-    if is_ros_bag(source):
-        how = {"topic": args.topic, "odometry": args.odometry, "poses": args.poses}
-        return ros_bag_drive(source, sensor, **how, max_points=args.max_file_points)
-    if args.poses is None and is_kitti_raw(source):
-        return kitti_raw_drive(source, sensor, max_points=args.max_file_points)
-    if args.poses is None and is_argoverse2_log(source):
-        return argoverse2_drive(source, sensor, max_points=args.max_file_points)
-    layout: dict[str, Any] = {"columns": args.columns, "dtype": args.dtype}
-    return folder_drive(source, sensor, args.poses, max_points=args.max_file_points, **layout)
+def _open(args: Stream, kind: Recording, detector: CloudDetector) -> Drive:
+    options: dict[str, Any] = {name: getattr(args, field) for field, name in _OPTIONS.items()}
+    options |= {"scene": args.scene, "num_sweeps": detector.config.num_sweeps}
+    given = {name: options[name] for name in kind.options}
+    drive = kind.open(args.source or args.data_root, detector.sensor, **given)
+    if args.track and not drive.posed:
+        raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
+    if not drive.posed:
+        print("no poses: every sweep is detected on its own, without earlier sweeps", file=sys.stderr)
+    return drive
 
 
 def _record(found: Found, classes: tuple[str, ...], min_score: float, drive: Drive) -> dict[str, Any]:
     """A line with the fields of ``fcos-lidar detect``; unknown values are null."""
-    cloud, sweep = found.cloud, found.sweep
-    dropped = int(found.detections.num_dropped) + cloud.num_removed
-    record: dict[str, Any] = {"file": sweep.name, "timestamp_us": sweep.time_us if drive.timed else None}
-    record |= {"sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if drive.posed else None}
-    record |= {"num_points": cloud.num_points, "num_dropped": dropped}
-    record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
-    return record | {"boxes": as_records(found.detections, classes, min_score=min_score)}
+    sweep = found.sweep
+    return {
+        "file": sweep.name,
+        "timestamp_us": sweep.time_us if drive.timed else None,
+        "sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if drive.posed else None,
+        **cloud_record(found.detections, found.cloud, classes, min_score=min_score),
+    }
