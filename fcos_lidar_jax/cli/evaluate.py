@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -51,6 +52,7 @@ from fcos_lidar_jax.visualization.evaluation_report import (
     write_evaluation_report,
 )
 from fcos_lidar_jax.visualization.page import page_frame, write_page
+from fcos_lidar_jax.visualization.report import Picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +90,18 @@ class Evaluate:
     """Share the detection among several processes."""
 
 
-def run(args: Evaluate) -> None:
-    """Detect if a detector is given, evaluate, write, and print the scores."""
+Draw = Callable[[Evaluation, FrameSet, float], tuple[list[Picture], list[tuple[str, str]]]]
+"""Evaluation, its frames and the threshold of the shown scores -> more pictures and links for the report."""
+
+
+def run(args: Evaluate, *, title: str | None = None, draw: Draw | None = None) -> None:
+    """Detect if a detector is given, evaluate, write, and print the scores.
+
+    Args:
+        args: the options.
+        title: of the report; by default the detector or the results, and the data.
+        draw: draws more for the report.
+    """
     _check(args)
     join_processes(args.processes)
     is_main_process = jax.process_index() == 0
@@ -105,7 +117,11 @@ def run(args: Evaluate) -> None:
             take_sigterm_back()
         with agreed("cannot evaluate"):
             if is_main_process:  # the others wait, because the first one would report their exit
-                _score(args, task, compared or task.comparison.read(args.out / task.comparison.file))
+                compared = compared or task.comparison.read(args.out / task.comparison.file)
+                evaluation = _score(args, task, compared)
+                if args.report:
+                    _report(args, task, compared, evaluation, title, draw)
+                print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
 
 
 def _check(args: Evaluate) -> None:
@@ -213,7 +229,7 @@ def _detect(args: Evaluate, task: _Task) -> None:
         tell(f"{removed['invalid']} points dropped: not finite, or beyond physical limits")
 
 
-def _score(args: Evaluate, task: _Task, compared: Compared) -> None:
+def _score(args: Evaluate, task: _Task, compared: Compared) -> Evaluation:
     for line in compared.warnings:
         tell(f"warning: {line}")
     file, given = args.out / task.comparison.file, args.results
@@ -228,14 +244,14 @@ def _score(args: Evaluate, task: _Task, compared: Compared) -> None:
     print(describe(evaluation, intervals), flush=True)
     if (kitti := write_kitti(args.out, compared.detections, task.frames)) is not None:
         print(describe_kitti(kitti), flush=True)
-    if args.report:
-        _report(args, task, compared, evaluation)
-    print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
+    return evaluation
 
 
-def _report(args: Evaluate, task: _Task, compared: Compared, evaluation: Evaluation) -> None:
+def _report(
+    args: Evaluate, task: _Task, compared: Compared, evaluation: Evaluation, title: str | None, draw: Draw | None
+) -> None:
     """Write the report and the page that it links to."""
-    title = f"{(args.checkpoint or args.results or Path()).name} on {task.name}"
+    title = title or f"{(args.checkpoint or args.results or Path()).name} on {task.name}"
     examples = choose_examples(evaluation)
     source = evaluation, task.frames, compared.truth.ego_translation
     frames = [
@@ -245,11 +261,13 @@ def _report(args: Evaluate, task: _Task, compared: Compared, evaluation: Evaluat
     if frames:
         options = {"classes": evaluation.metric.classes, "min_score": examples.min_score}
         write_page(args.out / PAGE, frames, title=title, **options)
+    pictures, links = draw(evaluation, task.frames, examples.min_score) if draw and task.frames else ([], [])
     write_evaluation_report(
         args.out,
         title=title,
         num_samples=len(compared.truth.tokens),
         examples=make_examples(*source, examples.rows, min_score=examples.min_score),
         sensor=task.sensor,
-        links=[("Look at the worst and the best frames", PAGE)] if frames else [],
+        pictures=pictures,
+        links=links + ([("Look at the worst and the best frames", PAGE)] if frames else []),
     )
