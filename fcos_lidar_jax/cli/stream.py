@@ -26,7 +26,7 @@ from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, Recording, find_recording
-from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
+from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
 _OPTIONS = {
@@ -120,8 +120,8 @@ def run(args: Stream) -> None:
     _tell(drive.notes)
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:
-        threshold: dict[str, Any] = {"min_score": args.min_score} if args.min_score else {}
-        write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source), **threshold)
+        title, min_score = args.scene or str(args.source), args.min_score or SHOWN_SCORE
+        write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)
 
 
 @contextlib.contextmanager
