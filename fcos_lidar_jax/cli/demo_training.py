@@ -18,7 +18,7 @@ from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.simulation.frame_set import fresh_streets, unseen_frames
 from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.metrics_log import read_metrics
-from fcos_lidar_jax.training.pictures import draw_frame
+from fcos_lidar_jax.training.pictures import draw_predictions
 from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.visualization.range_image import draw_range_image
 from fcos_lidar_jax.visualization.report import Picture, write_report
@@ -44,7 +44,7 @@ def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
     """
     began = time.monotonic()
     shipped = load_trained("quickstart")
-    tests, sensor = unseen_frames(shipped.sensor, test_frames), shipped.sensor
+    tests, num_drawn = unseen_frames(shipped.sensor, test_frames), min(_NUM_DRAWN, test_frames)
     metrics: dict[str, Any] = {}
     pictures: list[Picture] = []
 
@@ -54,11 +54,10 @@ def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
         minutes = (time.monotonic() - began) / 60
         score = f"mAP {summary['mean_ap']:.3f} on {test_frames} unseen frames"
         print(f"{_TITLES[model]}: {score}, after {minutes:.1f} minutes", flush=True)
-        for found in predict(detector, tests, indices=range(min(_NUM_DRAWN, test_frames)) if draw else ()):
-            path, title = out / f"{model}_{found.index}.png", f"unseen frame {found.index}, {_TITLES[model]}"
-            frame = found.frame or tests.frame(found.index)
-            draw_frame(path, frame, found.detections, title, limit_m=sensor.limit_xy_m, classes=tests.classes)
-            pictures.append((f"{title}, from above.", path))
+        if draw:
+            first, title = predict(detector, tests, indices=range(num_drawn)), f"{_TITLES[model]}, unseen frame"
+            paths = draw_predictions(out, first, tests, prefix=model, title=title)
+            pictures.extend((f"From above: {title} {index}.", path) for index, path in enumerate(paths))
 
     assess("shipped", shipped)
     run_folder = out / "run"
@@ -68,11 +67,11 @@ def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
         assess("before", TrainedDetector(trained.model, trained.model.init(jax.random.key(seed))), draw=False)
         assess("after", trained)
         metrics["training"] = _training_record(run_folder)
-    clouds = [tests.frame(index).points for index in range(min(_NUM_DRAWN, test_frames))]
+    clouds = [tests.frame(index).points for index in range(num_drawn)]
     for index, points in enumerate(clouds):
         atomic_write(out / "unseen" / f"frame_{index:03d}.npy", lambda path, points=points: np.save(path, points))
     path = out / "range_image.png"
-    image = project_points(clouds[0], np.ones(len(clouds[0]), bool), sensor, num_rounds=1)
+    image = project_points(clouds[0], np.ones(len(clouds[0]), bool), tests.sensor, num_rounds=1)
     draw_range_image(image, path, title="unseen frame 0 as the network sees it")
     pictures.append(("The range image of unseen frame 0.", path))
     if steps:

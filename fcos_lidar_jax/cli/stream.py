@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import sys
 import time
@@ -93,11 +94,11 @@ def run(args: Stream) -> None:
         _write_lines(args.out) as write_line,
         _Timing() as timing,
     ):
-        sweeps = timing.read(_announcing(drive.sweeps))
         how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": drive.at_us}
         if not drive.posed:
             how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
-        for found in timing.detect(detect_stream(sweeps, detector, **how)):
+        detect = functools.partial(detect_stream, detector=detector, **how)
+        for found in timing.detect(_announcing(drive.sweeps), detect):
             points = found.cloud.points[found.cloud.valid]
             if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
                 print(f"warning: {line}", file=sys.stderr)
@@ -153,11 +154,10 @@ def _tell(notes: list[str]) -> None:
 
 
 class _Timing(contextlib.AbstractContextManager):
-    """Seconds per sweep and stage, and the number of programs compiled up to each sweep."""
+    """Seconds per sweep and stage, and the number of programs compiled after the first sweep."""
 
     def __init__(self) -> None:
-        self._reading, self._to_boxes, self._writing = list[float](), list[float](), list[float]()
-        self._read, self._programs, self._programs_by_sweep = list[float](), 0, list[int]()
+        self._seconds, self._programs = list[tuple[float, float, float]](), 0
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def __exit__(self, *error: object) -> None:
@@ -166,38 +166,37 @@ class _Timing(contextlib.AbstractContextManager):
     def _listen(self, event: str, *_: object, **__: object) -> None:
         self._programs += event.endswith("/backend_compile_duration")
 
-    def read(self, sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
-        return _timed(sweeps, self._read, [])
+    def detect(
+        self, sweeps: Iterable[Sweep], detect: Callable[[Iterable[Sweep]], Iterator[Found]]
+    ) -> Iterator[Found]:
+        """Detections in sweeps. What the caller does with one until it takes the next one counts as writing."""
+        reading, began = 0.0, time.perf_counter()
 
-    def detect(self, stream: Iterable[Found]) -> Iterator[Found]:
-        for found in _timed(stream, self._to_boxes, self._writing):
-            self._reading.append(sum(self._read))  # including sweeps that are only fused
-            self._read.clear()
+        def read() -> Iterator[Sweep]:
+            nonlocal reading
+            before = time.perf_counter()
+            for sweep in sweeps:
+                reading += time.perf_counter() - before  # including sweeps that are only fused
+                yield sweep
+                before = time.perf_counter()
+
+        for found in detect(read()):
+            ready = time.perf_counter()
             yield found
-            self._programs_by_sweep.append(self._programs)
+            self._seconds.append((reading, ready - began - reading, time.perf_counter() - ready))
+            if len(self._seconds) == 1:
+                self._programs = 0
+            reading, began = 0.0, time.perf_counter()
 
     def summary(self) -> str:
         """A line with the medians. The first sweep, which includes the compilation, is listed separately."""
-        number = len(self._programs_by_sweep)
+        number = len(self._seconds)
         if number < 2:
             return f"{number} sweeps"
-        reading, to_boxes, writing = map(np.array, (self._reading, self._to_boxes, self._writing))
-        stages = {"reading": reading, "detection": to_boxes - reading, "writing": writing}
-        later = ", ".join(f"{np.median(s[1:]) * 1e3:.1f} ms {name}" for name, s in stages.items())
-        compilations = f"{self._programs_by_sweep[-1] - self._programs_by_sweep[0]} compilations"
-        first = f"the first, which compiles, {to_boxes[0] + writing[0]:.1f} s"
-        return f"{number} sweeps: {first}; the others {later} (medians), {compilations}"
-
-
-def _timed(items: Iterable[Any], within: list[float], between: list[float]) -> Iterator[Any]:
-    """The items. Appends the seconds to produce each item to ``within``, and to consume it to ``between``."""
-    began = time.perf_counter()
-    for item in items:
-        ready = time.perf_counter()
-        within.append(ready - began)
-        yield item
-        began = time.perf_counter()
-        between.append(began - ready)
+        medians = zip(np.median(self._seconds[1:], axis=0), ("reading", "detection", "writing"), strict=True)
+        later = ", ".join(f"{1e3 * seconds:.1f} ms {stage}" for seconds, stage in medians)
+        first = f"the first, which compiles, {sum(self._seconds[0]):.1f} s"
+        return f"{number} sweeps: {first}; the others {later} (medians), {self._programs} compilations"
 
 
 def _find(args: Stream) -> Recording:

@@ -167,7 +167,11 @@ def _open(args: Train) -> _Task:
     if split is None and args.samples is None and tests is None:
         tell(f"{data.root}: no splits: training on all {len(frames)} frames, with no evaluation")
     if tests is not None:
-        _tell_of_overlap(frames, tests)
+        names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
+        if shared := len(names & tested):
+            tell(
+                f"{shared} of the {len(tests)} evaluation frames are also training frames: scores will be too high"
+            )
     if not data.on_disk:
         _check_simulated(len(frames), config)
     steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
@@ -237,10 +241,3 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
             f"{config.num_sweeps} sweeps: run fcos-lidar prepare again, with the same data options"
         )
     return database.open_database(folder)
-
-
-def _tell_of_overlap(frames: FrameSet, tests: FrameSet) -> None:
-    """Count the frames that are both trained and evaluated on."""
-    names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
-    if shared := len(names & tested):
-        tell(f"{shared} of the {len(tests)} evaluation frames are also training frames: scores will be too high")

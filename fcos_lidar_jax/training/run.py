@@ -252,7 +252,8 @@ def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | No
     examples = list(predict(trained, run.tests, indices=first, devices=run.devices))
     if metrics is not None:
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
-        draw_predictions(run.folder / "pictures", examples, run.tests, number)
+        prefix, title = f"step_{number:06d}_frame", f"step {number}, test frame"
+        draw_predictions(run.folder / "pictures", examples, run.tests, prefix=prefix, title=title)
         if not math.isnan(score):
             run.checkpoints.record_score(number, score)
         values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
