@@ -10,12 +10,15 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from fcos_lidar_jax.cli import demo_training, evaluate
+from fcos_lidar_jax.cli import demo_training
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder, option_name
-from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, write_scores
 from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
 from fcos_lidar_jax.evaluation.metrics import Evaluation
 from fcos_lidar_jax.inference import CloudDetector, load_detector
+from fcos_lidar_jax.input_pipeline import open_frames
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
@@ -61,24 +64,33 @@ def run(args: Demo) -> None:
             raise ValueError(f"{option_name(name)}: expected --train with it")
     began = time.monotonic()
     print(f"simulating a drive of {args.keyframes} keyframes", file=sys.stderr, flush=True)
-    _simulate(args, load_detector(WEIGHTS))
-    data = DataOptions(data_root=args.out / "drive")
-    evaluation = evaluate.Evaluate(data, args.out, split="train", checkpoint=Path(WEIGHTS), bootstrap=200)
-    title = f"{WEIGHTS} on an unseen simulated drive"
-    evaluate.run(evaluation, title=title, draw=functools.partial(_draw, args.out, title))
+    detector, title = load_detector(WEIGHTS), f"{WEIGHTS} on an unseen simulated drive"
+    frames = _simulate(args, detector)
+    comparison = compare_by_benchmark(frames, "the drive", detector.classes)
+    task = Task("the drive", comparison, detector.sensor, detector, frames)
+    write_detections(task, args.out)
+    compared = comparison.read(args.out / comparison.file)
+    evaluation = write_scores(task, compared, args.out, bootstrap=200)
+    draw = functools.partial(_draw, args.out, title)
+    write_reports(task, compared, evaluation, args.out, title=title, draw=draw)
     cloud = min((args.out / "drive" / "samples" / CHANNEL).iterdir())
+    print(f"done after {time.monotonic() - began:.0f} s")
     print(
-        f"after {time.monotonic() - began:.0f} s; to detect in a cloud yourself:\n"
+        f"look at {args.out / 'report.html'}, or detect in a cloud yourself:\n"
         f"  fcos-lidar detect {cloud} --checkpoint {WEIGHTS} --out boxes.json --pictures {args.out / 'detected'}"
     )
     if args.train:
         demo_training.run(args.out / "training", args.steps, args.test_frames, args.seed)
 
 
-def _simulate(args: Demo, detector: CloudDetector) -> None:
-    """Write the drive as a data set."""
-    spec = DatasetSpec(1, args.drive, args.keyframes, detector.sensor, True, "v1.0-drive")
-    write_dataset(spec, args.out / "drive", workers=1, report=Progress("sweeps", spec.sweeps).show)
+def _simulate(args: Demo, detector: CloudDetector) -> NuScenesFrames:
+    """Write the drive as a data set; returns its keyframes."""
+    root, sensor = args.out / "drive", detector.sensor
+    spec = DatasetSpec(1, args.drive, args.keyframes, sensor, True, "v1.0-drive")
+    write_dataset(spec, root, workers=1, report=Progress("sweeps", spec.sweeps).show)
+    frames = open_frames(root, reading=detector.config.reading, sensor=sensor)
+    assert isinstance(frames, NuScenesFrames)
+    return frames
 
 
 def _draw(
