@@ -1,7 +1,6 @@
 """``fcos-lidar demo``: a trained detector on a simulated drive, without any data."""
 
 import dataclasses
-import functools
 import sys
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, wr
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
+from fcos_lidar_jax.evaluation.examples import choose_examples
 from fcos_lidar_jax.evaluation.metrics import Evaluation
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.input_pipeline import open_frames
@@ -26,12 +26,11 @@ from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.visualization.drive import draw_drive
 from fcos_lidar_jax.visualization.evaluation_report import make_examples
 from fcos_lidar_jax.visualization.page import page_frame, write_page
-from fcos_lidar_jax.visualization.report import Picture
 
 WEIGHTS = "hdl32e"
 _CAPTION = """The drive, one keyframe every half second: the range image, and the view from above, where higher
 points are darker, detections have the colour of their class, and the truth is dashed."""
-_PAGE = "drive.html"
+_GIF, _PAGE = "drive.gif", "drive.html"
 _MAX_LIMIT_M = 50.0  # half the side of the square that pictures show
 
 
@@ -71,8 +70,9 @@ def run(args: Demo) -> None:
     write_detections(task, args.out)
     compared = comparison.read(args.out / comparison.file)
     evaluation = write_scores(task, compared, args.out, bootstrap=200)
-    draw = functools.partial(_draw, args.out, title)
-    write_reports(task, compared, evaluation, args.out, title=title, draw=draw)
+    _draw(args.out, title, evaluation, frames)
+    more = {"pictures": [(_CAPTION, args.out / _GIF)], "links": [("Look at the drive: play, turn, zoom", _PAGE)]}
+    write_reports(task, compared, evaluation, args.out, title=title, **more)
     cloud = min((args.out / "drive" / "samples" / CHANNEL).iterdir())
     print(f"done after {time.monotonic() - began:.0f} s")
     print(
@@ -93,10 +93,9 @@ def _simulate(args: Demo, detector: CloudDetector) -> NuScenesFrames:
     return frames
 
 
-def _draw(
-    out: Path, title: str, evaluation: Evaluation, frames: FrameSet, min_score: float
-) -> tuple[list[Picture], list[tuple[str, str]]]:
-    """Draw the animation, and write the page that plays the drive; returns the picture and the link."""
+def _draw(out: Path, title: str, evaluation: Evaluation, frames: FrameSet) -> None:
+    """Draw the animation, and write the page that plays the drive."""
+    min_score = choose_examples(evaluation).min_score
     rows = {name: row for row, name in enumerate(evaluation.tokens)}
     origins = np.zeros((len(rows), 3))
     scenes = list(make_examples(evaluation, frames, origins, rows, min_score=0, all_sweeps=True))
@@ -114,7 +113,7 @@ def _draw(
     classes, sensor = evaluation.metric.classes, frames.sensor
     write_page(out / _PAGE, page_frames, classes=classes, title=title, min_score=min_score)
     draw_drive(
-        out / "drive.gif",
+        out / _GIF,
         scenes,
         sensor=sensor,
         classes=classes,
@@ -123,4 +122,3 @@ def _draw(
         limit_m=min(sensor.limit_xy_m, _MAX_LIMIT_M),
         report=Progress("pictures", len(scenes)).show,
     )
-    return [(_CAPTION, out / "drive.gif")], [("Look at the drive: play, turn, zoom", _PAGE)]

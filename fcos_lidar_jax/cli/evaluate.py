@@ -22,22 +22,17 @@ from fcos_lidar_jax.cli.checks import (
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
+from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
-from fcos_lidar_jax.evaluation.comparison import (
-    RESULT_FILES,
-    compare_by_benchmark,
-    compare_by_distance,
-)
+from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
 from fcos_lidar_jax.evaluation.truth import read_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.sensors import load_sensor
-from fcos_lidar_jax.visualization.evaluation_report import (
-    PAGE,
-)
+from fcos_lidar_jax.visualization.evaluation_report import PAGE
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Detection, scores and reports on a data set, for the commands ``evaluate`` and ``demo``."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
 from fcos_lidar_jax.cli.processes import tell
@@ -24,9 +24,6 @@ from fcos_lidar_jax.visualization.evaluation_report import (
 )
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 from fcos_lidar_jax.visualization.report import Picture
-
-Draw = Callable[[Evaluation, FrameSet, float], tuple[list[Picture], list[tuple[str, str]]]]
-"""Evaluation, its frames and the threshold of the shown scores -> more pictures and links for the report."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,9 +73,16 @@ def write_scores(task: Task, compared: Compared, out: Path, *, bootstrap: int = 
 
 
 def write_reports(
-    task: Task, compared: Compared, evaluation: Evaluation, out: Path, *, title: str, draw: Draw | None = None
+    task: Task,
+    compared: Compared,
+    evaluation: Evaluation,
+    out: Path,
+    *,
+    title: str,
+    pictures: Sequence[Picture] = (),
+    links: Sequence[tuple[str, str]] = (),
 ) -> None:
-    """Write the report, with what ``draw`` adds to it, and the page that it links to."""
+    """Write the report, with more pictures and links, and the page of frames that it links to."""
     examples = choose_examples(evaluation)
     source = evaluation, task.frames, compared.truth.ego_translation
     frames = [
@@ -88,7 +92,6 @@ def write_reports(
     if frames:
         options = {"classes": evaluation.metric.classes, "min_score": examples.min_score}
         write_page(out / PAGE, frames, title=title, **options)
-    pictures, links = draw(evaluation, task.frames, examples.min_score) if draw and task.frames else ([], [])
     write_evaluation_report(
         out,
         title=title,
@@ -96,5 +99,5 @@ def write_reports(
         examples=make_examples(*source, examples.rows, min_score=examples.min_score),
         sensor=task.sensor,
         pictures=pictures,
-        links=links + ([("Look at the worst and the best frames", PAGE)] if frames else []),
+        links=[*links, *([("Look at the worst and the best frames", PAGE)] if frames else [])],
     )
