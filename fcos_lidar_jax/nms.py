@@ -56,9 +56,7 @@ def rotated_nms(
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     scores = jnp.where(usable, scores, -jnp.inf)
     labels = jnp.zeros(scores.shape, jnp.int32) if labels is None else jnp.asarray(labels)
-    if overlap not in ("bev", "3d"):
-        raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
-    options = {"threshold": iou_threshold, "max_outputs": max_outputs, "vertical": overlap == "3d"}
+    options = {"threshold": iou_threshold, "max_outputs": max_outputs, "vertical": _is_vertical(overlap)}
     rows, matrix = (functools.partial(suppress, **options) for suppress in (_by_rows, _by_matrix))
     candidates = oriented(boxes), scores, usable, labels
     return in_form(form, {"rows": rows, "matrix": matrix}, *candidates, cpu="rows", default="matrix")
@@ -100,10 +98,17 @@ def merge_boxes(
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
     labels = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
-    mean = functools.partial(_weighted_mean, threshold=iou_threshold, vertical=overlap == "3d")
+    mean = functools.partial(_weighted_mean, threshold=iou_threshold, vertical=_is_vertical(overlap))
     arrays = jnp.asarray(boxes, jnp.float32), weights, labels, usable, kept, used
     rows, matrix = (functools.partial(merge, mean) for merge in (_merged_by_rows, _merged_by_matrix))
     return in_form(form, {"rows": rows, "matrix": matrix}, *arrays, cpu="rows", default="matrix")
+
+
+def _is_vertical(overlap: str) -> bool:
+    """Whether an overlap is measured in 3D; rejects other names than ``"bev"`` and ``"3d"``."""
+    if overlap not in ("bev", "3d"):
+        raise ValueError(f"overlap: got {overlap!r}, expected 'bev' or '3d'")
+    return overlap == "3d"
 
 
 def _weighted_mean(

@@ -1,6 +1,7 @@
 """Check that both forms of rotated NMS keep the same boxes as a greedy loop with Shapely."""
 
 import functools
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -187,6 +188,19 @@ def test_merging_loops_only_on_cpus():
         merge = jax.jit(lambda *given: merge_boxes(*given, labels=labels, iou_threshold=0.3))
         program = export.export(merge, platforms=(platform,))(*given)
         assert program.mlir_module().count("stablehlo.while") == loops
+
+
+def test_an_unknown_overlap_is_refused():
+    """Without the checks of types that the tests add to functions."""
+    boxes, scores, valid, labels = clusters(0)
+    best = compute(boxes, scores, valid, labels=labels, **OPTIONS)
+    suppress, merge = inspect.unwrap(rotated_nms), inspect.unwrap(merge_boxes)
+    for call in (
+        lambda: suppress(boxes, scores, valid, **OPTIONS, overlap="BEV"),
+        lambda: merge(boxes, scores, valid, *best, iou_threshold=0.3, overlap="BEV"),
+    ):
+        with pytest.raises(ValueError, match=r"^overlap: got 'BEV', expected 'bev' or '3d'$"):
+            call()
 
 
 @FORMS

@@ -33,7 +33,9 @@ from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.evaluation.benchmark import evaluate_keyframes
+from fcos_lidar_jax.evaluation.metrics import evaluate
+from fcos_lidar_jax.evaluation.results import LIDAR_META, read_results, result_entries
+from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.presets import COMPACT
@@ -96,7 +98,12 @@ def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
     scores = scores_by_range(found, visited, repeats=_REPEATS, groups=drives)
     record: dict[str, Any] = {"keyframes": len(visited), **scores}
     if isinstance(frames, NuScenesFrames):
-        evaluation = evaluate_keyframes(found, frames.nuscenes, frames.tokens, detector.classes)
+        results = {
+            token: result_entries(boxes, token, frames.nuscenes.sensor_to_global(token), detector.classes)
+            for token, boxes in zip(frames.tokens, found, strict=True)
+        }
+        boxes = read_results({"meta": LIDAR_META, "results": results}, frames.tokens).boxes
+        evaluation = evaluate(boxes, split_truth(frames.nuscenes, frames.tokens))
         for name, key in (("official mAP", "mean_ap"), ("official NDS", "nd_score")):
             record[name] = {
                 "score": round(evaluation.summary[key], 4),

@@ -1,47 +1,40 @@
 """The training of ``fcos-lidar demo --train``: the quickstart preset from scratch, beside its shipped weights."""
 
-import json
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import jax
+import msgspec
 import numpy as np
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
-from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.frame import Frame
-from fcos_lidar_jax.evaluation.frames import evaluate_frames
-from fcos_lidar_jax.evaluation.metrics import DISTANCES_M, metric_of
-from fcos_lidar_jax.evaluation.records import as_records
+from fcos_lidar_jax.evaluation.metrics import DISTANCES_M
 from fcos_lidar_jax.files import atomic_write
-from fcos_lidar_jax.inference import TrainedDetector, load_trained
-from fcos_lidar_jax.inference.prediction import predict
+from fcos_lidar_jax.inference import TrainedDetector, evaluate, load_trained, predict
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.simulation.frame_set import fresh_streets, unseen_frames
 from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.metrics_log import read_metrics
-from fcos_lidar_jax.training.pictures import SHOWN_SCORE, draw_frame
+from fcos_lidar_jax.training.pictures import draw_predictions
 from fcos_lidar_jax.training.plan import RUN_SPEC
-from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.range_image import draw_range_image
-from fcos_lidar_jax.visualization.report import write_report
+from fcos_lidar_jax.visualization.report import Picture, write_report
 
 _NUM_DRAWN = 3  # frames in the report and in the folder unseen
 _NUM_VALIDATED = 10  # test frames of the evaluations during training
 _NUM_EVALUATIONS = 6
 
 _TITLES = {"shipped": "shipped weights", "after": "trained here", "before": "untrained"}
-_Pictures = list[tuple[str, Path]]  # captions and files
 
 
 def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
     """Detect with the shipped weights, train, detect again, and write the report.
 
-    Writes metrics.json, pictures, report.html, unseen clouds with their boxes, and the run with its checkpoints.
-    Ctrl-C ends the training early and evaluates the result.
+    Writes metrics.json, pictures, report.html, unseen clouds, and the run with its checkpoints. Ctrl-C ends the
+    training early and evaluates the result.
 
     Args:
         out: folder for the results.
@@ -51,34 +44,34 @@ def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
     """
     began = time.monotonic()
     shipped = load_trained("quickstart")
-    tests = unseen_frames(shipped.sensor, test_frames)
-    frames = [tests.frame(i) for i in range(len(tests))]
-    detections: dict[str, list[Detections]] = {}
+    tests, num_drawn = unseen_frames(shipped.sensor, test_frames), min(_NUM_DRAWN, test_frames)
     metrics: dict[str, Any] = {}
+    pictures: list[Picture] = []
 
-    def assess(model: str, detector: TrainedDetector) -> str:
-        """Evaluate on the test frames; returns the score as a line of text."""
-        detections[model] = [prediction.detections for prediction in predict(detector, tests)]
-        summary = metrics[model] = evaluate_frames(detections[model], frames, metric_of(NUSCENES_CLASSES)).summary
+    def assess(model: str, detector: TrainedDetector, *, draw: bool = True) -> None:
+        """Evaluate on the test frames, print the score, and draw the first frames."""
+        summary = metrics[model] = evaluate(detector, tests).summary
         minutes = (time.monotonic() - began) / 60
-        return f"mAP {summary['mean_ap']:.3f} on {test_frames} unseen frames, after {minutes:.1f} minutes"
+        score = f"mAP {summary['mean_ap']:.3f} on {test_frames} unseen frames"
+        print(f"{_TITLES[model]}: {score}, after {minutes:.1f} minutes", flush=True)
+        if draw:
+            first, title = predict(detector, tests, indices=range(num_drawn)), f"{_TITLES[model]}, unseen frame"
+            paths = draw_predictions(out, first, tests, prefix=model, title=title)
+            pictures.extend((f"From above: {title} {index}.", path) for index, path in enumerate(paths))
 
-    line = assess("shipped", shipped)
-    _save_frames(out / "unseen", frames, detections)
-    limit_m = shipped.sensor.limit_xy_m
-    pictures = _draw_frames(out, "shipped", frames, detections["shipped"], limit_m)
-    print(f"shipped weights: {line}; see {pictures[0][1]}", flush=True)
+    assess("shipped", shipped)
     run_folder = out / "run"
     if steps:
         _train(run_folder, steps, test_frames, seed)
         trained = load_trained(run_folder)
-        assess("before", TrainedDetector(trained.model, trained.model.init(jax.random.key(seed))))
-        line = assess("after", trained)
+        assess("before", TrainedDetector(trained.model, trained.model.init(jax.random.key(seed))), draw=False)
+        assess("after", trained)
         metrics["training"] = _training_record(run_folder)
-        _save_frames(out / "unseen", frames, detections)
-        pictures += _draw_frames(out, "after", frames, detections["after"], limit_m)
-    points, path = frames[0].points, out / "range_image.png"
-    image = project_points(points, np.ones(len(points), bool), shipped.sensor, num_rounds=1)
+    clouds = [tests.frame(index).points for index in range(num_drawn)]
+    for index, points in enumerate(clouds):
+        atomic_write(out / "unseen" / f"frame_{index:03d}.npy", lambda path, points=points: np.save(path, points))
+    path = out / "range_image.png"
+    image = project_points(clouds[0], np.ones(len(clouds[0]), bool), tests.sensor, num_rounds=1)
     draw_range_image(image, path, title="unseen frame 0 as the network sees it")
     pictures.append(("The range image of unseen frame 0.", path))
     if steps:
@@ -87,10 +80,9 @@ def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
             ("Scores during the training, on some of the unseen frames.", run_folder / "scores.png"),
         ]
     metrics["minutes"] = round((time.monotonic() - began) / 60, 2)
-    atomic_write(out / "metrics.json", lambda p: p.write_text(json.dumps(_without_nan(metrics), indent=1)))
+    text = msgspec.json.format(msgspec.json.encode(metrics), indent=1)  # NaN becomes null
+    atomic_write(out / "metrics.json", lambda path: path.write_bytes(text))
     _report(out, test_frames, metrics, pictures)
-    if steps:
-        print(f"trained here: {line}; untrained {metrics['before']['mean_ap']:.3f}")
     print(
         f"look at {out / 'report.html'}, or detect in a cloud yourself:\n"
         f"  fcos-lidar detect {out / 'unseen' / 'frame_000.npy'} "
@@ -133,38 +125,7 @@ def _training_record(folder: Path) -> dict[str, Any]:
     }
 
 
-def _without_nan(value: Any) -> Any:
-    """Replace NaN by None, since JSON has no NaN."""
-    if isinstance(value, dict):
-        return {k: _without_nan(v) for k, v in value.items()}
-    return None if isinstance(value, float) and np.isnan(value) else value
-
-
-def _draw_frames(
-    out: Path, model: str, frames: list[Frame], detections: list[Detections], limit_m: float
-) -> _Pictures:
-    pictures = []
-    for i, (frame, boxes) in enumerate(zip(frames[:_NUM_DRAWN], detections, strict=False)):
-        path, title = out / f"{model}_{i}.png", f"unseen frame {i}, {_TITLES[model]}"
-        draw_frame(path, frame, boxes, title, limit_m=limit_m, classes=NUSCENES_CLASSES)
-        pictures.append((f"Unseen frame {i} from above, {_TITLES[model]}.", path))
-    return pictures
-
-
-def _save_frames(folder: Path, frames: list[Frame], detections: dict[str, list[Detections]]) -> None:
-    """Write a few unseen clouds, and JSON files with their truth and detections."""
-    for i, frame in enumerate(frames[:_NUM_DRAWN]):
-        boxes = zip(frame.labels, frame.boxes.tolist(), strict=True)
-        record = {
-            "truth": [{"label": NUSCENES_CLASSES[label], "box": box} for label, box in boxes],
-            **{m: as_records(d[i], NUSCENES_CLASSES, min_score=SHOWN_SCORE) for m, d in detections.items()},
-        }
-        text = json.dumps(record, indent=1)
-        atomic_write(folder / f"frame_{i:03d}.npy", lambda path, points=frame.points: np.save(path, points))
-        atomic_write(folder / f"frame_{i:03d}.json", lambda path, text=text: path.write_text(text))
-
-
-def _report(out: Path, test_frames: int, metrics: dict[str, Any], pictures: _Pictures) -> None:
+def _report(out: Path, test_frames: int, metrics: dict[str, Any], pictures: list[Picture]) -> None:
     models = [model for model in _TITLES if model in metrics]
     rows = [
         (name.replace("_", " "), *(metrics[model]["mean_dist_aps"][name] for model in models))

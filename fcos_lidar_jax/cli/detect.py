@@ -27,16 +27,17 @@ from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import about_z, read_list, sensor_before_rotation, turned
-from fcos_lidar_jax.evaluation.records import as_records, confident
+from fcos_lidar_jax.evaluation.json_io import write_lines
+from fcos_lidar_jax.evaluation.records import cloud_record, confident
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
-from fcos_lidar_jax.files import atomic_write, file_lock
+from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.inference.prediction_log import detections_fingerprint
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.types import Detections
-from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
+from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 
 _CLEAR_SCORE = 0.2  # boxes with at least this score are counted on the screen
 _MIN_PICTURE_SCORE = 0.1
@@ -85,7 +86,8 @@ def run(args: Detect) -> None:
     states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
     with _resume_log(args, detector) as log:
         _detect(args, detector, clouds, states, log)
-        atomic_write(args.out, lambda path: _write_results(path, log.entries(states)))
+        lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
+        write_lines(args.out, b'{"files": [', lines, b"]}\n")
         if args.page is not None:
             _write_page(args, clouds, detector, (json.loads(entry)[0] for _, entry in log.entries(states)))
 
@@ -180,13 +182,11 @@ def _detect(
         expect_points(file, cloud, int(detections.num_dropped), detector.sensor)
         if (picture := pictures[index]) is not None:
             _draw(picture, points, detections, detector, max(args.min_score, _MIN_PICTURE_SCORE))
-        records = as_records(detections, detector.classes, min_score=args.min_score)
-        dropped = int(detections.num_dropped) + cloud.num_removed
-        record = {"file": str(file), "num_points": cloud.num_points, "num_dropped": dropped}
-        record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
-        log.add(states[index], [record | {"boxes": records}])
-        clear = sum(box["score"] >= _CLEAR_SCORE for box in records)
-        progress.show(number, f"{file}: {len(records)} boxes, {clear} of score {_CLEAR_SCORE} and more")
+        record = cloud_record(detections, cloud, detector.classes, min_score=args.min_score)
+        log.add(states[index], [{"file": str(file), **record}])
+        scores = [box["score"] for box in record["boxes"]]
+        clear = sum(score >= _CLEAR_SCORE for score in scores)
+        progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {_CLEAR_SCORE} and more")
 
 
 def _draw(
@@ -198,15 +198,6 @@ def _draw(
     limit_m, title = detector.sensor.limit_xy_m, f"{path.stem}: boxes of score {min_score:g} and more"
     boxes = confident(detections, min_score)
     draw_bev(points, path, detections=boxes, limit_m=limit_m, classes=detector.classes, title=title)
-
-
-def _write_results(path: Path, results: Iterable[tuple[str, bytes]]) -> None:
-    """Write one line per file, with one entry of the log (a list of one record) in memory at a time."""
-    with path.open("wb") as file:
-        file.write(b'{"files": [')
-        for number, (_, entry) in enumerate(results):
-            file.write((b",\n" if number else b"\n") + entry[1:-1])
-        file.write(b"\n]}\n")
 
 
 def _write_page(
@@ -222,5 +213,5 @@ def _write_page(
         frames.append(
             page_frame(clouds.frame(index).points, (boxes, labels, scores), name=clouds.files[index].name)
         )
-    threshold: dict[str, Any] = {"min_score": args.min_score} if args.min_score else {}
-    write_page(args.page, frames, classes=detector.classes, title=f"Boxes of {args.checkpoint.name}", **threshold)
+    title, min_score = f"Boxes of {args.checkpoint.name}", args.min_score or SHOWN_SCORE
+    write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)

@@ -22,35 +22,17 @@ from fcos_lidar_jax.cli.checks import (
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
-from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
-from fcos_lidar_jax.evaluation.comparison import (
-    RESULT_FILES,
-    Compared,
-    Comparison,
-    compare_by_benchmark,
-    compare_by_distance,
-)
-from fcos_lidar_jax.evaluation.examples import choose_examples
-from fcos_lidar_jax.evaluation.kitti import describe_kitti
-from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, write_kitti
-from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
-from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
+from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
+from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
 from fcos_lidar_jax.evaluation.truth import read_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
-from fcos_lidar_jax.progress import Progress
-from fcos_lidar_jax.sensors import Sensor, load_sensor
-from fcos_lidar_jax.visualization.evaluation_report import (
-    PAGE,
-    clear_report,
-    make_examples,
-    write_evaluation_report,
-)
-from fcos_lidar_jax.visualization.page import page_frame, write_page
+from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.visualization.evaluation_report import PAGE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,11 +83,24 @@ def run(args: Evaluate) -> None:
             if is_main_process:
                 locked.enter_context(folder_lock(args.out, "evaluating"))
         if compared is None:
-            _detect(args, task)
+            write_detections(task, args.out, batch_size=args.batch_size)
             take_sigterm_back()
         with agreed("cannot evaluate"):
             if is_main_process:  # the others wait, because the first one would report their exit
-                _score(args, task, compared or task.comparison.read(args.out / task.comparison.file))
+                compared = compared or task.comparison.read(args.out / task.comparison.file)
+                _copy(args, task)
+                evaluation = write_scores(task, compared, args.out, bootstrap=args.bootstrap)
+                if args.report:
+                    title = f"{(args.checkpoint or args.results or Path()).name} on {task.name}"
+                    write_reports(task, compared, evaluation, args.out, title=title)
+                print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
+
+
+def _copy(args: Evaluate, task: Task) -> None:
+    """Copy a given results file to the other results."""
+    file, given = args.out / task.comparison.file, args.results
+    if given is not None and not (file.exists() and file.samefile(given)):
+        atomic_write(file, lambda path: shutil.copyfile(given, path))
 
 
 def _check(args: Evaluate) -> None:
@@ -140,23 +135,14 @@ def _check(args: Evaluate) -> None:
         check_out_file("--out", args.out / name, keep=[file for file in inputs if file is not args.results])
 
 
-@dataclasses.dataclass(frozen=True)
-class _Task:
-    name: str  # of the truth, for the report
-    comparison: Comparison
-    sensor: Sensor
-    detector: CloudDetector | None = None
-    frames: FrameSet | None = None  # None if the report has no points
-
-
-def _open(args: Evaluate) -> _Task:
+def _open(args: Evaluate) -> Task:
     """Open the detector and the data, and check that they fit together."""
     detector = None if args.checkpoint is None else load_detector(args.checkpoint, backend=args.backend)
     config = NUSCENES_SINGLE if detector is None else detector.config
     sensor = load_sensor(args.sensor) if detector is None else detector.sensor
     if args.ground_truth is not None:
         comparison = compare_by_benchmark(read_truth(args.ground_truth), str(args.ground_truth))
-        return _Task(args.ground_truth.name, comparison, sensor)
+        return Task(args.ground_truth.name, comparison, sensor)
     data = args.data.find()
     official = detector is None or (set(detector.classes) <= set(NUSCENES_CLASSES) and args.data.class_map is None)
     benchmark = data.tables is not None and official
@@ -170,7 +156,7 @@ def _open(args: Evaluate) -> _Task:
         frames = args.data.open(config, split=split, samples=args.samples, sensor=sensor)
         if split is None and args.samples is None:
             tell(f"{data.root}: no splits: evaluating all {len(frames)} frames; {too_high}")
-        return _Task(name, compare_by_distance(frames, config.ranges_m), sensor, detector, frames)
+        return Task(name, compare_by_distance(frames, config.ranges_m), sensor, detector, frames)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
     assert isinstance(frames, NuScenesFrames)
     if args.samples is not None:
@@ -180,8 +166,8 @@ def _open(args: Evaluate) -> _Task:
     # Evaluating a results file needs only the tables.
     if detector is None and args.report and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
         tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
-        return _Task(name, comparison, sensor)
-    return _Task(name, comparison, sensor, detector, frames)
+        return Task(name, comparison, sensor)
+    return Task(name, comparison, sensor, detector, frames)
 
 
 def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: bool) -> None:
@@ -192,64 +178,3 @@ def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: 
         raise ValueError("--results: got --checkpoint too, expected one of them for nuScenes")
     if not benchmark and detector is None:
         raise ValueError("--results: expected --checkpoint too, for the classes of detections.json")
-
-
-def _detect(args: Evaluate, task: _Task) -> None:
-    """Write the detections, and count the removed points, except for close ones."""
-    assert task.detector is not None
-    assert task.frames is not None
-    comparison = task.comparison
-    removed = write_predictions(
-        task.detector,
-        task.frames,
-        args.out / comparison.file,
-        entries=comparison.entries,
-        write=comparison.write,
-        batch_size=args.batch_size,
-    )
-    if removed["truncated"]:
-        tell(f"{removed['truncated']} points truncated: more than the detector's max_points")
-    if removed["invalid"]:
-        tell(f"{removed['invalid']} points dropped: not finite, or beyond physical limits")
-
-
-def _score(args: Evaluate, task: _Task, compared: Compared) -> None:
-    for line in compared.warnings:
-        tell(f"warning: {line}")
-    file, given = args.out / task.comparison.file, args.results
-    if given is not None and not (file.exists() and file.samefile(given)):
-        atomic_write(file, lambda path: shutil.copyfile(given, path))
-    clear_report(args.out)  # it may show other numbers
-    evaluation = evaluate(compared.predictions, compared.truth, task.comparison.metric)
-    progress = Progress("sets", args.bootstrap)
-    intervals = write_evaluation(args.out, evaluation, compared.meta, repeats=args.bootstrap, report=progress.show)
-    for line in warnings(evaluation, len(compared.predictions), compared.truth):
-        tell(line)
-    print(describe(evaluation, intervals), flush=True)
-    if (kitti := write_kitti(args.out, compared.detections, task.frames)) is not None:
-        print(describe_kitti(kitti), flush=True)
-    if args.report:
-        _report(args, task, compared, evaluation)
-    print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
-
-
-def _report(args: Evaluate, task: _Task, compared: Compared, evaluation: Evaluation) -> None:
-    """Write the report and the page that it links to."""
-    title = f"{(args.checkpoint or args.results or Path()).name} on {task.name}"
-    examples = choose_examples(evaluation)
-    source = evaluation, task.frames, compared.truth.ego_translation
-    frames = [
-        page_frame(each.points, each.detections, name=f"{each.kind}: {each.name}", truth=each.truth)
-        for each in make_examples(*source, examples.extremes, min_score=0, all_sweeps=True)
-    ]
-    if frames:
-        options = {"classes": evaluation.metric.classes, "min_score": examples.min_score}
-        write_page(args.out / PAGE, frames, title=title, **options)
-    write_evaluation_report(
-        args.out,
-        title=title,
-        num_samples=len(compared.truth.tokens),
-        examples=make_examples(*source, examples.rows, min_score=examples.min_score),
-        sensor=task.sensor,
-        links=[("Look at the worst and the best frames", PAGE)] if frames else [],
-    )

@@ -47,7 +47,7 @@ Close = Annotated[
     Literal["all", "sweeps", "none"] | None,
     option(
         "{all,sweeps,none}",
-        default="as the detector was trained, else all",
+        default="as the detector was trained, else sweeps",
         text="Drop points within a metre of the sensor in x and y: of all sweeps, of older sweeps only, or none.",
     ),
 ]

@@ -54,7 +54,7 @@ def run(args: Project) -> None:
     points = read_points(
         args.file, sensor, columns=args.columns, dtype=args.dtype, max_points=args.max_file_points
     )
-    projection = ProjectionConfig(remove_close=args.remove_close or "all")
+    projection = ProjectionConfig(remove_close=args.remove_close or ProjectionConfig.remove_close)
     config = Config(max_points=max(len(points), 1), projection=projection)
     cloud = make_cloud(points, config, sensor=sensor)
     rounds = {"num_rounds": args.rounds, "prioritize_current": args.prioritize_current}

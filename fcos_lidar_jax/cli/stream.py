@@ -2,10 +2,11 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,23 +17,25 @@ import tyro
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score_and_angle, option_name
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
-from fcos_lidar_jax.data.drives import Drive, folder_drive
-from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
-from fcos_lidar_jax.data.nuscenes.reader import NuScenes
+from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
 from fcos_lidar_jax.data.sweeps import Sweep
-from fcos_lidar_jax.evaluation.records import as_records, confident
+from fcos_lidar_jax.evaluation.records import cloud_record, confident
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
-from fcos_lidar_jax.input_pipeline.open import find_data_set
-from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.visualization.page import PageFrame, page_frame, write_page
+from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, Recording, find_recording
+from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
+
+_OPTIONS = {
+    **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype")},
+    **{name: name for name in ("version", "index", "keyframes", "allow_missing_sweeps", "follow_links")},
+    "max_file_points": "max_points",
+}
+"""Options that not every kind of drive takes, and the names that their functions give them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,13 +83,9 @@ class Stream:
 
 def run(args: Stream) -> None:
     """Detect, write one line per sweep, and the page at the end."""
-    _check(args)
+    kind = _find(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
-    drive, at_us = _open(args, detector)
-    if args.track and not drive.posed:
-        raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
-    if not drive.posed:
-        print("no poses: every sweep is detected on its own, without earlier sweeps", file=sys.stderr)
+    drive = _open(args, kind, detector)
     _tell(drive.notes)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
@@ -95,11 +94,11 @@ def run(args: Stream) -> None:
         _write_lines(args.out) as write_line,
         _Timing() as timing,
     ):
-        sweeps = timing.read(_announcing(drive.sweeps))
-        how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": at_us}
+        how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": drive.at_us}
         if not drive.posed:
             how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
-        for found in timing.detect(detect_stream(sweeps, detector, **how)):
+        detect = functools.partial(detect_stream, detector=detector, **how)
+        for found in timing.detect(_announcing(drive.sweeps), detect):
             points = found.cloud.points[found.cloud.valid]
             if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
                 print(f"warning: {line}", file=sys.stderr)
@@ -122,8 +121,8 @@ def run(args: Stream) -> None:
     _tell(drive.notes)
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:
-        threshold: dict[str, Any] = {"min_score": args.min_score} if args.min_score else {}
-        write_page(args.page, frames, classes=detector.classes, title=args.scene or str(args.source), **threshold)
+        title, min_score = args.scene or str(args.source), args.min_score or SHOWN_SCORE
+        write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)
 
 
 @contextlib.contextmanager
@@ -155,11 +154,10 @@ def _tell(notes: list[str]) -> None:
 
 
 class _Timing(contextlib.AbstractContextManager):
-    """Seconds per sweep and stage, and the number of programs compiled up to each sweep."""
+    """Seconds per sweep and stage, and the number of programs compiled after the first sweep."""
 
     def __init__(self) -> None:
-        self._reading, self._to_boxes, self._writing = list[float](), list[float](), list[float]()
-        self._read, self._programs, self._programs_by_sweep = list[float](), 0, list[int]()
+        self._seconds, self._programs = list[tuple[float, float, float]](), 0
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def __exit__(self, *error: object) -> None:
@@ -168,41 +166,41 @@ class _Timing(contextlib.AbstractContextManager):
     def _listen(self, event: str, *_: object, **__: object) -> None:
         self._programs += event.endswith("/backend_compile_duration")
 
-    def read(self, sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
-        return _timed(sweeps, self._read, [])
+    def detect(
+        self, sweeps: Iterable[Sweep], detect: Callable[[Iterable[Sweep]], Iterator[Found]]
+    ) -> Iterator[Found]:
+        """Detections in sweeps. What the caller does with one until it takes the next one counts as writing."""
+        reading, began = 0.0, time.perf_counter()
 
-    def detect(self, stream: Iterable[Found]) -> Iterator[Found]:
-        for found in _timed(stream, self._to_boxes, self._writing):
-            self._reading.append(sum(self._read))  # including sweeps that are only fused
-            self._read.clear()
+        def read() -> Iterator[Sweep]:
+            nonlocal reading
+            before = time.perf_counter()
+            for sweep in sweeps:
+                reading += time.perf_counter() - before  # including sweeps that are only fused
+                yield sweep
+                before = time.perf_counter()
+
+        for found in detect(read()):
+            ready = time.perf_counter()
             yield found
-            self._programs_by_sweep.append(self._programs)
+            self._seconds.append((reading, ready - began - reading, time.perf_counter() - ready))
+            if len(self._seconds) == 1:
+                self._programs = 0
+            reading, began = 0.0, time.perf_counter()
 
     def summary(self) -> str:
         """A line with the medians. The first sweep, which includes the compilation, is listed separately."""
-        number = len(self._programs_by_sweep)
+        number = len(self._seconds)
         if number < 2:
             return f"{number} sweeps"
-        reading, to_boxes, writing = map(np.array, (self._reading, self._to_boxes, self._writing))
-        stages = {"reading": reading, "detection": to_boxes - reading, "writing": writing}
-        later = ", ".join(f"{np.median(s[1:]) * 1e3:.1f} ms {name}" for name, s in stages.items())
-        compilations = f"{self._programs_by_sweep[-1] - self._programs_by_sweep[0]} compilations"
-        first = f"the first, which compiles, {to_boxes[0] + writing[0]:.1f} s"
-        return f"{number} sweeps: {first}; the others {later} (medians), {compilations}"
+        medians = zip(np.median(self._seconds[1:], axis=0), ("reading", "detection", "writing"), strict=True)
+        later = ", ".join(f"{1e3 * seconds:.1f} ms {stage}" for seconds, stage in medians)
+        first = f"the first, which compiles, {sum(self._seconds[0]):.1f} s"
+        return f"{number} sweeps: {first}; the others {later} (medians), {self._programs} compilations"
 
 
-def _timed(items: Iterable[Any], within: list[float], between: list[float]) -> Iterator[Any]:
-    """The items. Appends the seconds to produce each item to ``within``, and to consume it to ``between``."""
-    began = time.perf_counter()
-    for item in items:
-        ready = time.perf_counter()
-        within.append(ready - began)
-        yield item
-        began = time.perf_counter()
-        between.append(began - ready)
-
-
-def _check(args: Stream) -> None:
+def _find(args: Stream) -> Recording:
+    """The kind of the drive; rejects options that do not fit it, and outputs that would replace inputs."""
     check_at_least(args, 1, "max_file_points")
     check_score_and_angle(args)
     if args.source is not None and not args.source.exists():
@@ -211,21 +209,13 @@ def _check(args: Stream) -> None:
         raise ValueError("stream: expected either a folder of point files or a recording, or --data-root")
     if (args.data_root is None) != (args.scene is None):
         raise ValueError("stream: expected --data-root and --scene together")
-    is_ros = args.source is not None and is_ros_bag(args.source)
-    foreign: dict[str, str] = {}  # options that do not fit the source, and what they are for
-    if args.source is not None:
-        of_scenes = "version", "index", "keyframes", "allow_missing_sweeps", "follow_links"
-        foreign |= dict.fromkeys(of_scenes, "--data-root")
-    elif args.max_file_points != MAX_POINTS:
-        raise ValueError("--max-file-points: expected only with a folder or a recording")
-    if args.source is None or is_ros or _is_log(args):
-        foreign |= dict.fromkeys(("columns", "dtype"), "a folder of point files")
-    if not is_ros:
-        foreign |= dict.fromkeys(("topic", "odometry"), "a ROS recording (.bag, .mcap, .db3, metadata.yaml)")
-    if args.source is None or args.odometry is not None:
-        foreign["poses"] = "a folder of point files, or with a ROS recording without --odometry"
-    if given := [name for name in foreign if getattr(args, name)]:
-        raise ValueError(f"{option_name(given[0])}: expected only with {foreign[given[0]]}")
+    kind = find_recording(args.source or Path(), scene=args.scene, poses=args.poses)
+    for field, name in _OPTIONS.items():
+        if getattr(args, field) != getattr(Stream, field) and name not in kind.options:
+            fitting = " or ".join(each.title for each in RECORDINGS if name in each.options)
+            raise ValueError(f"{option_name(field)}: expected only with {fitting}")
+    if args.poses is not None and args.odometry is not None:
+        raise ValueError(f"--poses: expected only with {FOLDER.title}, or with a ROS recording without --odometry")
     keep = [path for path in (args.source, args.poses) if path is not None and path.is_file()]
     if args.source is not None and args.source.is_dir():
         keep += [path for path in args.source.rglob("*") if path.name.lower().endswith(ENDINGS)]
@@ -233,46 +223,27 @@ def _check(args: Stream) -> None:
         check_rerun()
     check_outputs(args.checkpoint, keep, out=args.out, page=args.page, rrd=args.rrd)
     args.out.parent.mkdir(parents=True, exist_ok=True)
+    return kind
 
 
-def _is_log(args: Stream) -> bool:
-    """Whether the source is a KITTI raw drive or an Argoverse 2 log, which define their poses and file layout."""
-    source = args.source
-    return args.poses is None and source is not None and (is_kitti_raw(source) or is_argoverse2_log(source))
-
-
-def _open(args: Stream, detector: CloudDetector) -> tuple[Drive, Collection[int] | None]:
-    """Open the drive; also returns the times of the sweeps to detect in, None for all."""
-    if args.source is not None:
-        return _open_source(args, args.source, detector.sensor), None
-    assert args.data_root is not None
-    assert args.scene is not None
-    version = find_data_set(args.data_root, "nuscenes", args.version).version
-    allowed = {"allow_missing_sweeps": args.allow_missing_sweeps, "follow_links": args.follow_links}
-    data = NuScenes(args.data_root, version, index=args.index, **allowed)
-    only_keyframes = args.keyframes and detector.config.num_sweeps == 1
-    at_us = data.keyframe_times_us(args.scene) if args.keyframes else None
-    return Drive(data.drive(args.scene, keyframes=only_keyframes)), at_us
-
-
-def _open_source(args: Stream, source: Path, sensor: Sensor) -> Drive:
-    if is_ros_bag(source):
-        how = {"topic": args.topic, "odometry": args.odometry, "poses": args.poses}
-        return ros_bag_drive(source, sensor, **how, max_points=args.max_file_points)
-    if args.poses is None and is_kitti_raw(source):
-        return kitti_raw_drive(source, sensor, max_points=args.max_file_points)
-    if args.poses is None and is_argoverse2_log(source):
-        return argoverse2_drive(source, sensor, max_points=args.max_file_points)
-    layout: dict[str, Any] = {"columns": args.columns, "dtype": args.dtype}
-    return folder_drive(source, sensor, args.poses, max_points=args.max_file_points, **layout)
+def _open(args: Stream, kind: Recording, detector: CloudDetector) -> Drive:
+    options: dict[str, Any] = {name: getattr(args, field) for field, name in _OPTIONS.items()}
+    options |= {"scene": args.scene, "num_sweeps": detector.config.num_sweeps}
+    given = {name: options[name] for name in kind.options}
+    drive = kind.open(args.source or args.data_root, detector.sensor, **given)
+    if args.track and not drive.posed:
+        raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
+    if not drive.posed:
+        print("no poses: every sweep is detected on its own, without earlier sweeps", file=sys.stderr)
+    return drive
 
 
 def _record(found: Found, classes: tuple[str, ...], min_score: float, drive: Drive) -> dict[str, Any]:
     """A line with the fields of ``fcos-lidar detect``; unknown values are null."""
-    cloud, sweep = found.cloud, found.sweep
-    dropped = int(found.detections.num_dropped) + cloud.num_removed
-    record: dict[str, Any] = {"file": sweep.name, "timestamp_us": sweep.time_us if drive.timed else None}
-    record |= {"sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if drive.posed else None}
-    record |= {"num_points": cloud.num_points, "num_dropped": dropped}
-    record |= {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
-    return record | {"boxes": as_records(found.detections, classes, min_score=min_score)}
+    sweep = found.sweep
+    return {
+        "file": sweep.name,
+        "timestamp_us": sweep.time_us if drive.timed else None,
+        "sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if drive.posed else None,
+        **cloud_record(found.detections, found.cloud, classes, min_score=min_score),
+    }

@@ -20,13 +20,12 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed
-from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.training import Schedule, train
-from fcos_lidar_jax.training.plan import check_numbers, check_run
+from fcos_lidar_jax.training.run import run_folder
 
 _ABOUT = {
     "nuscenes": "the paper's detector on ten sweeps",
@@ -99,7 +98,8 @@ class Train:
 
 def run(args: Train) -> None:
     """Train, and print the paths of the run and its checkpoints."""
-    _check(args)
+    check_processes(args.processes)
+    check_out_folder(args.out)
     schedule = Schedule(args.save_every, args.evaluate_every, args.keep)
     join_processes(args.processes)
     is_main_process = jax.process_index() == 0
@@ -110,9 +110,7 @@ def run(args: Train) -> None:
         with contextlib.ExitStack() as held:
             with agreed("cannot train"):
                 if task.cuts_objects and is_main_process:  # the other processes open the result
-                    check_numbers(task.steps, args.seed)
-                    held.enter_context(folder_lock(args.out, "training"))
-                    check_run(args.out, resume=args.resume)  # another process may have started the run
+                    held.enter_context(run_folder(args.out, resume=args.resume))
                     assert task.config.copy_paste is not None
                     min_points = task.config.copy_paste.min_points
                     database.prepare_database(task.frames, args.out / _OBJECTS, min_points=min_points)
@@ -158,8 +156,6 @@ def _open(args: Train) -> _Task:
         augment=None if args.no_augment else args.config.augment,
         copy_paste=None if args.no_copy_paste else args.config.copy_paste,
     )
-    check_run(args.out, resume=args.resume)
-    check_out_folder(args.out)
     data = args.data.find()
     index = args.data.index or data.index
     if data.tables is not None and data.tables.is_dir() and not has_index(index):
@@ -167,11 +163,15 @@ def _open(args: Train) -> _Task:
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
     _check_sensor(config, data, frames)
-    tests = _open_tests(args, config, data)
+    tests = _open_tests(args, config, data.root)
     if split is None and args.samples is None and tests is None:
         tell(f"{data.root}: no splits: training on all {len(frames)} frames, with no evaluation")
     if tests is not None:
-        _tell_of_overlap(frames, tests)
+        names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
+        if shared := len(names & tested):
+            tell(
+                f"{shared} of the {len(tests)} evaluation frames are also training frames: scores will be too high"
+            )
     if not data.on_disk:
         _check_simulated(len(frames), config)
     steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
@@ -188,27 +188,18 @@ def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
         )
 
 
-def _open_tests(args: Train, config: Config, data: DataSet) -> FrameSet | None:
+def _open_tests(args: Train, config: Config, root: Path) -> FrameSet | None:
     """Open the frames to evaluate on during training, if any."""
-    split, tests = args.val_split or args.data.split("val", required=False), None
+    split = args.val_split or args.data.split("val", required=False)
     if split != "none" and (split or args.val_samples):
-        tests = args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
-    if tests is None and args.evaluate_every is not None:
-        raise ValueError(
-            f"--evaluate-every: got {args.evaluate_every}, expected --val-split or --val-samples too: "
-            f"{data.root} has no split to evaluate on"
-        )
-    return tests
-
-
-def _check(args: Train) -> None:
-    check_processes(args.processes)
-    if args.val_split == "none":
-        for name in ("val_samples", "evaluate_every"):
-            if (given := getattr(args, name)) is not None:
-                raise ValueError(
-                    f"{option_name(name)}: got {given!r} with --val-split none, which turns evaluation off"
-                )
+        return args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
+    off = f", expected --val-split or --val-samples too: {root} has no split to evaluate on"
+    if split == "none":
+        off = " with --val-split none, which turns evaluation off"
+    for name in ("val_samples", "evaluate_every"):
+        if (given := getattr(args, name)) is not None:
+            raise ValueError(f"{option_name(name)}: got {given!r}{off}")
+    return None
 
 
 def _check_simulated(number: int, config: Config) -> None:
@@ -250,10 +241,3 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
             f"{config.num_sweeps} sweeps: run fcos-lidar prepare again, with the same data options"
         )
     return database.open_database(folder)
-
-
-def _tell_of_overlap(frames: FrameSet, tests: FrameSet) -> None:
-    """Count the frames that are both trained and evaluated on."""
-    names, tested = ({each.name(index) for index in range(len(each))} for each in (frames, tests))
-    if shared := len(names & tested):
-        tell(f"{shared} of the {len(tests)} evaluation frames are also training frames: scores will be too high")

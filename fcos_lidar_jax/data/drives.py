@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +29,7 @@ class Drive:
     sweeps: Iterable[Sweep]  # in temporal order, read on demand
     posed: bool = True  # False: poses are unknown and replaced by the identity
     timed: bool = True  # False: times are unknown and replaced by 0, 1, ...
+    at_us: Collection[int] | None = None  # times of the sweeps to detect in; None for all
     notes: list[str] = dataclasses.field(default_factory=list)
     """Notes about assumptions and, once the last sweep was read, about skipped sweeps."""
 

@@ -11,10 +11,9 @@ import numpy as np
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation.boxes import NO_BOXES, BoxColumns, GroundTruth, join, make_columns
-from fcos_lidar_jax.evaluation.json_io import expect, expect_samples, index_of, read_json
+from fcos_lidar_jax.evaluation.json_io import expect, expect_samples, index_of, read_json, write_lines
 from fcos_lidar_jax.evaluation.metrics import Evaluation, Metric, evaluate
 from fcos_lidar_jax.evaluation.records import confident
-from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.types import Detections
 
 
@@ -76,8 +75,7 @@ def write_detections(path: Path, frames: Iterable[tuple[str, bytes]], classes: S
         frames: names with their boxes as JSON, see :func:`fcos_lidar_jax.evaluation.records.as_records`.
     """
     lines = (b'{"name": %s, "boxes": %s}' % (json.dumps(name).encode(), boxes) for name, boxes in frames)
-    text = b'{"classes": %s, "frames": [\n%s\n]}\n' % (json.dumps(list(classes)).encode(), b",\n".join(lines))
-    atomic_write(path, lambda file: file.write_bytes(text))
+    write_lines(path, b'{"classes": %s, "frames": [' % json.dumps(list(classes)).encode(), lines, b"]}\n")
 
 
 class _Box(msgspec.Struct, gc=False):

@@ -3,7 +3,7 @@
 import json
 import mmap
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation.boxes import heading_yaw
+from fcos_lidar_jax.files import atomic_write
 
 _NOT_FINITE = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|(NaN|-?Infinity)')
 """Also matches strings, so that their contents are not replaced."""
@@ -191,3 +192,16 @@ def expect(
         box = int(np.argmin(good))
         got = list(value) if isinstance(value := getattr(boxes[box], field), tuple) else value
         raise ValueError(f"{where}: box {box}: {field}: got {got!r}, expected {expected}")
+
+
+def write_lines(path: str | Path, before: bytes, lines: Iterable[bytes], after: bytes) -> None:
+    """Write a JSON file with one line per item between two texts, and one item in memory at a time."""
+
+    def write(file: Path) -> None:
+        with file.open("wb") as stream:
+            stream.write(before)
+            for number, line in enumerate(lines):
+                stream.write((b",\n" if number else b"\n") + line)
+            stream.write(b"\n" + after)
+
+    atomic_write(path, write)

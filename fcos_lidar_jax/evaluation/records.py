@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.data.cloud_policy import Cloud
 from fcos_lidar_jax.types import Detections
 
 
@@ -19,6 +20,16 @@ def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 
         {"label": classes[label], "score": float(score), "box": [float(v) for v in box]}
         for box, label, score in zip(*confident(found, min_score), strict=True)
     ]
+
+
+def cloud_record(
+    found: Detections, cloud: Cloud, classes: Sequence[str], *, min_score: float = 0.0
+) -> dict[str, Any]:
+    """The boxes of a cloud as :func:`as_records`, with the numbers of its points and of those not used."""
+    counts = {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
+    dropped = int(found.num_dropped) + cloud.num_removed
+    boxes = as_records(found, classes, min_score=min_score)
+    return {"num_points": cloud.num_points, "num_dropped": dropped, **counts, "boxes": boxes}
 
 
 def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,7 +22,6 @@ from fcos_lidar_jax.evaluation.boxes import (
     make_columns,
 )
 from fcos_lidar_jax.evaluation.metrics import MAX_BOXES
-from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.types import Detections
 
 USE_FLAGS = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
@@ -177,12 +176,5 @@ def write_results(path: str | Path, samples: Iterable[tuple[str, bytes]]) -> Non
     Args:
         samples: tokens of the whole split with entries as JSON, ``[]`` for samples without detections.
     """
-
-    def write(file: Path) -> None:
-        with file.open("wb") as stream:
-            stream.write(b'{"meta": %s, "results": {' % json.dumps(LIDAR_META).encode())
-            for i, (token, entries) in enumerate(samples):
-                stream.write(b"%s\n%s: %s" % (b"," if i else b"", json.dumps(token).encode(), entries))
-            stream.write(b"\n}}\n")
-
-    atomic_write(path, write)
+    lines = (b"%s: %s" % (json.dumps(token).encode(), entries) for token, entries in samples)
+    json_io.write_lines(path, b'{"meta": %s, "results": {' % json.dumps(LIDAR_META).encode(), lines, b"}}\n")

@@ -1,4 +1,4 @@
-"""The plan of a run: checks all inputs before anything is written to its folder."""
+"""The plan of a run: checks all inputs, and the folder, before anything is written to it."""
 
 import dataclasses
 import json
@@ -111,7 +111,7 @@ def plan_run(
     """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``.
 
     Raises:
-        ValueError: the arguments do not fit each other or the folder.
+        ValueError: the arguments do not fit each other.
     """
     check_numbers(steps, seed)
     order = SampleOrder(frames, config, seed=seed)
@@ -141,8 +141,6 @@ def plan_run(
         "ground_truth_database": None if objects is None else objects.fingerprint(),
         "weights": str(weights) if isinstance(weights, str | Path) else None,
     }
-    spec = json.loads(json.dumps(spec))
-    check_run(out, spec, resume=resume)
     if config.copy_paste is not None and objects is not None:
         make_paste(objects, config)
     on_cpus = mesh.devices.flat[0].platform == "cpu"
@@ -157,7 +155,7 @@ def plan_run(
         order=order,
         tests=tests,
         devices=devices,
-        spec=spec,
+        spec=json.loads(json.dumps(spec)),
         weights=None if resume and Checkpoints(out / CHECKPOINTS).paths() else _initial_weights(detector, weights),
         packing=packing_for(frames, config) if packing or (packing is None and not on_cpus) else None,
         warnings=tuple(_warnings(frames, config)),

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.checkpoints.preemption import stop_requests
@@ -125,7 +124,10 @@ def train(
     packed = None if run.packing is None else dataclasses.asdict(run.packing)
     program = json.dumps([run.spec, packed], sort_keys=True)
     check_same(checksum(program.encode()), "configuration, data or packing")
-    with _own_folder(run, resume=resume):
+    with contextlib.ExitStack() as held:
+        with agreed("cannot train"):
+            if is_main_process:
+                held.enter_context(run_folder(run.folder, run.spec, resume=resume))
         start = _start(run, resume=resume)
         first = int(start.step)
         pending = run.evaluation_pending(first)
@@ -211,25 +213,21 @@ def train(
 
 
 @contextlib.contextmanager
-def _own_folder(run: Run, *, resume: bool) -> Iterator[None]:
-    """Lock the folder in the main process, check it and write the specification; the others wait for this."""
-    with contextlib.ExitStack() as held:
-        error: Exception | None = None
-        if jax.process_index() == 0:
-            try:
-                held.enter_context(folder_lock(run.folder, "training"))
-                missing = check_run(run.folder, run.spec, resume=resume)  # another process may have been faster
-                if missing:
-                    print(f"{run.folder}: an older run; not compared: {', '.join(missing)}", file=sys.stderr)
-                text = json.dumps(run.spec, indent=1)
-                if not resume:
-                    atomic_write(run.folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
-            except (OSError, ValueError) as failure:
-                error = failure
-        if jax.process_count() > 1 and not multihost_utils.broadcast_one_to_all(np.array(error is None)):
-            error = error or OSError(f"{run.folder}: the main process cannot work there")
-        if error is not None:
-            raise error
+def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool) -> Iterator[None]:
+    """Hold the folder of a run against other processes; with ``spec``, it becomes the folder of that run.
+
+    Raises:
+        ValueError: see :func:`~fcos_lidar_jax.training.plan.check_run`; nothing is written.
+        OSError: another process holds the folder.
+    """
+    check_run(folder, spec, resume=resume)  # before the lock, which makes the folder
+    with folder_lock(folder, "training"):
+        missing = check_run(folder, spec, resume=resume)  # another process may have been faster
+        if missing:
+            print(f"{folder}: an older run; not compared: {', '.join(missing)}", file=sys.stderr)
+        if spec is not None and not resume:
+            text = json.dumps(spec, indent=1)
+            atomic_write(folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
         yield
 
 
@@ -254,7 +252,8 @@ def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | No
     examples = list(predict(trained, run.tests, indices=first, devices=run.devices))
     if metrics is not None:
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
-        draw_predictions(run.folder / "pictures", examples, run.tests, number)
+        prefix, title = f"step_{number:06d}_frame", f"step {number}, test frame"
+        draw_predictions(run.folder / "pictures", examples, run.tests, prefix=prefix, title=title)
         if not math.isnan(score):
             run.checkpoints.record_score(number, score)
         values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}

@@ -1,6 +1,5 @@
 """Animation of a drive with the range image and the bird's-eye view of each keyframe."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CHANNELS
 from fcos_lidar_jax.visualization.bev import bev_on, class_legend
+from fcos_lidar_jax.visualization.evaluation_report import Example
 from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
 
 _SIZE_IN = (8.0, 9.6)
@@ -19,23 +19,15 @@ _DPI = 90
 _COLORS = 96  # colours of the GIF; more colours increase its size but hardly its quality
 
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """A keyframe in its sensor's frame."""
-
-    points: np.ndarray  # f32[n, >= 3]
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f32[d, 9], labels, scores
-    truth: tuple[np.ndarray, np.ndarray]  # boxes f32[m, 9], labels
-
-
 def draw_drive(
     path: str | Path,
-    scenes: Sequence[Scene],
+    scenes: Sequence[Example],
     *,
     sensor: Sensor,
     classes: Sequence[str],
     title: str,
     limit_m: float,
+    min_score: float,
     seconds_a_scene: float = 0.5,
     report: Callable[[int], object] = lambda done: None,
 ) -> list[Path]:
@@ -48,7 +40,9 @@ def draw_drive(
         path: GIF file; the PNG files are named ``NAME_00.png``, ``NAME_01.png`` and so on.
         sensor: sensor of the range image.
         classes: class names by label.
+        title: begins the title of each picture.
         limit_m: half the side of the bird's-eye view.
+        min_score: threshold of the detections.
         seconds_a_scene: duration of each scene.
         report: called with the number of finished scenes.
 
@@ -59,14 +53,19 @@ def draw_drive(
 
     path = Path(path)
     files = [path.with_name(f"{path.stem}_{number:02d}.png") for number in range(len(scenes))]
-    labels = {int(k) for scene in scenes for k in (*scene.detections[1], *scene.truth[1])}
+    shown = [
+        (boxes[scores >= min_score], labels[scores >= min_score], scores[scores >= min_score])
+        for boxes, labels, scores in (scene.detections for scene in scenes)
+    ]
+    labels = {int(k) for scene, found in zip(scenes, shown, strict=True) for k in (*found[1], *scene.truth[1])}
+    title = f"{title}: score {min_score:.2f} and more, truth dashed"
     size = max(len(scene.points) for scene in scenes)  # one size, so that the projection is compiled once
     pictures = []
-    for number, (scene, file) in enumerate(zip(scenes, files, strict=True)):
+    for number, (scene, found, file) in enumerate(zip(scenes, shown, files, strict=True)):
         figure = new_figure(*_SIZE_IN)
         strip, view = figure.subplots(2, 1, height_ratios=(1, 7.4))
         _draw_ranges(strip, scene.points, size, sensor)
-        bev_on(view, scene.points, limit_m=limit_m, detections=scene.detections, truth=scene.truth, scores=False)
+        bev_on(view, scene.points, limit_m=limit_m, detections=found, truth=scene.truth, scores=False)
         class_legend(figure, sorted(labels), classes, detections=True, truth=True)
         strip.set_title(f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
         save_png(figure, file, dpi=_DPI)

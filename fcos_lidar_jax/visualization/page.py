@@ -16,6 +16,7 @@ from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.visualization.figure import class_color
 
 STEP_M = 0.02  # resolution of the points
+SHOWN_SCORE = 0.3  # initial threshold of the visible boxes
 _LIMIT = 2**15 - 1  # int16, for points up to 655 m
 
 
@@ -110,7 +111,12 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
 
 
 def write_page(
-    path: str | Path, frames: Sequence[PageFrame], *, classes: Sequence[str], title: str, min_score: float = 0.3
+    path: str | Path,
+    frames: Sequence[PageFrame],
+    *,
+    classes: Sequence[str],
+    title: str,
+    min_score: float = SHOWN_SCORE,
 ) -> None:
     """Write the HTML page.
 

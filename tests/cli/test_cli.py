@@ -223,6 +223,7 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
     np.testing.assert_array_equal(features[:, :, 0][filled], points[index[filled], 0])
     assert 11 not in index
     assert counts["kept_by_round"] == filled.sum((0, 1)).tolist()
+    assert counts["num_close"] == 0  # as configurations read the current sweep
     assert png.stat().st_size > 10_000
 
 

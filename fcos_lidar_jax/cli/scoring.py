@@ -1,0 +1,103 @@
+"""Detection, scores and reports on a data set, for the commands ``evaluate`` and ``demo``."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from fcos_lidar_jax.cli.processes import tell
+from fcos_lidar_jax.data.frame import FrameSet
+from fcos_lidar_jax.evaluation.comparison import Compared, Comparison
+from fcos_lidar_jax.evaluation.examples import choose_examples
+from fcos_lidar_jax.evaluation.kitti import describe_kitti
+from fcos_lidar_jax.evaluation.kitti_results import write_kitti
+from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
+from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
+from fcos_lidar_jax.inference import CloudDetector
+from fcos_lidar_jax.inference.prediction_log import write_predictions
+from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.visualization.evaluation_report import (
+    PAGE,
+    clear_report,
+    make_examples,
+    write_evaluation_report,
+)
+from fcos_lidar_jax.visualization.page import page_frame, write_page
+from fcos_lidar_jax.visualization.report import Picture
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What is compared with what."""
+
+    name: str  # of the truth, for the report
+    comparison: Comparison
+    sensor: Sensor
+    detector: CloudDetector | None = None
+    frames: FrameSet | None = None  # None if the report has no points
+
+
+def write_detections(task: Task, out: Path, *, batch_size: int = 1) -> None:
+    """Write the detections, and count the removed points, except for close ones."""
+    assert task.detector is not None
+    assert task.frames is not None
+    comparison = task.comparison
+    removed = write_predictions(
+        task.detector,
+        task.frames,
+        out / comparison.file,
+        entries=comparison.entries,
+        write=comparison.write,
+        batch_size=batch_size,
+    )
+    if removed["truncated"]:
+        tell(f"{removed['truncated']} points truncated: more than the detector's max_points")
+    if removed["invalid"]:
+        tell(f"{removed['invalid']} points dropped: not finite, or beyond physical limits")
+
+
+def write_scores(task: Task, compared: Compared, out: Path, *, bootstrap: int = 0) -> Evaluation:
+    """Evaluate, write the scores and print them, with the intervals of a number of resampled sets."""
+    for line in compared.warnings:
+        tell(f"warning: {line}")
+    clear_report(out)  # it may show other numbers
+    evaluation = evaluate(compared.predictions, compared.truth, task.comparison.metric)
+    progress = Progress("sets", bootstrap)
+    intervals = write_evaluation(out, evaluation, compared.meta, repeats=bootstrap, report=progress.show)
+    for line in warnings(evaluation, len(compared.predictions), compared.truth):
+        tell(line)
+    print(describe(evaluation, intervals), flush=True)
+    if (kitti := write_kitti(out, compared.detections, task.frames)) is not None:
+        print(describe_kitti(kitti), flush=True)
+    return evaluation
+
+
+def write_reports(
+    task: Task,
+    compared: Compared,
+    evaluation: Evaluation,
+    out: Path,
+    *,
+    title: str,
+    pictures: Sequence[Picture] = (),
+    links: Sequence[tuple[str, str]] = (),
+) -> None:
+    """Write the report, with more pictures and links, and the page of frames that it links to."""
+    examples = choose_examples(evaluation)
+    source = evaluation, task.frames, compared.truth.ego_translation
+    frames = [
+        page_frame(each.points, each.detections, name=f"{each.kind}: {each.name}", truth=each.truth)
+        for each in make_examples(*source, examples.extremes, min_score=0, all_sweeps=True)
+    ]
+    if frames:
+        options = {"classes": evaluation.metric.classes, "min_score": examples.min_score}
+        write_page(out / PAGE, frames, title=title, **options)
+    write_evaluation_report(
+        out,
+        title=title,
+        num_samples=len(compared.truth.tokens),
+        examples=make_examples(*source, examples.rows, min_score=examples.min_score),
+        sensor=task.sensor,
+        pictures=pictures,
+        links=[*links, *([("Look at the worst and the best frames", PAGE)] if frames else [])],
+    )

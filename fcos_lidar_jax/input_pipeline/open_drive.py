@@ -1,0 +1,83 @@
+"""One function to open any drive; a table has one row per kind of recording."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from fcos_lidar_jax.data.argoverse2 import argoverse2_drive, is_argoverse2_log
+from fcos_lidar_jax.data.drives import Drive, folder_drive
+from fcos_lidar_jax.data.kitti_raw import is_kitti_raw, kitti_raw_drive
+from fcos_lidar_jax.data.nuscenes.reader import NuScenes
+from fcos_lidar_jax.data.ros_bags import is_ros_bag, ros_bag_drive
+from fcos_lidar_jax.input_pipeline.open import find_data_set
+from fcos_lidar_jax.sensors import Sensor
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A kind of drive.
+
+    Attributes:
+        title: what it is, in messages.
+        recognises: whether a path is of this kind; None if it does not show.
+        open: ``(path, sensor, **options) -> drive``.
+        options: options that ``open`` takes.
+    """
+
+    title: str
+    recognises: Callable[[Path], bool] | None
+    open: Callable[..., Drive]
+    options: tuple[str, ...]
+
+
+def _scene_drive(
+    root: Path,
+    _: Sensor,
+    *,
+    scene: str,
+    version: str | None = None,
+    index: Path | None = None,
+    keyframes: bool = False,
+    num_sweeps: int = 1,
+    allow_missing_sweeps: bool = False,
+    follow_links: bool = False,
+) -> Drive:
+    """A scene of nuScenes; with ``keyframes``, the sweeps between them are only read if they are fused."""
+    version = find_data_set(root, "nuscenes", version).version
+    data = NuScenes(
+        root, version, index=index, allow_missing_sweeps=allow_missing_sweeps, follow_links=follow_links
+    )
+    at_us = data.keyframe_times_us(scene) if keyframes else None
+    return Drive(data.drive(scene, keyframes=keyframes and num_sweeps == 1), at_us=at_us)
+
+
+FOLDER = Recording("a folder of point files", None, folder_drive, ("poses", "columns", "dtype", "max_points"))
+SCENE = Recording(
+    "--data-root and --scene",
+    None,
+    _scene_drive,
+    ("scene", "version", "index", "keyframes", "num_sweeps", "allow_missing_sweeps", "follow_links"),
+)
+RECORDINGS = (
+    FOLDER,
+    Recording(
+        "a ROS recording (.bag, .mcap, .db3, metadata.yaml)",
+        is_ros_bag,
+        ros_bag_drive,
+        ("poses", "topic", "odometry", "max_points"),
+    ),
+    Recording("a KITTI raw drive", is_kitti_raw, kitti_raw_drive, ("max_points",)),
+    Recording("an Argoverse 2 log", is_argoverse2_log, argoverse2_drive, ("max_points",)),
+    SCENE,
+)
+
+
+def find_recording(source: Path, *, scene: str | None = None, poses: Path | None = None) -> Recording:
+    """The kind of a drive: a scene of the data set ``source``, or what ``source`` looks like.
+
+    With a file of poses, recordings that have poses of their own are read as folders of point files.
+    """
+    if scene is not None:
+        return SCENE
+    kinds = (kind for kind in RECORDINGS if kind.recognises is not None and kind.recognises(source))
+    return next((kind for kind in kinds if poses is None or "poses" in kind.options), FOLDER)
