@@ -282,20 +282,11 @@ def packing_for(frames: FrameSet, config: Config) -> Packing:
     return choose_packing(usable, num_sweeps=config.num_sweeps, num_pasted=sum(config.paste_targets))
 
 
-def check_loader_options(
-    config: Config,
-    objects: GroundTruthDatabase | None,
-    *,
-    threads: int | None,
-    workers: int,
-    num_processes: int = 1,
-) -> None:
+def check_loader_options(config: Config, *, threads: int | None, workers: int, num_processes: int = 1) -> None:
     """Check the options of :func:`make_batches` before a run begins."""
     for name, value in (("threads", threads), ("workers", workers)):
         if value is not None and value < 0:
             raise ValueError(f"{name}: got {value}, expected at least 0")
-    if config.copy_paste is not None and objects is None:
-        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
     if workers:
         _check_shared_memory(config, workers, num_processes)
 

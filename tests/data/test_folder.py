@@ -224,7 +224,7 @@ BAD = {
     "sensor": (
         lambda r: write(r / "sensor.json", {"name": "mine", "num_columns": 8}),
         "sensor.json",
-        "inclinations_rad: missing",
+        "sensor.json: inclinations_rad: missing, expected a list",
     ),
     "no sensor": (lambda r: (r / "sensor.json").unlink(), "sensor.json", "no such file"),
     "preset": (lambda r: write(r / "sensor.json", '"tinny"'), "sensor.json", "got 'tinny', expected tiny"),
