@@ -5,7 +5,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from fcos_lidar_jax.data.box_geometry import find_bad_box
 from fcos_lidar_jax.data.cloud_policy import usable_rows, write_points
 from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.types import Batch
@@ -84,16 +83,6 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
                 raise ValueError(f"frame {row}: {name}: got {len(rows)}, expected at most {limit}")
         fill_row(batch, row, [frame])
     return batch
-
-
-def check_boxes(boxes: np.ndarray, name: str) -> None:
-    """Refuse implausible boxes f32[m, 9] of a frame, since a single one would make all weights NaN.
-
-    Raises:
-        ValueError: with the frame and the first such box; NaN velocities are allowed and mean unknown.
-    """
-    if (bad := find_bad_box(boxes)) is not None:
-        raise ValueError(f"frame {name!r}: box {bad[0]}: {bad[1]}")
 
 
 def check_counts(frames: FrameSet) -> None:

@@ -20,9 +20,10 @@ import jax
 import numpy as np
 
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.box_geometry import check_boxes
 from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
+from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack, pack_row
@@ -143,7 +144,7 @@ class _BatchOf:
     def _fill(self, batch: Batch, row: int, step: int, position: int) -> dict[str, int]:
         index, num_pasted = self.order[position], 0
         frame = self.frames.frame(index)
-        check_boxes(frame.boxes, self.frames.name(index))
+        check_boxes(frame.boxes, lambda box: f"frame {self.frames.name(index)!r}: box {box}")
         seen = frame.num_points >= 1
         boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
         parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)

@@ -8,11 +8,13 @@ from typing import Any, Literal
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes, unknown_name
-from fcos_lidar_jax.data.folder import FolderFrames, find_folder_splits
+from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.kitti import KittiFrames
+from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
-from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL, own_splits
+from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
+from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.simulation.frame_set import SIMULATED_SPLITS, simulated_split
 
@@ -67,7 +69,7 @@ READERS = (
         "folder",
         ("clouds",),
         None,
-        lambda data, file: find_folder_splits(data.root, file),
+        lambda data, file: list(own_splits(data.root, file)),
         lambda data, split, sensor, reading, **options: FolderFrames(
             data.root, sensor, split=split, reading=reading, **options
         ),
@@ -103,7 +105,7 @@ class DataSet:
     @property
     def index(self) -> Path:
         """The default folder of ``prepare``'s output."""
-        return self.root / ".fcos_lidar" / self.version
+        return default_index(self.root, self.version)
 
 
 def find_data_set(root: str | Path | None, format: str | None = None, version: str | None = None) -> DataSet:

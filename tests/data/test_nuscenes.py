@@ -20,8 +20,8 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.build import build_index, velocities
-from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
-from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames, default_index
+from fcos_lidar_jax.data.nuscenes.index import default_index, open_index, save_index
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import SampleData, read_table
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
