@@ -1,4 +1,4 @@
-"""KITTI raw: poses from GPS and inertial unit, one line for what is wrong."""
+"""KITTI raw recordings: poses from GPS and inertial unit; one-line errors."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def recording(tmp_path):
     return folder
 
 
-def test_positions_and_headings_are_those_on_the_ground(recording):
+def test_poses_follow_from_the_positions_on_the_ground(recording):
     assert is_kitti_raw(recording)
     assert not is_kitti_raw(recording.parent)
     first, second = kitti_raw_drive(recording, KITTI_HDL64E).sweeps
@@ -60,7 +60,7 @@ def test_positions_and_headings_are_those_on_the_ground(recording):
         ("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 1", "calib_imu_to_velo.txt: T: missing, expected R, T"),
     ],
 )
-def test_mistakes_are_one_line(recording, file, text, message):
+def test_missing_and_damaged_files_are_refused(recording, file, text, message):
     (recording / file).unlink() if text is None else (recording / file).write_text(text)
     with refused(message):
         list(kitti_raw_drive(recording, KITTI_HDL64E).sweeps)

@@ -1,4 +1,4 @@
-"""Recordings of ROS: layouts of drivers, poses against closed forms, and one line for everything that is wrong."""
+"""ROS recordings: point layouts of drivers, poses against closed forms, one-line errors."""
 
 import sys
 
@@ -41,7 +41,7 @@ DRIVERS = {
 
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("form", ["ros1", "mcap"])
-def test_clouds_of_the_usual_drivers(tmp_path, driver, form):
+def test_clouds_of_common_drivers_are_read(tmp_path, driver, form):
     rng, dtype = np.random.default_rng(1), DRIVERS[driver]
     points = np.frombuffer(rng.bytes(dtype.itemsize * 20), dtype).copy()  # noise in the gaps and in other fields
     values = rng.integers(1, 60, (20, 4))
@@ -61,7 +61,7 @@ def test_clouds_of_the_usual_drivers(tmp_path, driver, form):
     assert sweep.points.shape == (20, 5)
 
 
-def test_rows_of_organised_clouds_may_be_padded_and_hold_nan(tmp_path):
+def test_rows_of_organised_clouds_may_be_padded_and_contain_nan(tmp_path):
     rows = np.stack([POINTS[:6], POINTS[6:]])
     rows["z"][1, 2] = np.nan
     padded = np.zeros((2, 6 * 16 + 10), np.uint8)
@@ -74,7 +74,7 @@ def test_rows_of_organised_clouds_may_be_padded_and_hold_nan(tmp_path):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_without_odometry_sweeps_have_times_alone(tmp_path, form):
+def test_without_odometry_sweeps_have_times_but_no_poses(tmp_path, form):
     bag = write_recording(
         tmp_path / "a",
         form,
@@ -142,7 +142,7 @@ TO_LIDAR = matrix(*MOUNT) @ matrix(*HEAD)
     [("lidar", np.eye(4)), ("/base_link", TO_LIDAR), ("imu", np.linalg.inv(matrix(*IMU)) @ TO_LIDAR)],
 )
 @pytest.mark.parametrize("form", ["ros1", "sqlite"])
-def test_odometry_is_interpolated_and_completed_by_transforms(tmp_path, form, child, to_lidar):
+def test_odometry_is_interpolated_and_combined_with_transforms(tmp_path, form, child, to_lidar):
     def poses(make):
         return (("/odom", make.odometry(t, *motion(seconds), child)) for seconds, t in times_ns())
 
@@ -151,7 +151,7 @@ def test_odometry_is_interpolated_and_completed_by_transforms(tmp_path, form, ch
 
 
 @pytest.mark.parametrize("kind", ["pose_stamped", "pose_with_covariance"])
-def test_poses_without_a_child_frame_are_the_sensors_own(tmp_path, kind):
+def test_poses_without_a_child_frame_are_taken_as_the_sensors(tmp_path, kind):
     def poses(make):
         return (("/pose", getattr(make, kind)(t, *motion(seconds))) for seconds, t in times_ns())
 
@@ -163,7 +163,7 @@ def test_poses_without_a_child_frame_are_the_sensors_own(tmp_path, kind):
 
 
 @pytest.mark.parametrize("form", ["ros1", "mcap file"])
-def test_transforms_lead_to_odom_which_does_not_jump(tmp_path, form):
+def test_transforms_are_followed_up_to_odom_only(tmp_path, form):
     def poses(make):
         for number, (seconds, t) in enumerate(times_ns()):
             yield "/tf", make.transform(t, "map", "odom", (number**2, 0, 0), NO_TURN)  # corrections that jump
@@ -174,9 +174,9 @@ def test_transforms_lead_to_odom_which_does_not_jump(tmp_path, form):
     expect_poses(ros_bag_drive(bag, TINY, odometry="tf"), lambda s: matrix(*motion(s)) @ TO_LIDAR)
 
 
-def test_moving_transforms_are_multiplied_up_to_the_last_frame(tmp_path):
+def test_without_odom_transforms_are_followed_up_to_the_root(tmp_path):
     def poses(make):
-        yield "/tf", make.transform(0, "earth", "world", (5, 6, 7), turn(1))  # once: it stays there
+        yield "/tf", make.transform(0, "earth", "world", (5, 6, 7), turn(1))  # sent once: valid at all times
         for seconds, t in times_ns():
             yield "/tf", make.transform(t, "world", "lift", (0, 0, seconds), NO_TURN)
             yield "/tf", make.transform(t + 5 * 10**7, "lift", "base_link", *motion(seconds + 0.05))
@@ -191,7 +191,7 @@ def test_moving_transforms_are_multiplied_up_to_the_last_frame(tmp_path):
     expect_poses(ros_bag_drive(bag, TINY, odometry="tf"), expected)
 
 
-def test_lines_of_poses_are_of_the_sensor(tmp_path):
+def test_poses_from_a_file_are_of_the_sensor(tmp_path):
     lines = [
         " ".join(map(str, [f"{t // 10**9}.{t % 10**9:09d}", *place, *quaternion]))
         for t, (place, quaternion) in ((t, motion(seconds)) for seconds, t in times_ns())
@@ -201,7 +201,7 @@ def test_lines_of_poses_are_of_the_sensor(tmp_path):
     expect_poses(ros_bag_drive(bag, TINY, poses=tmp_path / "poses.txt"), lambda s: matrix(*motion(s)))
 
 
-def test_messages_need_no_definitions_of_the_recording(tmp_path):
+def test_message_definitions_in_the_recording_are_ignored(tmp_path):
     bag = write_recording(tmp_path / "a", "ros1", lambda make: [("/points", make.cloud(1, POINTS))])
     content = bag.read_bytes()
     assert content.count(b"uint32 height") > 0
@@ -210,7 +210,7 @@ def test_messages_need_no_definitions_of_the_recording(tmp_path):
     np.testing.assert_array_equal(sweep.points[:, 0], POINTS["x"])
 
 
-def test_clouds_outside_of_the_poses_are_left_out_and_told(tmp_path):
+def test_clouds_outside_the_poses_are_skipped_with_a_note(tmp_path):
     def poses(make):
         return (("/odom", make.odometry(t, *motion(seconds), "lidar")) for seconds, t in times_ns()[1:6])
 
@@ -226,13 +226,13 @@ def test_clouds_outside_of_the_poses_are_left_out_and_told(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a%20b", "a?mode=rw", "a#b"])
-def test_names_are_no_addresses_for_sqlite(tmp_path, name):
+def test_file_names_that_sqlite_misreads_are_refused(tmp_path, name):
     with refused(f"{name}.db3: %, ? or # in the name"):
         (tmp_path / f"{name}.db3").touch()
         ros_bag_drive(tmp_path / f"{name}.db3", TINY)
 
 
-def test_other_branches_of_the_tree_may_be_wrong(tmp_path):
+def test_errors_in_unused_branches_of_the_tree_are_ignored(tmp_path):
     def poses(make):
         for name in ("odom", "map"):
             yield "/tf", make.transform(START_NS, name, "base_link", (0, 0, 0), NO_TURN)
@@ -255,7 +255,7 @@ def odometry(*rows):
 
 
 def standing(*stamps_ns):
-    """Odometry at the origin."""
+    """Odometry that stays at the origin."""
     return odometry(*((stamp, (0, 0, 0), NO_TURN) for stamp in stamps_ns))
 
 
@@ -302,14 +302,14 @@ WRONG_DRIVES = {  # source of the poses, their messages, fragments of the messag
 
 
 @pytest.mark.parametrize("case", WRONG_DRIVES)
-def test_wrong_drives_are_one_line(tmp_path, case):
+def test_unusable_poses_are_refused(tmp_path, case):
     source, poses, *fragments = WRONG_DRIVES[case]
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, poses))
     with refused(f"{bag}: ", *fragments):
         list(ros_bag_drive(bag, TINY, odometry=source).sweeps)
 
 
-def test_several_topics_of_clouds_are_listed(tmp_path):
+def test_topics_must_be_named_if_there_are_several(tmp_path):
     bag = write_recording(
         tmp_path / "a",
         "mcap",
@@ -348,7 +348,7 @@ WRONG_CLOUDS = {
 
 
 @pytest.mark.parametrize("case", WRONG_CLOUDS)
-def test_wrong_clouds_are_one_line(tmp_path, case):
+def test_damaged_clouds_are_refused(tmp_path, case):
     changed, message = WRONG_CLOUDS[case]
 
     def content(make):
@@ -363,7 +363,7 @@ def test_wrong_clouds_are_one_line(tmp_path, case):
         list(ros_bag_drive(bag, TINY).sweeps)
 
 
-def test_too_many_points_and_missing_lasers_are_one_line(tmp_path):
+def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS))])
     with refused("/p: message 0: got 12 x 1 points, expected at most 11"):
         list(ros_bag_drive(bag, NUSCENES_HDL32E, max_points=11).sweeps)
@@ -383,7 +383,7 @@ def test_compressed_recordings_are_read(tmp_path, form, how):
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("share", [0, 0.3, 0.97])
-def test_truncated_recordings_are_one_line(tmp_path, form, share):
+def test_truncated_recordings_are_refused(tmp_path, form, share):
     clouds = [structured(np.random.default_rng(i).normal(0, 5, (5000, 4)).astype(np.float32)) for i in range(3)]
     bag = write_recording(
         tmp_path / "a", form, lambda make: [("/p", make.cloud(i, cloud)) for i, cloud in enumerate(clouds)]
@@ -396,14 +396,14 @@ def test_truncated_recordings_are_one_line(tmp_path, form, share):
 
 
 @pytest.mark.parametrize("text", ["", "{", "rosbag2_bagfile_information: 3", "a: &a [*a]", "\0"])
-def test_broken_metadata_are_one_line(tmp_path, text):
+def test_damaged_metadata_are_refused(tmp_path, text):
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS))])
     (bag / "metadata.yaml").write_text(text)
     with refused(f"{bag}: cannot be read: "):
         ros_bag_drive(bag, TINY)
 
 
-def test_a_missing_library_names_the_extra(tmp_path, monkeypatch):
+def test_without_rosbags_the_error_names_the_extra(tmp_path, monkeypatch):
     (tmp_path / "a.bag").touch()
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with refused("a.bag: rosbags is not installed", "pip install 'fcos-lidar-jax[ros]'"):
