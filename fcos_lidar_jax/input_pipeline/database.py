@@ -25,6 +25,7 @@ from fcos_lidar_jax.data.box_geometry import check_boxes, points_in_boxes
 from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.npy_files import parse_npz
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write, checksum, read_json
 from fcos_lidar_jax.workers import end_with_parent
 
@@ -98,8 +99,7 @@ class GroundTruthDatabase:
 
     def num_points(self, num_sweeps: int) -> np.ndarray:
         """i32[n]: points of every object in the newest sweeps (at most :data:`MAX_SWEEPS`) of its frame."""
-        if not 1 <= num_sweeps <= MAX_SWEEPS:
-            raise ValueError(f"num_sweeps: got {num_sweeps}, expected 1 to {MAX_SWEEPS} for copy-paste")
+        check(1 <= num_sweeps <= MAX_SWEEPS, "num_sweeps", num_sweeps, f"1 to {MAX_SWEEPS} for copy-paste")
         return self.table["newest"][:, num_sweeps - 1]
 
     def points(self, index: int) -> np.ndarray:
@@ -115,9 +115,7 @@ class GroundTruthDatabase:
         start, count = int(row["start"]) * columns, int(row["count"]) * columns
         values = np.fromfile(file, "<f4", count=count, offset=4 * start)
         if zlib.crc32(values.data) != row["crc32"]:
-            raise ValueError(
-                f"{file}: object {index}: checksum differs, expected the bytes that were written; build it anew"
-            )
+            raise ValueError(f"{file}: object {index}: checksum differs from the table's; build it anew")
         return values.reshape(-1, columns)
 
 
@@ -134,9 +132,8 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
     folder = Path(folder)
     manifest = read_manifest(folder)
     file = folder / _MANIFEST
-    if fingerprint is not None and manifest.source != fingerprint:
-        found = f"got {manifest.source!r}, expected {fingerprint!r}"
-        raise ValueError(f"{file}: source: {found}: built from other data, build it anew")
+    expected = f"{fingerprint!r}: built from other data, build it anew"
+    check(fingerprint in (None, manifest.source), f"{file}: source", manifest.source, expected)
     tables = []
     for entry in manifest.shards:
         table = _read_shard(folder, entry.name, manifest.columns, expected=entry.table_blake2b)
@@ -148,9 +145,8 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
         tables.append(table.rows)
     rows = np.concatenate([np.zeros(0, _ROW), *tables])
     if len(manifest.classes) <= rows["label"].max(initial=-1):
-        raise ValueError(
-            f"{file}: classes: got {manifest.classes}, expected at least {rows['label'].max() + 1}; build it anew"
-        )
+        expected = f"at least {rows['label'].max() + 1}; build it anew"
+        raise ValueError(f"{file}: classes: got {manifest.classes}, expected {expected}")
     shard = np.repeat(np.arange(len(tables), dtype=np.int32), [len(table) for table in tables])
     return GroundTruthDatabase(folder, manifest, rows, shard)
 
@@ -163,8 +159,7 @@ def cut_reading(num_sweeps: int) -> CloudReading:
 def objects_folder(index: Path, split: str | None) -> Path:
     """The database folder of a split; splits are separate, so that no validation object enters the training."""
     name = split or "all_frames"
-    if name in (".", "..") or "/" in name or "\0" in name:
-        raise ValueError(f"split: got {name!r}, expected a name that a folder can have")
+    check(name not in (".", "..") and not set("/\0") & set(name), "split", name, "a name that a folder can have")
     return index / "objects" / name
 
 
@@ -177,8 +172,8 @@ def read_manifest(folder: Path) -> Manifest:
         raise ValueError(f"{file}: {found}; build it anew: fcos-lidar prepare")
     manifest = read_json(file, Manifest)
     for shard in manifest.shards:
-        if "/" in shard.name or "\0" in shard.name:  # which would lead elsewhere
-            raise ValueError(f"{file}: shards: name: got {shard.name!r}, expected one that a file can have")
+        leads_elsewhere = set("/\0") & set(shard.name)
+        check(not leads_elsewhere, f"{file}: shards: name", shard.name, "one that a file can have")
     return manifest
 
 
@@ -212,8 +207,7 @@ def prepare_database(
         OSError: an error of the file system, or a worker died.
     """
     folder = Path(folder)
-    if workers < 1:
-        raise ValueError(f"workers: got {workers}, expected at least 1")
+    check(workers >= 1, "workers", workers, "at least 1")
     shards, source, columns = shards_by_scene(frames), frames.fingerprint(), frames.sensor.point_columns
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.iterdir():  # partial files of a killed run, and shards of scenes that are gone
@@ -298,8 +292,8 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     start = 0
     for index in job.indices:
         frame = frames.frame(index)
-        if (columns := frame.points.shape[1]) != job.columns:
-            raise ValueError(f"frame {index}: points: got {columns} columns, expected {job.columns} of the sensor")
+        columns = frame.points.shape[1]
+        check(columns == job.columns, f"frame {index}: point columns", columns, f"{job.columns} of the sensor")
         check_boxes(frame.boxes, lambda box, index=index: f"frame {frames.name(index)!r}: box {box}")
         cloud = frame.points[usable_rows(frame.points)]
         lags = np.unique(np.append(cloud[:, 4], np.float32(0)))[:MAX_SWEEPS]

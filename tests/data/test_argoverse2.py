@@ -1,7 +1,6 @@
 """Argoverse 2: logs written by hand in the official layout against plain geometry; one-line errors."""
 
 import dataclasses
-import pickle
 import sys
 from pathlib import Path
 
@@ -65,8 +64,8 @@ def root(tmp_path):
 
 
 def test_static_points_coincide_in_fused_sweeps_of_a_log(root):
-    frames = pickle.loads(pickle.dumps(Argoverse2Frames(root, reading=CloudReading(3, "none"))))
-    assert len(frames) == 4  # also in worker processes
+    frames = Argoverse2Frames(root, reading=CloudReading(3, "none"))
+    assert len(frames) == 4
     for i in range(4):
         points = frames.frame(i).points
         ages = min(i, 2) + 1
@@ -75,17 +74,6 @@ def test_static_points_coincide_in_fused_sweeps_of_a_log(root):
         # Half floats hold 30 m to 2 cm.
         np.testing.assert_allclose(points[:, :3], np.tile(in_ego(WORLD, i), (ages, 1)), atol=0.03)
         np.testing.assert_array_equal(points[:, [3, 5]], np.tile(MEASURED, (ages, 1)))
-
-
-def test_close_points_are_removed_around_the_sensor_in_each_sweep(root):
-    origin = ARGOVERSE2.origin_m
-    for i in range(2):  # in the second, the point is where the sensor of the first was
-        points = np.array([[origin[0] + 0.9, -0.9, 0, 9, 0], [origin[0] + 1.1, 0, 0, 9, 0]])
-        write_sweep(root / "train" / "log-a", START_NS + i * STEP_NS, points)
-    for mode, expected in {"all": (1, 1, 2), "sweeps": (2, 1, 1), "none": (2, 2, 0)}.items():
-        frame = Argoverse2Frames(root, reading=CloudReading(2, mode)).frame(1)
-        older = frame.points[:, 4] > 0
-        assert ((~older).sum(), older.sum(), frame.num_close) == expected
 
 
 def test_boxes_are_in_the_ego_frame_with_velocities_from_their_tracks(root):
@@ -101,8 +89,6 @@ def test_boxes_are_in_the_ego_frame_with_velocities_from_their_tracks(root):
         np.testing.assert_allclose(car[7:], (ego(i)[:3, :3].T @ SPEED)[:2], atol=1e-4)
         assert frame.num_points.tolist() == ([1] if i == 2 else []) + [7 + i]
     assert np.isnan(frames.frame(2).boxes[0, 7:]).all()  # seen once
-    arrays = (getattr(frames.frame(2), name) for name in ("points", "boxes", "labels", "num_points"))
-    assert [array.dtype for array in arrays] == ["f4", "f4", "i4", "i4"]
 
 
 def test_labels_are_of_boxes_with_a_point(root):

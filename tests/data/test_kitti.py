@@ -42,8 +42,6 @@ def test_frames_are_sorted_by_name_and_have_points_boxes_labels_and_counts(root)
     np.testing.assert_array_equal(frames.labels(1), frame.labels)
     np.testing.assert_allclose(frame.boxes[0, :7], CAR, atol=1e-3)
     assert np.isnan(frame.boxes[:, 7:]).all()
-    dtypes = [a.dtype for a in (frame.points, frame.boxes, frame.labels, frame.num_points)]
-    assert dtypes == ["f4", "f4", "i4", "i4"]
     empty = frames.frame(0)
     assert (empty.boxes.shape, empty.labels.tolist(), empty.num_points.tolist()) == ((0, 9), [], [])
 

@@ -217,7 +217,7 @@ def test_a_wrong_dtype_is_refused_and_the_right_one_named(tmp_path, points, stor
             "not a multiple of 16 (4 float32 values per point): truncated, or another layout, 5 columns",
         ),
         ("a.bin", 8, {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
-        ("a.bin", 8, {"dtype": "int16"}, "dtype: got int16, expected float16"),
+        ("a.bin", 8, {"dtype": "int16"}, "dtype: got 'int16', expected float16"),
         ("a.npy", 8, {"columns": 4}, "columns and dtype are for raw .bin files"),
         ("a.pcd", 8, {"dtype": "float32"}, "columns and dtype are for raw .bin files"),
     ],

@@ -332,7 +332,7 @@ def test_a_database_of_other_data_is_refused(tmp_path):
 def test_all_frames_must_have_the_columns_of_the_sensor(tmp_path):
     frames = ListedFrames((toy_frame(0), toy_frame(1, columns=6)))
     for folder, scenes in (("a", (("s", (0, 1)),)), ("b", (("s", (0,)), ("t", (1,))))):
-        with refused("frame 1: points: got 6 columns, expected 5 of the sensor"):
+        with refused("frame 1: point columns: got 6, expected 5 of the sensor"):
             build(tmp_path / folder, frames, scenes=scenes)
     six = InMemoryFrames(frames.frames[1:], ARGOVERSE2, NUSCENES_CLASSES)
     assert build(tmp_path / "c", six, scenes=(("t", (0,)),)).points(0).shape[1] == 6

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import pickle
 import shutil
 from typing import NamedTuple
 
@@ -59,7 +60,7 @@ def roots(tmp_path_factory):
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_format_is_recognised_and_its_frames_are_consistent(roots, format):
     assert find_data_set(roots[format]).reader.name == format
-    frames = open_frames(roots[format])
+    frames = pickle.loads(pickle.dumps(open_frames(roots[format])))  # as in worker processes
     assert type(frames) is FORMATS[format].reader
     assert len(frames) == FORMATS[format].frames
     for i in range(len(frames)):
@@ -67,7 +68,8 @@ def test_a_format_is_recognised_and_its_frames_are_consistent(roots, format):
         assert frame.points.shape[1] == frames.sensor.point_columns
         assert (frame.points[:, 4] == 0).all()  # one sweep by default
         assert len(frame.boxes) == len(frame.labels) == len(frame.num_points)
-        assert frame.labels.dtype == np.int32
+        arrays = frame.points, frame.boxes, frame.labels, frame.num_points
+        assert [array.dtype for array in arrays] == ["f4", "f4", "i4", "i4"]
         assert frame.labels.max(initial=0) < len(frames.classes)
         assert frames.name(i)
     assert len({frames.name(i) for i in range(len(frames))}) == len(frames)
@@ -94,6 +96,8 @@ def test_options_are_passed_to_the_readers(roots):
         kept, all_of_them = (len(frame.points) for frame in close)
         assert kept + close[0].num_close == all_of_them + close[1].num_close
         assert kept < all_of_them
+        sensor = dataclasses.replace(open_frames(roots[format]).sensor, origin_m=(1000.0, 0.0, 0.0))
+        assert open_frames(roots[format], reading=readings[0], sensor=sensor).frame(0).num_close == 0
 
 
 def test_a_class_map_renames_and_drops_classes(roots):
