@@ -57,7 +57,7 @@ def objects(tmp_path_factory):
 
 
 def run(frames=None, config=PLAIN, *, count=None, seed=0, num_steps=STEPS, threads=0, **options):
-    frames = frames or ToyFrames()
+    frames = ToyFrames() if frames is None else frames
     with make_batches(frames, config, seed=seed, num_steps=num_steps, threads=threads, **options) as batches:
         return list(itertools.islice(batches, count))
 
