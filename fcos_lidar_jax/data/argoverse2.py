@@ -254,8 +254,6 @@ def _track_velocities(track: np.ndarray, time_ns: np.ndarray, in_city: np.ndarra
 
 def _read_table(file: Path, kinds: Mapping[str, str]) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Columns of a table (integers as i64, other numbers as f64, text as objects) and the pose of every row."""
-    if not file.is_file():
-        raise ValueError(f"{file}: no such file, expected one for every log")
     wide = {"fiu": np.float64, "iu": np.int64, "O": object}
     table = {name: column.astype(wide[kinds[name]]) for name, column in read_feather(file, kinds).items()}
     rotation, translation = (np.stack([table[n] for n in names], axis=1) for names in (_ROTATION, _TRANSLATION))

@@ -192,6 +192,8 @@ def read_tum(path: Path) -> PoseTrack:
     """
     places, times, rows = [], [], []
     for where, words in read_lines(path, "poses"):
+        if words[0].startswith("#"):
+            continue
         if len(words) != 8:
             raise ValueError(f"{where}: got {' '.join(words)[:80]!r}, expected t x y z qx qy qz qw")
         _, x, y, z, *vector, scalar = (read_number(word, where, largest=_LATEST_S) for word in words)

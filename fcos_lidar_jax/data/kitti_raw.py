@@ -39,10 +39,8 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
     if not files:
         raise ValueError(f"{points / 'data'}: no .bin file in it, expected sweeps")
     times = dict(read_lines(points / "timestamps.txt", "the times of the sweeps"))
-    calibration = next((f for f in (folder / _CALIBRATION, folder.parent / _CALIBRATION) if f.is_file()), None)
-    if calibration is None:
-        raise ValueError(f"{folder.parent / _CALIBRATION}: no such file, expected the calibration of the day")
-    velodyne_to_imu = np.linalg.inv(_imu_to_velodyne(calibration))
+    own, of_day = folder / _CALIBRATION, folder.parent / _CALIBRATION
+    velodyne_to_imu = np.linalg.inv(_imu_to_velodyne(own if own.is_file() else of_day))
 
     def read() -> Iterator[Sweep]:
         scale = None

@@ -11,7 +11,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
-    """The place of each line, for messages, and its words; blank lines and lines that begin with # are skipped.
+    """The place of each line, for messages, and its words; blank lines are skipped.
 
     Raises:
         ValueError: with the file: it cannot be read or is not text; ``what`` describes what is expected.
@@ -25,7 +25,7 @@ def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{file}: got {error.reason} at byte {error.start}, expected {what}") from None
     rows = ((f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1))
-    return [(where, words) for where, words in rows if words and not words[0].startswith("#")]
+    return [(where, words) for where, words in rows if words]
 
 
 def read_number(word: str, where: str, *, largest: float = _LARGEST) -> float:

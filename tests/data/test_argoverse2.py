@@ -186,7 +186,7 @@ def boxes(**changes):
 
 ONE = np.array([1, 0, 0, 0.0])
 BAD = {
-    "no poses": (lambda log: (log / P).unlink(), P, "no such file, expected one for every log"),
+    "no poses": (lambda log: (log / P).unlink(), P, "cannot be read: No such file or directory"),
     "no Feather": (rewrite(P, lambda _: b"timestamp_ns,qw"), P, "not a readable .feather file: "),
     "empty": (rewrite(P, lambda _: b""), P, "empty file"),
     "cut": (rewrite(A, lambda content: content[:-40]), A, "not a readable .feather file: "),
