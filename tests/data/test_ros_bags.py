@@ -91,6 +91,10 @@ def test_without_odometry_sweeps_have_times_but_no_poses(tmp_path, form):
     assert [sweep.time_us for sweep in sweeps] == [START_NS // 1000 + i * 10**5 for i in range(3)]
 
 
+def one_cloud(make):
+    return [("/p", make.cloud(1, POINTS))]
+
+
 def turn(yaw):
     return Rotation.from_euler("z", yaw).as_quat()
 
@@ -123,11 +127,11 @@ def drive_content(make, poses):
         yield "/points", make.cloud(START_NS + round(seconds * 1e9), POINTS, "/lidar")
 
 
-def expect_poses(drive, expected, atol=1e-5):
+def expect_poses(drive, expected):
     assert drive.posed
     for sweep, seconds in zip(drive.sweeps, CLOUDS_S, strict=True):
         # Whole microseconds: at 9 m/s up to a hundredth of a millimetre beside the stamp.
-        np.testing.assert_allclose(sweep.sensor_to_world, expected(seconds), atol=atol)
+        np.testing.assert_allclose(sweep.sensor_to_world, expected(seconds), atol=1e-5)
 
 
 def times_ns():
@@ -135,60 +139,71 @@ def times_ns():
 
 
 TO_LIDAR = matrix(*MOUNT) @ matrix(*HEAD)
+IMU_TO_LIDAR = np.linalg.inv(matrix(*IMU)) @ TO_LIDAR
 
 
-@pytest.mark.parametrize(
-    ("child", "to_lidar"),
-    [("lidar", np.eye(4)), ("/base_link", TO_LIDAR), ("imu", np.linalg.inv(matrix(*IMU)) @ TO_LIDAR)],
-)
+def body(seconds):
+    return matrix(*motion(seconds))
+
+
+def odometry_of(child):
+    return lambda make: (("/odom", make.odometry(t, *motion(seconds), child)) for seconds, t in times_ns())
+
+
+def poses_of(kind):
+    return lambda make: (("/pose", getattr(make, kind)(t, *motion(seconds))) for seconds, t in times_ns())
+
+
+def transforms_below_map(make):
+    for number, (seconds, t) in enumerate(times_ns()):
+        yield "/tf", make.transform(t, "map", "odom", (number**2, 0, 0), NO_TURN)  # corrections that jump
+        for _ in range(2):  # some transforms are sent twice
+            yield "/tf", make.transform(t, "odom", "base_link", *motion(seconds))
+
+
+def transforms_below_earth(make):
+    yield "/tf", make.transform(0, "earth", "world", (5, 6, 7), turn(1))  # sent once: valid at all times
+    for seconds, t in times_ns():
+        yield "/tf", make.transform(t, "world", "lift", (0, 0, seconds), NO_TURN)
+        yield "/tf", make.transform(t + 5 * 10**7, "lift", "base_link", *motion(seconds + 0.05))
+    yield "/tf", make.transform(START_NS - 10**8, "lift", "base_link", *motion(-0.1))
+
+
+def below_earth(seconds):
+    return matrix((5, 6, 7), turn(1)) @ matrix((0, 0, seconds), NO_TURN) @ body(seconds) @ TO_LIDAR
+
+
+def odometry_beside_two_parents(make):
+    for name in ("odom", "map"):
+        yield "/tf", make.transform(START_NS, name, "base_link", (0, 0, 0), NO_TURN)
+    yield from odometry_of("base_link")(make)
+
+
+SOURCES = {  # source of the poses, their messages, the pose of the LiDAR at a time
+    "odometry of the LiDAR": ("/odom", odometry_of("lidar"), body),
+    "odometry of the vehicle": ("/odom", odometry_of("/base_link"), lambda s: body(s) @ TO_LIDAR),
+    "odometry of the IMU": (
+        "/odom",
+        odometry_of("imu"),
+        lambda s: body(s) @ IMU_TO_LIDAR,
+    ),
+    "poses": ("/pose", poses_of("pose_stamped"), body),
+    "poses with covariance": ("/pose", poses_of("pose_with_covariance"), body),
+    "transforms up to odom, which does not jump": ("tf", transforms_below_map, lambda s: body(s) @ TO_LIDAR),
+    "transforms up to the root": ("tf", transforms_below_earth, below_earth),
+    "errors in unused branches": ("/odom", odometry_beside_two_parents, lambda s: body(s) @ TO_LIDAR),
+}
+
+
+@pytest.mark.parametrize("case", SOURCES)
 @pytest.mark.parametrize("form", ["ros1", "sqlite"])
-def test_odometry_is_interpolated_and_combined_with_transforms(tmp_path, form, child, to_lidar):
-    def poses(make):
-        return (("/odom", make.odometry(t, *motion(seconds), child)) for seconds, t in times_ns())
-
+def test_poses_are_interpolated_and_combined_with_transforms(tmp_path, form, case):
+    source, poses, expected = SOURCES[case]
     bag = write_recording(tmp_path / "a", form, lambda make: drive_content(make, poses))
-    expect_poses(ros_bag_drive(bag, TINY, odometry="/odom"), lambda s: matrix(*motion(s)) @ to_lidar)
-
-
-@pytest.mark.parametrize("kind", ["pose_stamped", "pose_with_covariance"])
-def test_poses_without_a_child_frame_are_taken_as_the_sensors(tmp_path, kind):
-    def poses(make):
-        return (("/pose", getattr(make, kind)(t, *motion(seconds))) for seconds, t in times_ns())
-
-    bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
-    drive = ros_bag_drive(bag, TINY, odometry="/pose")
-    [note] = drive.notes
-    assert note.startswith("/pose does not name the frame of its poses")
-    expect_poses(drive, lambda s: matrix(*motion(s)))
-
-
-@pytest.mark.parametrize("form", ["ros1", "mcap file"])
-def test_transforms_are_followed_up_to_odom_only(tmp_path, form):
-    def poses(make):
-        for number, (seconds, t) in enumerate(times_ns()):
-            yield "/tf", make.transform(t, "map", "odom", (number**2, 0, 0), NO_TURN)  # corrections that jump
-            for _ in range(2):  # some are sent twice
-                yield "/tf", make.transform(t, "odom", "base_link", *motion(seconds))
-
-    bag = write_recording(tmp_path / "a", form, lambda make: drive_content(make, poses))
-    expect_poses(ros_bag_drive(bag, TINY, odometry="tf"), lambda s: matrix(*motion(s)) @ TO_LIDAR)
-
-
-def test_without_odom_transforms_are_followed_up_to_the_root(tmp_path):
-    def poses(make):
-        yield "/tf", make.transform(0, "earth", "world", (5, 6, 7), turn(1))  # sent once: valid at all times
-        for seconds, t in times_ns():
-            yield "/tf", make.transform(t, "world", "lift", (0, 0, seconds), NO_TURN)
-            yield "/tf", make.transform(t + 5 * 10**7, "lift", "base_link", *motion(seconds + 0.05))
-        yield "/tf", make.transform(START_NS - 10**8, "lift", "base_link", *motion(-0.1))
-
-    bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, poses))
-
-    def expected(seconds):
-        lift = matrix((0, 0, seconds), NO_TURN)
-        return matrix((5, 6, 7), turn(1)) @ lift @ matrix(*motion(seconds)) @ TO_LIDAR
-
-    expect_poses(ros_bag_drive(bag, TINY, odometry="tf"), expected)
+    drive = ros_bag_drive(bag, TINY, odometry=source)
+    assumed = "/pose does not name the frame of its poses: assumed to be the clouds' frame"
+    assert drive.notes == ([assumed] if source == "/pose" else [])
+    expect_poses(drive, expected)
 
 
 def test_poses_from_a_file_are_of_the_sensor(tmp_path):
@@ -198,7 +213,7 @@ def test_poses_from_a_file_are_of_the_sensor(tmp_path):
     ]
     (tmp_path / "poses.txt").write_text("\n".join(lines))
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: drive_content(make, lambda _: ()))
-    expect_poses(ros_bag_drive(bag, TINY, poses=tmp_path / "poses.txt"), lambda s: matrix(*motion(s)))
+    expect_poses(ros_bag_drive(bag, TINY, poses=tmp_path / "poses.txt"), body)
 
 
 def test_message_definitions_in_the_recording_are_ignored(tmp_path):
@@ -212,15 +227,13 @@ def test_message_definitions_in_the_recording_are_ignored(tmp_path):
 
 def test_clouds_outside_the_poses_are_skipped_with_a_note(tmp_path):
     def poses(make):
-        return (("/odom", make.odometry(t, *motion(seconds), "lidar")) for seconds, t in times_ns()[1:6])
+        return list(odometry_of("lidar")(make))[1:6]
 
     bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
     drive = ros_bag_drive(bag, TINY, odometry="/odom")
     assert [sweep.name[-1] for sweep in drive.sweeps] == ["1", "2"]
     assert drive.notes == ["2 clouds before the first or after the last pose were skipped"]
-    bag = write_recording(
-        tmp_path / "b", "mcap", lambda make: drive_content(make, lambda make: list(poses(make))[:1])
-    )
+    bag = write_recording(tmp_path / "b", "mcap", lambda make: drive_content(make, lambda make: poses(make)[:1]))
     with refused("/points: message 0: /odom: at 1700000000.173456 s: a gap in the poses"):
         list(ros_bag_drive(bag, TINY, odometry="/odom").sweeps)
 
@@ -230,16 +243,6 @@ def test_file_names_that_sqlite_misreads_are_refused(tmp_path, name):
     with refused(f"{name}.db3: %, ? or # in the name"):
         (tmp_path / f"{name}.db3").touch()
         ros_bag_drive(tmp_path / f"{name}.db3", TINY)
-
-
-def test_errors_in_unused_branches_of_the_tree_are_ignored(tmp_path):
-    def poses(make):
-        for name in ("odom", "map"):
-            yield "/tf", make.transform(START_NS, name, "base_link", (0, 0, 0), NO_TURN)
-        yield from (("/odom", make.odometry(t, *motion(seconds))) for seconds, t in times_ns())
-
-    bag = write_recording(tmp_path / "a", "mcap", lambda make: drive_content(make, poses))
-    expect_poses(ros_bag_drive(bag, TINY, odometry="/odom"), lambda s: matrix(*motion(s)) @ TO_LIDAR)
 
 
 def moving(*names):
@@ -328,7 +331,6 @@ def test_topics_must_be_named_if_there_are_several(tmp_path):
         ros_bag_drive(tmp_path / "a", TINY, topic="/rear", odometry="tf")
 
 
-NAMES = ("x", "y", "z", "intensity")
 WRONG_CLOUDS = {
     "too short": (
         {"data": np.zeros(191, np.uint8)},
@@ -364,7 +366,7 @@ def test_damaged_clouds_are_refused(tmp_path, case):
 
 
 def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):
-    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS))])
+    bag = write_recording(tmp_path / "a", "sqlite", one_cloud)
     with refused("/p: message 0: got 12 x 1 points, expected at most 11"):
         list(ros_bag_drive(bag, NUSCENES_HDL32E, max_points=11).sweeps)
     with refused("/p: message 0: no laser number in it"):
@@ -376,7 +378,7 @@ def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):
     [("ros1", "LZ4"), ("ros1", "BZ2"), ("sqlite", "FILE"), ("sqlite", "MESSAGE"), ("mcap file", "STORAGE")],
 )
 def test_compressed_recordings_are_read(tmp_path, form, how):
-    bag = write_recording(tmp_path / "a", form, lambda make: [("/p", make.cloud(1, POINTS))], compression=how)
+    bag = write_recording(tmp_path / "a", form, one_cloud, compression=how)
     [sweep] = ros_bag_drive(bag, TINY).sweeps
     np.testing.assert_array_equal(sweep.points[:, 2], POINTS["z"])
 
@@ -397,7 +399,7 @@ def test_truncated_recordings_are_refused(tmp_path, form, share):
 
 @pytest.mark.parametrize("text", ["", "{", "rosbag2_bagfile_information: 3", "a: &a [*a]", "\0"])
 def test_damaged_metadata_are_refused(tmp_path, text):
-    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS))])
+    bag = write_recording(tmp_path / "a", "sqlite", one_cloud)
     (bag / "metadata.yaml").write_text(text)
     with refused(f"{bag}: cannot be read: "):
         ros_bag_drive(bag, TINY)
