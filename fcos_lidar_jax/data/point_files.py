@@ -176,6 +176,14 @@ def _read_columns(pyarrow: Any, content: bytes, kinds: Mapping[str, str], max_ro
     return columns
 
 
+def check_inside(file: Path, folder: Path, where: str) -> None:
+    """Refuse a file that a link or ``..`` leads out of a folder; ``where`` names it in the message."""
+    real = os.path.realpath(file)
+    if not Path(real).is_relative_to(os.path.realpath(folder)):
+        found = f"resolves to {real}, expected a file inside {folder}"
+        raise ValueError(f"{where}: {found}; --follow-links allows links that lead out")
+
+
 def _read_whole(path: Path, max_points: int) -> bytes:
     """The bytes of a file, which may be at most as large as a cloud."""
     limit = max_points * BYTES_PER_POINT + _HEADER_BYTES

@@ -16,7 +16,7 @@ from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, default_index, has_index, open_index
 from fcos_lidar_jax.data.nuscenes.names import label_of
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
-from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.point_files import MAX_POINTS, check_inside
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix, rotation_matrix, wrap_angle
@@ -89,7 +89,6 @@ class NuScenes:
         folder = default_index(root, version) if index is None else Path(index)
         known = index is not None or has_index(folder)
         self.index: Index = open_index(folder, tables=self.tables) if known else build_index(self.tables)
-        self._base = self.root.resolve()
         self._sample_row = {token.decode(): i for i, token in enumerate(self.index.sample_token)}
         self._label = np.array([label_of(str(name)) for name in self.index.category_name], np.int32)
 
@@ -270,9 +269,8 @@ class NuScenes:
             needed = self.allow_missing_sweeps or row in self.index.sample_sweep  # keyframes are never skipped
             hint = "" if needed else "; --allow-missing-sweeps continues with fewer sweeps"
             raise ValueError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
-        if not self.follow_links and not path.resolve().is_relative_to(self._base):
-            problem = f"resolves to {path.resolve()}, expected a file below {self._base}"
-            raise ValueError(f"{path}: {problem}; --follow-links allows links that lead out")
+        if not self.follow_links:
+            check_inside(path, self.root, str(path))
         size = path.stat().st_size
         if size == 0 or size % (4 * _COLUMNS) or size > 4 * _COLUMNS * MAX_POINTS:
             found = "an empty file" if size == 0 else f"{size} bytes"
