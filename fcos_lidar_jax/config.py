@@ -418,7 +418,7 @@ def config_from_json(record: Any, where: str = "config") -> Config:
 
     >>> config_from_json({"name": "mine"}, "mine.json")
     Traceback (most recent call last):
-    ValueError: mine.json.sensor: missing
+    ValueError: mine.json: sensor: missing, expected str
     """
     if not isinstance(record, Mapping):
         return from_json(Config, record, where)

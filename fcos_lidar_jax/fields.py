@@ -90,12 +90,23 @@ def _dataclass_from_json(kind: Any, value: Any, where: str, defaults: bool) -> A
     hints = get_type_hints(kind)
     for name in value:
         if name not in hints:
-            raise ValueError(f"{where}.{name}: unknown field, expected one of {', '.join(hints)}")
+            raise ValueError(f"{_place(where, name)}: unknown field, expected one of {', '.join(hints)}")
     for field in dataclasses.fields(kind):
         if field.name not in value and not (defaults and field.default is not dataclasses.MISSING):
-            raise ValueError(f"{where}.{field.name}: missing")
-    fields = {name: from_json(hints[name], entry, f"{where}.{name}") for name, entry in value.items()}
+            raise ValueError(f"{_place(where, field.name)}: missing, expected {_described(hints[field.name])}")
+    fields = {name: from_json(hints[name], entry, _place(where, name)) for name, entry in value.items()}
     try:
         return kind(**fields)
     except ValueError as error:
-        raise ValueError(f"{where}.{error}") from None
+        raise ValueError(_place(where, str(error))) from None
+
+
+def _described(kind: Any) -> str:
+    if dataclasses.is_dataclass(kind):
+        return "a JSON object"
+    return "a list" if get_origin(kind) is tuple else getattr(kind, "__name__", "a value")
+
+
+def _place(where: str, field: str) -> str:
+    """``FILE: FIELD``, and ``FILE: FIELD.FIELD`` within a field."""
+    return f"{where}{'.' if ': ' in where else ': '}{field}"

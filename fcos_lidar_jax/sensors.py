@@ -247,7 +247,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     64
     """
     if isinstance(record, dict) and "inclinations_deg" in record:
-        beams = from_json(_EvenBeams, record["inclinations_deg"], f"{where}.inclinations_deg")
+        beams = from_json(_EvenBeams, record["inclinations_deg"], f"{where}: inclinations_deg")
         table = even_inclinations(beams.lowest, beams.highest, beams.rows)
         others = {name: value for name, value in record.items() if name != "inclinations_deg"}
         record = {**others, "inclinations_rad": table}

@@ -12,10 +12,10 @@ from fcos_lidar_jax.fields import from_json
 @pytest.mark.parametrize(
     ("change", "message", "by_msgspec"),
     [
-        ({"colour": 1}, r"run\.colour: unknown field, expected one of name, sensor, .*", None),
-        ({"loss": ...}, r"run\.loss: missing", None),
-        ({"num_sweeps": "ten"}, r"run\.num_sweeps: got 'ten', expected int", "Expected `int`, got `str`"),
-        ({"model": {"precision": "half"}}, r"run\.model\.\w+: missing", "Invalid enum value 'half'"),
+        ({"colour": 1}, r"run: colour: unknown field, expected one of name, sensor, .*", None),
+        ({"loss": ...}, r"run: loss: missing, expected a JSON object", None),
+        ({"num_sweeps": "ten"}, r"run: num_sweeps: got 'ten', expected int", "Expected `int`, got `str`"),
+        ({"model": {"precision": "half"}}, r"run: model\.\w+: missing, expected .*", "Invalid enum value 'half'"),
     ],
     ids=["unknown field", "missing field", "wrong type", "unknown choice"],
 )

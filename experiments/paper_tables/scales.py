@@ -24,8 +24,8 @@ from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemCon
 from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.data.nuscenes.index import has_index
-from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames, default_index
+from fcos_lidar_jax.data.nuscenes.index import default_index, has_index
+from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.metrics import evaluate
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
 from fcos_lidar_jax.evaluation.truth import split_truth

@@ -16,7 +16,6 @@ from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
-from fcos_lidar_jax.data.nuscenes.tables import TableError
 from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
@@ -80,7 +79,7 @@ def _make_index(tables: Path, folder: Path) -> Index:
     if has_index(folder):
         try:
             return open_index(folder, tables=tables)
-        except TableError as error:
+        except ValueError as error:
             print(f"{error}: rebuilding it", file=sys.stderr)
     for left_over in folder.glob(".*"):
         if re.fullmatch(r"\.[0-9a-f]{12}\.(npy|json)", left_over.name):  # of a killed process

@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.input_pipeline import database
-from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
+from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.training import Schedule, train
@@ -156,6 +156,8 @@ def _open(args: Train) -> _Task:
         augment=None if args.no_augment else args.config.augment,
         copy_paste=None if args.no_copy_paste else args.config.copy_paste,
     )
+    options = {"threads": args.threads, "workers": args.workers, "num_processes": jax.process_count()}
+    check_loader_options(config, **options)  # before objects are cut
     data = args.data.find()
     index = args.data.index or data.index
     if data.tables is not None and data.tables.is_dir() and not has_index(index):

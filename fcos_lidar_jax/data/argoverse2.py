@@ -10,13 +10,13 @@ import numpy as np
 
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
+from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes
 from fcos_lidar_jax.data.class_mapping import map_labels, unknown_name
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points, size_and_time
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
-from fcos_lidar_jax.data.sweeps import Sweep, find_bad_pose, fuse_sweeps
+from fcos_lidar_jax.data.sweeps import Sweep, check_poses, fuse_sweeps
 from fcos_lidar_jax.geometry import pose_matrix, wrap_angle
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
 
@@ -227,8 +227,7 @@ def _read_boxes(file: Path, poses: _Poses) -> _Boxes:
     boxes[:, :3] = in_ego[:, :3, 3]
     boxes[:, 3:6] = np.stack([table[name] for name in _SIZE], axis=1)
     boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
-    if (bad := find_bad_box(boxes)) is not None:
-        raise ValueError(f"{file}: row {bad[0]}: {bad[1]}")
+    check_boxes(boxes, lambda row: f"{file}: row {row}")
     velocity = _track_velocities(table["track_uuid"], time_ns, (ego @ in_ego)[:, :3, 3], ego)
     possible = (np.abs(velocity) <= LIMITS["vx"]).all(axis=1)  # the velocity of a jumping track is unknown
     boxes[possible, 7:] = velocity[possible]
@@ -255,11 +254,8 @@ def _track_velocities(track: np.ndarray, time_ns: np.ndarray, in_city: np.ndarra
 
 def _read_table(file: Path, kinds: Mapping[str, str]) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Columns of a table (integers as i64, other numbers as f64, text as objects) and the pose of every row."""
-    if not file.is_file():
-        raise ValueError(f"{file}: no such file, expected one for every log")
     wide = {"fiu": np.float64, "iu": np.int64, "O": object}
     table = {name: column.astype(wide[kinds[name]]) for name, column in read_feather(file, kinds).items()}
     rotation, translation = (np.stack([table[n] for n in names], axis=1) for names in (_ROTATION, _TRANSLATION))
-    if (bad := find_bad_pose(rotation, translation)) is not None:
-        raise ValueError(f"{file}: row {bad[0]}: {bad[1]}")
+    check_poses(rotation, translation, lambda row: f"{file}: row {row}")
     return table, pose_matrix(rotation, translation)

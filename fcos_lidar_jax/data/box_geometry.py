@@ -1,5 +1,7 @@
 """Box geometry on the host: plausibility, overlap in the ground plane, and the points inside boxes."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from fcos_lidar_jax.geometry import points_in_box
@@ -11,14 +13,19 @@ _MAX_CELLS = 1024  # per side: a box far away makes the cells larger instead of 
 _SLACK_M = 1e-3  # far above float32 rounding, so that the coarse tests never lose an inside point
 
 
-def find_bad_box(boxes: np.ndarray) -> tuple[int, str] | None:
-    """The row of the first implausible box and its problem; None if all boxes are plausible.
+def check_boxes(boxes: np.ndarray, place: Callable[[int], str]) -> None:
+    """Refuse implausible boxes: a single one would make all weights NaN.
 
     Args:
         boxes: [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``; an unknown velocity is NaN twice.
+        place: row -> name of a box, for messages.
 
-    >>> find_bad_box(np.array([[8, 0, 0, 4, 2, 0, 0, np.nan, np.nan]]))
-    (0, 'h: got 0, expected a size above 0 m')
+    Raises:
+        ValueError: with the first such box, the field, the found and the expected value.
+
+    >>> check_boxes(np.array([[8, 0, 0, 4, 2, 0, 0, np.nan, np.nan]]), "box {}".format)
+    Traceback (most recent call last):
+    ValueError: box 0: h: got 0, expected a size above 0 m
     """
     finite, positive = np.isfinite(boxes), np.ones(boxes.shape, bool)
     finite[:, 7:] |= np.isnan(boxes[:, 7:]).all(axis=1, keepdims=True)
@@ -26,12 +33,12 @@ def find_bad_box(boxes: np.ndarray) -> tuple[int, str] | None:
     near = ~(np.abs(boxes) > list(LIMITS.values()))
     good = finite & positive & near
     if good.all():
-        return None
+        return
     row, column = np.argwhere(~good)[0]
     name = list(LIMITS)[column]
     expected = f"at most {LIMITS[name]:g}" if positive[row, column] else "a size above 0 m"
     expected = expected if finite[row, column] else "a finite number"
-    return int(row), f"{name}: got {boxes[row, column]:g}, expected {expected}"
+    raise ValueError(f"{place(int(row))}: {name}: got {boxes[row, column]:g}, expected {expected}")
 
 
 def footprints_overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -3,17 +3,18 @@
 import dataclasses
 import itertools
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from fcos_lidar_jax.data.clouds import find_clouds
-from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
-from fcos_lidar_jax.data.sweeps import Sweep, find_bad_pose, read_entries
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.sweeps import Sweep, check_poses, read_entries
+from fcos_lidar_jax.data.text_files import read_lines, read_number
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.sensors import Sensor
 
@@ -32,6 +33,10 @@ class Drive:
     at_us: Collection[int] | None = None  # times of the sweeps to detect in; None for all
     notes: list[str] = dataclasses.field(default_factory=list)
     """Notes about assumptions and, once the last sweep was read, about skipped sweeps."""
+
+
+PoseRow = tuple[float, ...]
+"""Quaternion w, x, y, z and translation in metres."""
 
 
 class OutsidePosesError(ValueError):
@@ -73,15 +78,22 @@ class PoseTrack(NamedTuple):
         return pose_matrix(turn.as_quat(scalar_first=True), place)
 
 
-def folder_drive(
-    folder: Path,
-    sensor: Sensor,
-    poses: Path | None = None,
-    *,
-    columns: int | None = None,
-    dtype: str | None = None,
-    max_points: int = MAX_POINTS,
-) -> Drive:
+def make_track(times_us: Sequence[int], rows: Sequence[PoseRow], place: Callable[[int], str]) -> PoseTrack:
+    """A track of poses at increasing times; ``place`` names a pose in messages.
+
+    Raises:
+        ValueError: with the first invalid time or pose.
+    """
+    for row, (before, after) in enumerate(itertools.pairwise(times_us), 1):
+        if after <= before:
+            found = f"got {after / 1e6} s after {before / 1e6} s"
+            raise ValueError(f"{place(row)}: time: {found}, expected a later one")
+    poses = np.array(rows, np.float64).reshape(-1, 7)
+    check_poses(poses[:, :4], poses[:, 4:], place)
+    return PoseTrack(np.array(times_us, np.int64), poses[:, :4], poses[:, 4:])
+
+
+def folder_drive(folder: Path, sensor: Sensor, poses: Path | None = None, **layout: Any) -> Drive:
     """The clouds of a folder, or one file.
 
     Args:
@@ -92,7 +104,7 @@ def folder_drive(
             seconds. If the clouds' names are times (seconds with a decimal point, or nanoseconds), poses are
             interpolated between neighbours at most :data:`MAX_POSE_GAP_US` apart; otherwise the file must have one
             line per cloud.
-        columns, dtype, max_points: of raw files, as in :func:`read_points`.
+        layout: options of :func:`read_points`.
 
     Raises:
         ValueError: with the file, the found and the expected value.
@@ -107,8 +119,7 @@ def folder_drive(
 
     def read() -> Iterator[Sweep]:
         for file, time_us, matrix in zip(files, times, matrices, strict=True):
-            points = read_points(file, sensor, columns=columns, dtype=dtype, max_points=max_points)
-            yield Sweep(points, matrix, time_us, str(file))
+            yield Sweep(read_points(file, sensor, **layout), matrix, time_us, str(file))
 
     return Drive(read(), posed=poses is not None, timed=poses is not None)
 
@@ -180,30 +191,16 @@ def read_tum(path: Path) -> PoseTrack:
     Raises:
         ValueError: with the file, the line, the found and the expected value.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file, expected poses")
-    rows: list[list[float]] = []
-    times: list[int] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+    places, times, rows = [], [], []
+    for where, words in read_lines(path, "poses"):
+        if words[0].startswith("#"):
             continue
-        try:
-            time_s, *row = map(float, words)
-        except ValueError:
-            time_s, row = 0.0, []
-        where = f"{path}: line {number}"
-        if len(row) != 7 or not abs(time_s) < _LATEST_S:
-            raise ValueError(f"{where}: got {line[:80]!r}, expected t x y z qx qy qz qw")
-        time_us = round(Decimal(words[0]) * 1_000_000)  # a float cannot represent today's microseconds
-        if times and time_us <= times[-1]:
-            found = f"{time_us / 1e6} s after {times[-1] / 1e6} s"
-            raise ValueError(f"{where}: time: got {found}, expected a later one")
-        if bad := find_bad_pose(np.array([row[6:] + row[3:6]]), np.array([row[:3]])):
-            raise ValueError(f"{where}: {bad[1]}")
-        rows.append(row)
-        times.append(time_us)
+        if len(words) != 8:
+            raise ValueError(f"{where}: got {' '.join(words)[:80]!r}, expected t x y z qx qy qz qw")
+        _, x, y, z, *vector, scalar = (read_number(word, where, largest=_LATEST_S) for word in words)
+        places.append(where)
+        times.append(round(Decimal(words[0]) * 1_000_000))  # a float cannot represent today's microseconds
+        rows.append((scalar, *vector, x, y, z))
     if not rows:
         raise ValueError(f"{path}: no pose in it, expected lines t x y z qx qy qz qw")
-    poses = np.array(rows)
-    return PoseTrack(np.array(times), poses[:, [6, 3, 4, 5]], poses[:, :3])
+    return make_track(times, rows, places.__getitem__)

@@ -11,22 +11,21 @@ import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import point_files
-from fcos_lidar_jax.data.box_geometry import LIMITS, count_inside, find_bad_box
+from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes, count_inside
 from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import (
     Frame,
     FrameSet,
-    distinct_names,
     drop_close,
     files_fingerprint,
     without_points,
 )
+from fcos_lidar_jax.data.splits import SPLITS, distinct_names, own_splits
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.sensors import PRESETS, Sensor, sensor_from_json
 
-_SPLITS = "splits.json"
 _MAX_LAGS = 100  # far more sweeps than anybody fuses
 _Speed = Annotated[float, msgspec.Meta(ge=-LIMITS["vx"], le=LIMITS["vx"])]  # no NaN: unknown speeds are null
 
@@ -116,7 +115,7 @@ class FolderFrames(FrameSet):
         self.sensor = _read_sensor(root, self._inside) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
-            self.names = _read_split(root / _SPLITS if splits is None else Path(splits), split, self._clouds)
+            self.names = _read_split(root, splits, split, self._clouds)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -181,8 +180,7 @@ class FolderFrames(FrameSet):
         file = self._boxes[self.names[index]]
         records = read_json(file, _Annotation).boxes
         boxes = np.array([record.box for record in records], np.float64).reshape(-1, 9)  # null becomes NaN
-        if (bad := find_bad_box(boxes)) is not None:
-            raise ValueError(f"{file}: $.boxes[{bad[0]}].box: {bad[1]}")
+        check_boxes(boxes, lambda i: f"{file}: $.boxes[{i}].box")
         kept, labels = [], []
         for i, record in enumerate(records):
             label = self._translation.get(record.label, record.label)
@@ -242,10 +240,8 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
     """Refuse a missing file, and one that a link or ``..`` leads out of the folder ``inside``."""
     if not os.path.isfile(file):
         raise ValueError(f"{where}: no such file" + ("" if where == str(file) else f": {file}"))
-    real = os.path.realpath(file)
-    if inside is not None and not Path(real).is_relative_to(os.path.realpath(inside)):
-        found = f"resolves to {real}, expected a file inside {inside}"
-        raise ValueError(f"{where}: {found}; --follow-links allows links that lead out")
+    if inside is not None:
+        point_files.check_inside(file, inside, where)
 
 
 def _read_sensor(root: Path, inside: Path | None) -> Sensor:
@@ -259,19 +255,9 @@ def _read_sensor(root: Path, inside: Path | None) -> Sensor:
     return PRESETS[record]
 
 
-def find_folder_splits(root: Path, file: str | Path | None = None) -> list[str]:
-    """Names of the splits in a file, by default ``splits.json``; empty if that file is missing."""
-    default = root / _SPLITS
-    return list(_read_splits(Path(file or default))) if file is not None or default.exists() else []
-
-
-def _read_splits(file: Path) -> dict[str, list[str]]:
-    return read_json(file, dict[str, list[str]], what="splits")
-
-
-def _read_split(file: Path, split: str, clouds: Collection[str]) -> tuple[str, ...]:
-    splits = _read_splits(file)
+def _read_split(root: Path, file: str | Path | None, split: str, clouds: Collection[str]) -> tuple[str, ...]:
+    file = Path(file or root / SPLITS)
+    splits, where = own_splits(root, file), f"{file}: {split}"
     if split not in splits:
         raise ValueError(f"{file}: split: {unknown_name(split, splits)}")
-    where = f"{file}: {split}"
     return distinct_names(((f"{where}[{i}]", name) for i, name in enumerate(splits[split])), clouds, where)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -219,29 +219,6 @@ def size_and_time(file: Path) -> tuple[int, ...]:
     except FileNotFoundError:
         return ()
     return stat.st_size, stat.st_mtime_ns
-
-
-def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], where: str) -> tuple[str, ...]:
-    """Check a list of frame names: at least one, each known and listed once.
-
-    Args:
-        listed: the place of each name, for messages, and the name.
-        known: names of all frames.
-        where: the place of the list, for messages.
-
-    Raises:
-        ValueError: with the place, the found and the expected value.
-    """
-    names: dict[str, None] = {}
-    for place, name in listed:
-        if name not in known:
-            raise ValueError(f"{place}: got {name!r}, expected the name of a cloud")
-        if name in names:
-            raise ValueError(f"{place}: got {name!r} a second time, expected every frame once")
-        names[name] = None
-    if not names:
-        raise ValueError(f"{where}: no frame in it, expected at least one")
-    return tuple(names)
 
 
 def drop_close(points: np.ndarray, sensor: Sensor, reading: CloudReading) -> tuple[np.ndarray, int]:

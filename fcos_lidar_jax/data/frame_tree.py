@@ -1,19 +1,14 @@
 """Static and moving coordinate frames, from ROS's ``/tf_static`` and ``/tf``."""
 
 from collections import defaultdict
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from fcos_lidar_jax.data.drives import PoseTrack
-from fcos_lidar_jax.data.sweeps import find_bad_pose
+from fcos_lidar_jax.data.drives import PoseRow, PoseTrack, make_track
 
 _ODOM = "odom"  # by ROS's REP 105 it never jumps; frames above it may
 _MAX_LISTED = 20  # frames listed in a message
-
-PoseRow = tuple[float, ...]
-"""Quaternion w, x, y, z and translation in metres."""
 
 
 def printable(text: str) -> str:
@@ -24,18 +19,6 @@ def printable(text: str) -> str:
     """
     text = text if text.isprintable() else repr(text)
     return text if len(text) <= 500 else text[:500] + "..."
-
-
-def make_track(times_us: Sequence[int], rows: Sequence[PoseRow], where: str) -> PoseTrack:
-    """A track of poses at increasing times.
-
-    Raises:
-        ValueError: with ``where`` and the number of an invalid pose.
-    """
-    values = np.array(rows, np.float64).reshape(-1, 7)
-    if bad := find_bad_pose(values[:, :4], values[:, 4:]):
-        raise ValueError(f"{where}: pose {bad[0]}: {bad[1]}")
-    return PoseTrack(np.array(times_us, np.int64), values[:, :4], values[:, 4:])
 
 
 class FrameTree:
@@ -112,4 +95,5 @@ class FrameTree:
         """Poses of a frame in its parent; a single pose, valid at all times, if it never changes."""
         known = {0: self._static[edge]} if edge in self._static else self._moving[edge]
         times = sorted(known) if len(set(known.values())) > 1 else [min(known)]
-        return make_track(times, [known[time] for time in times], f"{self._where}: tf of {printable(edge[0])}")
+        where = f"{self._where}: tf of {printable(edge[0])}: pose"
+        return make_track(times, [known[time] for time in times], lambda row: f"{where} {row}")

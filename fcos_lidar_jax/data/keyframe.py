@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.box_geometry import LIMITS, find_bad_box
+from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import read_json
@@ -39,8 +39,7 @@ def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
     except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{file}: a field is missing or of another kind: {error}") from None
     boxes = boxes.reshape(-1, 9)
-    if (bad := find_bad_box(boxes)) is not None:
-        raise ValueError(f"{file}: box {bad[0]} of the ten classes: {bad[1]}")
+    check_boxes(boxes, lambda i: f"{file}: box {i} of the ten classes")
     labels = np.array([NUSCENES_CLASSES.index(b["class"]) for b in rows], np.int32)
     try:
         points = read_points(cloud, sensor)

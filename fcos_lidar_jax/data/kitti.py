@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.box_geometry import count_inside, find_bad_box
+from fcos_lidar_jax.data.box_geometry import check_boxes, count_inside
 from fcos_lidar_jax.data.class_mapping import unknown_name
-from fcos_lidar_jax.data.frame import Frame, FrameSet, distinct_names, drop_close, files_fingerprint
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.data.sweeps import is_rotation
+from fcos_lidar_jax.data.splits import distinct_names
+from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
 CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
@@ -35,7 +36,6 @@ _FIELDS = (
     *("truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
-_LARGEST = float(np.finfo(np.float32).max)
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -95,8 +95,7 @@ class KittiFrames(FrameSet):
         calibration = read_calibration(self._file("calib", name))
         camera_boxes, labels = read_labels(self._file("label_2", name))
         boxes = to_lidar(camera_boxes, calibration["velo_to_rect"])
-        if (bad := find_bad_box(boxes)) is not None:
-            raise ValueError(f"{self._file('calib', name)}: takes box {bad[0]} of the labels far away: {bad[1]}")
+        check_boxes(boxes, lambda i: f"{self._file('calib', name)}: takes box {i} of the labels far away")
         boxes = boxes.astype(np.float32)
         points = read_points(self._file("velodyne", name), self.sensor)
         kept = np.ones(len(points), bool)
@@ -184,20 +183,20 @@ def read_objects(file: Path) -> tuple[list[str], np.ndarray]:
         ValueError: as :func:`read_labels`.
     """
     types, rows, places = [], [], []
-    for where, words in _lines(file):
+    for where, words in read_lines(file):
         if len(words) not in (15, 16):
             raise ValueError(f"{where}: got {len(words)} values, expected 15, or 16 with a score")
         if words[0] not in (*CLASSES, "DontCare"):
             raise ValueError(f"{where}: type: {unknown_name(words[0], CLASSES)}")
-        rows.append([_number(word, f"{where}: {name}") for name, word in zip(_FIELDS, words[1:], strict=False)])
+        named = zip(_FIELDS, words[1:], strict=False)
+        rows.append([read_number(word, f"{where}: {name}") for name, word in named])
         rows[-1] += [np.nan] * (16 - len(words))
         types.append(words[0])
         places.append(where)
     fields = np.array(rows, np.float64).reshape(-1, 15)
     objects = np.flatnonzero(np.array(types, object) != "DontCare")
     boxes = np.pad(fields[objects][:, [10, 11, 12, 9, 8, 7, 13]], ((0, 0), (0, 2)), constant_values=np.nan)
-    if (bad := find_bad_box(boxes)) is not None:
-        raise ValueError(f"{places[objects[bad[0]]]}: {bad[1]}")
+    check_boxes(boxes, lambda i: places[objects[i]])
     return types, fields
 
 
@@ -207,23 +206,10 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
     Raises:
         ValueError: with the file, the matrix, the found and the expected value.
     """
-    matrices = {}
-    for where, words in _lines(file):
-        name = words[0].removesuffix(":")
-        if name not in _SHAPES:
-            continue
-        rows, columns = _SHAPES[name]
-        if len(words) - 1 != rows * columns:
-            raise ValueError(f"{where}: {name}: got {len(words) - 1} numbers, expected {rows * columns}")
-        matrix = np.array([_number(word, f"{where}: {name}") for word in words[1:]]).reshape(rows, columns)
-        if name != "P2" and not is_rotation(matrix[:, :3]):
-            raise ValueError(f"{where}: {name}: got no rotation in its 3x3, expected orthonormal rows")
-        matrices[name] = np.eye(4)
-        matrices[name][:rows, :columns] = matrix
-    for name in _SHAPES:
-        if name not in matrices:
-            raise ValueError(f"{file}: {name}: missing, expected {', '.join(_SHAPES)}")
-    return {"velo_to_rect": matrices["R0_rect"] @ matrices["Tr_velo_to_cam"], "P2": matrices["P2"][:3]}
+    matrices = read_matrices(file, _SHAPES, ("R0_rect", "Tr_velo_to_cam"))
+    to_rect, to_camera = np.eye(4), np.eye(4)
+    to_rect[:3, :3], to_camera[:3] = matrices["R0_rect"], matrices["Tr_velo_to_cam"]
+    return {"velo_to_rect": to_rect @ to_camera, "P2": matrices["P2"]}
 
 
 def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
@@ -231,7 +217,7 @@ def _read_split(root: Path, split: str, clouds: set[str]) -> tuple[str, ...]:
     if split not in splits:
         raise ValueError(f"{root / 'ImageSets'}: split: {unknown_name(split, sorted(splits))}")
     file = root / "ImageSets" / f"{split}.txt"
-    return distinct_names(((where, " ".join(words)) for where, words in _lines(file)), clouds, str(file))
+    return distinct_names(((where, " ".join(words)) for where, words in read_lines(file)), clouds, str(file))
 
 
 def _stems(folder: Path, ending: str) -> set[str]:
@@ -241,24 +227,3 @@ def _stems(folder: Path, ending: str) -> set[str]:
     if not stems:
         raise ValueError(f"{folder}: no {ending} file in it, expected at least one")
     return stems
-
-
-def _lines(file: Path) -> list[tuple[str, list[str]]]:
-    """The place of each line, for messages, and its words; blank lines are skipped."""
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{file}: got {error.reason} at byte {error.start}, expected text") from None
-    return [(f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
-
-
-def _number(word: str, where: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = np.nan
-    if not abs(value) <= _LARGEST:
-        raise ValueError(f"{where}: got {word!r}, expected a finite number")
-    return value

@@ -1,9 +1,10 @@
 """Safe parsing of ``.npy`` and ``.npz`` files: sizes are Python integers and checked before any allocation."""
 
+import contextlib
 import io
 import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -55,7 +56,8 @@ def _read_header(content: bytes, max_rows: int | None) -> tuple[tuple[int, ...],
 
 def npz_names(content: bytes) -> list[str]:
     """Names of the arrays in an ``.npz`` file; ValueError if it is damaged."""
-    return list(_members(content))
+    with _opened(content) as archive:
+        return [_name(member) for member in archive.infolist()]
 
 
 def parse_npz(
@@ -72,30 +74,35 @@ def parse_npz(
     Raises:
         ValueError: damaged, an array is missing or too large, or an error of :func:`parse_npy`.
     """
-    members, arrays = _members(content), {}
-    for name in names:
-        if name not in members:
-            raise ValueError(f"got arrays {', '.join(members) or 'none'}, expected {name}")
-        member = members[name]
-        if member.file_size > max_bytes:
-            raise ValueError(f"got {member.file_size} bytes unpacked, expected at most {max_bytes}")
-        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError("got another compression, expected none or deflate")
-        try:
-            with zipfile.ZipFile(io.BytesIO(content)) as archive, archive.open(member) as stream:
-                head = stream.read(_HEADER_BYTES)
-                _read_header(head, max_rows)  # before the rest is unpacked
-                # Limited, since an archive may unpack to more than it says.
-                unpacked = head + stream.read(max(member.file_size + 1 - len(head), 0))
-        except Exception as error:  # damaged archives raise arbitrary exceptions
-            raise ValueError(" ".join(str(error).split())) from None
-        arrays[name] = parse_npy(unpacked, max_rows=max_rows)
-    return arrays
+    with _opened(content) as archive:
+        members, arrays = {_name(member): member for member in archive.infolist()}, {}
+        for name in names:
+            if name not in members:
+                raise ValueError(f"got arrays {', '.join(members) or 'none'}, expected {name}")
+            arrays[name] = parse_npy(_unpack(archive, members[name], max_rows, max_bytes), max_rows=max_rows)
+        return arrays
 
 
-def _members(content: bytes) -> dict[str, zipfile.ZipInfo]:
+def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, max_rows: int | None, max_bytes: int) -> bytes:
+    if member.file_size > max_bytes:
+        raise ValueError(f"got {member.file_size} bytes unpacked, expected at most {max_bytes}")
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("got another compression, expected none or deflate")
+    with archive.open(member) as stream:
+        head = stream.read(_HEADER_BYTES)
+        _read_header(head, max_rows)  # before the rest is unpacked
+        # Limited, since an archive may unpack to more than it says.
+        return head + stream.read(max(member.file_size + 1 - len(head), 0))
+
+
+def _name(member: zipfile.ZipInfo) -> str:
+    return member.filename.removesuffix(".npy")
+
+
+@contextlib.contextmanager
+def _opened(content: bytes) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            yield archive
     except Exception as error:  # damaged archives raise arbitrary exceptions
         raise ValueError(" ".join(str(error).split())) from None

@@ -2,12 +2,13 @@
 
 import dataclasses
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
-COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "time_lag")}
-COLUMNS["intensity"] = ("intensity", "reflectivity")
-COLUMNS["laser"] = ("laser_number", "laser", "ring", "line", "channel")
+_COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "time_lag")}
+_COLUMNS["intensity"] = ("intensity", "reflectivity")
+_COLUMNS["laser"] = ("laser_number", "laser", "ring", "line", "channel")
 """Column -> its field names in various drivers, the most specific first. Other fields are skipped."""
 _KINDS = {"F": ("f", "248"), "I": ("i", "1248"), "U": ("u", "1248")}
 """TYPE -> NumPy's type letter and the allowed sizes."""
@@ -47,16 +48,22 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
     form = " ".join(header["DATA"]).lower()
     if form not in _FORMS:
         raise ValueError(f"DATA: got {form!r}, expected {', '.join(_FORMS)}")
-    places: dict[str, int] = {}
-    names = [field.name for field in fields]
-    for column, aliases in COLUMNS.items():
-        alias = next((a for a in aliases if a in names), None)
-        if alias is not None:
-            places[column] = names.index(alias)
-            if fields[places[column]].count != 1:
-                raise ValueError(f"COUNT: got {fields[places[column]].count} for field {alias}, expected 1")
+    places = find_columns([field.name for field in fields])
+    for field in (fields[place] for place in places.values()):
+        if field.count != 1:
+            raise ValueError(f"COUNT: got {field.count} for field {field.name}, expected 1")
     columns = _FORMS[form](body, fields, number, list(places.values()))
     return dict(zip(places, columns, strict=True))
+
+
+def find_columns(names: Sequence[str]) -> dict[str, int]:
+    """Column -> index of the first field with its most specific name; columns without a field are left out.
+
+    >>> find_columns(["x", "y", "z", "t", "line", "ring"])
+    {'x': 0, 'y': 1, 'z': 2, 'laser': 5}
+    """
+    found = {column: next((a for a in aliases if a in names), None) for column, aliases in _COLUMNS.items()}
+    return {column: names.index(alias) for column, alias in found.items() if alias is not None}
 
 
 def _read_header(content: bytes) -> tuple[dict[str, list[str]], memoryview]:

@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.pcd import COLUMNS
+from fcos_lidar_jax.data.pcd import find_columns
 from fcos_lidar_jax.data.point_files import assemble_points
 from fcos_lidar_jax.sensors import Sensor
 
-_COLUMNS = {column: names for column, names in COLUMNS.items() if column != "time_lag"}
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Datatype of a field -> NumPy's type."""
 
@@ -47,14 +46,14 @@ def parse_point_cloud2(cloud: Any, where: str, sensor: Sensor, *, max_points: in
 def _find_columns(cloud: Any, where: str) -> list[tuple[str, np.dtype, int]]:
     """The message's columns, with type and offset within a point."""
     columns, names = [], [field.name for field in cloud.fields]
-    for column, aliases in _COLUMNS.items():
-        name = next((alias for alias in aliases if alias in names), None)
-        if name is None:
-            if column in "xyz":
-                listed = ", ".join(map(repr, names))[:500] or "none"
-                raise ValueError(f"{where}: fields: got {listed}, expected one named {column}")
-            continue
-        field = cloud.fields[names.index(name)]
+    places = find_columns(names)
+    for axis in "xyz":
+        if axis not in places:
+            listed = ", ".join(map(repr, names))[:500] or "none"
+            raise ValueError(f"{where}: fields: got {listed}, expected one named {axis}")
+    places.pop("time_lag", None)  # messages hold single sweeps
+    for column, place in places.items():
+        name, field = names[place], cloud.fields[place]
         if field.datatype not in _NUMBERS or field.count > 1:
             got = f"{field.count} of datatype {field.datatype}"
             raise ValueError(f"{where}: field {name}: got {got}, expected one number of datatype 1 to 8")

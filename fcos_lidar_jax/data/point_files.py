@@ -10,6 +10,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.npy_files import npz_names, parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.sensors import Sensor
 
 ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # supported names, the longest first
@@ -70,10 +71,8 @@ def read_points(
     """
     path = Path(path)
     kind = _kind(path, raw=columns is not None or dtype is not None)
-    if columns is not None and columns not in _RAW_COLUMNS:
-        raise ValueError(f"{path}: columns: got {columns}, expected 3, 4, 5 or 6")
-    if dtype is not None and dtype not in _RAW_DTYPES:
-        raise ValueError(f"{path}: dtype: got {dtype}, expected {', '.join(_RAW_DTYPES)}")
+    check(columns in (None, *_RAW_COLUMNS), f"{path}: columns", columns, "3, 4, 5 or 6")
+    check(dtype in (None, *_RAW_DTYPES), f"{path}: dtype", dtype, ", ".join(_RAW_DTYPES))
     if not kind.endswith(".bin") and (columns is not None or dtype is not None):
         raise ValueError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
     if kind == ".feather":
@@ -117,8 +116,8 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         found = getattr(array, "dtype", type(array).__name__)
         raise ValueError(f"{where}: dtype: got {found}, expected real numbers")
-    if array.ndim != 2 or array.shape[1] not in _RAW_COLUMNS:
-        raise ValueError(f"{where}: shape: got {array.shape}, expected N x 3, 4, 5 or 6")
+    fits = array.ndim == 2 and array.shape[1] in _RAW_COLUMNS
+    check(fits, f"{where}: shape", array.shape, "N x 3, 4, 5 or 6")
     lag = array[:, 4] if array.shape[1] > 4 else np.zeros(0)
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
     if len(lag) and lag.max() > 1 and not (lag % 1).any():
@@ -175,6 +174,14 @@ def _read_columns(pyarrow: Any, content: bytes, kinds: Mapping[str, str], max_ro
             expected = {"fiu": "numbers", "iu": "whole numbers", "O": "texts"}[kind]
             raise ValueError(f"{name}: got {got}, expected {expected}")
     return columns
+
+
+def check_inside(file: Path, folder: Path, where: str) -> None:
+    """Refuse a file that a link or ``..`` leads out of a folder; ``where`` names it in the message."""
+    real = os.path.realpath(file)
+    if not Path(real).is_relative_to(os.path.realpath(folder)):
+        found = f"resolves to {real}, expected a file inside {folder}"
+        raise ValueError(f"{where}: {found}; --follow-links allows links that lead out")
 
 
 def _read_whole(path: Path, max_points: int) -> bytes:

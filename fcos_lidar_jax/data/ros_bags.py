@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.drives import Drive, OutsidePosesError, PoseTrack, read_tum
-from fcos_lidar_jax.data.frame_tree import FrameTree, PoseRow, make_track, printable
+from fcos_lidar_jax.data.drives import Drive, OutsidePosesError, PoseRow, PoseTrack, make_track, read_tum
+from fcos_lidar_jax.data.frame_tree import FrameTree, printable
 from fcos_lidar_jax.data.point_cloud2 import parse_point_cloud2
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import Sweep
@@ -215,9 +215,6 @@ def _read_odometry(bag: _Bag, topic: str) -> tuple[PoseTrack, str]:
     """Poses of a topic and their frame, "" if the messages do not name it."""
     rows, times, child = [], [], None
     for where, message in bag.messages(topic, _POSE):
-        time_us = _time_us(message.header)
-        if times and time_us <= times[-1]:
-            raise ValueError(f"{where}: time: got {time_us} us after {times[-1]} us, expected a later one")
         frame = _frame(getattr(message, "child_frame_id", ""))
         child = frame if child is None else child
         if frame != child:
@@ -225,8 +222,9 @@ def _read_odometry(bag: _Bag, topic: str) -> tuple[PoseTrack, str]:
             raise ValueError(f"{where}: child_frame_id: got {got!r}, expected {expected!r} as before")
         pose = getattr(message.pose, "pose", message.pose)  # poses with covariance are nested
         rows.append(_numbers(pose.orientation, pose.position))
-        times.append(time_us)
-    return make_track(times, rows, f"{bag.path}: {printable(topic)}"), child or ""
+        times.append(_time_us(message.header))
+    place = f"{bag.path}: {printable(topic)}: message"
+    return make_track(times, rows, lambda row: f"{place} {row}"), child or ""
 
 
 def _read_transforms(bag: _Bag) -> FrameTree:

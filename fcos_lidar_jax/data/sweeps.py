@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
+from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.projection import close_to_sensor
 from fcos_lidar_jax.sensors import Sensor
@@ -81,27 +81,18 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
     return np.concatenate(parts), num_close
 
 
-def read_sweeps(
-    path: Path,
-    sensor: Sensor,
-    reading: CloudReading,
-    *,
-    columns: int | None = None,
-    dtype: str | None = None,
-    max_points: int = MAX_POINTS,
-) -> tuple[np.ndarray, int]:
+def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any) -> tuple[np.ndarray, int]:
     """Fuse the sweeps of a JSON list; the result is that of :func:`fuse_sweeps`.
 
     Args:
         path: the JSON file, see :func:`read_list`.
         sensor: sensor that recorded the points.
         reading: maximum number of sweeps, from the current one on, and which points are dropped.
-        columns, dtype, max_points: of raw files, as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
+        layout: options of :func:`~fcos_lidar_jax.data.point_files.read_points`.
 
     Raises:
         ValueError: with the file, the entry, the field, the found and the expected value.
     """
-    layout: dict[str, Any] = {"columns": columns, "dtype": dtype, "max_points": max_points}
 
     def read(index: int, each: ListedSweep) -> Sweep:
         try:
@@ -152,15 +143,20 @@ def is_rotation(matrix: np.ndarray) -> bool:
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(matrix) > 0)
 
 
-def find_bad_pose(rotation: np.ndarray, translation: np.ndarray) -> tuple[int, str] | None:
-    """The row of the first invalid pose and its problem; None if all poses are valid.
+def check_poses(rotation: np.ndarray, translation: np.ndarray, place: Callable[[int], str]) -> None:
+    """Refuse rotations of another length than 1, and translations beyond :data:`FARTHEST_M`.
 
     Args:
         rotation: f64[n, 4], quaternions w, x, y, z.
         translation: f64[n, 3], metres.
+        place: row -> name of a pose, for messages.
 
-    >>> find_bad_pose(np.array([[2.0, 0, 0, 0]]), np.zeros((1, 3)))
-    (0, 'rotation: got [2.0, 0.0, 0.0, 0.0], expected a unit quaternion w, x, y, z')
+    Raises:
+        ValueError: with the first such pose, the field, the found and the expected value.
+
+    >>> check_poses(np.array([[2.0, 0, 0, 0]]), np.zeros((1, 3)), "pose {}".format)
+    Traceback (most recent call last):
+    ValueError: pose 0: rotation: got [2.0, 0.0, 0.0, 0.0], expected a unit quaternion w, x, y, z
     """
     near = (np.abs(translation) <= FARTHEST_M).all(axis=1)
     with np.errstate(over="ignore"):  # lengths may overflow
@@ -171,8 +167,7 @@ def find_bad_pose(rotation: np.ndarray, translation: np.ndarray) -> tuple[int, s
     ):
         if not good.all():
             row = int(np.argmin(good))
-            return row, f"{name}: got {values[row].tolist()}, expected {expected}"
-    return None
+            raise ValueError(f"{place(row)}: {name}: got {values[row].tolist()}, expected {expected}")
 
 
 def about_z(yaw_rad: float) -> np.ndarray:

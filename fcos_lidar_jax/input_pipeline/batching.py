@@ -5,7 +5,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from fcos_lidar_jax.data.box_geometry import find_bad_box
 from fcos_lidar_jax.data.cloud_policy import usable_rows, write_points
 from fcos_lidar_jax.data.frame import Frame, FrameSet
 from fcos_lidar_jax.types import Batch
@@ -86,14 +85,13 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     return batch
 
 
-def check_boxes(boxes: np.ndarray, name: str) -> None:
-    """Refuse implausible boxes f32[m, 9] of a frame, since a single one would make all weights NaN.
+def spread_indices(size: int, number: int) -> list[int]:
+    """At most ``number`` indices, spread evenly over a sequence of a given size.
 
-    Raises:
-        ValueError: with the frame and the first such box; NaN velocities are allowed and mean unknown.
+    >>> spread_indices(9, 3), spread_indices(2, 3), spread_indices(0, 3)
+    ([0, 4, 8], [0, 1], [])
     """
-    if (bad := find_bad_box(boxes)) is not None:
-        raise ValueError(f"frame {name!r}: box {bad[0]}: {bad[1]}")
+    return sorted({round(i) for i in np.linspace(0, size - 1, number).tolist()}) if size else []
 
 
 def check_counts(frames: FrameSet) -> None:
@@ -104,12 +102,12 @@ def check_counts(frames: FrameSet) -> None:
     Raises:
         ValueError: with the first frame that has a box.
     """
-    empty, last = None, max(len(frames) - 1, 0)
-    for index in np.unique(np.linspace(0, last, _NUM_INSPECTED).round().astype(int))[: len(frames)]:
-        frame = frames.frame(int(index))
+    empty = None
+    for index in spread_indices(len(frames), _NUM_INSPECTED):
+        frame = frames.frame(index)
         if (frame.num_points >= 1).any():
             return
-        empty = frames.name(int(index)) if empty is None and len(frame.boxes) else empty
+        empty = frames.name(index) if empty is None and len(frame.boxes) else empty
     if empty is not None:
         raise ValueError(
             f"frame {empty!r}: box 0: got 0 points, like all boxes of {min(_NUM_INSPECTED, len(frames))} frames, "

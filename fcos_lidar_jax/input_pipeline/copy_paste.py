@@ -8,6 +8,7 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.box_geometry import footprints_overlap, points_in_boxes
 from fcos_lidar_jax.data.class_mapping import map_labels
 from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 
 MakePaste = Callable[[Frame, np.random.Generator], tuple[Frame, np.ndarray]]
@@ -35,10 +36,8 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
     """
     assert config.copy_paste is not None
     targets, min_points, manifest = config.paste_targets, config.copy_paste.min_points, objects.manifest
-    if min_points < manifest.min_points:
-        raise ValueError(
-            f"copy_paste.min_points: got {min_points}, expected at least the database's {manifest.min_points}"
-        )
+    expected = f"at least the database's {manifest.min_points}"
+    check(min_points >= manifest.min_points, "copy_paste.min_points", min_points, expected)
     of_class = map_labels(manifest.classes, config.classes)
     if (of_class < 0).all():
         got, expected = ", ".join(manifest.classes), ", ".join(config.classes)

@@ -21,12 +21,12 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.box_geometry import points_in_boxes
+from fcos_lidar_jax.data.box_geometry import check_boxes, points_in_boxes
 from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.npy_files import parse_npz
-from fcos_lidar_jax.files import atomic_write, checksum
-from fcos_lidar_jax.input_pipeline.batching import check_boxes
+from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.files import atomic_write, checksum, read_json
 from fcos_lidar_jax.workers import end_with_parent
 
 MAX_SWEEPS = 20  # number of sweeps for which an object's points are counted
@@ -46,10 +46,6 @@ _ROW = np.dtype(
 )
 """One object in a shard's table."""
 _BLOCK = 100  # frames per shard if the data have no scenes
-
-
-class DatabaseError(ValueError):
-    """An unusable database; the message names the file, the found and the expected value."""
 
 
 class Shard(msgspec.Struct, forbid_unknown_fields=True):
@@ -103,8 +99,7 @@ class GroundTruthDatabase:
 
     def num_points(self, num_sweeps: int) -> np.ndarray:
         """i32[n]: points of every object in the newest sweeps (at most :data:`MAX_SWEEPS`) of its frame."""
-        if not 1 <= num_sweeps <= MAX_SWEEPS:
-            raise ValueError(f"num_sweeps: got {num_sweeps}, expected 1 to {MAX_SWEEPS} for copy-paste")
+        check(1 <= num_sweeps <= MAX_SWEEPS, "num_sweeps", num_sweeps, f"1 to {MAX_SWEEPS} for copy-paste")
         return self.table["newest"][:, num_sweeps - 1]
 
     def points(self, index: int) -> np.ndarray:
@@ -113,16 +108,14 @@ class GroundTruthDatabase:
         Opens the file for each object instead of mapping it: a thousand maps would exhaust a process's open files.
 
         Raises:
-            DatabaseError: the points were altered.
+            ValueError: the points were altered.
         """
         row, columns = self.table[index], self.manifest.columns
         file, _ = _files(self.folder, self.manifest.shards[self.shard[index]].name)
         start, count = int(row["start"]) * columns, int(row["count"]) * columns
         values = np.fromfile(file, "<f4", count=count, offset=4 * start)
         if zlib.crc32(values.data) != row["crc32"]:
-            raise DatabaseError(
-                f"{file}: object {index}: checksum differs, expected the bytes that were written; build it anew"
-            )
+            raise ValueError(f"{file}: object {index}: checksum differs from the table's; build it anew")
         return values.reshape(-1, columns)
 
 
@@ -134,28 +127,26 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
         fingerprint: expected fingerprint of the source frames; None accepts any.
 
     Raises:
-        DatabaseError: missing, unfinished, altered, truncated, or of another format version or other data.
+        ValueError: missing, unfinished, altered, truncated, or of another format version or other data.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
     file = folder / _MANIFEST
-    if fingerprint is not None and manifest.source != fingerprint:
-        found = f"got {manifest.source!r}, expected {fingerprint!r}"
-        raise DatabaseError(f"{file}: source: {found}: built from other data, build it anew")
+    expected = f"{fingerprint!r}: built from other data, build it anew"
+    check(fingerprint in (None, manifest.source), f"{file}: source", manifest.source, expected)
     tables = []
     for entry in manifest.shards:
         table = _read_shard(folder, entry.name, manifest.columns, expected=entry.table_blake2b)
         if (len(table.rows), table.num_points) != (entry.objects, entry.points):
-            raise DatabaseError(
+            raise ValueError(
                 f"{file}: {entry.name}: got {entry.objects} objects of {entry.points} points, "
                 f"expected {len(table.rows)} of {table.num_points} as in its table; build it anew"
             )
         tables.append(table.rows)
     rows = np.concatenate([np.zeros(0, _ROW), *tables])
     if len(manifest.classes) <= rows["label"].max(initial=-1):
-        raise DatabaseError(
-            f"{file}: classes: got {manifest.classes}, expected at least {rows['label'].max() + 1}; build it anew"
-        )
+        expected = f"at least {rows['label'].max() + 1}; build it anew"
+        raise ValueError(f"{file}: classes: got {manifest.classes}, expected {expected}")
     shard = np.repeat(np.arange(len(tables), dtype=np.int32), [len(table) for table in tables])
     return GroundTruthDatabase(folder, manifest, rows, shard)
 
@@ -168,30 +159,21 @@ def cut_reading(num_sweeps: int) -> CloudReading:
 def objects_folder(index: Path, split: str | None) -> Path:
     """The database folder of a split; splits are separate, so that no validation object enters the training."""
     name = split or "all_frames"
-    if name in (".", "..") or "/" in name or "\0" in name:
-        raise ValueError(f"split: got {name!r}, expected a name that a folder can have")
+    check(name not in (".", "..") and not set("/\0") & set(name), "split", name, "a name that a folder can have")
     return index / "objects" / name
 
 
 def read_manifest(folder: Path) -> Manifest:
     """Read a finished database's manifest; errors as in :func:`open_database`."""
     file = folder / _MANIFEST
-    if not file.is_file():
-        raise DatabaseError(f"{file}: no such file, expected a finished ground-truth database")
-    data = _read(file)
-    try:
-        header = msgspec.json.decode(data, type=_Header)
-        if (header.format, header.version) != (_FORMAT, _VERSION):
-            raise DatabaseError(
-                f"{file}: got {header.format!r} version {header.version}, expected {_FORMAT!r} version "
-                f"{_VERSION}; build it anew: fcos-lidar prepare"
-            )
-        manifest = msgspec.json.decode(data, type=Manifest)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise DatabaseError(f"{file}: {error}") from None
+    header = read_json(file, _Header, what="a finished ground-truth database")
+    if (header.format, header.version) != (_FORMAT, _VERSION):
+        found = f"got {header.format!r} version {header.version}, expected {_FORMAT!r} version {_VERSION}"
+        raise ValueError(f"{file}: {found}; build it anew: fcos-lidar prepare")
+    manifest = read_json(file, Manifest)
     for shard in manifest.shards:
-        if "/" in shard.name or "\0" in shard.name:  # which would lead elsewhere
-            raise DatabaseError(f"{file}: shards: name: got {shard.name!r}, expected one that a file can have")
+        leads_elsewhere = set("/\0") & set(shard.name)
+        check(not leads_elsewhere, f"{file}: shards: name", shard.name, "one that a file can have")
     return manifest
 
 
@@ -225,8 +207,7 @@ def prepare_database(
         OSError: an error of the file system, or a worker died.
     """
     folder = Path(folder)
-    if workers < 1:
-        raise ValueError(f"workers: got {workers}, expected at least 1")
+    check(workers >= 1, "workers", workers, "at least 1")
     shards, source, columns = shards_by_scene(frames), frames.fingerprint(), frames.sensor.point_columns
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.iterdir():  # partial files of a killed run, and shards of scenes that are gone
@@ -294,7 +275,7 @@ def _finished(job: _Job) -> bool:
     """Whether an earlier run completed the shard, including every point."""
     try:
         table = _read_shard(job.folder, job.name, job.columns)
-    except DatabaseError:
+    except ValueError:
         return False
     if table.recipe != job.recipe:
         return False
@@ -311,9 +292,9 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     start = 0
     for index in job.indices:
         frame = frames.frame(index)
-        if (columns := frame.points.shape[1]) != job.columns:
-            raise ValueError(f"frame {index}: points: got {columns} columns, expected {job.columns} of the sensor")
-        check_boxes(frame.boxes, frames.name(index))
+        columns = frame.points.shape[1]
+        check(columns == job.columns, f"frame {index}: point columns", columns, f"{job.columns} of the sensor")
+        check_boxes(frame.boxes, lambda box, index=index: f"frame {frames.name(index)!r}: box {box}")
         cloud = frame.points[usable_rows(frame.points)]
         lags = np.unique(np.append(cloud[:, 4], np.float32(0)))[:MAX_SWEEPS]
         for box, label, inside in zip(frame.boxes, frame.labels, points_in_boxes(cloud, frame.boxes), strict=True):
@@ -369,32 +350,28 @@ def _work(job: _Job) -> int:
 def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None = None) -> _Table:
     """Read and check a shard's table and the size of its points; ``expected`` is the table's checksum."""
     points_file, file = _files(folder, name)
-    data = _read(file)
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{file}: {error.strerror}, expected a part of a ground-truth database") from None
     digest = checksum(data)
     if expected is not None and digest != expected:
-        raise DatabaseError(f"{file}: checksum differs from the manifest's; build it anew")
+        raise ValueError(f"{file}: checksum differs from the manifest's; build it anew")
     try:
         arrays = parse_npz(data, ["rows", "recipe"])
         rows, recipe = arrays["rows"], str(arrays["recipe"])
     except ValueError as error:
-        raise DatabaseError(f"{file}: not a table of objects: {error}") from None
+        raise ValueError(f"{file}: not a table of objects: {error}") from None
     if rows.dtype != _ROW or rows.ndim != 1:
-        raise DatabaseError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; build it anew")
+        raise ValueError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; build it anew")
     ends = rows["count"].cumsum(dtype=np.int64)
     newest = rows["newest"]
     placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)
     if not (placed & (newest >= 0).all(axis=1) & (newest <= rows["count"][:, None]).all(axis=1)).all():
-        raise DatabaseError(f"{file}: got objects with points outside the shard; build it anew")
+        raise ValueError(f"{file}: got objects with points outside the shard; build it anew")
     table = _Table(rows, recipe, digest, int(ends[-1]) if len(ends) else 0)
     size = 4 * columns * table.num_points
     found = f"{points_file.stat().st_size} bytes" if points_file.is_file() else "no file"
     if found != f"{size} bytes":
-        raise DatabaseError(f"{points_file}: got {found}, expected {size} bytes of points; build it anew")
+        raise ValueError(f"{points_file}: got {found}, expected {size} bytes of points; build it anew")
     return table
-
-
-def _read(file: Path) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise DatabaseError(f"{file}: {error.strerror}, expected a part of a ground-truth database") from None

@@ -20,9 +20,11 @@ import jax
 import numpy as np
 
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.box_geometry import check_boxes
 from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.input_pipeline.batching import check_boxes, empty_batch, fill_row
+from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row, spread_indices
 from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack, pack_row
@@ -143,7 +145,7 @@ class _BatchOf:
     def _fill(self, batch: Batch, row: int, step: int, position: int) -> dict[str, int]:
         index, num_pasted = self.order[position], 0
         frame = self.frames.frame(index)
-        check_boxes(frame.boxes, self.frames.name(index))
+        check_boxes(frame.boxes, lambda box: f"frame {self.frames.name(index)!r}: box {box}")
         seen = frame.num_points >= 1
         boxes = {field: getattr(frame, field)[seen] for field in ("boxes", "labels", "num_points")}
         parts, removed = [dataclasses.replace(frame, **boxes)], np.zeros(0, np.int64)
@@ -216,8 +218,7 @@ def make_batches(
     import grain
     from absl import flags
 
-    if not 0 <= first_step <= num_steps:
-        raise ValueError(f"first_step: got {first_step}, expected 0 to {num_steps}")
+    check(0 <= first_step <= num_steps, "first_step", first_step, f"0 to {num_steps}")
     threads = default_threads(workers) if threads is None else threads
     size = config.optimizer.batch_size
     if not 0 <= process_index < num_processes or size % num_processes:
@@ -276,26 +277,15 @@ def packing_for(frames: FrameSet, config: Config) -> Packing:
     >>> packing_for(SimulatedFrames(TINY, 3), QUICKSTART).num_lags > 0
     True
     """
-    indices = np.unique(np.linspace(0, len(frames) - 1, _NUM_INSPECTED).round().astype(int))
-    clouds = (frames.frame(int(index)).points for index in indices)
+    clouds = (frames.frame(index).points for index in spread_indices(len(frames), _NUM_INSPECTED))
     usable = (points[usable_rows(points)] for points in clouds)
     return choose_packing(usable, num_sweeps=config.num_sweeps, num_pasted=sum(config.paste_targets))
 
 
-def check_loader_options(
-    config: Config,
-    objects: GroundTruthDatabase | None,
-    *,
-    threads: int | None,
-    workers: int,
-    num_processes: int = 1,
-) -> None:
+def check_loader_options(config: Config, *, threads: int | None, workers: int, num_processes: int = 1) -> None:
     """Check the options of :func:`make_batches` before a run begins."""
     for name, value in (("threads", threads), ("workers", workers)):
-        if value is not None and value < 0:
-            raise ValueError(f"{name}: got {value}, expected at least 0")
-    if config.copy_paste is not None and objects is None:
-        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
+        check(value is None or value >= 0, name, value, "at least 0")
     if workers:
         _check_shared_memory(config, workers, num_processes)
 

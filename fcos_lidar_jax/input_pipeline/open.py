@@ -8,11 +8,13 @@ from typing import Any, Literal
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes, unknown_name
-from fcos_lidar_jax.data.folder import FolderFrames, find_folder_splits
+from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.kitti import KittiFrames
+from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
-from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL, own_splits
+from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
+from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.simulation.frame_set import SIMULATED_SPLITS, simulated_split
 
@@ -28,7 +30,7 @@ class Reader:
         marks: glob patterns; a folder that matches one has this format. ``()``: the frames are not on disk.
         sensor: default sensor; None if the data name it.
         splits: ``(data set, file of own splits) -> names of the splits``.
-        open: ``(data set, split, sensor, reading, **options) -> frames``.
+        open: ``(data set, *, split, sensor, reading, **options) -> frames``.
         options: further options of :func:`open_frames` that this format takes.
     """
 
@@ -46,7 +48,7 @@ READERS = (
         ("*/sample.json",),
         NUSCENES_HDL32E,
         lambda data, file: list(own_splits(data.root / data.version, file) or OFFICIAL),
-        lambda data, *how, **options: open_keyframes(data.root, data.version, *how, **options),
+        lambda data, **how: open_keyframes(data.root, data.version, **how),
         ("version", "index", "splits", "allow_missing_sweeps", "follow_links"),
     ),
     Reader(
@@ -54,23 +56,21 @@ READERS = (
         ("training/velodyne",),
         KITTI_HDL64E,
         lambda data, _: sorted(file.stem for file in (data.root / "ImageSets").glob("*.txt")),
-        lambda data, split, sensor, reading: KittiFrames(data.root, split, sensor=sensor, reading=reading),
+        lambda data, **how: KittiFrames(data.root, **how),
     ),
     Reader(
         "argoverse2",
         ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar"),
         ARGOVERSE2,
         lambda data, _: find_splits(data.root),
-        lambda data, split, sensor, reading: Argoverse2Frames(data.root, split, sensor=sensor, reading=reading),
+        lambda data, **how: Argoverse2Frames(data.root, **how),
     ),
     Reader(
         "folder",
         ("clouds",),
         None,
-        lambda data, file: find_folder_splits(data.root, file),
-        lambda data, split, sensor, reading, **options: FolderFrames(
-            data.root, sensor, split=split, reading=reading, **options
-        ),
+        lambda data, file: list(own_splits(data.root, file)),
+        lambda data, **how: FolderFrames(data.root, **how),
         ("splits", "follow_links"),
     ),
     Reader(
@@ -78,7 +78,7 @@ READERS = (
         (),
         NUSCENES_HDL32E,
         lambda data, _: list(SIMULATED_SPLITS),
-        lambda data, split, sensor, reading: simulated_split(split or "train", sensor, reading),
+        lambda data, split, **how: simulated_split(split or "train", **how),
     ),
 )
 
@@ -103,7 +103,7 @@ class DataSet:
     @property
     def index(self) -> Path:
         """The default folder of ``prepare``'s output."""
-        return self.root / ".fcos_lidar" / self.version
+        return default_index(self.root, self.version)
 
 
 def find_data_set(root: str | Path | None, format: str | None = None, version: str | None = None) -> DataSet:
@@ -117,20 +117,20 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
     Raises:
         ValueError: no or several formats or versions match; the message names the folder and the patterns.
     """
-    if format is not None and format not in (names := [reader.name for reader in READERS]):
-        raise ValueError(f"format: {unknown_name(format, names)}")
-    readers = [reader for reader in READERS if reader.name == format]
-    if readers and not readers[0].marks:
+    readers: dict[str, Reader] = {reader.name: reader for reader in READERS}
+    if format is not None and format not in readers:
+        raise ValueError(f"format: {unknown_name(format, readers)}")
+    reader = readers[format] if format else None
+    if reader is not None and not reader.marks:
         if root is not None:
             raise ValueError(f"data root: got {root}, expected none for {format} frames")
-        data = DataSet(Path(readers[0].name), readers[0])
+        data = DataSet(Path(reader.name), reader)
+    elif root is None:
+        raise ValueError("data root: missing, expected the folder of a data set")
+    elif not Path(root).is_dir():
+        raise ValueError(f"{root}: no such folder, expected a data set")
     else:
-        if root is None:
-            raise ValueError("data root: missing, expected the folder of a data set")
-        root = Path(root)
-        if not root.is_dir():
-            raise ValueError(f"{root}: no such folder, expected a data set")
-        data = DataSet(root, readers[0] if readers else _recognise(root))
+        data = DataSet(Path(root), reader or _recognise(Path(root)))
     if "version" not in data.reader.options:
         _refuse(data, version=version)
         return data
@@ -241,7 +241,7 @@ def open_frames(
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
-    frames = data.reader.open(data, split, sensor or data.reader.sensor, reading, **options)
+    frames = data.reader.open(data, split=split, sensor=sensor or data.reader.sensor, reading=reading, **options)
     if class_map is None:
         return frames
     return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)

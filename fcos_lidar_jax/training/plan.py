@@ -123,7 +123,9 @@ def plan_run(
         )
     check_counts(frames)
     check_batch_size(config.optimizer.batch_size, mesh)
-    check_loader_options(config, objects, threads=threads, workers=workers, num_processes=jax.process_count())
+    check_loader_options(config, threads=threads, workers=workers, num_processes=jax.process_count())
+    if config.copy_paste is not None and objects is None:
+        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
     if config.augment is not None:
         check_augmentation(config.augment, frames.sensor)
     detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, steps)

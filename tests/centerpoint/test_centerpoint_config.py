@@ -42,7 +42,7 @@ def test_a_file_says_by_its_fields_which_detector_it_is_of():
     assert record["pillars"]["pillar_m"] == 0.2
     assert type(config_from_json(record)) is CenterPointConfig
     assert config_from_json({**config_to_json(NUSCENES), "pillars": None}) == NUSCENES
-    with pytest.raises(ValueError, match=r"run\.pillars\.range_m: missing"):
+    with pytest.raises(ValueError, match=r"run: pillars\.range_m: missing"):
         config_from_json({**record, "pillars": {"pillar_m": 0.2}}, "run")
 
 

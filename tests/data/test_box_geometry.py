@@ -1,14 +1,40 @@
-"""Boxes in the ground plane against polygons and the plain test of every point."""
+"""Boxes: which are plausible, overlap against polygons, and points inside against a test of every pair."""
 
 import numpy as np
 import oracles
 import pytest
+from refusal import refused
 from shapely import area, intersection
 
-from fcos_lidar_jax.data.box_geometry import footprints_overlap, points_in_boxes
+from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes, footprints_overlap, points_in_boxes
+
+CAR = dict(zip(LIMITS, (8, 1, -1, 4, 2, 1.5, 0.25, 1.5, -0.5), strict=True))
 
 
-def test_overlap_equals_polygons():
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"yaw": np.nan}, "yaw: got nan, expected a finite number"),
+        ({"x": np.inf}, "x: got inf, expected a finite number"),
+        ({"vx": np.inf}, "vx: got inf, expected a finite number"),
+        ({"vy": np.nan}, "vy: got nan, expected a finite number"),  # a velocity is unknown as a whole
+        ({"z": 1e30}, "z: got 1e+30, expected at most 10000"),
+        ({"l": 501}, "l: got 501, expected at most 500"),
+        ({"vx": -501}, "vx: got -501, expected at most 500"),
+        ({"w": -2}, "w: got -2, expected a size above 0 m"),
+        ({"h": 0}, "h: got 0, expected a size above 0 m"),
+        ({"h": 1e-60}, "h: got 1e-60, expected a size above 0 m"),  # zero as float32
+    ],
+)
+def test_an_implausible_box_is_refused_with_its_row_and_field(changes, message):
+    unknown_velocity = CAR | {"vx": np.nan, "vy": np.nan}
+    boxes = np.array([list(box.values()) for box in (unknown_velocity, CAR | changes, CAR | changes)])
+    check_boxes(boxes[:1], "box {}".format)
+    with refused(f"box 1: {message}"):
+        check_boxes(boxes, "box {}".format)
+
+
+def test_overlap_equals_that_of_polygons():
     rng = np.random.default_rng(0)
     a, b = oracles.random_boxes(rng, 60, 6), oracles.random_boxes(rng, 80, 6)
     found = footprints_overlap(a[:, None], b)
@@ -28,14 +54,14 @@ def test_overlap_equals_polygons():
         ([2 + np.sqrt(0.5) - 1e-6, 0, 0, 1, 1, 1, np.pi / 4], True),
     ],
 )
-def test_touching_is_no_overlap(other, expected):
+def test_touching_boxes_do_not_overlap(other, expected):
     box = np.array([[0, 0, 0, 4, 2, 1, 0.0]])
     assert footprints_overlap(box, np.array([other])).item() is expected
     assert footprints_overlap(np.array([other]), box).item() is expected
 
 
 @pytest.mark.parametrize("reach_m", [6, 40, 4000])
-def test_points_in_boxes_equal_the_test_of_every_pair(reach_m):
+def test_points_in_boxes_equal_a_test_of_every_pair(reach_m):
     rng = np.random.default_rng(1)
     boxes = oracles.random_boxes(rng, 25, reach_m)
     points = rng.uniform(-reach_m, reach_m, (3000, 5)).astype(np.float32)
@@ -47,7 +73,7 @@ def test_points_in_boxes_equal_the_test_of_every_pair(reach_m):
     assert sum(map(len, found)) > 300
 
 
-def test_points_on_the_boundary_are_inside_and_nothing_gives_nothing():
+def test_points_on_the_boundary_are_inside_and_inputs_may_be_empty():
     box = np.array([[10, -3, 1, 4, 2, 2, 0.0]])
     points = np.array([[12, -2, 2], [8, -4, 0], [12, -4, 2], [10, -3, 2], [12.001, -3, 1]], np.float32)
     assert points_in_boxes(points, box)[0].tolist() == [0, 1, 2, 3]

@@ -1,4 +1,4 @@
-"""Kept frames: made once, the same as fresh ones, made anew where damaged, never another set's."""
+"""The cache of frames: made once, bit-identical, made anew if damaged, refused for other frame sets."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ FRAMES = SimulatedFrames(TINY, 6, reading=CloudReading(2), fast_traffic=True)
 
 @dataclasses.dataclass(frozen=True)
 class Toy(ToyFrames):
-    """Small frames; a line in a file for every one that is made."""
+    """Small frames that log their indices to a file."""
 
     size: int = 20
     log: str = ""
@@ -51,7 +51,7 @@ def assert_same(a: Frame, b: Frame) -> None:
         np.testing.assert_array_equal(x, y)
 
 
-def test_kept_frames_are_the_fresh_ones_bit_by_bit(tmp_path):
+def test_cached_frames_are_bit_identical(tmp_path):
     cached = CachedFrames(FRAMES, tmp_path / "new" / "cache")
     for index in (4, 0) * 2:
         assert_same(cached.frame(index), FRAMES.frame(index))
@@ -61,7 +61,7 @@ def test_kept_frames_are_the_fresh_ones_bit_by_bit(tmp_path):
     assert sorted(p.name for p in cached.folder.iterdir()) == ["000000.npz", "000004.npz", "frames.json"]
 
 
-def test_frames_are_made_once_and_only_those_that_are_asked_for(tmp_path, toy):
+def test_only_requested_frames_are_made_and_only_once(tmp_path, toy):
     for _ in range(3):
         cached = CachedFrames(toy, tmp_path / "cache")
         for index in (7, 2, 7):
@@ -70,7 +70,7 @@ def test_frames_are_made_once_and_only_those_that_are_asked_for(tmp_path, toy):
     assert Path(toy.log).read_text().split() == ["7", "2"]
 
 
-def test_every_cut_and_every_damaged_byte_is_noticed(tmp_path, toy, capsys):
+def test_truncated_and_altered_files_are_made_anew(tmp_path, toy, capsys):
     cached, right = CachedFrames(toy, tmp_path / "cache"), toy.frame(5)
     cached.frame(5)
     file = cached.folder / "000005.npz"
@@ -83,7 +83,7 @@ def test_every_cut_and_every_damaged_byte_is_noticed(tmp_path, toy, capsys):
     for content in wrong:
         file.write_bytes(content)
         assert_same(cached.frame(5), right)
-        if warning := capsys.readouterr().err:  # a change that does not matter, in a date say, is no damage
+        if warning := capsys.readouterr().err:  # some bytes do not matter, such as dates
             assert re.fullmatch(rf"warning: {re.escape(str(file))}: damaged \(.*\): made anew\n", warning)
             assert_same(cached.frame(5), right)
             assert capsys.readouterr().err == ""
@@ -92,7 +92,7 @@ def test_every_cut_and_every_damaged_byte_is_noticed(tmp_path, toy, capsys):
     assert not list(cached.folder.glob(".*"))
 
 
-def test_another_sets_folder_is_refused(tmp_path, toy):
+def test_a_folder_of_other_frames_is_refused(tmp_path, toy):
     folder = tmp_path / "cache"
     CachedFrames(FRAMES, folder).frame(0)
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
@@ -109,7 +109,7 @@ def test_another_sets_folder_is_refused(tmp_path, toy):
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
 
 
-def test_folders_that_are_no_cache_are_refused_in_one_line(tmp_path, toy):
+def test_a_folder_that_is_not_a_cache_is_refused(tmp_path, toy):
     folder = tmp_path / "cache"
     CachedFrames(toy, folder).frame(0)
     description = folder / "frames.json"
@@ -131,7 +131,7 @@ def test_folders_that_are_no_cache_are_refused_in_one_line(tmp_path, toy):
         CachedFrames(toy, tmp_path / "file")
 
 
-def test_only_sets_that_can_be_described_are_kept(tmp_path):
+def test_frame_sets_that_json_cannot_describe_are_refused(tmp_path):
     @dataclasses.dataclass(frozen=True)
     class Opaque(Toy):
         source: object = dataclasses.field(default_factory=object)
@@ -147,7 +147,7 @@ def test_only_sets_that_can_be_described_are_kept(tmp_path):
     assert not (tmp_path / "cache").exists()
 
 
-def test_a_frame_that_cannot_be_made_leaves_nothing(tmp_path):
+def test_a_frame_that_cannot_be_made_leaves_no_file(tmp_path):
     class Broken(Toy):
         def frame(self, index: int) -> Frame:
             raise ValueError("no such street")
@@ -164,8 +164,8 @@ def read_all(folder: Path, toy: Toy) -> list[Frame]:
         return list(pool.map(cached.frame, range(20)))
 
 
-def test_threads_and_processes_share_a_folder(tmp_path, toy):
-    """All begin at once with nothing there."""
+def test_threads_and_processes_can_share_a_folder(tmp_path, toy):
+    """All of them begin at the same time with an empty folder."""
     folder = tmp_path / "cache"
     context = multiprocessing.get_context("spawn")
     with context.Pool(2) as pool:

@@ -13,7 +13,7 @@ LABELS = ([0, 2, 1, 2], [3], [])
 
 
 def make(labels=LABELS) -> InMemoryFrames:
-    """Boxes whose first number says of which frame and place they are."""
+    """Boxes whose values identify their frame and row."""
     frames = []
     for i, own in enumerate(labels):
         boxes = np.arange(len(own) * 9, dtype=np.float32).reshape(-1, 9) + 100 * i
@@ -30,11 +30,11 @@ def make(labels=LABELS) -> InMemoryFrames:
         (("pet",), {"dog": "pet", "ant": "insect"}, [-1, -1, -1, 0]),
     ],
 )
-def test_labels_map_by_name(to, class_map, expected):
+def test_labels_are_mapped_by_name(to, class_map, expected):
     assert map_labels(OWN, to, class_map).tolist() == expected
 
 
-def test_boxes_of_other_classes_are_left_out_and_counted():
+def test_boxes_of_other_classes_are_dropped_and_counted():
     mapped = MappedFrames(make(), ("cow", "elk", "ant"))
     assert (mapped.classes, mapped.sensor, len(mapped)) == (("cow", "elk", "ant"), TINY, 3)
     frame = mapped.frame(0)
@@ -46,7 +46,7 @@ def test_boxes_of_other_classes_are_left_out_and_counted():
     assert MappedFrames(make(), ("dog", "cow", "bee", "ant")).left_out() == {}
 
 
-def test_nothing_in_common_and_unknown_names_are_refused():
+def test_disjoint_classes_and_unknown_names_are_refused():
     with refused("have ant, bee, cow, dog, the detector car, bus, expected a name"):
         MappedFrames(make(), ("car", "bus"))
     with refused("expected a name in both"):
@@ -55,7 +55,7 @@ def test_nothing_in_common_and_unknown_names_are_refused():
         map_labels(("ant", "bee"), ("ant",), {"zebra": "ant"})
 
 
-def test_a_fingerprint_tells_mappings_apart_and_stays_without_one():
+def test_the_fingerprint_depends_on_the_mapping_unless_it_changes_nothing():
     frames = make()
     others = [(OWN, {"ant": "bee"}), (OWN, {"ant": None}), (("bee", "ant", "cow", "dog"),), (OWN[:3],)]
     prints = [MappedFrames(frames, *other).fingerprint() for other in [*others, ((*OWN, "elk"),), (OWN,)]]
@@ -64,7 +64,7 @@ def test_a_fingerprint_tells_mappings_apart_and_stays_without_one():
 
 
 class Placed(InMemoryFrames):
-    """Frames that know where, when and of which drive they are."""
+    """Frames with poses, times and scenes."""
 
     def pose(self, index: int) -> np.ndarray:
         return np.eye(4) * index
@@ -76,7 +76,7 @@ class Placed(InMemoryFrames):
         return f"drive {index}"
 
 
-def test_what_frames_know_besides_boxes_stays():
+def test_wrapped_frames_keep_pose_time_scene_and_name():
     placed = Placed(make(([0], [0], [0])).frames, TINY, ("ant",))
     frames = SelectedFrames(MappedFrames(placed, ("bee", "ant")), (2, 0))
     assert (len(frames), frames.classes, frames.sensor) == (2, ("bee", "ant"), TINY)
@@ -89,6 +89,6 @@ def test_what_frames_know_besides_boxes_stays():
     assert (plain.pose(0), plain.time_us(0), plain.scene(0)) == (None, None, "")
 
 
-def test_frames_in_memory_have_the_fingerprint_of_their_content():
+def test_the_fingerprint_of_frames_in_memory_depends_on_their_content():
     prints = [make(labels).fingerprint() for labels in (LABELS, ([0, 2, 1, 2], [3], [1]), LABELS[:2], LABELS)]
     assert (len(set(prints)), prints[-1]) == (3, prints[0])

@@ -1,4 +1,4 @@
-"""The cloud policy: what is removed, counted and truncated, and clouds of another sensor."""
+"""The cloud policy: removal, truncation and counts of points, and warnings about another sensor."""
 
 import dataclasses
 import itertools
@@ -31,14 +31,14 @@ def cloud_of(points, size=200, *, sensor=TINY, remove="all", close_m=1.0, **opti
 
 
 def numbered(lags=LAGS, *, columns=5):
-    """Rows whose x tells their place, in an order in which the sweeps are mixed."""
+    """Rows that are numbered by x, with the sweeps in mixed order."""
     points = np.full((len(lags), columns), 9, np.float32)
     points[:, 0] = 5 + np.arange(len(lags)) / 1000
     points[:, 4] = np.random.default_rng(0).permutation(lags)
     return points
 
 
-def test_rows_that_are_fine_stay_as_they_are():
+def test_valid_rows_stay_unchanged():
     points = numbered()
     cloud = cloud_of(points)
     np.testing.assert_array_equal(cloud.points[:150], points)
@@ -54,7 +54,7 @@ def test_rows_that_are_fine_stay_as_they_are():
         *((3, 1e30, MAX_INTENSITY), (3, -65_536.0, -1.0), (4, 60.1, MAX_TIME_LAG_S), (4, -0.05, 0.0)),
     ],
 )
-def test_rows_that_are_not_finite_or_beyond_physical_limits_are_removed_in_their_places(column, absurd, fine):
+def test_rows_beyond_physical_limits_are_marked_invalid(column, absurd, fine):
     points = numbered()
     points[[3, 77], column], points[4, column] = absurd, fine
     cloud = cloud_of(points)
@@ -66,21 +66,21 @@ def test_rows_that_are_not_finite_or_beyond_physical_limits_are_removed_in_their
     ("mode", "close_m", "removed"),
     [("all", 1.0, [0, 2]), ("all", 1.01, [0, 1, 2]), ("sweeps", 1.0, [2]), ("none", 1.0, [])],
 )
-def test_close_points_are_removed_once_as_configured(mode, close_m, removed):
+def test_close_points_are_removed_as_configured_and_counted_once(mode, close_m, removed):
     points = numbered()
     points[:4, :2] = [[0.5, -0.5], [1.0, 0], [-0.99, 0.99], [0, 0]]
     points[:4, 4] = [0, 0, 0.05, 0.05]
-    points[3, 3] = np.nan  # close, and not finite: counted as that
+    points[3, 3] = np.nan  # close and not finite: counted as not finite
     cloud = cloud_of(points, remove=mode, close_m=close_m)
     assert np.flatnonzero(~cloud.valid[:150]).tolist() == [*removed, 3]
     assert (cloud.num_close, cloud.num_invalid) == (len(removed), 1)
     assert (cloud.num_points, cloud.num_removed) == (150, len(removed) + 1)
-    read = cloud_of(points, remove=mode, close_m=close_m, num_close=11)  # the reader removed its own
+    read = cloud_of(points, remove=mode, close_m=close_m, num_close=11)  # the reader has removed close points
     assert np.flatnonzero(~read.valid[:150]).tolist() == [3]
     assert (read.num_points, read.num_close, read.num_removed) == (161, 11, 12)
 
 
-def test_an_unknown_mode_of_close_points_is_refused():
+def test_an_unknown_way_to_remove_close_points_is_refused():
     with refused("remove_close: got 'some'"):
         CloudReading(3, "some")  # pyright: ignore[reportArgumentType]
 
@@ -96,12 +96,12 @@ def test_the_oldest_sweeps_are_truncated_first(size, kept):
     assert cloud.valid.all()
     assert cloud.num_truncated == 150 - size
     assert tuple(np.count_nonzero(cloud.points[:, 4] == lag) for lag in np.unique(LAGS)) == kept
-    assert (np.diff(cloud.points[:, 0]) > 0).all()  # in their order, none twice
+    assert (np.diff(cloud.points[:, 0]) > 0).all()  # in their order, each once
     assert np.isin(cloud.points[:, 0], points[:, 0]).all()
 
 
-def test_rows_of_the_sweep_at_the_boundary_go_by_lot():
-    """Evenly over the sweep, not its end: a part of the turn would be missing."""
+def test_random_rows_of_the_boundary_sweep_are_truncated():
+    """They are spread over the sweep; otherwise a sector of the scan would be missing."""
     points = numbered(np.zeros(10_000, np.float32))
     first, again = cloud_of(points, 4000), cloud_of(points, 4000)
     np.testing.assert_array_equal(first.points, again.points)
@@ -109,7 +109,7 @@ def test_rows_of_the_sweep_at_the_boundary_go_by_lot():
     assert np.abs(np.bincount(rows // 1000, minlength=10) - 400).max() < 60
 
 
-def test_removed_rows_do_not_take_places_of_others():
+def test_removed_rows_do_not_count_towards_the_limit():
     points = numbered()
     points[:30, 0] = np.nan
     cloud = cloud_of(points, 120)
@@ -119,7 +119,7 @@ def test_removed_rows_do_not_take_places_of_others():
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5, 6])
-def test_missing_columns_are_zero_and_others_are_left_out(columns):
+def test_missing_columns_are_zero_and_surplus_columns_are_dropped(columns):
     cloud = cloud_of(numbered(columns=6)[:, :columns].astype(np.float64))
     assert (cloud.points.shape, cloud.points.dtype) == ((200, 5), np.float32)
     assert cloud.points[:150, 3].any() == (columns > 3)
@@ -131,12 +131,12 @@ def test_missing_columns_are_zero_and_others_are_left_out(columns):
     ("shape", "sensor", "expected"),
     [((4, 2), TINY, "3 to 6"), ((4, 7), TINY, "3 to 6"), ((5,), TINY, "3 to 6"), ((4, 5), ARGOVERSE2, "6")],
 )
-def test_other_columns_are_one_line(shape, sensor, expected):
+def test_a_wrong_number_of_columns_is_refused(shape, sensor, expected):
     with refused(f"points: got shape {shape}, expected [n, {expected}]"):
         cloud_of(np.zeros(shape, np.float32), sensor=sensor)
 
 
-def test_an_empty_cloud_is_one_line_with_what_became_of_its_points():
+def test_a_cloud_without_usable_points_is_refused_with_the_counts():
     points = numbered()
     points[:20, 2], points[20:50, :2] = np.nan, 0
     cloud = cloud_of(points)
@@ -155,14 +155,14 @@ def clouds():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_sensor_knows_its_own_clouds(clouds, name):
+def test_a_sensors_own_clouds_give_no_warning(clouds, name):
     sensor = PRESETS[name]
     assert sensor_mismatch(clouds[name], sensor) is None
     ahead = clouds[name][np.abs(np.arctan2(clouds[name][:, 1], clouds[name][:, 0])) < 0.7]
     assert sensor_mismatch(ahead, sensor) is None  # KITTI's labelled part of the turn
 
 
-def test_older_sweeps_do_not_count():
+def test_the_warning_is_about_the_current_sweep_only():
     points = make_frame(1, TINY, reading=CloudReading(4, "none")).points
     assert sensor_mismatch(points, TINY) is None
     points[:, 4] = 0
@@ -170,7 +170,7 @@ def test_older_sweeps_do_not_count():
 
 
 @pytest.mark.parametrize(("own", "other"), list(itertools.permutations(PRESETS, 2)))
-def test_a_sensor_knows_the_clouds_of_others(clouds, own, other):
+def test_clouds_of_another_sensor_give_a_warning(clouds, own, other):
     points, sensor = clouds[other], PRESETS[own]
     if sensor.row_source == "laser":
         with refused("expected [n, 6]"):
@@ -181,7 +181,7 @@ def test_a_sensor_knows_the_clouds_of_others(clouds, own, other):
     assert "\n" not in (line or "")
 
 
-def test_what_a_mismatch_says(clouds):
+def test_the_warning_describes_the_mismatch(clouds):
     hdl32e = clouds["nuscenes_hdl32e"]
     millimetres = hdl32e * np.array([1000, 1000, 1000, 1, 1], np.float32)
     shares = hdl32e * np.array([1, 1, 1, 1 / 255, 1], np.float32)
@@ -203,13 +203,13 @@ def test_what_a_mismatch_says(clouds):
         assert re.search(finding, sensor_mismatch(points, PRESETS[sensor]) or "")
 
 
-def test_few_points_tell_nothing():
+def test_too_few_points_give_no_warning():
     assert sensor_mismatch(np.ones((400, 5), np.float32) * 9, TINY) is None
     assert sensor_mismatch(np.zeros((0, 3), np.float32), TINY) is None
 
 
 @pytest.mark.real_data
-def test_real_clouds_are_of_their_sensor_alone(real_data):
+def test_real_clouds_fit_their_sensor_only(real_data):
     patterns = ("nuscenes_scene0[01]*/*.pcd.bin", "nuscenes_scene0523/samples/*/*.bin")
     files = [file for pattern in patterns for file in real_data.glob(pattern)]
     assert len(files) == 43

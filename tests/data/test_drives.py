@@ -1,4 +1,4 @@
-"""Drives: poses of lines, and the scenes of nuScenes."""
+"""Drives: clouds with poses from files, and scenes of nuScenes."""
 
 import json
 
@@ -26,7 +26,7 @@ def poses(tmp_path):
     return tmp_path
 
 
-def test_poses_are_interpolated_where_names_are_times(poses):
+def test_poses_are_interpolated_if_file_names_are_times(poses):
     for name in ("0.0", "0.1", "0.4"):
         np.save(poses / "clouds" / f"{name}.npy", CLOUD)
     drive = folder_drive(poses / "clouds", TINY, poses / "poses.txt")
@@ -37,7 +37,7 @@ def test_poses_are_interpolated_where_names_are_times(poses):
         np.testing.assert_allclose(sweep.sensor_to_world[:3, 3], (1 + 2 * share, 0, 0), atol=1e-12)
 
 
-def test_names_that_are_times_are_in_the_order_of_time(poses):
+def test_clouds_named_by_times_are_in_temporal_order(poses):
     (poses / "poses.txt").write_text("9.8 0 0 0 0 0 0 1\n10.2 4 0 0 0 0 0 1\n")
     for name in ("9.9", "10.0", "10.1", "9.8"):
         np.save(poses / "clouds" / f"{name}.npy", CLOUD)
@@ -47,7 +47,7 @@ def test_names_that_are_times_are_in_the_order_of_time(poses):
     np.testing.assert_allclose([sweep.sensor_to_world[0, 3] for sweep in sweeps], [0, 1, 2, 3], atol=1e-12)
 
 
-def test_other_names_have_a_line_each(poses):
+def test_clouds_with_other_names_need_one_pose_each(poses):
     for name in ("b", "a"):
         np.save(poses / "clouds" / f"{name}.npy", CLOUD)
     sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
@@ -58,18 +58,18 @@ def test_other_names_have_a_line_each(poses):
         folder_drive(poses / "clouds", TINY, poses / "poses.txt")
 
 
-def test_names_whose_order_is_not_that_of_their_numbers_get_no_pose_by_it(poses):
+def test_names_that_are_not_sorted_by_their_numbers_are_refused(poses):
     for name in ("sweep_9", "sweep_10"):
         np.save(poses / "clouds" / f"{name}.npy", CLOUD)
     with refused("got sweep_10.npy before sweep_9.npy, expected numbers of one length"):
         folder_drive(poses / "clouds", TINY, poses / "poses.txt")
     (poses / "clouds" / "sweep_9.npy").rename(poses / "clouds" / "sweep_09.npy")
-    np.save(poses / "clouds" / "._sweep_09.npy", CLOUD)  # as macOS leaves them on other file systems
+    np.save(poses / "clouds" / "._sweep_09.npy", CLOUD)  # hidden files of macOS are skipped
     sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
     assert [sweep.name[-6:] for sweep in sweeps] == ["09.npy", "10.npy"]
 
 
-def test_a_cloud_that_is_listed_twice_is_refused(poses):
+def test_a_cloud_listed_twice_is_refused(poses):
     np.save(poses / "clouds" / "a.npy", CLOUD)
     entry = {"file": "clouds/a.npy", "sensor_to_world": np.eye(4).tolist()}
     (poses / "poses.json").write_text(json.dumps([entry | {"timestamp_us": i} for i in range(2)]))
@@ -80,13 +80,13 @@ def test_a_cloud_that_is_listed_twice_is_refused(poses):
 @pytest.mark.parametrize(
     "line", ["x 0 0 0 0 0 0 1", "1 0 0 0 0 0 1", "1 0 0 nan 0 0 0 1", "nan 0 0 0 0 0 0 1", "1e999 0 0 0 0 0 0 1"]
 )
-def test_lines_that_are_no_pose_are_refused(tmp_path, line):
+def test_lines_that_are_not_poses_are_refused(tmp_path, line):
     (tmp_path / "poses.txt").write_text(f"# t\n0 0 0 0 0 0 0 1\n{line}\n")
     with refused("poses.txt: line 3: "):
         read_tum(tmp_path / "poses.txt")
 
 
-def test_a_scene_is_all_its_sweeps_or_its_keyframes(tmp_path):
+def test_a_scene_consists_of_all_its_sweeps_or_its_keyframes(tmp_path):
     data = NuScenes(write(tmp_path, *make_tables()), VERSION)
     sweeps, keyframes = list(data.drive("scene-1")), list(data.drive("scene-1", keyframes=True))
     assert len(sweeps) == KEYFRAMES * BETWEEN
@@ -102,12 +102,12 @@ def test_a_scene_is_all_its_sweeps_or_its_keyframes(tmp_path):
         data.drive("scene-7")
 
 
-def test_the_times_of_keyframes_are_theirs(tmp_path):
+def test_keyframe_times_are_those_of_the_keyframes(tmp_path):
     data = NuScenes(write(tmp_path, *make_tables()), VERSION)
     assert data.keyframe_times_us("scene-1") == {k.time_us for k in data.drive("scene-1", keyframes=True)}
 
 
-def test_a_scene_without_a_file_is_refused(tmp_path):
+def test_a_scene_without_any_file_is_refused(tmp_path):
     root = write(tmp_path, *make_tables())
     for sweep in list(NuScenes(root, VERSION).drive("scene-1")):
         (root / sweep.name).unlink()
@@ -115,7 +115,7 @@ def test_a_scene_without_a_file_is_refused(tmp_path):
         NuScenes(root, VERSION, allow_missing_sweeps=True).drive("scene-1")
 
 
-def test_a_scene_may_lack_sweeps_but_not_keyframes(tmp_path):
+def test_missing_sweeps_are_skipped_if_allowed_but_a_scene_needs_keyframes(tmp_path):
     root = write(tmp_path, *make_tables())
     number = len(list(NuScenes(root, VERSION).drive("scene-1")))
     data = NuScenes(root, VERSION)
@@ -130,8 +130,8 @@ def test_a_scene_may_lack_sweeps_but_not_keyframes(tmp_path):
         NuScenes(root, VERSION).drive("scene-9")
 
 
-def test_rows_beyond_all_numbers_become_infinite_without_a_warning():
-    """They are then removed and counted as other rows that are not finite."""
+def test_overflowing_coordinates_become_infinite_without_a_warning():
+    """The cloud policy then removes and counts them."""
     turned = np.eye(4)
     turned[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
     points = np.full((2, 5), 3e38, np.float32)

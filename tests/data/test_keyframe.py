@@ -1,4 +1,4 @@
-"""Folders of annotated keyframes: points, boxes and counts as they are there, and every mistake in one line."""
+"""Folders of annotated keyframes: points, boxes and counts as in the files; one-line errors."""
 
 import json
 
@@ -12,9 +12,9 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
 
 
-def test_keyframe_folder_gives_points_boxes_and_unknown_velocities(tmp_path):
+def test_a_keyframe_has_points_boxes_and_unknown_velocities(tmp_path):
     points = make_frame(0, NUSCENES_HDL32E).points[:2000]
-    points[:, 4] = np.arange(len(points)) % 32  # nuScenes' files hold the laser there
+    points[:, 4] = np.arange(len(points)) % 32  # the ring, as in files of nuScenes
     points.tofile(tmp_path / "a.pcd.bin")
     box = dict(zip("xyzlwh", range(1, 7), strict=True)) | {"yaw": 0.5, "vx": None, "vy": None, "num_lidar_pts": 9}
     counted = {("num_lidar_pts_at_key_frame" if k == "num_lidar_pts" else k): v for k, v in box.items()}
@@ -37,20 +37,12 @@ def test_keyframe_folder_gives_points_boxes_and_unknown_velocities(tmp_path):
     for text, message in [("{", "not JSON"), ('{"boxes": []}', "'lidar_file'"), ('{"boxes": 3}', "missing or of")]:
         with refused(message):
             read(text)
-    for name, value, message in [
-        ("x", 1e30, "x: got 1e+30, expected at most 10000"),
-        ("h", -2, "h: got -2, expected a size above 0 m"),
-        ("yaw", float("nan"), "yaw: got nan, expected a finite number"),
-        ("vx", float("inf"), "vx: got inf, expected a finite number"),
-        ("vx", 3, "vy: got nan, expected a finite number"),
-        ("z", None, "z: got nan, expected a finite number"),
-    ]:
-        with refused(f"box 1 of the ten classes: {message}"):
-            read(record({**box, "class": "truck"}, {**box, "class": "car", name: value}))
+    with refused("box 1 of the ten classes: z: got nan, expected a finite number"):
+        read(record({**box, "class": "truck"}, {**box, "class": "car", "z": None}))
 
 
 @pytest.mark.real_data
-def test_real_keyframe_has_its_boxes(real_data):
+def test_a_real_keyframe_has_its_boxes(real_data):
     frame = read_keyframe(real_data / "nuscenes_scene0061", NUSCENES_HDL32E)
     assert frame.boxes.shape == (68, 9)
     assert np.isnan(frame.boxes[:, 7]).sum() == 2
@@ -58,8 +50,8 @@ def test_real_keyframe_has_its_boxes(real_data):
 
 
 @pytest.mark.real_data
-def test_a_list_of_real_keyframes_has_their_boxes_and_points(real_data):
-    """Counts with the yaw alone are near those of the full rotation, which are exact."""
+def test_real_keyframes_of_a_list_have_their_boxes_and_points(real_data):
+    """The annotated counts are of boxes with their full rotation, so that a few differ."""
     counts = []
     for number, total in ((0, 23), (1, 55)):
         frame = read_keyframe(real_data / "nuscenes_scene0103", NUSCENES_HDL32E, number)

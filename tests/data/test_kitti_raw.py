@@ -1,4 +1,4 @@
-"""KITTI raw: poses from GPS and inertial unit, one line for what is wrong."""
+"""KITTI raw recordings: poses from GPS and inertial unit; one-line errors."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def recording(tmp_path):
     return folder
 
 
-def test_positions_and_headings_are_those_on_the_ground(recording):
+def test_poses_follow_from_the_positions_on_the_ground(recording):
     assert is_kitti_raw(recording)
     assert not is_kitti_raw(recording.parent)
     first, second = kitti_raw_drive(recording, KITTI_HDL64E).sweeps
@@ -50,16 +50,17 @@ def test_positions_and_headings_are_those_on_the_ground(recording):
     ("file", "text", "message"),
     [
         ("oxts/data/0000000001.txt", None, "0000000001.txt: no such file"),
-        ("oxts/data/0000000001.txt", "49 8 110 0 x 0", "0000000001.txt: got '49 8 110 0 x 0', expected 6 numbers"),
-        ("oxts/data/0000000000.txt", "90 8 110 0 0 0", "latitude: got 90, expected"),
-        ("velodyne_points/timestamps.txt", "2011-09-26 13:02:25.5", "time of 0000000001.bin: got ''"),
-        ("velodyne_points/timestamps.txt", "today\n", "time of 0000000000.bin: got 'today'"),
+        ("oxts/data/0000000001.txt", "49 8 110 0 x 0", "0000000001.txt: pitch: got 'x', expected a fi"),
+        ("oxts/data/0000000001.txt", "49 8 110 0", "0000000001.txt: got 4 numbers, expected at least 6"),
+        ("oxts/data/0000000000.txt", "90 8 110 0 0 0", "latitude: got '90', expected a finite number of at m"),
+        ("velodyne_points/timestamps.txt", "2011-09-26 13:02:25.5", "line 2: time of 0000000001.bin: got ''"),
+        ("velodyne_points/timestamps.txt", "today\n", "line 1: time of 0000000000.bin: got 'today'"),
         ("../calib_imu_to_velo.txt", None, "calib_imu_to_velo.txt: no such file"),
-        ("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 -1\nT: 0 0 0", "expected a rotation"),
-        ("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 1", "T: got '', expected 3 numbers"),
+        ("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 -1\nT: 0 0 0", "line 1: R: got no rotation in its 3x3"),
+        ("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 1", "calib_imu_to_velo.txt: T: missing, expected R, T"),
     ],
 )
-def test_mistakes_are_one_line(recording, file, text, message):
+def test_missing_and_damaged_files_are_refused(recording, file, text, message):
     (recording / file).unlink() if text is None else (recording / file).write_text(text)
     with refused(message):
         list(kitti_raw_drive(recording, KITTI_HDL64E).sweeps)

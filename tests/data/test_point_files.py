@@ -1,4 +1,4 @@
-"""Readers: every layout comes back as it was, and every bad file gets one line that names it."""
+"""Point files: every supported layout is read exactly; damaged files are refused in one line that names them."""
 
 import io
 import itertools
@@ -35,7 +35,7 @@ def pcd_header(form, number, fields="x y z intensity", kinds="F F F F", sizes="4
 
 
 def lzf(data: bytes) -> bytes:
-    """A greedy packer: copies of what came before, near or far, and literals between them."""
+    """A greedy LZF compressor: copies of earlier bytes, near and far, and literals between them."""
     out, literals, position = bytearray(), bytearray(), 0
     while position < len(data):
         start, length = data.rfind(data[position : position + 3], max(position - 8192, 0), position + 2), 0
@@ -56,7 +56,7 @@ def lzf(data: bytes) -> bytes:
 
 
 def save(path, content):
-    """Bytes as they are, arrays and dictionaries of arrays by NumPy, raw where the name is of a raw file."""
+    """Write bytes, an array or a dictionary of arrays in the format of the file name."""
     if isinstance(content, bytes):
         path.write_bytes(content)
     elif isinstance(content, dict):
@@ -68,7 +68,7 @@ def save(path, content):
     return path
 
 
-def test_the_laser_number_is_the_ring_or_the_sixth_column_where_the_sensor_has_one(tmp_path, points):
+def test_the_laser_number_is_the_ring_or_the_sixth_column(tmp_path, points):
     path = save(tmp_path / "a.pcd.bin", nuscenes_rows(points))
     read = read_points(path, NUSCENES_HDL32E)
     np.testing.assert_array_equal(read[:, :4], points[:, :4])
@@ -79,7 +79,7 @@ def test_the_laser_number_is_the_ring_or_the_sixth_column_where_the_sensor_has_o
 
 
 @pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.npz", "a.pcd.bin"])
-def test_every_intensity_is_scaled_except_in_nuscenes_files(tmp_path, points, name):
+def test_intensities_are_scaled_except_in_nuscenes_files(tmp_path, points, name):
     rows = nuscenes_rows(points)
     if name != "a.pcd.bin":
         rows = points[:, :4] / np.array([1, 1, 1, 255], np.float32)
@@ -90,7 +90,7 @@ def test_every_intensity_is_scaled_except_in_nuscenes_files(tmp_path, points, na
 
 @pytest.mark.parametrize("columns", [3, 4, 5])
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
-def test_other_raw_layouts_by_columns_and_dtype(tmp_path, points, columns, dtype):
+def test_other_raw_layouts_are_read_by_columns_and_dtype(tmp_path, points, columns, dtype):
     rows = points[:, :columns].astype(dtype)
     if columns == 5:
         rows[:, 4] = 0.05
@@ -100,8 +100,8 @@ def test_other_raw_layouts_by_columns_and_dtype(tmp_path, points, columns, dtype
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5])
-def test_numpy_files(tmp_path, points, columns):
-    """Of several arrays that called points, of one any."""
+def test_numpy_files_are_read(tmp_path, points, columns):
+    """Of several arrays the one named points is read; a single array may have any name."""
     rows = points[:, :columns]
     several, one = {"points": rows, "other": np.zeros(3)}, {"cloud": rows.astype(np.float64)}
     for name, content in (("a.npy", rows), ("several.npz", several), ("one.npz", one)):
@@ -110,8 +110,8 @@ def test_numpy_files(tmp_path, points, columns):
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
-def test_pcd_files_by_their_header(tmp_path, points, form):
-    """Fields of any type, size and count, in any order; those without a meaning here are skipped."""
+def test_pcd_files_are_read_by_their_header(tmp_path, points, form):
+    """Fields may have any type, size, count and order; unknown fields are skipped."""
     kinds = {"ring": "<u2", "X": "<f8", "y": "<f4", "normal": ("<f4", (2,)), "intensity": "u1"}
     kinds |= {"_": ("<i2", (3,)), "z": "<f2", "time_lag": "<f4", "t": "<i8"}
     record = np.dtype([(name, kind) for name, kind in kinds.items()])
@@ -139,8 +139,8 @@ def test_pcd_files_by_their_header(tmp_path, points, form):
     np.testing.assert_array_equal(read_points(path, NUSCENES_HDL32E), expected[:, :5])
 
 
-def test_pcd_packed_by_the_reference_library(tmp_path):
-    """Bytes that liblzf made of x = 1, 2, 3, 4 again and again, y = 0, z = -1.5."""
+def test_a_pcd_file_compressed_by_liblzf_is_read(tmp_path):
+    """The points are x = 1, 2, 3, 4, 1, ..., y = 0, z = -1.5."""
     packed = bytes.fromhex("070000803f000000402002200300804003e0360fe0470001c0bfe0410301c0bf")
     sizes = np.array([len(packed), 240], "<u4").tobytes()
     head = pcd_header("binary_compressed", 20, "x y z", "F F F", "4 4 4", "1 1 1")
@@ -148,8 +148,8 @@ def test_pcd_packed_by_the_reference_library(tmp_path):
     np.testing.assert_array_equal(read, [[1 + i % 4, 0, -1.5, 0, 0] for i in range(20)])
 
 
-def test_non_finite_points_are_kept_for_the_projection_to_count(tmp_path, points):
-    """All of a cloud or some; too large values become infinite without a warning."""
+def test_non_finite_points_are_kept(tmp_path, points):
+    """Too large values become infinite without a warning."""
     rows = nuscenes_rows(points)
     rows[7, 0], rows[9, 2] = np.nan, np.inf
     read = read_points(save(tmp_path / "a.pcd.bin", rows), NUSCENES_HDL32E)
@@ -166,7 +166,7 @@ def test_non_finite_points_are_kept_for_the_projection_to_count(tmp_path, points
 @pytest.mark.parametrize("intensity_scale", [1, 1 / 255, 0], ids=["0-255", "0-1", "none"])
 @pytest.mark.parametrize("fifth", ["ring", "lag"])
 @pytest.mark.parametrize("number", [40, 2000])
-def test_four_and_five_columns_are_told_apart(tmp_path, points, intensity_scale, fifth, number):
+def test_four_and_five_columns_are_distinguished_by_their_values(tmp_path, points, intensity_scale, fifth, number):
     rows = nuscenes_rows(points)[:number]
     rows[:, 3] *= intensity_scale
     if fifth == "lag":
@@ -184,7 +184,7 @@ def test_four_and_five_columns_are_told_apart(tmp_path, points, intensity_scale,
         read_points(four, NUSCENES_HDL32E)
 
 
-def test_columns_or_dtype_make_a_file_of_any_name_raw(tmp_path, points):
+def test_with_columns_or_dtype_a_file_of_any_name_is_raw(tmp_path, points):
     rows = points[:, :4].astype(np.float64)
     as_bin = read_points(save(tmp_path / "a.bin", rows), NUSCENES_HDL32E, dtype="float64")
     for name in ("000001.f64", "scan"):
@@ -197,7 +197,7 @@ def test_columns_or_dtype_make_a_file_of_any_name_raw(tmp_path, points):
 
 @pytest.mark.parametrize("stored", ["float16", "float32", "float64"])
 @pytest.mark.parametrize("named", ["float16", "float32", "float64"])
-def test_a_wrong_number_type_is_refused_by_name(tmp_path, points, stored, named):
+def test_a_wrong_dtype_is_refused_and_the_right_one_named(tmp_path, points, stored, named):
     path = save(tmp_path / "a.bin", points[:, :4].astype(stored))
     if stored == named:
         assert len(read_points(path, NUSCENES_HDL32E, dtype=named)) == len(points)
@@ -217,19 +217,19 @@ def test_a_wrong_number_type_is_refused_by_name(tmp_path, points, stored, named)
             "not a multiple of 16 (4 float32 values per point): truncated, or another layout, 5 columns",
         ),
         ("a.bin", 8, {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
-        ("a.bin", 8, {"dtype": "int16"}, "dtype: got int16, expected float16"),
+        ("a.bin", 8, {"dtype": "int16"}, "dtype: got 'int16', expected float16"),
         ("a.npy", 8, {"columns": 4}, "columns and dtype are for raw .bin files"),
         ("a.pcd", 8, {"dtype": "float32"}, "columns and dtype are for raw .bin files"),
     ],
 )
-def test_bad_layouts_are_refused(tmp_path, points, name, number, options, message):
+def test_wrong_layouts_are_refused(tmp_path, points, name, number, options, message):
     path = save(tmp_path / name, nuscenes_rows(points)[:number].tobytes())
     with refused(message, path):
         read_points(path, NUSCENES_HDL32E, **options)
 
 
 @pytest.mark.real_data
-def test_real_keyframe_reads_whole_and_refuses_other_layouts(real_data, tmp_path):
+def test_a_real_keyframe_is_read_and_other_layouts_are_refused(real_data, tmp_path):
     (path,) = (real_data / "nuscenes_scene0061").glob("*.pcd.bin")
     read = read_points(path, NUSCENES_HDL32E)
     assert read.shape == (34_688, 5)
@@ -265,7 +265,7 @@ def packed_pcd(packed, plain_size=16):
 
 
 def wrapping_pcd(number, count):
-    """A point of so many bytes that a 32-bit size is another; a few bytes of it."""
+    """A point of so many bytes that its size overflows, and only a few of its bytes."""
     names = " ".join(f"f{i}" for i in range(number))
     sizes, kinds, counts = "8 " * number, "F " * number, f"{count} " * number
     header = pcd_header("binary", 1, f"x y z {names}", f"F F F {kinds}", f"4 4 4 {sizes}", f"1 1 1 {counts}")
@@ -280,7 +280,7 @@ def zipped(method, size=1000):
 
 
 def with_size(archive, size):
-    """The archive, telling another unpacked size of its only member."""
+    """The archive with another unpacked size in the header of its only member."""
     at = archive.index(b"PK\x01\x02") + 24
     return archive[:at] + np.array(size, "<u4").tobytes() + archive[at + 4 :]
 
@@ -367,7 +367,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_files_get_one_line(tmp_path, name):
+def test_damaged_point_files_are_refused(tmp_path, name):
     content, message = BAD[name]
     if content is not None:
         save(tmp_path / name, content)
@@ -375,7 +375,7 @@ def test_bad_files_get_one_line(tmp_path, name):
         read_points(tmp_path / name, NUSCENES_HDL32E)
 
 
-def test_an_archive_that_unpacks_to_more_than_it_says_is_read_no_further(tmp_path):
+def test_an_archive_is_unpacked_no_further_than_its_stated_size(tmp_path):
     path = save(tmp_path / "a.npz", with_size(zipped(zipfile.ZIP_DEFLATED, 2**27), 1000))
     tracemalloc.start()
     with refused("not a readable .npz file"):
@@ -388,14 +388,14 @@ def test_an_archive_that_unpacks_to_more_than_it_says_is_read_no_further(tmp_pat
 @pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.pcd"])
 def test_a_file_larger_than_any_cloud_is_refused_before_it_is_read(tmp_path, name):
     with (tmp_path / name).open("wb") as file:
-        file.truncate(2**40)  # takes no room on the disk
+        file.truncate(2**40)  # a sparse file
     with refused("got 1099511627776 bytes, expected at most", "for 10000000 points"):
         read_points(tmp_path / name, NUSCENES_HDL32E)
 
 
 @pytest.mark.parametrize("name", ["a.bin", "a.npy", "a.npz", "a.pcd", "packed.pcd", "ascii.pcd", "a.feather"])
 def test_a_cloud_of_too_many_points_is_refused_before_it_takes_memory(tmp_path, name):
-    """A packed million of points; the limit is an option."""
+    """A million points; the limit is an option."""
     number, path, zeros = 10**6, tmp_path / name, np.zeros((10**6, 4), np.float32)
     if name == "a.npz":
         np.savez_compressed(path, zeros)
@@ -422,7 +422,7 @@ def test_a_cloud_of_too_many_points_is_refused_before_it_takes_memory(tmp_path, 
 
 
 @pytest.mark.parametrize("value", [-1, 64, 1.5])
-def test_bad_or_missing_laser_numbers_are_refused(tmp_path, value):
+def test_invalid_and_missing_laser_numbers_are_refused(tmp_path, value):
     path = save(tmp_path / "a.npy", np.array([[1, 2, 0, 3, 0, value]], np.float32))
     with refused(f"laser number: got {value:g} in row 0, expected whole"):
         read_points(path, ARGOVERSE2)

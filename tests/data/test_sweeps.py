@@ -1,4 +1,4 @@
-"""Lists of sweeps with their poses: fused in the frame of the newest, and every mistake in one line."""
+"""Lists of sweeps with poses: fusion in the frame of the newest, one-line errors."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.sweeps import read_sweeps
+from fcos_lidar_jax.data.sweeps import check_poses, read_sweeps
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 
 EYE = np.eye(4).tolist()
@@ -25,8 +25,8 @@ def fuse(folder, entries, sensor=TINY, remove_close="all"):
     return read_sweeps(path, sensor, CloudReading(20, remove_close))
 
 
-def test_sweeps_see_a_fixed_world(tmp_path):
-    """Points fixed in the world land on the same place from every pose; lags are exact microseconds."""
+def test_static_points_coincide_in_listed_sweeps(tmp_path):
+    """Also, the lags are exact to the microsecond."""
     rng = np.random.default_rng(0)
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("z", rng.uniform(-3, 3, (4, 1))).as_matrix()
@@ -44,7 +44,7 @@ def test_sweeps_see_a_fixed_world(tmp_path):
         np.testing.assert_array_equal(part[:, 4], np.float32(0.049999 * i))
 
 
-def test_raw_sweeps_of_another_layout_are_read_as_it_is_said(tmp_path):
+def test_sweeps_can_be_raw_files_of_another_layout(tmp_path):
     rows = np.random.default_rng(0).uniform(3, 9, (40, 6))
     rows.tofile(tmp_path / "a.bin")
     (tmp_path / "sweeps.json").write_text(json.dumps([entry("a.bin")]))
@@ -54,21 +54,43 @@ def test_raw_sweeps_of_another_layout_are_read_as_it_is_said(tmp_path):
 
 
 @pytest.mark.parametrize(("mode", "counts"), [("all", [1, 1]), ("sweeps", [2, 1]), ("none", [2, 2])])
-def test_close_points_are_judged_in_their_own_sweep(tmp_path, mode, counts):
+def test_close_points_are_removed_in_the_frame_of_their_own_sweep(tmp_path, mode, counts):
     np.save(tmp_path / "a.npy", np.array([[0.5, 0, 0], [10, 0, 0]]))
     entries = [entry(timestamp_us=100, sensor_to_world=[[1, 0, 0, 10], *EYE[1:]]), entry(timestamp_us=50)]
     fused, num_close = fuse(tmp_path, entries, remove_close=mode)
     assert [int((fused[:, 4] == 0).sum()), int((fused[:, 4] > 0).sum())] == counts
     assert num_close == 4 - sum(counts)
-    if mode == "all":  # the old sweep's far point now lies at the sensor and stays
+    if mode == "all":  # the older sweep's far point, which now lies at the sensor, stays
         assert [0, 0, 0] in fused[:, :3].tolist()
 
 
-def test_close_points_lie_around_the_sensors_origin(tmp_path):
+def test_close_points_are_removed_around_the_origin_of_the_sensor(tmp_path):
     np.save(tmp_path / "a.npy", np.array([[0.3, 0, 0], [2.3, 0.5, 0], [1.4, 0, 0]]))
     fused, num_close = fuse(tmp_path, [entry()], dataclasses.replace(TINY, origin_m=(1.4, 0.0, 1.6)))
     np.testing.assert_array_equal(fused[:, :3], np.array([[0.3, 0, 0]], np.float32))
     assert num_close == 2
+
+
+@pytest.mark.parametrize(
+    ("rotation", "place", "message"),
+    [
+        ((0, 0, 0, 0), (0, 0, 0), "rotation: got [0.0, 0.0, 0.0, 0.0], expected a unit quaternion"),
+        ((2, 0, 0, 0), (0, 0, 0), "rotation: got [2.0, 0.0, 0.0, 0.0], expected a unit quaternion"),
+        ((1e200, 0, 0, 0), (0, 0, 0), "rotation: got [1e+200, 0.0, 0.0, 0.0], expected a unit quaternion"),
+        ((np.nan, 0, 0, 0), (0, 0, 0), "rotation: got [nan, 0.0, 0.0, 0.0], expected a unit quaternion"),
+        (
+            (1, 0, 0, 0),
+            (0, np.nan, 0),
+            "translation: got [0.0, nan, 0.0], expected finite numbers of at m",
+        ),
+        ((1, 0, 0, 0), (0, 0, 1e9), "translation: got [0.0, 0.0, 1000000000.0], expected finite numbers of at m"),
+    ],
+)
+def test_an_impossible_pose_is_refused_with_its_row_and_field(rotation, place, message):
+    rotations, places = np.array([(1, 0, 0, 0), rotation], float), np.array([(0, 0, 0), place], float)
+    check_poses(rotations[:1], places[:1], "pose {}".format)
+    with refused(f"pose 1: {message}"):
+        check_poses(rotations, places, "pose {}".format)
 
 
 BAD_SWEEPS = {
@@ -102,7 +124,7 @@ BAD_SWEEPS = {
 
 
 @pytest.mark.parametrize("name", BAD_SWEEPS)
-def test_bad_sweep_lists_get_one_line(tmp_path, name):
+def test_invalid_lists_of_sweeps_are_refused(tmp_path, name):
     content, message = BAD_SWEEPS[name]
     np.save(tmp_path / "a.npy", np.ones((3, 3)))
     with refused(message, tmp_path / "sweeps.json"):

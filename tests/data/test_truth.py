@@ -1,4 +1,4 @@
-"""The boxes of a frame without its points: those of the frame in every format, and read without the clouds."""
+"""``truth``: in every format the boxes of the frame, without its points and, if possible, without reading them."""
 
 import dataclasses
 import json
@@ -64,7 +64,7 @@ def simulated(root: Path) -> FrameSet:
     return SimulatedFrames(TINY, 2, reading=CloudReading(2))
 
 
-def given(root: Path) -> FrameSet:
+def in_memory(root: Path) -> FrameSet:
     return InMemoryFrames((toy_frame(0), toy_frame(1)), TINY, ("car",) * 10)
 
 
@@ -72,13 +72,13 @@ def mapped(root: Path) -> FrameSet:
     return MappedFrames(nuscenes(root), ("cyclist", "person"), {"pedestrian": "person"})
 
 
-def chosen(root: Path) -> FrameSet:
+def selected(root: Path) -> FrameSet:
     return SelectedFrames(kitti(root), (2, 0))
 
 
-def kept(root: Path) -> FrameSet:
+def cached_frames(root: Path) -> FrameSet:
     frames = CachedFrames(SimulatedFrames(TINY, 2, reading=CloudReading(2)), root)
-    frames.frame(0)  # The other one is made when its boxes are asked for.
+    frames.frame(0)  # The other one is made when its boxes are requested.
     return frames
 
 
@@ -87,11 +87,11 @@ def clouds(root: Path) -> FrameSet:
     return CloudFiles((root / "clouds" / "000.npy", root / "sweeps" / "001.json"), TINY, CloudReading(2))
 
 
-MAKERS = (nuscenes, argoverse2, kitti, folder, simulated, given, mapped, chosen, kept, clouds)
-COUNTED = (kitti, folder, simulated, chosen, kept)  # From the clouds, by the reader or the simulation.
+MAKERS = (nuscenes, argoverse2, kitti, folder, simulated, in_memory, mapped, selected, cached_frames, clouds)
+COUNTED = (kitti, folder, simulated, selected, cached_frames)  # From the clouds, by the reader or the simulation.
 
 
-def test_every_format_is_tried():
+def test_every_format_is_tested():
     assert {make.__name__ for make in MAKERS} >= set(get_args(Format))
 
 
@@ -107,7 +107,7 @@ def assert_truth(found: Frame, frame: Frame) -> None:
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_the_truth_is_that_of_the_frame(make, tmp_path):
+def test_the_truth_has_the_boxes_of_the_frame(make, tmp_path):
     frames = make(tmp_path / "data")
     truths = [frames.truth(index) for index in range(len(frames))]
     assert sum(len(truth.boxes) for truth in truths) > 0 or make is clouds
@@ -118,7 +118,7 @@ def test_the_truth_is_that_of_the_frame(make, tmp_path):
 
 
 @pytest.mark.parametrize("make", [nuscenes, argoverse2, mapped, clouds])
-def test_the_clouds_are_not_read(make, tmp_path):
+def test_the_truth_is_read_without_the_clouds(make, tmp_path):
     frames = make(tmp_path / "data")
     expected = [frames.frame(index) for index in range(len(frames))]
     deleted = [file for ending in ("*.bin", "*.npy", "lidar/*.feather") for file in tmp_path.rglob(ending)]
@@ -131,7 +131,7 @@ def test_the_clouds_are_not_read(make, tmp_path):
         assert_truth(frames.truth(index), frame)
 
 
-def test_of_several_sweeps_in_a_folder_the_current_one_is_read(tmp_path):
+def test_the_truth_of_a_folder_reads_the_current_sweep_only(tmp_path):
     frames = folder(tmp_path / "data")
     expected = frames.frame(1)
     assert len(np.unique(expected.points[:, 4])) == 2
@@ -141,8 +141,8 @@ def test_of_several_sweeps_in_a_folder_the_current_one_is_read(tmp_path):
     assert_truth(frames.truth(1), expected)
 
 
-def test_of_a_kept_frame_the_points_stay_packed(tmp_path, monkeypatch):
-    frames, read = kept(tmp_path / "data"), []
+def test_the_truth_of_a_cached_frame_does_not_unpack_the_points(tmp_path, monkeypatch):
+    frames, read = cached_frames(tmp_path / "data"), []
     parse = cached.parse_npz
     monkeypatch.setattr(cached, "parse_npz", lambda data, names: read.extend(names) or parse(data, names))
     assert_truth(frames.truth(0), frames.frames.frame(0))
@@ -150,7 +150,7 @@ def test_of_a_kept_frame_the_points_stay_packed(tmp_path, monkeypatch):
     assert set(read) == {"boxes", "labels", "num_points"}
 
 
-def test_a_frame_without_its_points():
+def test_points_can_be_dropped_from_a_frame():
     frame = dataclasses.replace(toy_frame(0, columns=6), num_close=3)
     assert_truth(without_points(frame), frame)
     assert no_points(ARGOVERSE2).shape == (0, 6)

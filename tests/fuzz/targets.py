@@ -27,6 +27,7 @@ from fcos_lidar_jax.cli.data import read_class_map
 from fcos_lidar_jax.config import CloudReading, config_from_json, config_to_json
 from fcos_lidar_jax.data import argoverse2
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
+from fcos_lidar_jax.data.box_geometry import check_boxes
 from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.drives import read_tum
@@ -47,7 +48,6 @@ from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.inference.export import load_exported
-from fcos_lidar_jax.input_pipeline.batching import check_boxes
 from fcos_lidar_jax.input_pipeline.database import open_database, prepare_database
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import (
@@ -116,7 +116,7 @@ def check_points(points: np.ndarray, sensor: Sensor) -> None:
 def check_frame(frame: Frame, frames: FrameSet) -> None:
     if len(frame.points):
         check_points(frame.points, frames.sensor)
-    check_boxes(frame.boxes, "frame")
+    check_boxes(frame.boxes, "box {}".format)
     expect(frame.boxes.dtype == np.float32, "boxes that are not float32")
     for column in (frame.labels, frame.num_points):
         expect(column.shape == (len(frame.boxes),) and column.dtype == np.int32, "a column of another shape")
@@ -263,7 +263,7 @@ def _read_nuscenes(folder: Path, name: str) -> None:
     tokens = data.split("all")
     check_points(data.fuse_sweeps(tokens[0], CloudReading(2, "none"))[0], NUSCENES_HDL32E)
     boxes = data.boxes(tokens[0])
-    check_boxes(boxes.boxes, str(folder / name))
+    check_boxes(boxes.boxes, "box {}".format)
     truth = split_truth(data, tokens)
     check_columns(truth.boxes)
 
@@ -497,7 +497,7 @@ def make_targets() -> list[Target]:
         Target(
             "keyframe",
             {"boxes.json": _json({"lidar_file": "a.npy", "boxes": boxes}), "a.npy": arrays["a.npy"]},
-            lambda folder, _: check_boxes(read_keyframe(folder, NUSCENES_HDL32E).boxes, "frame"),
+            lambda folder, _: check_boxes(read_keyframe(folder, NUSCENES_HDL32E).boxes, "box {}".format),
         ),
         file_target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor),
         file_target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),

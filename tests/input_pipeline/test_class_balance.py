@@ -1,9 +1,10 @@
-"""The order of samples: class balance against shares counted by hand, redrawn in every epoch."""
+"""The order of samples: shares of the classes against numbers computed by hand, sampled anew in every epoch."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+from refusal import refused
 from toy_frames import ListedFrames
 
 from fcos_lidar_jax.data.frame import Frame
@@ -30,17 +31,17 @@ def epoch_of(order, epoch=0):
 
 
 @pytest.mark.parametrize("epoch", [0, 1, 5])
-def test_every_class_is_drawn_for_equally_often_in_each_epoch(epoch):
+def test_every_epoch_samples_equally_often_for_each_class(epoch):
     frames = np.array(epoch_of(order_of(SHOWS, seed=3), epoch))
     assert len(frames) == 3 * SHARE
-    # Nothing else shows class 9; class 4 shows up among the draws for class 0, too.
+    # Only the samples for class 9 show it; samples for class 0 may also show class 4.
     assert (frames >= 80).sum() == SHARE
     assert set(frames) <= set(range(85))
     assert SHARE <= ((frames >= 60) & (frames < 80)).sum() < 2 * SHARE
     assert len(set(frames[frames < 60])) > 10
 
 
-def test_each_of_a_class_frames_has_the_same_chance():
+def test_all_frames_of_a_class_are_equally_likely():
     order = order_of(SHOWS)
     many = np.concatenate([epoch_of(order, epoch) for epoch in range(60)])
     counts = np.bincount(many[many >= 80] - 80, minlength=5)
@@ -48,14 +49,14 @@ def test_each_of_a_class_frames_has_the_same_chance():
     assert ((counts - expected) ** 2 / expected).sum() < 18.5  # chi-squared, 4 degrees of freedom, 0.1 %
 
 
-def test_classes_that_share_their_frames_have_draws_of_their_own():
-    """All frames show both: sixty draws from thirty frames, and not each of them twice."""
+def test_classes_that_share_their_frames_are_sampled_independently():
+    """All frames show both classes: sixty samples from thirty frames, not each frame twice."""
     counts = np.bincount(epoch_of(order_of([np.array([0, 4])] * 30)), minlength=30)
     assert counts.sum() == 60
     assert (counts % 2).any()
 
 
-def test_the_seed_and_the_position_decide():
+def test_the_order_depends_only_on_the_seed_and_the_position():
     a, b, c = (order_of(SHOWS, seed=s) for s in (5, 5, 6))
     assert epoch_of(a, 1) == epoch_of(b, 1) != epoch_of(c, 1)
     epochs = [epoch_of(a, epoch) for epoch in range(4)]
@@ -65,19 +66,19 @@ def test_the_seed_and_the_position_decide():
     assert backwards[::-1] == epoch_of(a, 1)
 
 
-def test_without_class_balance_every_frame_is_shown_once():
+def test_without_class_balance_every_epoch_has_each_frame_once():
     order, neighbour = order_of(SHOWS, balanced=False), order_of(SHOWS, seed=1, balanced=False)
     epochs = [epoch_of(order, epoch) for epoch in range(4)]
     assert all(sorted(epoch) == list(range(100)) for epoch in epochs)
     assert len({tuple(epoch) for epoch in epochs}) == 4
     # Neighbouring seeds do not share epochs.
     assert not {tuple(epoch) for epoch in epochs} & {tuple(epoch_of(neighbour, epoch)) for epoch in range(4)}
-    # As every run so far has seen them.
+    # Golden values: a resumed run needs the order of its beginning.
     assert epoch_of(order)[:8] == [87, 61, 50, 7, 70, 72, 24, 52]
     assert epoch_of(order, 1)[:4] == [83, 27, 4, 75]
 
 
-def test_steps_of_an_epoch():
+def test_steps_per_epoch_are_rounded_up():
     config = dataclasses.replace(NUSCENES, optimizer=dataclasses.replace(NUSCENES.optimizer, batch_size=32))
     plain = dataclasses.replace(config, class_balanced=False)
     assert steps_per_epoch(frames_with(SHOWS), config) == 4  # 105 samples
@@ -85,6 +86,6 @@ def test_steps_of_an_epoch():
     assert steps_per_epoch(frames_with(SHOWS[:96]), plain) == 3
 
 
-def test_without_objects_it_is_one_line():
-    with pytest.raises(ValueError, match="none of the 2 frames shows an object"):
+def test_frames_without_objects_are_refused():
+    with refused("class balance: none of the 2 frames shows an object"):
         order_of([np.zeros(0, np.int32)] * 2)

@@ -88,7 +88,7 @@ def test_it_trains_and_its_checkpoint_gives_it_back(run, frames):
     metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert metrics[0]["loss/total"] == metrics[0]["loss/distance"] > 5
     assert [line["boxes"] for line in metrics if "boxes" in line] == [4] * 60
-    with pytest.raises(ValueError, match=r"^toy\.json\.colour: unknown field"):
+    with pytest.raises(ValueError, match=r"^toy\.json: colour: unknown field"):
         config_from_json({**config_to_json(TOY), "colour": "red"}, "toy.json")
 
 

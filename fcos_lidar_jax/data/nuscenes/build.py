@@ -9,8 +9,8 @@ import numpy as np
 from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.nuscenes import tables as kinds
 from fcos_lidar_jax.data.nuscenes.index import Index
-from fcos_lidar_jax.data.nuscenes.tables import R, Row, TableError, read_table
-from fcos_lidar_jax.data.sweeps import find_bad_pose
+from fcos_lidar_jax.data.nuscenes.tables import R, Row, read_table
+from fcos_lidar_jax.data.sweeps import check_poses
 
 CHANNEL = "LIDAR_TOP"  # the only sensor that is kept
 
@@ -59,12 +59,14 @@ class _Tables:
     def check_poses(self, kind: type[Row], tokens: list[str], columns: Columns) -> None:
         """Refuse invalid poses, and normalise rotations to the last bit."""
         rotation = columns["rotation"]
-        if (bad := find_bad_pose(rotation, columns["translation"])) is not None:
-            raise self.error(kind, tokens[bad[0]], bad[1])
+        check_poses(rotation, columns["translation"], lambda row: self.place(kind, tokens[row]))
         columns["rotation"] = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
 
-    def error(self, kind: type[Row], token: str, problem: str) -> TableError:
-        return TableError(f"{self.folder / kind.file}: record {token}: {problem}")
+    def place(self, kind: type[Row], token: str) -> str:
+        return f"{self.folder / kind.file}: record {token}"
+
+    def error(self, kind: type[Row], token: str, problem: str) -> ValueError:
+        return ValueError(f"{self.place(kind, token)}: {problem}")
 
 
 def _dangling(field: str, token: str) -> str:
@@ -84,11 +86,11 @@ def build_index(folder: str | Path, report: Report = lambda name, rows: None) ->
         report: called after every piece of a table.
 
     Raises:
-        TableError: with the file, the record, the field, the found and the expected value.
+        ValueError: with the file, the record, the field, the found and the expected value.
     """
     tables = _Tables(Path(folder), report)
     if not tables.folder.is_dir():
-        raise TableError(f"{folder}: no such folder, expected the tables of a version")
+        raise ValueError(f"{folder}: no such folder, expected the tables of a version")
     columns = _keyframes(tables)
     samples = {token.decode(): i for i, token in enumerate(columns["sample_token"])}
     columns |= _sweeps(tables, samples)

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.data.npy_files import parse_npy
-from fcos_lidar_jax.data.nuscenes.tables import TABLES, TableError
+from fcos_lidar_jax.data.nuscenes.tables import TABLES
 from fcos_lidar_jax.files import FileState, atomic_write, read_json
 
 _FORMAT, _FORMAT_VERSION = "fcos_lidar_index", 3
@@ -78,6 +78,15 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
     atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
 
 
+def default_index(root: str | Path, version: str) -> Path:
+    """The default folder of ``prepare``'s output: the index of a version of nuScenes, and the cut objects.
+
+    >>> default_index("nuscenes", "v1.0-mini").as_posix(), default_index("kitti", "").as_posix()
+    ('nuscenes/.fcos_lidar/v1.0-mini', 'kitti/.fcos_lidar')
+    """
+    return Path(root) / ".fcos_lidar" / version
+
+
 def has_index(folder: str | Path) -> bool:
     """Whether a folder contains a finished index, of any format version."""
     return (Path(folder) / _MANIFEST).is_file()
@@ -91,7 +100,7 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
         tables: ``ROOT/VERSION``.
 
     Raises:
-        TableError: with the file, the field, the found and the expected value.
+        ValueError: with the file, the field, the found and the expected value.
     """
     folder = Path(folder)
     manifest = _read_manifest(folder / _MANIFEST)
@@ -99,7 +108,7 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
     for name in {**present, **indexed}:
         if name not in indexed or name not in present or not indexed[name].holds(present[name]):
             problem = f"the index was made from another table than the one in {tables}: run prepare again"
-            raise TableError(f"{folder / _MANIFEST}: {name}: {problem}")
+            raise ValueError(f"{folder / _MANIFEST}: {name}: {problem}")
     columns = {}
     for field in dataclasses.fields(Index):
         file = folder / f"{field.name}.npy"
@@ -107,9 +116,9 @@ def open_index(folder: str | Path, *, tables: str | Path) -> Index:
             column = parse_npy(file.read_bytes())
             summary = _summary(column)
         except (OSError, ValueError) as error:
-            raise TableError(f"{file}: cannot be read ({error}): run prepare again") from None
+            raise ValueError(f"{file}: cannot be read ({error}): run prepare again") from None
         if manifest.columns.get(field.name) != summary:
-            raise TableError(f"{file}: content differs from {_MANIFEST}: run prepare again")
+            raise ValueError(f"{file}: content differs from {_MANIFEST}: run prepare again")
         columns[field.name] = column
     return Index(**columns)
 
@@ -125,11 +134,11 @@ def _read_manifest(file: Path) -> _Manifest:
     try:
         manifest = read_json(file, _Manifest, what="a finished index")
     except ValueError as error:
-        raise TableError(f"{error}: run prepare again") from None
+        raise ValueError(f"{error}: run prepare again") from None
     if manifest.format != _FORMAT:
-        raise TableError(f"{file}: format: expected {_FORMAT!r}")
+        raise ValueError(f"{file}: format: expected {_FORMAT!r}")
     if (version := manifest.format_version) != _FORMAT_VERSION:
-        raise TableError(f"{file}: format_version: got {version}, expected {_FORMAT_VERSION}: run prepare again")
+        raise ValueError(f"{file}: format_version: got {version}, expected {_FORMAT_VERSION}: run prepare again")
     return manifest
 
 

@@ -13,11 +13,10 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
 from fcos_lidar_jax.data.nuscenes.build import build_index
-from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, has_index, open_index
+from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, default_index, has_index, open_index
 from fcos_lidar_jax.data.nuscenes.names import label_of
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
-from fcos_lidar_jax.data.nuscenes.tables import TableError
-from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.point_files import MAX_POINTS, check_inside
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix, rotation_matrix, wrap_angle
@@ -40,11 +39,6 @@ class Boxes:
     num_lidar_pts: np.ndarray  # i32[m]: points of the current sweep inside, counted with the full rotation
     attributes: tuple[str, ...]  # attribute name of every box, '' for no attribute
     tokens: tuple[str, ...]  # annotation token of every box
-
-
-def default_index(root: str | Path, version: str) -> Path:
-    """The default folder of the index."""
-    return Path(root) / ".fcos_lidar" / version
 
 
 class NuScenes:
@@ -88,14 +82,13 @@ class NuScenes:
         self.root, self.version, self.allow_missing_sweeps = Path(root), version, allow_missing_sweeps
         self.follow_links = follow_links
         if not self.root.is_dir():
-            raise TableError(f"{root}: no such folder, expected a data root")
+            raise ValueError(f"{root}: no such folder, expected a data root")
         if not self.tables.is_dir():
             there = sorted(p.parent.name for p in self.root.glob("*/sample.json"))
-            raise TableError(f"{self.tables}: no such folder, expected one of {', '.join(there) or 'none here'}")
+            raise ValueError(f"{self.tables}: no such folder, expected one of {', '.join(there) or 'none here'}")
         folder = default_index(root, version) if index is None else Path(index)
         known = index is not None or has_index(folder)
         self.index: Index = open_index(folder, tables=self.tables) if known else build_index(self.tables)
-        self._base = self.root.resolve()
         self._sample_row = {token.decode(): i for i, token in enumerate(self.index.sample_token)}
         self._label = np.array([label_of(str(name)) for name in self.index.category_name], np.int32)
 
@@ -155,12 +148,8 @@ class NuScenes:
         self, sample_token: str, reading: CloudReading, sensor: Sensor = NUSCENES_HDL32E
     ) -> tuple[np.ndarray, int]:
         """:meth:`sweeps` with another reading; also returns the number of dropped points on the ego vehicle."""
-        chain = self._chain(sample_token, reading.num_sweeps)
-        if self.allow_missing_sweeps:
-            chain = [row for row in chain if row == chain[0] or os.path.isfile(self._path(row))]
-        times = self.index.sweep_time_us
-        sweeps = (Sweep(self._read(row), self._sensor_to_global(row), times[row]) for row in chain)
-        return fuse_sweeps(sweeps, sensor, reading)
+        current, *older = self._chain(sample_token, reading.num_sweeps)
+        return fuse_sweeps(map(self._read, [current, *self._present(older)]), sensor, reading)
 
     def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
         """The sweeps (or only keyframes) of a scene in temporal order, read on demand.
@@ -174,16 +163,9 @@ class NuScenes:
             while rows[-1] in following:
                 rows.append(following[rows[-1]])
             rows = self._chain_of(rows[-1], len(self.index.sweep_file))[::-1]
-        if self.allow_missing_sweeps:
-            present = [row for row in rows if os.path.isfile(self._path(row))]
-            if not present:
-                raise ValueError(f"{self.root}: scene {scene}: found no file of {len(rows)} sweeps, expected some")
-            rows = present
-        times = self.index.sweep_time_us
-        return (
-            Sweep(self._read(row), self._sensor_to_global(row), int(times[row]), str(self._path(row)))
-            for row in rows
-        )
+        if not (present := self._present(rows)):
+            raise ValueError(f"{self.root}: scene {scene}: found no file of {len(rows)} sweeps, expected some")
+        return map(self._read, present)
 
     def keyframe_times_us(self, scene: str) -> frozenset[int]:
         """Times of a scene's keyframes; errors as in :meth:`drive`."""
@@ -232,8 +214,8 @@ class NuScenes:
 
     def missing_sweeps(self, sample_tokens: list[str], num: int = 10) -> int:
         """Number of missing sweep files of some keyframes, each counted once."""
-        rows = {row for token in sample_tokens for row in self._chain(token, num)}
-        return sum(not os.path.isfile(self._path(row)) for row in rows)
+        files = {file for token in sample_tokens for file in self.sweep_files(token, num)}
+        return sum(not os.path.isfile(file) for file in files)
 
     def sweep_files(self, sample_token: str, num: int = 10) -> list[Path]:
         """Files of the sweeps up to a keyframe, the current one first, even if they are missing."""
@@ -253,7 +235,7 @@ class NuScenes:
 
     def _row(self, sample_token: str) -> int:
         if sample_token not in self._sample_row:
-            raise TableError(f"{self.tables / 'sample.json'}: {sample_token!r}: no such token")
+            raise ValueError(f"{self.tables / 'sample.json'}: {sample_token!r}: no such token")
         return self._sample_row[sample_token]
 
     def _sweep(self, sample_token: str) -> int:
@@ -277,21 +259,25 @@ class NuScenes:
     def _path(self, row: int) -> Path:
         return self.root / self.index.sweep_file[row].decode()
 
-    def _read(self, row: int) -> np.ndarray:
+    def _present(self, rows: list[int]) -> list[int]:
+        """The sweeps to read: only existing files if others may be missing."""
+        return [row for row in rows if os.path.isfile(self._path(row))] if self.allow_missing_sweeps else rows
+
+    def _read(self, row: int) -> Sweep:
         path = self._path(row)
         if not os.path.isfile(path):
             needed = self.allow_missing_sweeps or row in self.index.sample_sweep  # keyframes are never skipped
             hint = "" if needed else "; --allow-missing-sweeps continues with fewer sweeps"
             raise ValueError(f"{path}: no such file, expected a sweep that sample_data.json names{hint}")
-        if not self.follow_links and not path.resolve().is_relative_to(self._base):
-            problem = f"resolves to {path.resolve()}, expected a file below {self._base}"
-            raise ValueError(f"{path}: {problem}; --follow-links allows links that lead out")
+        if not self.follow_links:
+            check_inside(path, self.root, str(path))
         size = path.stat().st_size
         if size == 0 or size % (4 * _COLUMNS) or size > 4 * _COLUMNS * MAX_POINTS:
             found = "an empty file" if size == 0 else f"{size} bytes"
             expected = f"a multiple of {4 * _COLUMNS} (float32 x 5), at most {MAX_POINTS} points"
             raise ValueError(f"{path}: got {found}, expected {expected}")
-        return np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
+        points = np.fromfile(path, np.float32).reshape(-1, _COLUMNS)
+        return Sweep(points, self._sensor_to_global(row), int(self.index.sweep_time_us[row]), str(path))
 
 
 @dataclasses.dataclass(frozen=True)

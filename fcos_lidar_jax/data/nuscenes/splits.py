@@ -4,7 +4,7 @@ import ast
 import importlib.util
 from pathlib import Path
 
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.data.splits import SPLITS, own_splits
 
 OFFICIAL = ("train", "val", "test", "mini_train", "mini_val")
 """Splits of the official devkit, which lists their scenes in its source."""
@@ -24,8 +24,7 @@ def scenes_of_split(split: str, tables: str | Path, *, file: str | Path | None =
     Raises:
         ValueError: the split is unknown or has no scene.
     """
-    path = Path(tables) / "splits.json" if file is None else Path(file)
-    splits = own_splits(tables, file)
+    path, splits = Path(file or Path(tables) / SPLITS), own_splits(Path(tables), file)
     places = [f"{path} ({', '.join(splits)})" if splits else str(path)]
     if file is None and split not in splits and split in OFFICIAL:
         splits = _devkit_splits()
@@ -36,14 +35,6 @@ def scenes_of_split(split: str, tables: str | Path, *, file: str | Path | None =
     if not splits[split]:
         raise ValueError(f"{path}: {split}: got no scene, expected at least one")
     return splits[split]
-
-
-def own_splits(tables: str | Path, file: str | Path | None = None) -> dict[str, list[str]]:
-    """The splits in a file, by default the version's own ``splits.json``; empty if that is missing."""
-    path = Path(tables) / "splits.json" if file is None else Path(file)
-    if file is None and not path.is_file():
-        return {}
-    return read_json(path, dict[str, list[str]], what="splits")
 
 
 def _devkit_splits() -> dict[str, list[str]]:

@@ -21,10 +21,6 @@ _PIECE_BYTES = 1 << 24
 _BETWEEN_ROWS = re.compile(rb"\}(\s*),(\s*)\{")
 
 
-class TableError(ValueError):
-    """An unusable table; the message names the file, the record and the field."""
-
-
 class Row(msgspec.Struct, gc=False):
     """A row of a table."""
 
@@ -136,13 +132,13 @@ def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) 
         piece_bytes: approximate size of a piece's text.
 
     Raises:
-        TableError: the table is missing or not JSON, or a row lacks fields of ``kind``.
+        ValueError: the table is missing or not JSON, or a row lacks fields of ``kind``.
     """
     path = folder / kind.file
     if not path.is_file():
-        raise TableError(f"{path}: no such file, expected the table")
+        raise ValueError(f"{path}: no such file, expected the table")
     if path.stat().st_size == 0:
-        raise TableError(f"{path}: empty file, expected a JSON list")
+        raise ValueError(f"{path}: empty file, expected a JSON list")
     decoder = msgspec.json.Decoder(list[kind])
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text:
         num_rows = 0
@@ -172,14 +168,14 @@ def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, first_row: 
     except msgspec.ValidationError as error:
         text, _, place = str(error).rpartition(" - at `")
         place = re.sub(r"\$\[(\d+)\]", lambda match: f"$[{int(match[1]) + first_row}]", place.rstrip("`"))
-        raise TableError(f"{path}: {place or '$'}: {text or error}") from None
+        raise ValueError(f"{path}: {place or '$'}: {text or error}") from None
     except msgspec.DecodeError as error:
         at = re.search(r"byte (\d+)", str(error))
         place = int(at[1]) if at else len(piece)
         what = re.sub(r" ?\(byte \d+\)", "", str(error))
-        raise TableError(f"{path}: byte {place + offset}{_record_at(piece, place)}: not JSON: {what}") from None
+        raise ValueError(f"{path}: byte {place + offset}{_record_at(piece, place)}: not JSON: {what}") from None
     except (UnicodeDecodeError, RecursionError) as error:
-        raise TableError(f"{path}: not JSON: {error}") from None
+        raise ValueError(f"{path}: not JSON: {error}") from None
 
 
 def _record_at(piece: bytes, place: int) -> str:

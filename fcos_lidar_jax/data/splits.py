@@ -1,0 +1,38 @@
+"""Splits: named lists of scenes or frames."""
+
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from fcos_lidar_jax.files import read_json
+
+SPLITS = "splits.json"
+
+
+def own_splits(folder: Path, file: str | Path | None = None) -> dict[str, list[str]]:
+    """The splits in a file, by default the folder's ``splits.json``; empty if that is missing."""
+    if file is None and not (folder / SPLITS).exists():
+        return {}
+    return read_json(Path(file or folder / SPLITS), dict[str, list[str]], what="splits")
+
+
+def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], where: str) -> tuple[str, ...]:
+    """Check a list of frame names: at least one, each known and listed once.
+
+    Args:
+        listed: the place of each name, for messages, and the name.
+        known: names of all frames.
+        where: the place of the list, for messages.
+
+    Raises:
+        ValueError: with the place, the found and the expected value.
+    """
+    names: dict[str, None] = {}
+    for place, name in listed:
+        if name not in known:
+            raise ValueError(f"{place}: got {name!r}, expected the name of a cloud")
+        if name in names:
+            raise ValueError(f"{place}: got {name!r} a second time, expected every frame once")
+        names[name] = None
+    if not names:
+        raise ValueError(f"{where}: no frame in it, expected at least one")
+    return tuple(names)

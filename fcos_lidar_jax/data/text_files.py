@@ -1,0 +1,72 @@
+"""Text files of numbers: lines with their place for messages, finite numbers, named matrices."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fcos_lidar_jax.data.sweeps import is_rotation
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
+    """The place of each line, for messages, and its words; blank lines are skipped.
+
+    Raises:
+        ValueError: with the file: it cannot be read or is not text; ``what`` describes what is expected.
+    """
+    if not file.is_file():
+        raise ValueError(f"{file}: no such file, expected {what}")
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file}: got {error.reason} at byte {error.start}, expected {what}") from None
+    rows = ((f"{file}: line {i}", line.split()) for i, line in enumerate(lines, start=1))
+    return [(where, words) for where, words in rows if words]
+
+
+def read_number(word: str, where: str, *, largest: float = _LARGEST) -> float:
+    """A finite number of at most ``largest`` in magnitude.
+
+    >>> read_number("1e3", "a.txt: line 1: x")
+    1000.0
+    """
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not abs(value) <= largest:
+        raise ValueError(f"{where}: got {word!r}, expected a finite number of at most {largest:g}")
+    return value
+
+
+def read_matrices(
+    file: Path, shapes: Mapping[str, tuple[int, int]], rotations: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Read matrices from lines ``NAME: NUMBER NUMBER ...``; lines of other names are skipped.
+
+    Args:
+        file: the file.
+        shapes: names of the matrices, all of them required, and their rows and columns.
+        rotations: names of the matrices that begin with a 3x3 rotation.
+
+    Raises:
+        ValueError: with the file, the line, the matrix, the found and the expected value.
+    """
+    matrices = {}
+    for where, (name, *words) in read_lines(file):
+        if (name := name.removesuffix(":")) not in shapes:
+            continue
+        where = f"{where}: {name}"
+        if len(words) != np.prod(shapes[name]):
+            raise ValueError(f"{where}: got {len(words)} numbers, expected {np.prod(shapes[name])}")
+        matrices[name] = np.array([read_number(word, where) for word in words]).reshape(shapes[name])
+        if name in rotations and not is_rotation(matrices[name][:, :3]):
+            raise ValueError(f"{where}: got no rotation in its 3x3, expected orthonormal rows")
+    for name in shapes:
+        if name not in matrices:
+            raise ValueError(f"{file}: {name}: missing, expected {', '.join(shapes)}")
+    return matrices
