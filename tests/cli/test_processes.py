@@ -5,15 +5,14 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import assert_one_line_error, child_environment, command, in_use, mistakes
+from commands import assert_one_line_error, command, in_use, mistakes, run_python
+from forked import Forked
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
@@ -126,40 +125,33 @@ def root(tmp_path_factory) -> Path:
     return home / "data"
 
 
-def start(args: list[str], **variables: str) -> subprocess.Popen[str]:
-    words = [sys.executable, "-m", "fcos_lidar_jax", *args]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(words, env=child_environment(**variables), text=True, **pipes)
-
-
 def free_port() -> str:
     with socket.socket() as free:
         free.bind(("localhost", 0))
         return str(free.getsockname()[1])
 
 
-def start_two(how: str, *args: list[str]) -> list[subprocess.Popen[str]]:
+def start_two(how: str, *args: list[str]) -> list[Forked]:
     """Start the command as two processes, each with its own arguments, connected by ``how``."""
     port = free_port()
 
-    def one(index: int) -> subprocess.Popen[str]:
+    def one(index: int) -> Forked:
         if how == "coordinator":
             place = ["--coordinator", f"localhost:{port}", "--num-processes", "2", "--process-index", str(index)]
-            return start([*args[index], *place])
+            return Forked([*args[index], *place])
         own = {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index), "JAX_COORDINATOR_PORT": port}
-        return start([*args[index], "--distributed"], **SRUN, **own)
+        return Forked([*args[index], "--distributed"], **SRUN, **own)
 
     return [one(index) for index in range(2)]
 
 
-def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
+def ended(processes: list[Forked]) -> list[tuple[int, str, str]]:
     """Wait for the end; returns exit codes and output."""
     try:
-        printed = [process.communicate(timeout=200) for process in processes]
+        return [process.end() for process in processes]
     finally:
         for process in processes:
             process.kill()
-    return [(process.returncode, *texts) for process, texts in zip(processes, printed, strict=True)]
 
 
 def evaluate(data: Path, out: Path, *more: str) -> list[str]:
@@ -251,12 +243,12 @@ def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
     assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see its output"]
 
 
-def start_one(args: list[str]) -> list[subprocess.Popen[str]]:
+def start_one(args: list[str]) -> list[Forked]:
     """Start a cluster of one process."""
-    return [start([*args, "--coordinator", f"localhost:{free_port()}", "--num-processes=1", "--process-index=0"])]
+    return [Forked([*args, "--coordinator", f"localhost:{free_port()}", "--num-processes=1", "--process-index=0"])]
 
 
-def wait_for(file: Path, process: subprocess.Popen[str]) -> None:
+def wait_for(file: Path, process: Forked) -> None:
     """Wait until the file has content, or the process has ended."""
     until = time.monotonic() + 100
     while not (file.exists() and file.stat().st_size) and process.poll() is None and time.monotonic() < until:
@@ -309,8 +301,8 @@ _NOT_SHARED |= {"pasted_objects", "truncated_points", "truncated_boxes", "invali
 
 
 def test_two_processes_train_like_one_with_two_devices(root, tmp_path):
-    ((code, _, errors),) = ended([start(train(root, tmp_path / "alone"), JAX_NUM_CPU_DEVICES="2")])
-    assert code == 0, errors
+    alone = run_python("-m", "fcos_lidar_jax", *train(root, tmp_path / "alone"), JAX_NUM_CPU_DEVICES="2")
+    assert alone.returncode == 0, alone.stderr
     first, second = ended(start_two("coordinator", *[train(root, tmp_path / "run")] * 2))
     assert (first[0], second[0]) == (0, 0), first[2] + second[2]
     metrics = read_metrics(tmp_path / "run")
