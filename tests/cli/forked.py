@@ -1,12 +1,14 @@
 """Commands as other processes, forked after all imports: they start in a tenth of the time."""
 
 import atexit
+import itertools
 import multiprocessing
 import os
-import signal
+import pkgutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,11 +19,18 @@ _CONTEXT.set_forkserver_preload(["fcos_lidar_jax.cli.commands", __name__])
 
 
 class Forked:
-    """A command in another process, with the methods of ``subprocess.Popen`` that the tests use."""
+    """A command in another process.
 
-    def __init__(self, args: list[str], **variables: str) -> None:
+    Args:
+        args: words of the command.
+        before: called in the process before the command; a function of a module.
+        variables: environment variables that are read when the command runs, not when modules are imported.
+    """
+
+    def __init__(self, args: list[object], before: Callable[[], object] = int, **variables: str) -> None:
         self._files = tempfile.mkstemp()[1], tempfile.mkstemp()[1]
-        self._process = _CONTEXT.Process(target=_run, args=(args, variables, self._files), daemon=True)
+        given = list(map(str, args)), before, variables, self._files
+        self._process = _CONTEXT.Process(target=_run, args=given, daemon=True)
         with pytest.MonkeyPatch.context() as patch:  # of the server, which the first process starts
             for name, value in child_environment(JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0").items():
                 patch.setenv(name, value)
@@ -50,13 +59,27 @@ class Forked:
         self._process.join()
 
 
-def _run(args: list[str], variables: dict[str, str], files: tuple[str, str]) -> None:
+def signal_at(place: str, number: int, call: int = 1) -> None:
+    """Let this process send itself a signal where it calls ``module.function`` for the first or a later time."""
+    where, _, name = place.rpartition(".")
+    owner, calls = pkgutil.resolve_name(where), itertools.count(1)
+    function = getattr(owner, name)
+
+    def signalling(*args, **kwargs):
+        if next(calls) == call:
+            os.kill(os.getpid(), number)
+        return function(*args, **kwargs)
+
+    setattr(owner, name, signalling)
+
+
+def _run(args: list[str], before: Callable[[], object], variables: dict[str, str], files: tuple[str, str]) -> None:
     from fcos_lidar_jax.cli import main
 
     os.environ.update(variables)
     for descriptor, file in enumerate(files, start=1):
         os.dup2(os.open(file, os.O_WRONLY | os.O_APPEND), descriptor)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    before()
     try:
         sys.exit(main(args))
     finally:
