@@ -44,6 +44,8 @@ _QUICK = (
     "test_prediction",
     "test_prediction_log",
     "test_onnx_graph",
+    "test_openvino",
+    "test_stream",
 )
 
 

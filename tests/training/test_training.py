@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from tiny_run import bits
+from tiny_run import TINY_CONFIG, bits
 
 from fcos_lidar_jax.coding import encode
 from fcos_lidar_jax.config import OptimizerConfig
@@ -62,9 +62,8 @@ def counted(function):
 def trainer():
     """Detector, state and a jitted step that counts its traces."""
     detector = build_detector(CONFIG, TINY)
-    optimizer = make_optimizer(CONFIG.optimizer, STEPS)
-    state = jax.jit(lambda key: make_state(detector, optimizer, key))(jax.random.key(0))
-    return detector, state, *counted(make_train_step(detector, optimizer))
+    optimizer, key = make_optimizer(CONFIG.optimizer, STEPS), jax.random.key(0)
+    return detector, make_state(detector, optimizer, key), *counted(make_train_step(detector, optimizer))
 
 
 def test_a_short_run_learns_one_simulated_frame_and_compiles_once(trainer):
@@ -124,8 +123,8 @@ def test_a_step_is_finite_without_boxes_and_points(trainer, num_points, with_box
 @pytest.mark.parametrize(("augmented", "packing"), [(False, Packing(0, False)), (True, Packing(1, False))])
 def test_a_step_on_a_packed_batch_is_bit_identical(augmented, packing):
     """To a step on a plain batch with its valid rows in front; in any order, the metrics are bit-identical."""
-    detector = toy_detector(dataclasses.replace(CONFIG, augment=QUICKSTART.augment if augmented else None))
-    optimizer = make_optimizer(CONFIG.optimizer, STEPS)
+    config = dataclasses.replace(TINY_CONFIG, augment=QUICKSTART.augment if augmented else None)
+    detector, optimizer = build_detector(config, TINY), make_optimizer(config.optimizer, STEPS)
     state, step = make_state(detector, optimizer, jax.random.key(0)), jax.jit(make_train_step(detector, optimizer))
     scene = frame(3)
     scattered = make_batch([scene], **SIZES)
