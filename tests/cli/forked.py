@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from commands import child_environment
@@ -28,8 +27,8 @@ class Forked:
     """
 
     def __init__(self, args: list[object], before: Callable[[], object] = int, **variables: str) -> None:
-        self._files = tempfile.mkstemp()[1], tempfile.mkstemp()[1]
-        given = list(map(str, args)), before, variables, self._files
+        self._files = tempfile.NamedTemporaryFile("r"), tempfile.NamedTemporaryFile("r")  # noqa: SIM115
+        given = list(map(str, args)), before, variables, [file.name for file in self._files]
         self._process = _CONTEXT.Process(target=_run, args=given, daemon=True)
         with pytest.MonkeyPatch.context() as patch:  # of the server, which the first process starts
             for name, value in child_environment(JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0").items():
@@ -47,16 +46,17 @@ class Forked:
     def end(self, timeout_s: float = 200) -> tuple[int, str, str]:
         """Wait for the end; returns the exit code, standard output and standard error."""
         self._process.join(timeout_s)
-        code = self.poll()
+        code, (out, err) = self.poll(), (file.read() for file in self._files)
         self.kill()
         if code is None:
-            raise subprocess.TimeoutExpired("fcos-lidar", timeout_s)
-        out, err = (Path(file).read_text() for file in self._files)
+            raise subprocess.TimeoutExpired("fcos-lidar", timeout_s, out, err)
         return code, out, err
 
     def kill(self) -> None:
         self._process.kill()
         self._process.join()
+        for file in self._files:
+            file.close()
 
 
 def signal_at(place: str, number: int, call: int = 1) -> None:
@@ -73,7 +73,7 @@ def signal_at(place: str, number: int, call: int = 1) -> None:
     setattr(owner, name, signalling)
 
 
-def _run(args: list[str], before: Callable[[], object], variables: dict[str, str], files: tuple[str, str]) -> None:
+def _run(args: list[str], before: Callable[[], object], variables: dict[str, str], files: list[str]) -> None:
     from fcos_lidar_jax.cli import main
 
     os.environ.update(variables)
