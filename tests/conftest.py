@@ -29,7 +29,7 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
         signal.signal(number, usual)
 
 jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / "jax"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # a process compiles hundreds of small programs
 
 
 # Most of the time goes to compilation. Where the question is what a command or a run does, not how it rounds, the
@@ -43,6 +43,9 @@ _QUICK = (
     "devices",
     "test_prediction",
     "test_prediction_log",
+    "test_onnx_graph",
+    "test_openvino",
+    "test_stream",
 )
 
 

@@ -17,7 +17,7 @@ from tiny_run import TINY_CONFIG, bits, untrained
 
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli import demo, main
+from fcos_lidar_jax.cli import demo, demo_training, main
 from fcos_lidar_jax.cli import detect as detect_command
 from fcos_lidar_jax.cli.commands import _COMMANDS
 from fcos_lidar_jax.files import file_lock
@@ -324,8 +324,10 @@ def test_help_describes_every_option(name, capsys):
 @pytest.fixture(scope="module")
 def drive(home):
     """The results of a demo of three keyframes and two training steps, with a network that compiles in seconds."""
+    small = {"model": TINY_CONFIG.model, "inference": TINY_CONFIG.inference}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "WEIGHTS", str(home / "checkpoint"))
+        patch.setattr(demo_training, "QUICKSTART", dataclasses.replace(QUICKSTART, **small))
         command("demo --keyframes 3 --train --steps 2 --test-frames 3 --out", home / "demo")
     return home / "demo"
 

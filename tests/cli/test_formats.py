@@ -30,7 +30,7 @@ from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.run import train
 
-STEPS = 20
+STEPS = 2
 Made = tuple[str, str, Path, tuple[str, ...]]
 """Options of the data, preset with its options, a point file, and the classes."""
 
@@ -49,17 +49,17 @@ def nuscenes(root: Path) -> Made:
 
 
 def kitti(root: Path) -> Made:
-    coarse = dataclasses.replace(KITTI_HDL64E, num_columns=256)
+    coarse = dataclasses.replace(KITTI_HDL64E, num_columns=64)
     make_kitti(root, sensor=coarse)
     cloud = root / "training" / "velodyne" / "000000.bin"
-    return f"--data-root {root}", f"kitti {sensor_options(root, coarse, 16384)}", cloud, KITTI_CLASSES
+    return f"--data-root {root}", f"kitti {sensor_options(root, coarse, 4096)}", cloud, KITTI_CLASSES
 
 
 def argoverse2(root: Path) -> Made:
     coarse = dataclasses.replace(ARGOVERSE2, num_columns=64)
     make_argoverse2(root, sensor=coarse)
     cloud = next(root.rglob("sensors/lidar/*.feather"))
-    return f"--data-root {root}", f"argoverse2 {sensor_options(root, coarse, 8192)}", cloud, ARGOVERSE2_CLASSES
+    return f"--data-root {root}", f"argoverse2 {sensor_options(root, coarse, 4096)}", cloud, ARGOVERSE2_CLASSES
 
 
 def simulated(root: Path) -> Made:
@@ -181,13 +181,16 @@ def test_warns_if_frames_are_both_trained_and_evaluated_on(messages):
         assert "no splits" not in messages(line, {"train": [A, B], "val": [C]})
 
 
-def test_prepares_into_another_folder_and_evaluates_given_detections(tmp_path):
-    """For data on a read-only disk; the report names the frames."""
+def test_prepares_into_another_folder_and_evaluates_given_detections(tmp_path, monkeypatch):
+    """For data on a read-only disk; training finds the objects there, and the report names the frames."""
     root, data = own_data(tmp_path, train=2, val=2)
     data += f" --index {tmp_path}/prepared"
     command("prepare", data)
     assert not (root / ".fcos_lidar").exists()
-    command("train quickstart", data, "--out", tmp_path / "run", *NETWORK_OPTIONS, "--steps 2 --fade-epochs 0")
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", trained := Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(AssertionError):  # interrupted
+        command("train quickstart", data, "--out", tmp_path / "run")
+    assert trained.call_args.kwargs["objects"].folder.is_relative_to(tmp_path / "prepared")
     out, evaluate = tmp_path / "scores", f"evaluate {data} --checkpoint quickstart --out"
     command(evaluate, out)
     for line in ("The worst sample", "The best sample"):

@@ -40,7 +40,7 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
 
     commands = [shlex.split(line) for line in re.findall(r"^fcos-lidar .*", PAGE, re.MULTILINE)]
     assert [command[1] for command in commands] == ["prepare", "train", "evaluate", "detect"]
-    smaller = {"train": [*NETWORK_OPTIONS, "--steps 20 --save-every 20 --evaluate-every 20"]}
+    smaller = {"train": [*NETWORK_OPTIONS, "--steps 2 --save-every 2 --evaluate-every 2"]}
     for _, name, *args in commands:
         command(name, *args, *smaller.get(name, []))
     summary = json.loads(Path("evaluation/metrics_summary.json").read_text())

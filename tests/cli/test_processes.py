@@ -1,25 +1,26 @@
 """Several processes: the options, and two processes on this machine that train and evaluate together."""
 
+import functools
 import json
 import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import assert_one_line_error, child_environment, command, in_use, mistakes
+from commands import assert_one_line_error, command, in_use, mistakes, run_python
+from forked import Forked, signal_at
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 SRUN = {
@@ -126,40 +127,37 @@ def root(tmp_path_factory) -> Path:
     return home / "data"
 
 
-def start(args: list[str], **variables: str) -> subprocess.Popen[str]:
-    words = [sys.executable, "-m", "fcos_lidar_jax", *args]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(words, env=child_environment(**variables), text=True, **pipes)
-
-
 def free_port() -> str:
     with socket.socket() as free:
         free.bind(("localhost", 0))
         return str(free.getsockname()[1])
 
 
-def start_two(how: str, *args: list[str]) -> list[subprocess.Popen[str]]:
-    """Start the command as two processes, each with its own arguments, connected by ``how``."""
+def start_two(how: str, *args: list[str], last: Callable[[], object] = int) -> list[Forked]:
+    """Start the command as two processes, each with its own arguments, connected by ``how``.
+
+    The second process calls ``last`` first.
+    """
     port = free_port()
 
-    def one(index: int) -> subprocess.Popen[str]:
+    def one(index: int) -> Forked:
+        before = last if index else int
         if how == "coordinator":
             place = ["--coordinator", f"localhost:{port}", "--num-processes", "2", "--process-index", str(index)]
-            return start([*args[index], *place])
+            return Forked([*args[index], *place], before)
         own = {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index), "JAX_COORDINATOR_PORT": port}
-        return start([*args[index], "--distributed"], **SRUN, **own)
+        return Forked([*args[index], "--distributed"], before, **SRUN, **own)
 
     return [one(index) for index in range(2)]
 
 
-def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
+def ended(processes: list[Forked]) -> list[tuple[int, str, str]]:
     """Wait for the end; returns exit codes and output."""
     try:
-        printed = [process.communicate(timeout=200) for process in processes]
+        return [process.end() for process in processes]
     finally:
         for process in processes:
             process.kill()
-    return [(process.returncode, *texts) for process, texts in zip(processes, printed, strict=True)]
 
 
 def evaluate(data: Path, out: Path, *more: str) -> list[str]:
@@ -251,40 +249,31 @@ def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
     assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see its output"]
 
 
-def start_one(args: list[str]) -> list[subprocess.Popen[str]]:
+def start_one(args: list[str], before: Callable[[], object]) -> list[Forked]:
     """Start a cluster of one process."""
-    return [start([*args, "--coordinator", f"localhost:{free_port()}", "--num-processes=1", "--process-index=0"])]
-
-
-def wait_for(file: Path, process: subprocess.Popen[str]) -> None:
-    """Wait until the file has content, or the process has ended."""
-    until = time.monotonic() + 100
-    while not (file.exists() and file.stat().st_size) and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.01)
+    place = ["--coordinator", f"localhost:{free_port()}", "--num-processes=1", "--process-index=0"]
+    return [Forked([*args, *place], before)]
 
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path, number):
     frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
     args = ["evaluate", *frames, "--checkpoint", str(root.parent / "start"), "--out", str(tmp_path / "all")]
-    processes = start_one(args) if number == 1 else start_two("coordinator", args, args)
-    log = tmp_path / "all" / "detections.resume_log"
-    wait_for(log, processes[0])
-    processes[-1].send_signal(signal.SIGTERM)
+    stop = functools.partial(signal_at, f"{SimulatedFrames.__module__}.SimulatedFrames.frame", signal.SIGTERM, 40)
+    processes = start_one(args, stop) if number == 1 else start_two("coordinator", args, args, last=stop)
     for code, _, errors in ended(processes):
         assert (code, error_lines(errors)) == (143, []), errors
-    done = log.read_bytes().count(b"\n") - 1
+    done = (tmp_path / "all" / "detections.resume_log").read_bytes().count(b"\n") - 1
     assert 0 < done < 400
     assert done % number == 0
 
 
 def test_sigterm_ends_the_scoring_too(root, tmp_path):
-    (process,) = start_one([*evaluate(root, tmp_path / "alone"), "--bootstrap", "1000000"])
-    wait_for(tmp_path / "alone" / "results_nusc.json", process)
-    time.sleep(2)  # until the scoring has begun
-    process.send_signal(signal.SIGTERM)
-    ((code, _, errors),) = ended([process])
+    stop = functools.partial(signal_at, "fcos_lidar_jax.evaluation.summary.bootstrap", signal.SIGTERM)
+    ((code, _, errors),) = ended(start_one([*evaluate(root, tmp_path / "alone"), "--bootstrap", "9"], stop))
     assert (code, error_lines(errors)) == (143, []), errors
+    assert (tmp_path / "alone" / "results_nusc.json").exists()
+    assert not (tmp_path / "alone" / "bootstrap.json").exists()
 
 
 def train(data: Path, out: Path) -> list[str]:
@@ -309,8 +298,8 @@ _NOT_SHARED |= {"pasted_objects", "truncated_points", "truncated_boxes", "invali
 
 
 def test_two_processes_train_like_one_with_two_devices(root, tmp_path):
-    ((code, _, errors),) = ended([start(train(root, tmp_path / "alone"), JAX_NUM_CPU_DEVICES="2")])
-    assert code == 0, errors
+    alone = run_python("-m", "fcos_lidar_jax", *train(root, tmp_path / "alone"), JAX_NUM_CPU_DEVICES="2")
+    assert alone.returncode == 0, alone.stderr
     first, second = ended(start_two("coordinator", *[train(root, tmp_path / "run")] * 2))
     assert (first[0], second[0]) == (0, 0), first[2] + second[2]
     metrics = read_metrics(tmp_path / "run")

@@ -5,15 +5,14 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, child_environment, command, in_use, mistakes
+from commands import assert_one_line_error, command, in_use, mistakes
+from forked import Forked
 from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
 
 from fcos_lidar_jax import cli
@@ -66,27 +65,25 @@ def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys)
     command("detect", cloud, "--checkpoint", out, "--out", tmp_path / "boxes.json")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def child():
     """``child(args)`` starts the command as a process."""
     started = []
 
-    def start(args: list[str]) -> subprocess.Popen[str]:
-        words = [sys.executable, "-m", "fcos_lidar_jax", *args]
-        started.append(subprocess.Popen(words, env=child_environment(), stderr=subprocess.PIPE, text=True))
+    def start(args: list[str]) -> Forked:
+        started.append(Forked(args))
         return started[-1]
 
     yield start
     for process in started:
         process.kill()
-        process.wait()
 
 
 def checkpoints(out: Path) -> list[str]:
     return sorted(path.name for path in (out / "checkpoints").glob("*"))
 
 
-def wait_for_a_step(process: subprocess.Popen[str], out: Path, beyond: int = 0) -> None:
+def wait_for_a_step(process: Forked, out: Path, beyond: int = 0) -> None:
     """Wait until the run has done more steps, or has ended."""
     until = time.monotonic() + 200
     while process.poll() is None and time.monotonic() < until:
@@ -101,12 +98,12 @@ def long(root: Path) -> list[str]:
     return [*more, "--save-every", "2000"]
 
 
-def stop(process: subprocess.Popen[str], number: int, out: Path, beyond: int = 0) -> tuple[int, str, int]:
+def stop(process: Forked, number: int, out: Path, beyond: int = 0) -> tuple[int, str, int]:
     """Send a signal after one more step; returns the exit code, the messages and the total steps."""
     wait_for_a_step(process, out, beyond)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=200)
-    return process.returncode, errors, len(read_metrics(out))
+    code, _, errors = process.end()
+    return code, errors, len(read_metrics(out))
 
 
 def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
@@ -136,8 +133,8 @@ def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, 
     wait_for_a_step(both[0], out)
     both[1].send_signal(signal.SIGTERM)
     for process in both:
-        _, errors = process.communicate(timeout=200)
-        assert process.returncode == 143, errors
+        code, _, errors = process.end()
+        assert code == 143, errors
         assert "Traceback" not in errors
     steps = len(read_metrics(out))
     assert 0 < steps < 2000

@@ -1,21 +1,26 @@
 """The learning ladder: its trials are possible networks, and differ from the base in what they say."""
 
+import dataclasses
 import json
 
 import jax
 import pytest
+import tiny_run
 
 from experiments.studies import ladder
 from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, measure
-from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import COMPACT
+
+PARAMETERS = {"base": 1_265_726, "CenterPoint": 739_796, "local geometry": 1_288_574}
 
 
 @pytest.mark.parametrize("name", TRIALS)
 def test_every_trial_is_a_network_for_the_sector(name):
     config = TRIALS[name](BASE(COMPACT))
     detector = build_detector(config, SENSOR)
-    assert jax.eval_shape(detector.init, jax.random.key(0))["params"]
+    parameters = count_parameters(jax.eval_shape(detector.init, jax.random.key(0))["params"])["total"]
+    assert parameters == PARAMETERS[name]
     assert (config == BASE(COMPACT)) == (name == "local geometry")
     assert config.optimizer == COMPACT.optimizer
 
@@ -27,7 +32,9 @@ def test_an_unknown_trial_is_refused_before_anything_is_trained(monkeypatch):
 
 
 def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys):
-    """Two steps on four frames: that everything is there, not what it is."""
+    """Four steps on four frames with a tiny network: that everything is there, not what it is."""
+    model = dataclasses.replace(tiny_run.CONFIG.model, local_geometry=True)
+    monkeypatch.setattr(ladder, "COMPACT", dataclasses.replace(COMPACT, model=model))
     for name, value in (("TRAIN_FRAMES", 4), ("TEST_FRAMES", 3), ("CURVE_FRAMES", 2)):
         monkeypatch.setattr(ladder, name, value)
     out = tmp_path / "ladder.json"
@@ -37,7 +44,8 @@ def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys)
     assert (row["trial"], row["seed"], len(row["curve"])) == ("local geometry", 0, 4)
     assert 0 <= row["mAP"] <= 1
     assert row["step_s"] > 0
-    assert row["parameters"] == 1_288_574
+    shapes = jax.eval_shape(build_detector(BASE(ladder.COMPACT), SENSOR).init, jax.random.key(0))
+    assert row["parameters"] == sum(leaf.size for leaf in jax.tree.leaves(shapes["params"]))
     assert '"trial": "local geometry"' in capsys.readouterr().out
     monkeypatch.setattr(ladder, "trial", None)  # nothing is trained again
     measure(args)

@@ -2,10 +2,12 @@
 
 import functools
 import os
+import threading
+from pathlib import Path
 from typing import Any
 
 import jax
-from jax._src import compiler
+from jax._src import compiler, lru_cache
 
 _OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 _compile_options = compiler.get_compile_options
@@ -32,6 +34,21 @@ def environment(quick: bool) -> dict[str, str]:
         "JAX_DISABLE_MOST_OPTIMIZATIONS": str(int(quick)),
         "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]),
     }
+
+
+def _put_whole(cache: lru_cache.LRUCache, key: str, value: bytes) -> None:
+    """Store a compiled program under its name when it is whole.
+
+    JAX writes it in place, where another process can read the first half, also after this one is killed.
+    """
+    file = Path(str(cache.path), f"{key}{lru_cache._CACHE_SUFFIX}")
+    if not file.exists():
+        part = file.with_name(f".{os.getpid()}-{threading.get_ident()}-{file.name}")
+        part.write_bytes(value)
+        part.replace(file)
+
+
+lru_cache.LRUCache.put = _put_whole
 
 
 def _quick_compile_options(*args, env_options_overrides=None, **kwargs):
