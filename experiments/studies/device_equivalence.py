@@ -3,10 +3,11 @@
     python -m experiments.studies.device_equivalence
 
 Computes one gradient and five steps in float32 and float64 from the same state, on meshes of 1, 2, 4 and 8 virtual
-CPU devices in one process, and of 8 devices in two processes, on very unequal samples. A difference is the largest
-over all leaves, relative to the leaf's largest value. Expected: identical owners, labels and K; differences of
-gradient and five steps below 1e-9 in float64; in float32 a gradient that differs by less than twice ``rounding``,
-the difference between float32 and float64 on one device. In float32 the five steps are only reported, because
+CPU devices in one process, and of 8 devices in two processes, on very unequal samples. In one process it also
+computes one step under ``jax.pmap``; ``losses`` are those of one device, of the mesh and under ``pmap``. A
+difference is the largest over all leaves, relative to the leaf's largest value. Expected: identical owners, labels
+and K; differences of gradient, one step and five steps below 1e-9 in float64; in float32 a gradient that differs by
+less than twice ``rounding``, the difference between float32 and float64 on one device. In float32 the five steps are only reported, because
 AdamW turns rounding noise of a gradient near zero into a full-size step. Cost: eight minutes on two cores, mostly
 compilation.
 """
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -28,7 +30,7 @@ from experiments.changes import change
 from experiments.paper_tables.scales import small_network
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import StemConfig
-from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, replicate, shard_batch
+from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, pmap_step, replicate, shard_batch
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import Detector, build_detector
@@ -110,15 +112,32 @@ def measure(out: Path, mesh: Mesh, dtype: str, *, gradient: bool) -> None:
         of_batch = on_all(make_gradient(detector))(state.params, state.batch_stats, batches[0])
         results |= zip(("gradient", "statistics", "metrics"), of_batch, strict=True)
         results["targets"] = on_all(functools.partial(_targets_of, detector))(state, batches[0])
+        if processes == 1:
+            results["mapped"] = _mapped_step(make_train_step(detector, optimizer), start, mesh)
     step = jit_step(make_train_step(detector, optimizer), mesh)
-    metrics = {}
-    for batch in batches:
+    for i, batch in enumerate(batches):
         state, metrics = step(state, batch)
-    results["after"] = state.params, state.batch_stats, state.ema, metrics["loss/total"]
+        # A copy, because the next step donates the state.
+        results["after" if i else "step"] = jax.device_get(_outcome(state, metrics))
     leaves = jax.tree_util.tree_flatten_with_path(results)[0]
-    arrays = {jax.tree_util.keystr(path): np.asarray(leaf.addressable_data(0)) for path, leaf in leaves}
+    arrays = {jax.tree_util.keystr(path): np.asarray(_first_copy(leaf)) for path, leaf in leaves}
     if process == 0:
         np.savez(out, **arrays)  # type: ignore[arg-type]
+
+
+def _outcome(state: TrainState, metrics: Any) -> tuple[Any, ...]:
+    return state.params, state.batch_stats, state.ema, metrics["loss/total"]
+
+
+def _mapped_step(step: Any, start: TrainState, mesh: Mesh) -> tuple[Any, ...]:
+    """The outcome of one step under ``jax.pmap``, of the first device."""
+    state = jax.tree.map(lambda leaf: jnp.stack([leaf] * mesh.size), start)
+    batch = jax.tree.map(lambda leaf: leaf.reshape(mesh.size, -1, *leaf.shape[1:]), batch_of(0))
+    return jax.tree.map(lambda leaf: leaf[0], _outcome(*pmap_step(step, mesh)(state, batch)))
+
+
+def _first_copy(leaf: Any) -> Any:
+    return leaf.addressable_data(0) if isinstance(leaf, jax.Array) else leaf
 
 
 def work(
@@ -162,6 +181,9 @@ def _compare(folder: Path, devices: int, processes: int, dtype: str) -> dict[str
         record["k_of_samples"] = one["['targets'][2]"].sum(axis=1).tolist()
         record |= {part: _difference(one, many, part) for part in ("gradient", "statistics", "metrics")}
         record["rounding"] = _difference(exact, one, "gradient")
+    if mapped := {name.replace("mapped", "step"): many[name] for name in many if name.startswith("['mapped']")}:
+        record["step"], record["step_by_pmap"] = (_difference(one, other, "step") for other in (many, mapped))
+        record["losses"] = [float(each["['step'][3]"]) for each in (one, many, mapped)]
     return record | {"after_five_steps": _difference(one, many, "after")}
 
 
