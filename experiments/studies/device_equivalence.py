@@ -6,8 +6,8 @@ Computes one gradient and five steps in float32 and float64 from the same state,
 CPU devices in one process, and of 8 devices in two processes, on very unequal samples. In one process it also
 computes one step under ``jax.pmap``; ``losses`` are those of one device, of the mesh and under ``pmap``. A
 difference is the largest over all leaves, relative to the leaf's largest value. Expected: identical owners, labels
-and K; differences of gradient, one step and five steps below 1e-9 in float64; in float32 a gradient that differs by
-less than twice ``rounding``, the difference between float32 and float64 on one device. In float32 the steps are
+and K; differences of gradient, one step and five steps below 1e-9 in float64; in float32 a gradient that differs
+by less than twice ``rounding``, the difference between float32 and float64 on one device. In float32 the steps are
 only reported, because AdamW turns rounding noise of a gradient near zero into a full-size step. Cost: ten minutes
 on two cores, mostly compilation.
 """
