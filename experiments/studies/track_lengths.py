@@ -7,9 +7,9 @@
     python -m experiments.studies.track_lengths --tables drives/v1.0-synthetic --lines 1.jsonl 2.jsonl 3.jsonl
 
 Tracks the boxes that reach a score again, as ``--min-score`` does. A box finds the nearest object of its class
-that no better box has found, at most 2 m away, among the objects with points. An object switches where the last box
-that found it has another identity. Without ``--keyframes`` only the lengths are measured between keyframes. Cost:
-three minutes on one CPU core, or five without ``--keyframes``.
+that no better box has found, at most 2 m away, among the objects with points. An object switches where the last
+box that found it has another identity. Without ``--keyframes``, objects are known at keyframes only. Cost: two
+minutes on one CPU core, or five without ``--keyframes``.
 """
 
 import dataclasses
@@ -64,7 +64,9 @@ def find_objects(centres: np.ndarray, labels: np.ndarray, scores: np.ndarray, tr
     return found
 
 
-def measure_score(drives: list[list[dict[str, Any]]], truth: dict[int, Objects], min_score: float) -> dict[str, Any]:
+def measure_score(
+    drives: list[list[dict[str, Any]]], truth: dict[int, Objects], min_score: float
+) -> dict[str, Any]:
     """Lengths of the tracks and switches of the objects, over all drives."""
     lengths, boxes, hits, again, switches, followed = list[int](), 0, 0, 0, 0, 0
     scored = 0
