@@ -101,7 +101,7 @@ def measure_score(
         "in_three_or_more": round(followed / max(boxes, 1), 3),
         "true_boxes": round(hits / max(scored, 1), 3),
         "seen_again": again,
-        "switches": round(switches / max(again, 1), 3),
+        "switches": round(float(switches) / max(again, 1), 3),
     }
 
 
