@@ -96,6 +96,22 @@ def naming(path: Path) -> Iterator[None]:
         raise OSError(f"{path}: cannot be written: {error.strerror}") from None
 
 
+def local_path(path: str | Path) -> Path:
+    """The path, unless it is the URL of a bucket or another server: locks and renames need a file system.
+
+    >>> local_path("run")
+    PosixPath('run')
+    >>> local_path(Path("gs://bucket/run"))  # pathlib drops a slash
+    Traceback (most recent call last):
+    ValueError: gs://bucket/run: got a URL, expected a path: ...
+    """
+    if url := re.match(r"([A-Za-z][A-Za-z0-9+.-]+):/+", str(path)):
+        whole = f"{url[1]}://{str(path)[url.end() :]}"
+        hint = "copy the files (gsutil, aws s3) or mount the bucket (gcsfuse)"
+        raise ValueError(f"{whole}: got a URL, expected a path: {hint}")
+    return Path(path)
+
+
 def check_writable(path: Path) -> None:
     """Reject a path at which :func:`atomic_write` would fail, as far as this is known without writing.
 
@@ -115,7 +131,8 @@ def check_writable(path: Path) -> None:
 
 
 def _check_kind(path: Path) -> None:
-    """Reject paths that a file must not replace: folders, devices, and links, whose targets would remain."""
+    """Reject URLs, and what a file must not replace: folders, devices, and links, whose targets would remain."""
+    local_path(path)
     if path.is_symlink():
         raise FileExistsError(f"{path}: found a link to {path.readlink()}, expected a file to write")
     if path.is_dir():
@@ -146,7 +163,7 @@ def file_lock(path: str | Path, *, wait: bool = False) -> Iterator[bool]:
     ...     (first, second)
     (True, False)
     """
-    path = Path(path)
+    path = local_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
         try:
@@ -214,7 +231,7 @@ def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
     Traceback (most recent call last):
     ValueError: ...a.json: $[1]: got 3, expected str
     """
-    if not path.is_file():
+    if not local_path(path).is_file():
         raise ValueError(f"{path}: no such file, expected {what}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

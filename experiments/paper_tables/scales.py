@@ -24,7 +24,7 @@ from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemCon
 from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.data.nuscenes.index import default_index, has_index
+from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.metrics import evaluate
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
@@ -35,6 +35,7 @@ from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
+from fcos_lidar_jax.input_pipeline.open import default_split, find_data_set
 from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, Sensor, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
@@ -166,18 +167,21 @@ class NuScenesLayout:
     """
 
     data_root: Path | None = None  # Folder of a data set in the nuScenes layout, after fcos-lidar prepare.
-    version: str = "v1.0-trainval"  # Folder of its tables.
+    version: str | None = None  # Folder of its tables; default: the only one.
     index: Path | None = None
     """Index written by fcos-lidar prepare; default: DATA_ROOT/.fcos_lidar/VERSION."""
     splits: Path | None = None  # File {name: [scene, ...]} with your own splits.
-    train_split: str | None = None  # Default: mini_train for a version that ends in mini, otherwise train.
-    val_split: str | None = None  # Default: mini_val or val.
+    train_split: str | None = None  # Default: that of fcos-lidar prepare, train or mini_train.
+    val_split: str | None = None  # Default: val or mini_val.
     test_version: str | None = None
     """Version, such as v1.0-test, for whose split test table 8 writes a results file."""
     allow_missing_sweeps: bool = False  # Use fewer sweeps if files of older sweeps are missing.
     steps: int | None = None  # Updates of each cell, instead of the preset's epochs.
     accumulate: int = 1  # Micro-batches per step, if a batch does not fit; only batch norm changes.
+    batch_size: int = NUSCENES.optimizer.batch_size  # Samples per step.
+    learning_rate: float = NUSCENES.optimizer.peak_learning_rate  # Peak learning rate.
     precision: Literal["float32", "bfloat16"] = "float32"  # Precision of the convolutions after the first.
+    remat: bool = False  # Recompute the largest activations, for less memory.
     threads: int = 2  # Threads that prepare batches.
     workers: int = 0  # Additional processes that prepare batches.
 
@@ -197,18 +201,25 @@ class NuScenesLayout:
             tables = self.data_root / self.test_version
             if not tables.is_dir():
                 raise ValueError(f"--test-version: {tables}: no such folder, expected the version's tables")
-        index = self.index or default_index(self.data_root, self.version)
-        if (self.data_root / self.version).is_dir() and not has_index(index):
+        data = find_data_set(self.data_root, "nuscenes", self.version)
+        index = self.index or data.index
+        if (self.data_root / data.version).is_dir() and not has_index(index):
             raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
-        mini = "mini_" if self.version.endswith("mini") else ""
-        splits = {"train_split": self.train_split or f"{mini}train", "val_split": self.val_split or f"{mini}val"}
-        whole = dataclasses.replace(self, index=index, **splits)
+        split = functools.partial(default_split, data, required=True, splits=self.splits)
+        splits = {"train_split": self.train_split or split("train"), "val_split": self.val_split or split("val")}
+        whole = dataclasses.replace(self, version=data.version, index=index, **splits)
         whole.describe()
         return whole
 
     @property
     def base(self) -> Config:
-        return change(model__precision=self.precision, optimizer__accumulate=self.accumulate)(NUSCENES)
+        return change(
+            model__precision=self.precision,
+            model__remat=self.remat,
+            optimizer__batch_size=self.batch_size,
+            optimizer__accumulate=self.accumulate,
+            optimizer__peak_learning_rate=self.learning_rate,
+        )(NUSCENES)
 
     @functools.cache  # noqa: B019 - few scales per process
     def _data(self, version: str) -> NuScenes:
@@ -219,7 +230,9 @@ class NuScenesLayout:
     def frames(self, split: str | None, config: Config, version: str | None = None) -> NuScenesFrames:
         """Keyframes of a split, of the layout's version or another, read according to a configuration."""
         assert split is not None
-        data = self._data(version or self.version)
+        version = version or self.version
+        assert version is not None
+        data = self._data(version)
         return NuScenesFrames(data, tuple(data.split(split, file=self.splits)), config.reading)
 
     @functools.cache  # noqa: B019

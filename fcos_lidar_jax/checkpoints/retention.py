@@ -18,6 +18,7 @@ from fcos_lidar_jax.checkpoints.storage import (
     save_checkpoint,
     save_score,
 )
+from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.types import TrainState
 
 CHECKPOINTS = "checkpoints"  # folder of the checkpoints in the folder of a run
@@ -101,7 +102,7 @@ def find_checkpoint(folder: Path) -> Path:
     >>> find_checkpoint(Path("nowhere"))
     PosixPath('nowhere')
     """
-    if not folder.exists():
+    if not local_path(folder).exists():
         shipped = shipped_checkpoints()
         run_best = best_of(Checkpoints(folder.parent / CHECKPOINTS).paths()) if folder.name == BEST else None
         return run_best or shipped.get(str(folder), folder)

@@ -22,7 +22,7 @@ from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints.preemption import after_the_block
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
-from fcos_lidar_jax.files import atomic_write, checksum, naming, read_json
+from fcos_lidar_jax.files import atomic_write, checksum, local_path, naming, read_json
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
 from fcos_lidar_jax.types import TrainState
@@ -90,7 +90,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     ...     load_checkpoint(f"{folder}/mine").step
     7
     """
-    folder = Path(folder).absolute()
+    folder = local_path(folder).absolute()
     parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
     # Replicated arrays are complete on every device.
     parts = jax.tree.map(lambda x: np.asarray(x.addressable_data(0) if isinstance(x, jax.Array) else x), parts)
@@ -161,7 +161,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     Traceback (most recent call last):
     fcos_lidar_jax.checkpoints.storage.CheckpointError: /no/such/folder: found nothing, ...
     """
-    folder = Path(folder).absolute()
+    folder = local_path(folder).absolute()
     description = _verify(folder)
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     sensor = sensor_from_json(description["sensor"], f"{folder / _DESCRIPTION}: sensor")
@@ -178,7 +178,7 @@ def load_state(folder: str | Path, like: TrainState) -> TrainState:
     Raises:
         CheckpointError: see :func:`load_checkpoint`; also if the checkpoint has no state.
     """
-    folder = Path(folder).absolute()
+    folder = local_path(folder).absolute()
     description = _verify(folder)
     if not (folder / _STATE).is_dir():
         raise CheckpointError(f"{folder}: found a detector without a training state, expected both")

@@ -1,10 +1,12 @@
 """All commands with their options."""
 
 import contextlib
+import dataclasses
 import io
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from operator import or_
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -21,6 +23,7 @@ from fcos_lidar_jax.cli import (
     synthesize,
     train,
 )
+from fcos_lidar_jax.files import local_path
 
 _COMMANDS = {
     "demo": (demo.Demo, demo.run),
@@ -42,7 +45,7 @@ def parse(argv: Sequence[str] | None) -> Callable[[], object]:
     """Parse the arguments; returns the command, ready to run. Usage errors exit with 2.
 
     Raises:
-        ValueError: a configuration rejects a value.
+        ValueError: a configuration rejects a value, or an option is a URL.
     """
     output, rejection, command = io.StringIO(), None, None
     try:
@@ -54,8 +57,21 @@ def parse(argv: Sequence[str] | None) -> Callable[[], object]:
         raise ValueError(rejection)
     if command is None:
         command = _parse(argv)  # again, to print the help or the usage error
+    _check_paths(command)
     run = next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))
     return partial(run, command)
+
+
+def _check_paths(value: Any) -> None:
+    """Reject URLs in all options of a command."""
+    if isinstance(value, str | Path):
+        local_path(value)
+    elif isinstance(value, tuple):
+        for part in value:
+            _check_paths(part)
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            _check_paths(getattr(value, field.name))
 
 
 def _parse(argv: Sequence[str] | None) -> Any:

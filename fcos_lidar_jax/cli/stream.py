@@ -37,6 +37,8 @@ _OPTIONS = {
 }
 """Options that not every kind of drive takes, and the names that their functions give them."""
 
+_TRACKED_SCORE = 0.5  # Of boxes with lower scores, most are on no object, and their tracks last for a few sweeps.
+
 
 @dataclasses.dataclass(frozen=True)
 class Stream:
@@ -74,7 +76,8 @@ class Stream:
     """Also write a recording for the Rerun viewer. Needs pip install 'fcos-lidar-jax[viz]'."""
     yaw_deg: options.Yaw = 0.0
     track: bool = False  # Give each box the number of its object over time. Needs poses.
-    min_score: options.MinScore = 0.0
+    min_score: Annotated[float | None, option("S", default=f"{_TRACKED_SCORE} with --track, else 0")] = None
+    """Leave out boxes with a lower score, before tracking."""
     backend: options.Backend = "xla"
     columns: options.Columns = None
     dtype: options.Dtype = None
@@ -83,6 +86,9 @@ class Stream:
 
 def run(args: Stream) -> None:
     """Detect, write one line per sweep, and the page at the end."""
+    if args.min_score is None:
+        args = dataclasses.replace(args, min_score=_TRACKED_SCORE if args.track else 0.0)
+    assert args.min_score is not None
     kind = _find(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
     drive = _open(args, kind, detector)

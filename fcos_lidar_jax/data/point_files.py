@@ -11,6 +11,7 @@ import numpy as np
 from fcos_lidar_jax.data.npy_files import npz_names, parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
 from fcos_lidar_jax.fields import check
+from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.sensors import Sensor
 
 ENDINGS = (".pcd.bin", ".bin", ".npy", ".npz", ".pcd", ".feather")  # supported names, the longest first
@@ -69,7 +70,7 @@ def read_points(
     >>> read_points(file, KITTI_HDL64E).tolist()
     [[20.0, 3.0, -1.5, 51.0, 0.0], [8.0, -2.0, -1.7000000476837158, 102.0, 0.0]]
     """
-    path = Path(path)
+    path = local_path(path)
     kind = _kind(path, raw=columns is not None or dtype is not None)
     check(columns in (None, *_RAW_COLUMNS), f"{path}: columns", columns, "3, 4, 5 or 6")
     check(dtype in (None, *_RAW_DTYPES), f"{path}: dtype", dtype, ", ".join(_RAW_DTYPES))

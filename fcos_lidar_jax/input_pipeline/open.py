@@ -15,6 +15,7 @@ from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
 from fcos_lidar_jax.data.splits import own_splits
+from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.simulation.frame_set import SIMULATED_SPLITS, simulated_split
 
@@ -127,7 +128,7 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
         data = DataSet(Path(reader.name), reader)
     elif root is None:
         raise ValueError("data root: missing, expected the folder of a data set")
-    elif not Path(root).is_dir():
+    elif not local_path(root).is_dir():
         raise ValueError(f"{root}: no such folder, expected a data set")
     else:
         data = DataSet(Path(root), reader or _recognise(Path(root)))
@@ -229,6 +230,9 @@ def open_frames(
     Traceback (most recent call last):
     ValueError: ...: no known data set, expected one of ...
     """
+    for path in (root, index, splits):
+        if path is not None:
+            local_path(path)
     data = find_data_set(root, format, version)
     given: dict[str, Any] = {
         "index": index,

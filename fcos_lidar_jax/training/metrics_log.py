@@ -3,7 +3,7 @@
 import contextlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from fcos_lidar_jax.files import atomic_write, naming
 
 _FILE = "metrics.jsonl"
+_START = 1  # SessionLog.START
 
 
 class MetricsLog:
@@ -21,8 +22,7 @@ class MetricsLog:
     """
 
     def __init__(self, folder: Path, *, first_step: int) -> None:
-        from tensorboardX.proto.event_pb2 import SessionLog  # type: ignore[attr-defined]
-        from tensorboardX.record_writer import RecordWriter  # the thread of SummaryWriter would print its errors
+        from tensorboardX import RecordWriter  # the thread of SummaryWriter would print its errors
 
         file = folder / _FILE
         if file.exists():
@@ -35,7 +35,7 @@ class MetricsLog:
             self._events = RecordWriter(str(self._folder / f"events.out.tfevents.{time.time_ns()}"))
             self._write_event(first_step + 1, file_version="brain.Event:2")
             # TensorBoard then drops earlier events of these steps.
-            self._write_event(first_step + 1, session_log=SessionLog(status=SessionLog.START))
+            self._write_event(first_step + 1, session_log={"status": _START})
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Record numbers and lists of numbers by name."""
@@ -54,6 +54,19 @@ class MetricsLog:
         with naming(self._folder):
             self._write_event(step, summary={"value": numbers})
 
+    def write_pictures(self, step: int, pictures: Iterable[Path]) -> None:
+        """Show PNG files in TensorBoard, by the number of the frame with which their names end."""
+        from PIL import Image
+
+        images = list[dict[str, Any]]()
+        for path in pictures:
+            with Image.open(path) as picture:
+                size = {"width": picture.width, "height": picture.height, "colorspace": len(picture.getbands())}
+            tag = f"test/frame_{path.stem.rpartition('_')[2]}"
+            images.append({"tag": tag, "image": {**size, "encoded_image_string": path.read_bytes()}})
+        with naming(self._folder):
+            self._write_event(step, summary={"value": images})
+
     def flush(self) -> None:
         """Write buffered events, so that no checkpoint has more steps than the records."""
         with naming(self._folder):
@@ -64,7 +77,7 @@ class MetricsLog:
             self._events.close()
 
     def _write_event(self, step: int, **content: Any) -> None:
-        from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
+        from tensorboardX.proto.event_pb2 import Event  # TensorBoard's message # type: ignore[attr-defined]
 
         self._events.write(Event(step=step, wall_time=time.time(), **content).SerializeToString())
 

@@ -18,7 +18,7 @@ from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.mesh import check_batch_size
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.files import local_path, read_json
 from fcos_lidar_jax.input_pipeline.batching import check_counts
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
@@ -201,7 +201,7 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
         ValueError: the folder unexpectedly holds a run, holds no run to resume, or holds a different run; names
             the first field that differs.
     """
-    folder = Path(folder)
+    folder = local_path(folder)
     file = folder / RUN_SPEC
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: found a file, expected a folder")

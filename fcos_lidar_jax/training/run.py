@@ -25,14 +25,14 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, replicate
-from fcos_lidar_jax.files import atomic_write, checksum, folder_lock
+from fcos_lidar_jax.files import atomic_write, checksum, folder_lock, local_path
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.inference.prediction import evaluate, predict
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Variables
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
-from fcos_lidar_jax.training.metrics_log import MetricsLog
+from fcos_lidar_jax.training.metrics_log import MetricsLog, read_metrics
 from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, plan_run
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
@@ -40,7 +40,8 @@ from fcos_lidar_jax.types import TrainState
 
 _NUM_PICTURES = 2  # number of test frames drawn at an evaluation
 
-Hook = Callable[[int, Record], None]  # called after every step with the number of steps and the last metrics
+Hook = Callable[[int, Record], None]
+"""Called with the number of steps and the metrics of the last one; after an evaluation with its scores too."""
 
 
 def train(
@@ -75,7 +76,8 @@ def train(
         resume: resume the same run from the newest intact checkpoint in the folder.
         weights: initial weights, as a checkpoint or arrays; random by default.
         devices: devices that share each batch; by default all.
-        hooks: functions to call after every step.
+        hooks: functions ``(number of steps, metrics)`` to call in every process: after every step, and after every
+            evaluation with the same metrics and the scores ``test/mAP`` and ``test/AP/CLASS``.
         schedule: when to save and evaluate.
         threads, workers: number of threads and additional processes that prepare batches; by default as many
             threads as ``input_pipeline.loader.default_threads`` returns, and no processes.
@@ -107,7 +109,7 @@ def train(
         run = plan_run(
             config,
             MappedFrames(frames, config.classes),
-            Path(out),
+            local_path(out),
             mesh,
             steps=steps,
             seed=seed,
@@ -141,19 +143,29 @@ def train(
                 print(f"warning: {line}", file=sys.stderr, flush=True)
             print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
 
+        # Hooks may expect the metrics, also after the evaluation with which an interrupted run resumes.
+        latest: Record = _last_metrics(run, first) if pending and hooks else {}
+
         def report(number: int, record: Record) -> None:
+            nonlocal latest
+            latest = record
             if metrics is not None:
                 samples = config.optimizer.batch_size / max(float(record["seconds"]), 1e-9)  # type: ignore[arg-type]
                 metrics.write(number, record | {"samples_per_second": samples})
             for hook in hooks:
                 hook(number, record)
 
+        def evaluate_at(number: int, state: TrainState) -> None:
+            scores = _evaluate(run, number, state, metrics)
+            for hook in hooks:
+                hook(number, latest | scores)
+
         def pause(number: int, state: TrainState) -> None:
             if metrics is not None:
                 metrics.flush()
                 _save(run, state)  # before the evaluation, which may take long
             if run.evaluates_at(number):
-                _evaluate(run, number, state, metrics)
+                evaluate_at(number, state)
 
         batches = make_batches(
             run.frames,
@@ -180,7 +192,7 @@ def train(
             try:
                 state = replicate(start, mesh)
                 if pending:
-                    _evaluate(run, first, state, metrics)
+                    evaluate_at(first, state)
                 state = fit(
                     step,
                     state,
@@ -242,22 +254,32 @@ def _start(run: Run, *, resume: bool) -> TrainState:
     return make_state(run.detector, run.optimizer, key, variables=run.weights)
 
 
-def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | None) -> None:
-    """Evaluate on the test frames in all processes; the main process draws, saves and records."""
+def _last_metrics(run: Run, step: int) -> Record:
+    """The recorded metrics of a step; empty if there are none."""
+    with contextlib.suppress(OSError):
+        return next((r for r in read_metrics(run.folder) if r["step"] == step and "loss/total" in r), {})
+    return {}
+
+
+def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | None) -> Record:
+    """Evaluate on the test frames in all processes and return the scores; the main process draws and records."""
     assert run.tests is not None
     trained = TrainedDetector(run.detector, _local_variables(state))
     summary = evaluate(trained, run.tests, devices=run.devices).summary
     score = summary["mean_ap"]
+    scores: Record = {"test/mAP": score}
+    scores |= {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
     first = range(min(_NUM_PICTURES, len(run.tests)))
     examples = list(predict(trained, run.tests, indices=first, devices=run.devices))
     if metrics is not None:
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
         prefix, title = f"step_{number:06d}_frame", f"step {number}, test frame"
-        draw_predictions(run.folder / "pictures", examples, run.tests, prefix=prefix, title=title)
+        pictures = draw_predictions(run.folder / "pictures", examples, run.tests, prefix=prefix, title=title)
+        metrics.write_pictures(number, pictures)
         if not math.isnan(score):
             run.checkpoints.record_score(number, score)
-        values = {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
-        metrics.write(number, {"test/mAP": score, **values})  # last, because a recorded evaluation is not repeated
+        metrics.write(number, scores)  # last, because a recorded evaluation is not repeated
+    return scores
 
 
 def _save(run: Run, state: TrainState) -> None:

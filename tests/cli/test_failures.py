@@ -4,12 +4,22 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import assert_one_line_error, child_environment, run_python
+from refusal import refused
 
-from fcos_lidar_jax.cli import exit_code
+import fcos_lidar_jax as fcos
+from fcos_lidar_jax.checkpoints import load_checkpoint
+from fcos_lidar_jax.cli import exit_code, main
+from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.files import atomic_write, folder_lock, local_path
+from fcos_lidar_jax.input_pipeline.open import find_data_set
+from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
 
 def fail_with(error):
@@ -194,3 +204,59 @@ def test_an_output_on_a_full_disk_is_one_line(tmp_path, work):
         )
     line = "program: error: standard output: cannot be written: No space left on device\n"
     assert (done.returncode, done.stderr) == (1, line)
+
+
+URL_HINT = "got a URL, expected a path: copy the files (gsutil, aws s3) or mount the bucket (gcsfuse)"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train quickstart --format simulated --out gs://b/run",
+        "train quickstart --format simulated --out run --weights gs://b/run",
+        "train quickstart --data-root gs://b/run --out run",
+        "prepare --data-root run --index gs://b/run",
+        "evaluate --data-root run --checkpoint quickstart --out gs://b/run",
+        "detect a.bin gs://b/run --checkpoint quickstart --out boxes.json",
+        "detect a.bin --checkpoint quickstart --out gs://b/run",
+        "stream run --checkpoint quickstart --out boxes.jsonl --page gs://b/run",
+        "project a.bin --out a.npz --sensor gs://b/run",
+        "export --checkpoint gs://b/run --out a",
+        "synthesize --scenes 1 --out gs://b/run",
+        "benchmark --checkpoint quickstart --out=gs://b/run",
+        "demo --out gs:/b/run",
+    ],
+)
+def test_a_url_is_refused_in_one_line_by_every_option(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == 1
+    assert capsys.readouterr().err == f"fcos-lidar: error: gs://b/run: {URL_HINT}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+FRONT_DOORS = {
+    "train": lambda url: fcos.train(QUICKSTART, SimulatedFrames(TINY, 2), url, steps=1),
+    "load_detector": lambda url: fcos.load_detector(url),
+    "open_frames": lambda url: fcos.open_frames(url),
+    "splits": lambda url: fcos.open_frames(".", format="folder", splits=url),
+    "find_data_set": lambda url: find_data_set(url),
+    "read_points": lambda url: read_points(f"{url}/a.bin", TINY),
+    "load_checkpoint": lambda url: load_checkpoint(url),
+    "atomic_write": lambda url: atomic_write(url, lambda path: path.write_text("")),
+    "folder_lock": lambda url: folder_lock(Path(url), "training").__enter__(),
+}
+
+
+@pytest.mark.parametrize("door", FRONT_DOORS)
+@pytest.mark.parametrize("scheme", ["gs", "s3"])
+def test_a_url_is_refused_by_every_function(door, scheme, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with refused(f"{scheme}://b/run", URL_HINT):
+        FRONT_DOORS[door](f"{scheme}://b/run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_a_colon_is_no_url(tmp_path):
+    for name in ("2026-11-25T10:00", "a:b/c", "c:/d"):
+        assert local_path(name) == Path(name)
+    assert local_path(tmp_path / "gs:" / "b") == tmp_path / "gs:" / "b"

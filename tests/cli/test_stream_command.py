@@ -165,6 +165,18 @@ def test_tracks_and_page(home, tmp_path):
         assert frame["scores"] == [box["score"] for box in line["boxes"]]
 
 
+def test_only_confident_boxes_are_tracked_by_default(home, tmp_path, monkeypatch):
+    posed = home / "drive", "--poses", home / "poses.json"
+    scores = [box["score"] for line in stream(home, tmp_path / "a.jsonl", *posed) for box in line["boxes"]]
+    monkeypatch.setattr(cli_stream, "_TRACKED_SCORE", middle := float(np.median(scores)))
+    tracked, every = (
+        stream(home, tmp_path / "b.jsonl", *posed, more) for more in ("--track", "--track --min-score 0")
+    )
+    kept, whole = ([box["score"] for line in lines for box in line["boxes"]] for lines in (tracked, every))
+    assert kept == [score for score in scores if score >= middle]
+    assert whole == scores != kept
+
+
 def test_prints_the_time_of_each_stage(home, tmp_path, capsys):
     stream(home, tmp_path / "a.jsonl", recording(home, "ros1"), "--odometry tf --page", tmp_path / "page.html")
     number = r"\d+\.\d"

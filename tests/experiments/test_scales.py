@@ -81,9 +81,13 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
     monkeypatch.setattr(scales, "trained", trained)
     monkeypatch.setattr(scales, "write_submission", write_submission)
     options = {"steps": 5, "accumulate": 4, "workers": 2, "precision": "bfloat16"}
-    layout = NuScenesLayout(tmp_path / "one", "v1.0-mini", splits=splits, **options)
+    options |= {"batch_size": 8, "learning_rate": 0.02, "remat": True}
+    layout = NuScenesLayout(tmp_path / "one", splits=splits, **options)
     scale = layout.checked()
-    assert (scale.base.optimizer.accumulate, scale.base.model.precision) == (4, "bfloat16")
+    assert (scale.version, scale.train_split, scale.val_split) == ("v1.0-mini", "mini_train", "mini_val")
+    optimizer, model = scale.base.optimizer, scale.base.model
+    assert (optimizer.batch_size, optimizer.accumulate, optimizer.peak_learning_rate) == (8, 4, 0.02)
+    assert (model.precision, model.remat) == ("bfloat16", True)
     config = change(num_sweeps=3)(scale.base)
     scores = scale.score(config, 3, tmp_path / "run")
     assert (scores["mAP"], set(scores["AP"].values())) == (0, {0})

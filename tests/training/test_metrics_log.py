@@ -2,11 +2,10 @@
 
 import json
 import resource
-import struct
 from pathlib import Path
 
 import pytest
-from tensorboardX.proto.event_pb2 import Event
+from event_files import SESSION_LOG, STEP, fields, read_events, summaries
 
 from fcos_lidar_jax.training.metrics_log import MetricsLog, read_metrics
 
@@ -16,18 +15,6 @@ def write(folder: Path, steps, *, first_step: int = 0) -> None:
     for step in steps:
         records.write(step, {"loss/total": 10.0 / step, "positives": step, "per_level": [step, 0]})
     records.close()
-
-
-def events(folder: Path) -> list[Event]:
-    """All events, oldest file first; an event is u64 length, u32 checksum, message, u32 checksum."""
-    messages = []
-    for file in sorted((folder / "tensorboard").iterdir(), key=lambda file: file.stat().st_mtime_ns):
-        content, at = file.read_bytes(), 0
-        while at < len(content):
-            (length,) = struct.unpack_from("<Q", content, at)
-            messages.append(Event.FromString(content[at + 12 : at + 12 + length]))
-            at += 16 + length
-    return messages
 
 
 def steps(folder: Path) -> list[int]:
@@ -65,13 +52,14 @@ def test_a_resumed_run_drops_later_steps_and_invalid_lines(tmp_path, appended, k
 
 def test_tensorboard_gets_every_number_and_the_step_of_a_resumption(tmp_path):
     write(tmp_path, [1, 2])
-    values = {(v.tag, e.step): v.simple_value for e in events(tmp_path) for v in e.summary.value}
+    values = {(tag, step): value for tag, step, value in summaries(tmp_path / "tensorboard")}
     tags = ("loss/total", "positives", "per_level/0", "per_level/1")
     expected = {1: (10.0, 1.0, 1.0, 0.0), 2: (5.0, 2.0, 2.0, 0.0)}
     assert values == {(tag, step): v for step, row in expected.items() for tag, v in zip(tags, row, strict=True)}
     write(tmp_path, [2, 3], first_step=1)
-    starts = [e.step for e in events(tmp_path) if e.HasField("session_log")]
-    assert starts[-1] == 2  # TensorBoard then drops earlier events from step 2 on
+    starts = [event for event in read_events(tmp_path / "tensorboard") if SESSION_LOG in event]
+    # TensorBoard then drops earlier events from step 2 on; 1 is START.
+    assert (starts[-1][STEP], dict(fields(starts[-1][SESSION_LOG]))) == (2, {1: 1})
 
 
 def test_a_full_disk_raises_at_once_and_nothing_is_printed(tmp_path, capfd):

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import io
 import json
 import os
 import shutil
@@ -13,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run_python
+from event_files import summaries
+from PIL import Image
 from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 
 from fcos_lidar_jax.checkpoints import load_checkpoint
@@ -137,6 +140,12 @@ def test_the_folder_holds_specification_checkpoints_curves_and_pictures(finished
     assert checkpoint_names(folder) == [f"{step:08d}" for step in sorted({3, 4, best})]
     frames = [f"step_{step:06d}_frame_{index}.png" for step in (2, 4) for index in (0, 1)]
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == frames
+    images = {(tag, step): value for tag, step, value in summaries(folder / "tensorboard") if type(value) is dict}
+    assert len(images) == 4
+    for (tag, step), image in images.items():
+        png = (folder / "pictures" / f"step_{step:06d}_{tag.removeprefix('test/')}.png").read_bytes()
+        height, width = np.asarray(Image.open(io.BytesIO(png))).shape[:2]
+        assert (image[1], image[2], image[4]) == (height, width, png)
     for picture in folder.rglob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
     last = load_checkpoint(folder / "checkpoints" / "00000004")
@@ -383,8 +392,19 @@ def test_a_run_that_is_killed_during_an_evaluation_repeats_it_on_resume(finished
     assert checkpoint_names(folder)[-1] == "00000002"
     assert load_checkpoint(folder / "checkpoints" / "00000002").score is None
     monkeypatch.setattr(runs, "_evaluate", noted)
-    assert bits(train_tiny(folder, evaluate=2, tests=TESTS, resume=True)) == bits(finished[1])
+    hooked, losses = [], {line["step"]: line["loss/total"] for line in read_metrics(folder)}
+    options = {"hooks": [lambda *call: hooked.append(call)]}
+    assert bits(train_tiny(folder, evaluate=2, tests=TESTS, resume=True, **options)) == bits(finished[1])
     assert evaluated == [2, 4]
+    assert [(number, "test/mAP" in values) for number, values in hooked] == [
+        (2, True),
+        (3, False),
+        (4, False),
+        (4, True),
+    ]
+    assert {number: values["test/mAP"] for number, values in hooked if "test/mAP" in values} == scores(folder)
+    assert hooked[0][1]["loss/total"] == losses[2]  # a hook may expect the metrics, of the interrupted run as well
+    assert hooked[3][1].items() >= hooked[2][1].items()
     assert scores(folder) == scores(finished[0])
     assert load_checkpoint(folder / "checkpoints" / "00000004").score == scores(folder)[4]
     # Killed after the last evaluation and before its record.
