@@ -42,6 +42,7 @@ _QUICK = (
     "checkpoints",
     "devices",
     "test_prediction",
+    "test_documentation",
     "test_prediction_log",
     "test_inference",
     "test_centerpoint_network",
