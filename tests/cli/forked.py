@@ -31,7 +31,7 @@ class Forked:
         given = list(map(str, args)), before, variables, [file.name for file in self._files]
         self._process = _CONTEXT.Process(target=_run, args=given, daemon=True)
         with pytest.MonkeyPatch.context() as patch:  # of the server, which the first process starts
-            for name, value in child_environment(JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0").items():
+            for name, value in child_environment().items():
                 patch.setenv(name, value)
             self._process.start()
 

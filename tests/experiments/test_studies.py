@@ -1,14 +1,25 @@
 """The study of equivalence, in its short form."""
 
 import json
+import sys
 
-from commands import run_python
+import pytest
+import small_study
+from commands import child_environment
+
+from experiments.script import run_measurement
+from experiments.studies import device_equivalence as study
 
 
-def test_five_steps_are_the_same_on_one_device_and_on_eight_in_two_processes(tmp_path):
+def test_five_steps_are_the_same_on_one_device_and_on_eight_in_two_processes(tmp_path, monkeypatch):
     out = tmp_path / "record.json"
-    done = run_python("-m", "experiments.studies.device_equivalence", "--quick", "--out", out)
-    assert done.returncode == 0, done.stderr
+    for name, value in child_environment().items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(study, "work", small_study.work)
+    monkeypatch.setattr(sys, "argv", ["device_equivalence", "--quick", "--out", str(out)])
+    with pytest.raises(SystemExit) as ended:
+        run_measurement(study.measure_all, study.Args, study.__doc__)
+    assert ended.value.code == 0
     (mesh,) = json.loads(out.read_text())["meshes"]
     assert (mesh["devices"], mesh["processes"], mesh["dtype"]) == (8, 2, "float64")
     assert mesh["after_five_steps"] < 1e-9

@@ -1,6 +1,7 @@
 """Compile programs in a third of the time, for tests that do not depend on rounding."""
 
 import functools
+import gc
 import os
 import threading
 from pathlib import Path
@@ -11,6 +12,9 @@ from jax._src import compiler, lru_cache
 
 _OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 _compile_options = compiler.get_compile_options
+
+# Tracing makes so many objects that Python would look for garbage in a quarter of its time.
+gc.set_threshold(200_000, 50, 100)
 
 
 def compile_quickly(quick: bool) -> None:
