@@ -13,6 +13,9 @@ from jaxtyping import Array, Bool, Float32, Int32
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
 
 T = TypeVar("T")
 Mean = Callable[..., Array]

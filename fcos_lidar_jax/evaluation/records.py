@@ -8,6 +8,8 @@ import numpy as np
 from fcos_lidar_jax.data.cloud_policy import Cloud
 from fcos_lidar_jax.types import Detections
 
+SHOWN_SCORE = 0.3  # pictures, pages and recordings show boxes from this score
+
 
 def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 0.0) -> list[dict[str, Any]]:
     """Detections of one cloud, of NumPy arrays, that reach a score, as JSON objects, best first.
@@ -25,11 +27,14 @@ def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 
 def cloud_record(
     found: Detections, cloud: Cloud, classes: Sequence[str], *, min_score: float = 0.0
 ) -> dict[str, Any]:
-    """The boxes of a cloud as :func:`as_records`, with the numbers of its points and of those not used."""
+    """The boxes of a cloud as :func:`as_records`, after :func:`point_counts`."""
+    return {**point_counts(found, cloud), "boxes": as_records(found, classes, min_score=min_score)}
+
+
+def point_counts(found: Detections, cloud: Cloud) -> dict[str, Any]:
+    """The numbers of a cloud's points and of those not used."""
     counts = {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
-    dropped = int(found.num_dropped) + cloud.num_removed
-    boxes = as_records(found, classes, min_score=min_score)
-    return {"num_points": cloud.num_points, "num_dropped": dropped, **counts, "boxes": boxes}
+    return {"num_points": cloud.num_points, "num_dropped": int(found.num_dropped) + cloud.num_removed, **counts}
 
 
 def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
