@@ -1,5 +1,6 @@
 """Detections as plain records."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,6 +36,36 @@ def point_counts(found: Detections, cloud: Cloud) -> dict[str, Any]:
     """The numbers of a cloud's points and of those not used."""
     counts = {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
     return {"num_points": cloud.num_points, "num_dropped": int(found.num_dropped) + cloud.num_removed, **counts}
+
+
+def read_boxes(record: dict[str, Any], classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes, labels and scores of a record of :func:`cloud_record`."""
+    boxes = record["boxes"]
+    return (
+        np.array([box["box"] for box in boxes], np.float32).reshape(-1, 9),
+        np.array([classes.index(box["label"]) for box in boxes], np.int32),
+        np.array([box["score"] for box in boxes], np.float32),
+    )
+
+
+def select(
+    found: Detections,
+    classes: Sequence[str],
+    *,
+    min_score: float | None = None,
+    labels: Sequence[str] | None = None,
+) -> Detections:
+    """Turn detections of one cloud below a score, or of other classes than ``labels``, into padding.
+
+    >>> scores, labels = np.array([0.6, 0.4]), np.array([0, 1])
+    >>> found = Detections(np.ones((2, 9)), scores, labels, scores > 0, np.zeros(0))
+    >>> select(found, ("car", "tram"), labels=["tram"]).valid.tolist()
+    [False, True]
+    """
+    kept = np.asarray(found.valid) & (np.asarray(found.scores) >= (min_score or 0.0))
+    if labels:
+        kept &= np.isin(np.asarray(found.labels), [classes.index(name) for name in labels])
+    return dataclasses.replace(found, valid=kept)
 
 
 def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

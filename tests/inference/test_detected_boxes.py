@@ -74,7 +74,7 @@ def test_boxes_draw_themselves_in_a_notebook(made):
     assert "traffic&lt;cone&gt;" in shown
     assert "<cone>" not in shown
     assert "of score 0.3 and more, of 30" in shown
-    png = base64.b64decode(re.search(r"base64,([^\"]+)", shown)[1])
+    png = base64.b64decode(re.findall(r"base64,([^\"]+)", shown)[0])
     assert png == made.picture(min_score=0.3) != made.picture(min_score=0)
     assert made.picture() != made.picture(truth=(made.boxes, made.labels))
     assert Image.open(io.BytesIO(png)).width > 500
