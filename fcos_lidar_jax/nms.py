@@ -55,6 +55,9 @@ def rotated_nms(
     >>> kept, used = rotated_nms(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)
     >>> kept.tolist(), used.tolist()
     ([1, 2, 0], [True, True, False])
+    >>> compiled = jax.jit(rotated_nms, static_argnames=("iou_threshold", "max_outputs"))
+    >>> compiled(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)[0].tolist()
+    [1, 2, 0]
     """
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     scores = jnp.where(usable, scores, -jnp.inf)

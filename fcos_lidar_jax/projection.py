@@ -214,6 +214,9 @@ def project_points(
     >>> image = project_points(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2)
     >>> image.point_index.max(axis=(0, 1)).tolist()
     [1, 0]
+    >>> compiled = jax.jit(project_points, static_argnames=("sensor", "num_rounds"))
+    >>> compiled(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2).features.shape
+    (2, 8, 9, 2)
     """
     if points.shape[1] < sensor.point_columns:
         raise ValueError(
