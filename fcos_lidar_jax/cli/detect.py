@@ -81,8 +81,8 @@ def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
     inputs = _check(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
-    listed = None if args.sweeps is None else read_list(args.sweeps)[0]
-    check_results(args, detector.classes, posed=listed is not None, clouds=[*inputs] if listed is None else [])
+    place = dict[str, Any]() if args.sweeps is None else _place(args.sweeps)
+    check_results(args, detector.classes, posed=bool(place), clouds=[Path(place["file"])] if place else [*inputs])
     num_sweeps = detector.config.num_sweeps
     for file, parts in inputs.items():
         if len(parts) > num_sweeps:
@@ -97,10 +97,9 @@ def run(args: Detect) -> None:
             write_lines(args.out, b'{"files": [', lines, b"]}\n")
         else:
             how = {"annotator": f"fcos-lidar, {args.checkpoint.name}", "calibration": args.calibration}
-            place = {} if listed is None else msgspec.to_builtins(listed)
             with result_files(args.output_format, args.out, detector.classes, **how) as write:
                 for line in lines:
-                    write({**place, **json.loads(line)})
+                    write({**json.loads(line), **place})
         if args.page is not None or args.rrd is not None:
             _write_views(args, clouds, detector, (json.loads(entry)[0] for _, entry in log.entries(states)))
 
@@ -131,6 +130,12 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
         check_outside("--pictures", args.pictures, args.checkpoint)
         check_out_folder(args.pictures, "--pictures")
     return inputs
+
+
+def _place(sweeps: Path) -> dict[str, Any]:
+    """File, time and pose of the current sweep of a list."""
+    current = read_list(sweeps)[0]
+    return {**msgspec.to_builtins(current), "file": str(sweeps.parent / current.file)}
 
 
 def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector) -> CloudFiles:

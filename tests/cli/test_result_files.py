@@ -175,7 +175,8 @@ def test_a_drive_as_results_of_nuscenes(home, lines, tmp_path):
     (home / "sweeps.json").write_text(json.dumps(current))
     words = "--checkpoint", home / "checkpoint", "--min-score 0.001 --output-format nuscenes --out"
     command("detect --sweeps", home / "sweeps.json", *words, tmp_path / "one.json")
-    [entries] = json.loads((tmp_path / "one.json").read_text())["results"].values()
+    [(name, entries)] = json.loads((tmp_path / "one.json").read_text())["results"].items()
+    assert name == "000002.npy"
     assert_is_in_results(entries, lines[2])
 
 
