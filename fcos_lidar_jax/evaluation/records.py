@@ -12,8 +12,8 @@ from fcos_lidar_jax.types import Detections
 SHOWN_SCORE = 0.3  # pictures, pages and recordings show boxes from this score
 
 
-def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 0.0) -> list[dict[str, Any]]:
-    """Detections of one cloud, of NumPy arrays, that reach a score, as JSON objects, best first.
+def as_records(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Detections of one cloud, of NumPy arrays, as JSON objects, best first.
 
     >>> one = np.ones(1, np.float32)
     >>> as_records(Detections(np.ones((1, 9)), one, one.astype(int), one > 0, one), ("car", "tram"))[0]["label"]
@@ -21,15 +21,13 @@ def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 
     """
     return [
         {"label": classes[label], "score": float(score), "box": [float(v) for v in box]}
-        for box, label, score in zip(*confident(found, min_score), strict=True)
+        for box, label, score in zip(*confident(found, 0.0), strict=True)
     ]
 
 
-def cloud_record(
-    found: Detections, cloud: Cloud, classes: Sequence[str], *, min_score: float = 0.0
-) -> dict[str, Any]:
+def cloud_record(found: Detections, cloud: Cloud, classes: Sequence[str]) -> dict[str, Any]:
     """The boxes of a cloud as :func:`as_records`, after :func:`point_counts`."""
-    return {**point_counts(found, cloud), "boxes": as_records(found, classes, min_score=min_score)}
+    return {**point_counts(found, cloud), "boxes": as_records(found, classes)}
 
 
 def point_counts(found: Detections, cloud: Cloud) -> dict[str, Any]:
