@@ -3,10 +3,12 @@
 >>> import numpy as np
 >>> import fcos_lidar_jax as fcos
 >>> detector = fcos.load_detector("quickstart")
->>> detector(np.ones((100, 4), np.float32)).boxes.shape
-(500, 9)
+>>> found = detector(np.ones((100, 4), np.float32))
+>>> found.boxes.shape == (len(found), 9)
+True
 
-``open_frames`` opens a data set; ``train``, ``predict`` and ``evaluate`` work on its frames.
+``open_frames`` opens a data set; ``train``, ``predict`` and ``evaluate`` work on its frames. The modules of pure
+functions, such as ``fcos.projection`` and ``fcos.nms``, are imported when they are first used.
 """
 
 from importlib import import_module
@@ -31,14 +33,34 @@ _HOME = {
     "predict": "inference",
     "train": "training",
 }
+_MODULES = (
+    *(
+        "assignment",
+        "augment",
+        "coding",
+        "collectives",
+        "config",
+        "geometry",
+        "iou",
+        "locations",
+        "losses",
+        "nms",
+        "packing",
+    ),
+    *("presets", "projection", "sensors", "types"),
+    *("checkpoints", "data", "devices", "evaluation", "inference", "input_pipeline", "models", "simulation"),
+    *("training", "visualization"),
+)
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*__all__, *_MODULES, "__version__"]
 
 
 def __getattr__(name: str) -> Any:
     # Imported on first use, because importing the package must not load JAX.
+    if name in _MODULES:
+        return import_module(f"{__name__}.{name}")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

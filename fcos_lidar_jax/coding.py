@@ -15,6 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.geometry import atan2, wrap_angle
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
 
 Axes = Literal["lidar", "ray"]
 

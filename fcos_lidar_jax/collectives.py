@@ -10,6 +10,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
+
 Tree = TypeVar("Tree")
 
 

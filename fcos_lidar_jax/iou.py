@@ -15,6 +15,10 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
+
 _TINY = 1e-7
 _COINCIDENT_M = 1e-5
 """An edge within this distance of a parallel side counts as inside, so that the gradient of coincident edges does

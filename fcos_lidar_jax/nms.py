@@ -13,6 +13,9 @@ from jaxtyping import Array, Bool, Float32, Int32
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
 
 T = TypeVar("T")
 Mean = Callable[..., Array]
@@ -52,6 +55,9 @@ def rotated_nms(
     >>> kept, used = rotated_nms(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)
     >>> kept.tolist(), used.tolist()
     ([1, 2, 0], [True, True, False])
+    >>> compiled = jax.jit(rotated_nms, static_argnames=("iou_threshold", "max_outputs"))
+    >>> compiled(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)[0].tolist()
+    [1, 2, 0]
     """
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     scores = jnp.where(usable, scores, -jnp.inf)

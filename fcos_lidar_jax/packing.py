@@ -13,7 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.types import Batch, PackedBatch
+
+__dir__ = own_names(__name__)
 
 _MAX_LAGS = 2**16  # Number of two-byte indices.
 

@@ -15,6 +15,9 @@ from fcos_lidar_jax.config import (
     ProjectionConfig,
     StemConfig,
 )
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
 
 NUSCENES = Config()
 """The paper's detector: ten sweeps, five rounds."""

@@ -20,8 +20,11 @@ from jaxtyping import Array, Bool, Float32, Int32
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import image_columns, spherical
+from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import RangeImage
+
+__dir__ = own_names(__name__)
 
 
 def close_to_sensor(
@@ -211,6 +214,9 @@ def project_points(
     >>> image = project_points(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2)
     >>> image.point_index.max(axis=(0, 1)).tolist()
     [1, 0]
+    >>> compiled = jax.jit(project_points, static_argnames=("sensor", "num_rounds"))
+    >>> compiled(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2).features.shape
+    (2, 8, 9, 2)
     """
     if points.shape[1] < sensor.point_columns:
         raise ValueError(

@@ -9,6 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 from fcos_lidar_jax.fields import check, check_choices, check_hashable, from_json
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
 
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
 _MAX_ROWS = 4096  # Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.

@@ -14,6 +14,10 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float32, Int32, UInt8, UInt16
 
+from fcos_lidar_jax.namespaces import own_names
+
+__dir__ = own_names(__name__)
+
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
 """The nine channel types of a range image (paper, section 3.1)."""
 

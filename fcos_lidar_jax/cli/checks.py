@@ -28,7 +28,7 @@ def check_at_least(args: object, least: int, *fields: str) -> None:
 
 def check_score_and_angle(args: Any) -> None:
     """Reject a ``min_score`` outside of 0 to 1 and a ``yaw_deg`` that is not finite."""
-    if not 0 <= args.min_score <= 1:
+    if args.min_score is not None and not 0 <= args.min_score <= 1:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
     if not math.isfinite(args.yaw_deg):
         raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import tyro
 
@@ -22,13 +23,14 @@ from fcos_lidar_jax.cli.checks import (
     check_score_and_angle,
 )
 from fcos_lidar_jax.cli.options import option
+from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
 from fcos_lidar_jax.data.cloud_policy import expect_points
 from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import MAX_POINTS
 from fcos_lidar_jax.data.sweeps import about_z, read_list, sensor_before_rotation, turned
 from fcos_lidar_jax.evaluation.json_io import write_lines
-from fcos_lidar_jax.evaluation.records import cloud_record, confident
+from fcos_lidar_jax.evaluation.records import cloud_record, confident, read_boxes, select
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
@@ -38,14 +40,12 @@ from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
-
-_CLEAR_SCORE = 0.2  # boxes with at least this score are counted on the screen
-_MIN_PICTURE_SCORE = 0.1
+from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
 
 @dataclasses.dataclass(frozen=True)
 class Detect:
-    """Detect boxes in point files and write them as JSON.
+    """Detect boxes in point files and write them as JSON, or in the format of an annotation tool.
 
     A box is [x, y, z, l, w, h, yaw, vx, vy]: centre, length along the heading, width and height in metres, yaw in
     radians counter-clockwise from +x, velocity in m/s, all in the frame of the points.
@@ -57,15 +57,19 @@ class Detect:
     files: tyro.conf.Positional[Annotated[tuple[Path, ...], option("INPUT")]]
     """Point files (.pcd.bin, .bin, .npy, .npz, .pcd, .feather), one cloud per file, or folders of them."""
     checkpoint: options.Detector
-    out: Annotated[Path, option("FILE")]  # JSON file to write.
+    out: Annotated[Path, option("FILE")]  # File to write.
+    output_format: options.OutputFormat = "json"
+    calibration: options.Calibration = None
     sweeps: Annotated[Path | None, option("FILE.json")] = None
     """Sweeps to fuse, instead of INPUT: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], newest first."""
     yaw_deg: options.Yaw = 0.0
-    min_score: options.MinScore = 0.0
+    min_score: options.MinScore = None
+    labels: options.Labels = None
     remove_close: options.Close = None
     pictures: Annotated[Path | None, option("DIR")] = None
-    """Also draw every cloud from above, with its boxes of at least score 0.1 or --min-score."""
+    """Also draw every cloud from above, with its boxes."""
     page: options.Page = None
+    rrd: options.Rrd = None
     columns: options.Columns = None
     dtype: options.Dtype = None
     max_file_points: options.MaxFilePoints = MAX_POINTS
@@ -77,6 +81,8 @@ def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
     inputs = _check(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
+    place = dict[str, Any]() if args.sweeps is None else _place(args.sweeps)
+    check_results(args, detector.classes, posed=bool(place), clouds=[Path(place["file"])] if place else [*inputs])
     num_sweeps = detector.config.num_sweeps
     for file, parts in inputs.items():
         if len(parts) > num_sweeps:
@@ -87,9 +93,15 @@ def run(args: Detect) -> None:
     with _resume_log(args, detector) as log:
         _detect(args, detector, clouds, states, log)
         lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
-        write_lines(args.out, b'{"files": [', lines, b"]}\n")
-        if args.page is not None:
-            _write_page(args, clouds, detector, (json.loads(entry)[0] for _, entry in log.entries(states)))
+        if args.output_format == "json":
+            write_lines(args.out, b'{"files": [', lines, b"]}\n")
+        else:
+            how = {"annotator": f"fcos-lidar, {args.checkpoint.name}", "calibration": args.calibration}
+            with result_files(args.output_format, args.out, detector.classes, **how) as write:
+                for line in lines:
+                    write({**json.loads(line), **place})
+        if args.page is not None or args.rrd is not None:
+            _write_views(args, clouds, detector, (json.loads(entry)[0] for _, entry in log.entries(states)))
 
 
 def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
@@ -109,13 +121,21 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
         inputs = {args.sweeps: tuple(args.sweeps.parent / each.file for each in read_list(args.sweeps))}
     read = [*inputs, *itertools.chain.from_iterable(inputs.values())]
     log = _log_file(args)
-    check_outputs(args.checkpoint, read, out=args.out)
+    if args.rrd is not None:
+        check_rerun()
+    check_result_files(args, read)
     check_out_file("--out", log, keep=read)
-    check_outputs(args.checkpoint, [*read, args.out, log], page=args.page)
+    check_outputs(args.checkpoint, [*read, args.out, log], page=args.page, rrd=args.rrd)
     if args.pictures is not None:
         check_outside("--pictures", args.pictures, args.checkpoint)
         check_out_folder(args.pictures, "--pictures")
     return inputs
+
+
+def _place(sweeps: Path) -> dict[str, Any]:
+    """File, time and pose of the current sweep of a list."""
+    current = read_list(sweeps)[0]
+    return {**msgspec.to_builtins(current), "file": str(sweeps.parent / current.file)}
 
 
 def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector) -> CloudFiles:
@@ -138,7 +158,7 @@ def _log_file(args: Detect) -> Path:
 def _resume_log(args: Detect, detector: CloudDetector) -> Iterator[ResumeLog]:
     """The log of the files that an interrupted call with the same options has finished; deleted in the end."""
     file = _log_file(args)
-    same = args.remove_close, args.columns, args.dtype, args.yaw_deg, args.min_score, args.batch_size
+    same = args.remove_close, args.columns, args.dtype, args.yaw_deg, args.min_score, args.labels, args.batch_size
     with file_lock(file) as held:
         if not held:
             raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")
@@ -180,13 +200,15 @@ def _detect(
             boxes = to_world(np.asarray(detections.boxes), turn_back).astype(np.float32)
             detections = dataclasses.replace(detections, boxes=boxes)
         expect_points(file, cloud, int(detections.num_dropped), detector.sensor)
+        detections = select(detections, detector.classes, min_score=args.min_score, labels=args.labels)
+        shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
         if (picture := pictures[index]) is not None:
-            _draw(picture, points, detections, detector, max(args.min_score, _MIN_PICTURE_SCORE))
-        record = cloud_record(detections, cloud, detector.classes, min_score=args.min_score)
+            _draw(picture, points, detections, detector, shown_score)
+        record = cloud_record(detections, cloud, detector.classes)
         log.add(states[index], [{"file": str(file), **record}])
         scores = [box["score"] for box in record["boxes"]]
-        clear = sum(score >= _CLEAR_SCORE for score in scores)
-        progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {_CLEAR_SCORE} and more")
+        clear = sum(score >= shown_score for score in scores)
+        progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
 
 
 def _draw(
@@ -200,18 +222,22 @@ def _draw(
     draw_bev(points, path, detections=boxes, limit_m=limit_m, classes=detector.classes, title=title)
 
 
-def _write_page(
+def _write_views(
     args: Detect, clouds: CloudFiles, detector: CloudDetector, results: Iterable[dict[str, Any]]
 ) -> None:
-    """Write the page; reads all clouds again, because an interrupted call may have detected in some of them."""
-    assert args.page is not None
+    """Write the page and the recording for rerun.
+
+    Reads all clouds again, because an interrupted call may have detected in some of them.
+    """
     frames = list[PageFrame]()
-    for index, result in enumerate(results):
-        boxes = np.array([box["box"] for box in result["boxes"]], np.float32).reshape(-1, 9)
-        labels = np.array([detector.classes.index(box["label"]) for box in result["boxes"]], np.int32)
-        scores = np.array([box["score"] for box in result["boxes"]], np.float32)
-        frames.append(
-            page_frame(clouds.frame(index).points, (boxes, labels, scores), name=clouds.files[index].name)
-        )
-    title, min_score = f"Boxes of {args.checkpoint.name}", args.min_score or SHOWN_SCORE
-    write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)
+    min_score = SHOWN_SCORE if args.min_score is None else args.min_score
+    with rerun_recording(args.rrd, detector.classes, min_score=min_score) as record_rerun:
+        for index, result in enumerate(results):
+            points, name = clouds.frame(index).points, clouds.files[index].name
+            found = read_boxes(result, detector.classes)
+            record_rerun(points, found, name=name)
+            if args.page is not None:
+                frames.append(page_frame(points, found, name=name))
+    if args.page is not None:
+        title = f"Boxes of {args.checkpoint.name}"
+        write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)

@@ -22,7 +22,7 @@ from fcos_lidar_jax.cli.checks import (
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
-from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, write_scores
+from fcos_lidar_jax.cli.scoring import Task, write_detections, write_recording, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
@@ -33,6 +33,7 @@ from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.visualization.evaluation_report import PAGE
+from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Evaluate:
     bootstrap: Annotated[int, option("N")] = 0
     """Resampled sets for the 95 % intervals of mAP and NDS, such as 200; 0 for no intervals."""
     report: bool = True  # Write report.html with its pictures, and frames.html.
+    rrd: options.Rrd = None
     sensor: Annotated[str, option("SENSOR")] = "nuscenes_hdl32e"
     """Sensor preset or sensor file of the report's range images, without a --checkpoint."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
@@ -90,6 +92,8 @@ def run(args: Evaluate) -> None:
                 compared = compared or task.comparison.read(args.out / task.comparison.file)
                 _copy(args, task)
                 evaluation = write_scores(task, compared, args.out, bootstrap=args.bootstrap)
+                if args.rrd is not None:
+                    write_recording(task, evaluation, args.rrd)
                 if args.report:
                     title = f"{(args.checkpoint or args.results or Path()).name} on {task.name}"
                     write_reports(task, compared, evaluation, args.out, title=title)
@@ -128,6 +132,11 @@ def _check(args: Evaluate) -> None:
     check_out_folder(args.out)
     if args.checkpoint is not None:
         check_outside("--out", args.out, args.checkpoint)
+    if args.rrd is not None:
+        check_rerun()
+        check_out_file("--rrd", args.rrd, keep=[file for file in (args.results, args.ground_truth) if file])
+        if args.ground_truth is not None:
+            raise ValueError("--rrd: expected a data set: --ground-truth has no points")
     inputs = [file for file in (args.results, args.ground_truth) if file is not None]
     for name in ("metrics_summary.json", "curves.json", "bootstrap.json", "report.html", PAGE, KITTI_SUMMARY):
         check_out_file("--out", args.out / name, keep=inputs)

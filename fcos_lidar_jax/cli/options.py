@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from fcos_lidar_jax import inference
+from fcos_lidar_jax.cli import result_files
 
 
 def option(metavar: str | None = None, *, default: str | None = None, text: str | None = None) -> Any:
@@ -60,7 +61,39 @@ Dtype = Annotated[
     option("{float16,float32,float64}", default="float32", text=f"Number type {_RAW}."),
 ]
 MaxFilePoints = Annotated[int, option(text="Refuse point files with more points than this.")]
-MinScore = Annotated[float, option(text="Leave out boxes with a lower score.")]
+MinScore = Annotated[
+    float | None,
+    option(
+        "SCORE",
+        default="0 in files; pictures, pages and recordings show boxes from 0.3",
+        text="Leave out boxes with a lower score.",
+    ),
+]
+Labels = Annotated[
+    tuple[str, ...] | None, option("NAME...", default="all classes", text="Leave out boxes of other classes.")
+]
+OutputFormat = Annotated[
+    result_files.Format,
+    option(
+        text="Format of --out: JSON; a results file of nuScenes, in the global frame; result files of KITTI, for "
+        "which --out is a folder; or an ASAM OpenLABEL 1.0 file."
+    ),
+]
+Calibration = Annotated[
+    Path | None,
+    option(
+        "PATH",
+        default="calib beside the folder of the clouds",
+        text="For --output-format kitti: calibration file of KITTI, or a folder with one per cloud.",
+    ),
+]
+Rrd = Annotated[
+    Path | None,
+    option(
+        "FILE.rrd",
+        text="Also write a recording for the Rerun viewer. Needs pip install 'fcos-lidar-jax[viz]'.",
+    ),
+]
 Page = Annotated[
     Path | None, option("FILE.html", text="Also write a page for a browser, one file that works offline.")
 ]

@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from fcos_lidar_jax.cli.processes import tell
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.comparison import Compared, Comparison
@@ -11,6 +13,7 @@ from fcos_lidar_jax.evaluation.examples import choose_examples
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
 from fcos_lidar_jax.evaluation.kitti_results import write_kitti
 from fcos_lidar_jax.evaluation.metrics import Evaluation, evaluate
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
 from fcos_lidar_jax.inference import CloudDetector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
@@ -24,6 +27,7 @@ from fcos_lidar_jax.visualization.evaluation_report import (
 )
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 from fcos_lidar_jax.visualization.report import Picture
+from fcos_lidar_jax.visualization.rerun_recording import rerun_recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +74,18 @@ def write_scores(task: Task, compared: Compared, out: Path, *, bootstrap: int = 
     if (kitti := write_kitti(out, compared.detections, task.frames)) is not None:
         print(describe_kitti(kitti), flush=True)
     return evaluation
+
+
+def write_recording(task: Task, evaluation: Evaluation, path: Path) -> None:
+    """Write all frames with their boxes and truth for the rerun viewer."""
+    if task.frames is None:
+        raise ValueError("--rrd: files of keyframes are missing, expected all")
+    rows = {token: row for row, token in enumerate(evaluation.tokens)}
+    scenes = make_examples(evaluation, task.frames, np.zeros((len(rows), 3)), rows, min_score=0)
+    with rerun_recording(path, evaluation.metric.classes, min_score=SHOWN_SCORE) as record:
+        for row, scene in enumerate(scenes):
+            when = {"time_us": task.frames.time_us(row), "pose": task.frames.pose(row)}
+            record(scene.points, scene.detections, name=scene.name, truth=scene.truth, **when)
 
 
 def write_reports(

@@ -17,11 +17,12 @@ import tyro
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score_and_angle, option_name
 from fcos_lidar_jax.cli.options import option
+from fcos_lidar_jax.cli.result_files import FORMATS, check_result_files, check_results, result_files
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.sweeps import Sweep
-from fcos_lidar_jax.evaluation.records import cloud_record, confident
+from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
@@ -42,7 +43,7 @@ _TRACKED_SCORE = 0.5  # Of boxes with lower scores, most are on no object, and t
 
 @dataclasses.dataclass(frozen=True)
 class Stream:
-    """Detect boxes in a drive, and write one line of JSON per sweep as soon as it is ready.
+    """Detect boxes in a drive, and write one line of JSON per sweep as soon as it is ready, or another format.
 
     As many earlier sweeps as the detector was trained with are fused into each sweep. The boxes are those of
     `fcos-lidar detect --sweeps`.
@@ -50,6 +51,8 @@ class Stream:
 
     checkpoint: options.Detector
     out: Annotated[Path, option("FILE.jsonl")]  # File to write.
+    output_format: options.OutputFormat = "json"
+    calibration: options.Calibration = None
     source: tyro.conf.Positional[Annotated[Path | None, option("SOURCE")]] = None
     """Folder of point files, one per sweep; ROS 1 (.bag) or ROS 2 (folder, .mcap, .db3) recording; KITTI raw
     drive; or Argoverse 2 log."""
@@ -72,12 +75,17 @@ class Stream:
     allow_missing_sweeps: bool = False  # With --data-root: skip sweeps whose file is missing.
     follow_links: bool = False  # With --data-root: follow links that lead out of DATA_ROOT.
     page: options.Page = None
-    rrd: Annotated[Path | None, option("FILE.rrd")] = None
-    """Also write a recording for the Rerun viewer. Needs pip install 'fcos-lidar-jax[viz]'."""
+    rrd: options.Rrd = None
     yaw_deg: options.Yaw = 0.0
     track: bool = False  # Give each box the number of its object over time. Needs poses.
-    min_score: Annotated[float | None, option("S", default=f"{_TRACKED_SCORE} with --track, else 0")] = None
+    min_score: Annotated[
+        float | None,
+        option(
+            "SCORE", default=f"{_TRACKED_SCORE} with --track, else 0; pages and recordings show boxes from 0.3"
+        ),
+    ] = None
     """Leave out boxes with a lower score, before tracking."""
+    labels: options.Labels = None
     backend: options.Backend = "xla"
     columns: options.Columns = None
     dtype: options.Dtype = None
@@ -86,18 +94,18 @@ class Stream:
 
 def run(args: Stream) -> None:
     """Detect, write one line per sweep, and the page at the end."""
-    if args.min_score is None:
-        args = dataclasses.replace(args, min_score=_TRACKED_SCORE if args.track else 0.0)
-    assert args.min_score is not None
+    if args.track and args.min_score is None:
+        args = dataclasses.replace(args, min_score=_TRACKED_SCORE)
     kind = _find(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
     drive = _open(args, kind, detector)
     _tell(drive.notes)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
+    shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
     with (
-        rerun_recording(args.rrd, detector.classes) as record_rerun,
-        _write_lines(args.out) as write_line,
+        rerun_recording(args.rrd, detector.classes, min_score=shown_score) as record_rerun,
+        _write_lines(args, detector.classes) as write_line,
         _Timing() as timing,
     ):
         how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": drive.at_us}
@@ -108,14 +116,16 @@ def run(args: Stream) -> None:
             points = found.cloud.points[found.cloud.valid]
             if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
                 print(f"warning: {line}", file=sys.stderr)
-            record = _record(found, detector.classes, args.min_score, drive)
-            boxes, labels, scores = confident(found.detections, args.min_score)
+            kept = select(found.detections, detector.classes, min_score=args.min_score, labels=args.labels)
+            record = _record(dataclasses.replace(found, detections=kept), detector.classes, drive)
+            boxes, labels, scores = confident(kept, 0.0)
             ids = None
             if args.track:
                 dt = 0.0 if before_us is None else (found.sweep.time_us - before_us) / 1e6
                 tracks, ids = track(tracks, to_world(boxes, found.sweep.sensor_to_world), labels, scores, dt)
                 record["boxes"] = [b | {"track": int(i)} for b, i in zip(record["boxes"], ids, strict=True)]
-            write_line(record)
+            token = drive.tokens.get(found.sweep.time_us)
+            write_line(record if args.output_format == "json" else {**record, "token": token})
             details = {"name": Path(found.sweep.name).name, "ids": ids}
             if drive.posed:
                 details |= {"time_us": found.sweep.time_us, "pose": found.sweep.sensor_to_world}
@@ -127,19 +137,23 @@ def run(args: Stream) -> None:
     _tell(drive.notes)
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:
-        title, min_score = args.scene or str(args.source), args.min_score or SHOWN_SCORE
-        write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)
+        title = args.scene or str(args.source)
+        write_page(args.page, frames, classes=detector.classes, title=title, min_score=shown_score)
 
 
 @contextlib.contextmanager
-def _write_lines(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A function that writes a record as a line. The first line replaces an earlier file."""
+def _write_lines(args: Stream, classes: tuple[str, ...]) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A function that writes a record as a line, or in another format. The first line replaces an earlier file."""
     with contextlib.ExitStack() as stack:
+        if args.output_format != "json":
+            how = {"annotator": f"fcos-lidar, {args.checkpoint.name}", "calibration": args.calibration}
+            yield stack.enter_context(result_files(args.output_format, args.out, classes, **how))
+            return
         opened: list[Callable[[bytes], None]] = []
 
         def write(record: dict[str, Any]) -> None:
             if not opened:
-                opened.append(stack.enter_context(line_writer(path)))
+                opened.append(stack.enter_context(line_writer(args.out)))
             opened[0](json.dumps(record).encode())
 
         yield write
@@ -227,7 +241,10 @@ def _find(args: Stream) -> Recording:
         keep += [path for path in args.source.rglob("*") if path.name.lower().endswith(ENDINGS)]
     if args.rrd is not None:
         check_rerun()
-    check_outputs(args.checkpoint, keep, out=args.out, page=args.page, rrd=args.rrd)
+    check_result_files(args, keep)
+    check_outputs(args.checkpoint, [*keep, args.out], page=args.page, rrd=args.rrd)
+    if FORMATS[args.output_format].in_world and args.data_root is not None and not args.keyframes:
+        raise ValueError("--output-format nuscenes: expected --keyframes with --data-root: samples are keyframes")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     return kind
 
@@ -239,17 +256,18 @@ def _open(args: Stream, kind: Recording, detector: CloudDetector) -> Drive:
     drive = kind.open(args.source or args.data_root, detector.sensor, **given)
     if args.track and not drive.posed:
         raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
+    check_results(args, detector.classes, posed=drive.posed)
     if not drive.posed:
         print("no poses: every sweep is detected on its own, without earlier sweeps", file=sys.stderr)
     return drive
 
 
-def _record(found: Found, classes: tuple[str, ...], min_score: float, drive: Drive) -> dict[str, Any]:
+def _record(found: Found, classes: tuple[str, ...], drive: Drive) -> dict[str, Any]:
     """A line with the fields of ``fcos-lidar detect``; unknown values are null."""
     sweep = found.sweep
     return {
         "file": sweep.name,
         "timestamp_us": sweep.time_us if drive.timed else None,
         "sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if drive.posed else None,
-        **cloud_record(found.detections, found.cloud, classes, min_score=min_score),
+        **cloud_record(found.detections, found.cloud, classes),
     }

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ class Drive:
     posed: bool = True  # False: poses are unknown and replaced by the identity
     timed: bool = True  # False: times are unknown and replaced by 0, 1, ...
     at_us: Collection[int] | None = None  # times of the sweeps to detect in; None for all
+    tokens: Mapping[int, str] = dataclasses.field(default_factory=dict)  # time -> sample token of nuScenes
     notes: list[str] = dataclasses.field(default_factory=list)
     """Notes about assumptions and, once the last sweep was read, about skipped sweeps."""
 

@@ -1,5 +1,6 @@
 """Detections as plain records."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,9 +9,11 @@ import numpy as np
 from fcos_lidar_jax.data.cloud_policy import Cloud
 from fcos_lidar_jax.types import Detections
 
+SHOWN_SCORE = 0.3  # pictures, pages and recordings show boxes from this score
 
-def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 0.0) -> list[dict[str, Any]]:
-    """Detections of one cloud, of NumPy arrays, that reach a score, as JSON objects, best first.
+
+def as_records(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Detections of one cloud, of NumPy arrays, as JSON objects, best first.
 
     >>> one = np.ones(1, np.float32)
     >>> as_records(Detections(np.ones((1, 9)), one, one.astype(int), one > 0, one), ("car", "tram"))[0]["label"]
@@ -18,18 +21,49 @@ def as_records(found: Detections, classes: Sequence[str], *, min_score: float = 
     """
     return [
         {"label": classes[label], "score": float(score), "box": [float(v) for v in box]}
-        for box, label, score in zip(*confident(found, min_score), strict=True)
+        for box, label, score in zip(*confident(found, 0.0), strict=True)
     ]
 
 
-def cloud_record(
-    found: Detections, cloud: Cloud, classes: Sequence[str], *, min_score: float = 0.0
-) -> dict[str, Any]:
-    """The boxes of a cloud as :func:`as_records`, with the numbers of its points and of those not used."""
+def cloud_record(found: Detections, cloud: Cloud, classes: Sequence[str]) -> dict[str, Any]:
+    """The boxes of a cloud as :func:`as_records`, after :func:`point_counts`."""
+    return {**point_counts(found, cloud), "boxes": as_records(found, classes)}
+
+
+def point_counts(found: Detections, cloud: Cloud) -> dict[str, Any]:
+    """The numbers of a cloud's points and of those not used."""
     counts = {name: getattr(cloud, name) for name in ("num_close", "num_invalid", "num_truncated")}
-    dropped = int(found.num_dropped) + cloud.num_removed
-    boxes = as_records(found, classes, min_score=min_score)
-    return {"num_points": cloud.num_points, "num_dropped": dropped, **counts, "boxes": boxes}
+    return {"num_points": cloud.num_points, "num_dropped": int(found.num_dropped) + cloud.num_removed, **counts}
+
+
+def read_boxes(record: dict[str, Any], classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes, labels and scores of a record of :func:`cloud_record`."""
+    boxes = record["boxes"]
+    return (
+        np.array([box["box"] for box in boxes], np.float32).reshape(-1, 9),
+        np.array([classes.index(box["label"]) for box in boxes], np.int32),
+        np.array([box["score"] for box in boxes], np.float32),
+    )
+
+
+def select(
+    found: Detections,
+    classes: Sequence[str],
+    *,
+    min_score: float | None = None,
+    labels: Sequence[str] | None = None,
+) -> Detections:
+    """Turn detections of one cloud below a score, or of other classes than ``labels``, into padding.
+
+    >>> scores, labels = np.array([0.6, 0.4]), np.array([0, 1])
+    >>> found = Detections(np.ones((2, 9)), scores, labels, scores > 0, np.zeros(0))
+    >>> select(found, ("car", "tram"), labels=["tram"]).valid.tolist()
+    [False, True]
+    """
+    kept = np.asarray(found.valid) & (np.asarray(found.scores) >= (min_score or 0.0))
+    if labels:
+        kept &= np.isin(np.asarray(found.labels), [classes.index(name) for name in labels])
+    return dataclasses.replace(found, valid=kept)
 
 
 def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

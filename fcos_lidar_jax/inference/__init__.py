@@ -1,6 +1,7 @@
 """From points to boxes, for single clouds, frames and drives."""
 
 from fcos_lidar_jax.inference.detect import Stages, make_detect, make_stages
+from fcos_lidar_jax.inference.detected_boxes import DetectedBox, DetectedBoxes
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
 from fcos_lidar_jax.inference.load import Backend, load_detector, load_trained
 from fcos_lidar_jax.inference.prediction import Prediction, evaluate, predict
@@ -8,6 +9,8 @@ from fcos_lidar_jax.inference.prediction import Prediction, evaluate, predict
 __all__ = [
     "Backend",
     "CloudDetector",
+    "DetectedBox",
+    "DetectedBoxes",
     "Prediction",
     "Stages",
     "TrainedDetector",

@@ -17,7 +17,9 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
+from fcos_lidar_jax.evaluation.records import confident, point_counts
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
+from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
@@ -64,7 +66,7 @@ class CloudDetector(abc.ABC):
             ``batch_size`` times the number of devices, split over the devices.
         """
 
-    def __call__(self, points: np.ndarray | str | Path) -> Detections:
+    def __call__(self, points: np.ndarray | str | Path) -> DetectedBoxes:
         """Detect boxes in one cloud of any length; compiled once.
 
         Warns in one line if the cloud does not fit the sensor of the detector.
@@ -74,21 +76,28 @@ class CloudDetector(abc.ABC):
                 in metres, intensity, time lag in seconds, laser number, as in an array file.
 
         Returns:
-            NumPy arrays, best score first, padded to ``config.inference.max_detections`` boxes; ``valid`` is False
-            for padding.
+            the boxes, best score first, at most ``config.inference.max_detections``, without padding.
 
         Raises:
             ValueError: invalid shape or type, or a fifth column that contains rings instead of time lags.
         """
         sensor = self.sensor
-        read = read_points if isinstance(points, str | Path) else points_from_array
-        cloud = read(points, sensor)  # type: ignore[arg-type]
-        if line := sensor_mismatch(cloud, sensor):
+        is_file = isinstance(points, str | Path)
+        rows = (read_points if is_file else points_from_array)(points, sensor)  # type: ignore[arg-type]
+        if line := sensor_mismatch(rows, sensor):
             warnings.warn(line, stacklevel=2)
-        return self.detect(make_cloud(cloud, self.config, sensor=sensor))
+        cloud = make_cloud(rows, self.config, sensor=sensor)
+        found = self.detect(cloud)
+        boxes, labels, scores = confident(found, 0.0)
+        counts = ({"file": str(points)} if is_file else {}) | point_counts(found, cloud)
+        used = cloud.points[cloud.valid]
+        return DetectedBoxes(boxes, scores, labels, self.classes, used, counts, sensor.limit_xy_m)
 
     def detect(self, cloud: Cloud) -> Detections:
-        """Detect boxes in a cloud from :func:`~fcos_lidar_jax.data.cloud_policy.make_cloud`, as NumPy arrays."""
+        """Detect boxes in a cloud from :func:`~fcos_lidar_jax.data.cloud_policy.make_cloud`, as NumPy arrays.
+
+        Padded to ``config.inference.max_detections`` boxes; ``valid`` is False for padding.
+        """
         mesh = make_mesh(jax.local_devices()[:1])
         found = self.program(mesh)(*shard_batch((cloud.points[None], cloud.valid[None]), mesh))
         return jax.tree.map(lambda leaf: leaf[0], jax.device_get(found))

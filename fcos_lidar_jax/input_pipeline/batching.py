@@ -72,9 +72,29 @@ def fill_row(
 def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> Batch:
     """Pad at least one frame to a common shape and stack them; all have the same point columns.
 
+    Args:
+        frames: frames with labels by the classes of the detector, see
+            :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames`.
+        max_points: rows of points of each sample, such as ``config.max_points``.
+        max_boxes: rows of boxes of each sample, such as ``config.max_boxes``.
+
+    Returns:
+        NumPy arrays. Rows of points that are not finite or beyond physical limits are left out.
+
     Raises:
-        ValueError: a frame is too large; nothing is truncated.
+        ValueError: no frame, or one that is too large; nothing is truncated.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+    >>> frames = SimulatedFrames(TINY, 2)
+    >>> batch = make_batch([frames.frame(i) for i in range(2)], max_points=4096, max_boxes=64)
+    >>> batch.points.shape, batch.boxes.shape, batch.box_valid.sum(axis=1).tolist() == [
+    ...     len(frames.labels(i)) for i in range(2)
+    ... ]
+    ((2, 4096, 5), (2, 64, 9), True)
     """
+    if not frames:
+        raise ValueError("frames: got none, expected at least one")
     columns = frames[0].points.shape[1]
     batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
     for row, frame in enumerate(frames):

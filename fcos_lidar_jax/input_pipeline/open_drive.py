@@ -47,8 +47,9 @@ def _scene_drive(
     data = NuScenes(
         root, version, index=index, allow_missing_sweeps=allow_missing_sweeps, follow_links=follow_links
     )
-    at_us = data.keyframe_times_us(scene) if keyframes else None
-    return Drive(data.drive(scene, keyframes=keyframes and num_sweeps == 1), at_us=at_us)
+    tokens = data.keyframe_tokens(scene)
+    sweeps = data.drive(scene, keyframes=keyframes and num_sweeps == 1)
+    return Drive(sweeps, at_us=frozenset(tokens) if keyframes else None, tokens=tokens)
 
 
 FOLDER = Recording("a folder of point files", None, folder_drive, ("poses", "columns", "dtype", "max_points"))

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.cloud_policy import MAX_TIME_LAG_S
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.visualization.figure import class_color
 
 STEP_M = 0.02  # resolution of the points
-SHOWN_SCORE = 0.3  # initial threshold of the visible boxes
 _LIMIT = 2**15 - 1  # int16, for points up to 655 m
 
 

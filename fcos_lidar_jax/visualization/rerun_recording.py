@@ -26,7 +26,9 @@ def check_rerun() -> None:
 
 
 @contextlib.contextmanager
-def rerun_recording(path: Path | None, classes: Sequence[str]) -> Iterator[Callable[..., None]]:
+def rerun_recording(
+    path: Path | None, classes: Sequence[str], *, min_score: float = 0.0
+) -> Iterator[Callable[..., None]]:
     """Yield a function that records frames, with the arguments of :func:`~.page.page_frame`.
 
     Frames are written immediately. The file appears when the context ends without an error.
@@ -34,6 +36,7 @@ def rerun_recording(path: Path | None, classes: Sequence[str]) -> Iterator[Calla
     Args:
         path: recording (.rrd), or None to record nothing.
         classes: class names by label.
+        min_score: boxes with a lower score are not recorded, because the viewer cannot hide them.
 
     >>> with rerun_recording(None, ("car",)) as record:
     ...     record(np.zeros((0, 4)), (np.zeros((0, 9)), np.zeros(0), np.zeros(0)), name="a")
@@ -48,14 +51,16 @@ def rerun_recording(path: Path | None, classes: Sequence[str]) -> Iterator[Calla
         recording.save(temporary)
         number = iter(range(2**63))
         with recording:
-            yield lambda *given, **named: _record(recording, next(number), classes, *given, **named)
+            fixed = recording, number, classes, min_score
+            yield lambda *given, **named: _record(*fixed, *given, **named)
         recording.disconnect()
 
 
 def _record(
     recording: Any,
-    number: int,
+    number: Iterator[int],
     classes: Sequence[str],
+    min_score: float,
     points: np.ndarray,
     found: tuple[np.ndarray, np.ndarray, np.ndarray],
     *,
@@ -63,12 +68,13 @@ def _record(
     time_us: int | None = None,
     pose: np.ndarray | None = None,
     ids: np.ndarray | None = None,
+    truth: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
-    """Record points coloured by height, and boxes with class, score and identity, in the sensor's frame."""
+    """Record points coloured by height, boxes with class, score and identity, and truth, in the sensor's frame."""
     import matplotlib as mpl
     import rerun as rr  # pyright: ignore[reportMissingImports]
 
-    recording.set_time("frame", sequence=number)
+    recording.set_time("frame", sequence=next(number))
     if time_us is not None:
         recording.set_time("time", timestamp=np.datetime64(time_us, "us"))
     if pose is not None:
@@ -77,17 +83,25 @@ def _record(
     height = points[:, 2] - (np.quantile(points[:, 2], 0.1) if len(points) else 0)
     colors = mpl.colormaps["viridis"](height / _HIGH_M, bytes=True)
     recording.log("sensor/points", rr.Points3D(points[:, :3], colors=colors))
-    boxes, labels, scores = found
+    kept = found[2] >= min_score
+    boxes, labels, scores = (array[kept] for array in found)
     texts = [f"{classes[k]} {score:.2f}" for k, score in zip(labels, scores, strict=True)]
     if ids is not None:
-        texts = [f"{text} #{i}" for text, i in zip(texts, ids, strict=True)]
+        texts = [f"{text} #{i}" for text, i in zip(texts, ids[kept], strict=True)]
+    recording.log("sensor/boxes", _shapes(boxes, labels, texts))
+    if truth is not None:
+        recording.log("sensor/truth", _shapes(*truth, [f"{classes[k]}, truth" for k in truth[1]]))
+    recording.log("name", rr.TextLog(name))
+
+
+def _shapes(boxes: np.ndarray, labels: np.ndarray, texts: list[str]) -> Any:
+    import rerun as rr  # pyright: ignore[reportMissingImports]
+
     half, zero = boxes[:, 6] / 2, np.zeros(len(boxes))
-    shapes = rr.Boxes3D(
+    return rr.Boxes3D(
         centers=boxes[:, :3],
         half_sizes=boxes[:, 3:6] / 2,
         quaternions=np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1),
         labels=texts,
         colors=[int(class_color(k)[1:] + "ff", 16) for k in labels],
     )
-    recording.log("sensor/boxes", shapes)
-    recording.log("name", rr.TextLog(name))

@@ -160,13 +160,22 @@ def test_detect_accepts_any_name_for_its_output(home, tmp_path, name):
     assert len(files_of(tmp_path / name)) == 1
 
 
-def test_a_page_starts_with_the_given_min_score(home, tmp_path):
+@pytest.mark.parametrize(("option", "score"), [("", 0.3), ("--min-score 0.25", 0.25), ("--min-score 0", 0)])
+def test_pages_and_pictures_show_boxes_from_one_score(home, tmp_path, monkeypatch, option, score):
     page = tmp_path / "page.html"
-    command(*detect(home, home / "good.npy", "--out", tmp_path / "x.json"), "--min-score 0.25 --page", page)
-    assert page_content(page)["score"] == 0.25
+    monkeypatch.setattr(detect_command, "_draw", drawn := Mock())
+    where = "--out", tmp_path / "x.json", "--pictures", tmp_path / "pictures"
+    command(*detect(home, home / "good.npy", *where), option, "--page", page)
+    assert page_content(page)["score"] == score
+    assert drawn.call_args.args[-1] == score
+    assert page_content(page)["frames"][0]["scores"] == [
+        box["score"] for box in files_of(tmp_path / "x.json")[0]["boxes"]
+    ]
 
 
-@pytest.mark.parametrize("change", ["--min-score 0.3", "--yaw-deg 90", "--remove-close none", "other clouds"])
+@pytest.mark.parametrize(
+    "change", ["--min-score 0.3", "--labels car", "--yaw-deg 90", "--remove-close none", "other clouds"]
+)
 def test_detect_does_not_resume_with_other_options_or_clouds(home, tmp_path, capsys, change):
     clouds = [shutil.copy(home / "good.npy", tmp_path / f"{name}.npy") for name in "abc"]
     out = "--out", tmp_path / "x.json"

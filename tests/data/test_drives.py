@@ -104,7 +104,10 @@ def test_a_scene_consists_of_all_its_sweeps_or_its_keyframes(tmp_path):
 
 def test_keyframe_times_are_those_of_the_keyframes(tmp_path):
     data = NuScenes(write(tmp_path, *make_tables()), VERSION)
-    assert data.keyframe_times_us("scene-1") == {k.time_us for k in data.drive("scene-1", keyframes=True)}
+    tokens = data.keyframe_tokens("scene-1")
+    assert set(tokens) == {k.time_us for k in data.drive("scene-1", keyframes=True)}
+    for time_us, token in tokens.items():
+        assert data.index.sweep_time_us[data.index.sample_sweep[data.sample_tokens.index(token)]] == time_us
 
 
 def test_a_scene_without_any_file_is_refused(tmp_path):

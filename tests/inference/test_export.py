@@ -14,6 +14,7 @@ from tiny_run import TINY_CONFIG, bits, untrained
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
+from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.inference.export import PLATFORMS, export_detector, load_exported, read_record
 from fcos_lidar_jax.sensors import TINY, sensor_from_json
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -39,9 +40,11 @@ def test_boxes_are_bit_identical_to_the_checkpoint(home):
     trained, exported = (fcos.load_detector(home / name) for name in ("checkpoint", "detector.fcos"))
     clouds = [*(make_frame(seed, TINY).points for seed in range(3)), np.load(home / "cloud.npy")]
     for points in clouds:
-        found = exported(points)
+        cloud = make_cloud(points, TINY_CONFIG, sensor=TINY)
+        found = exported.detect(cloud)
         assert found.valid.any()
-        assert bits(found) == bits(trained(points))
+        assert bits(found) == bits(trained.detect(cloud))
+        assert exported(points).to_dict() == trained(points).to_dict()
     assert exported.classes == trained.classes
     assert exported.sensor == trained.sensor
 
@@ -54,8 +57,9 @@ def test_the_program_cleans_raw_clouds(home):
     valid = np.arange(TINY_CONFIG.max_points)[None] < len(points)
     program = jax.jit(exported.call)
     found = program(padded, valid, True)
+    expected = trained.detect(make_cloud(points, TINY_CONFIG, sensor=TINY))
     assert {name: bits(leaf[0]) for name, leaf in found.items()} == {
-        name: bits(getattr(trained(points), name)) for name in found
+        name: bits(getattr(expected, name)) for name in found
     }
     kept = program(padded, valid, False)
     assert bits(kept) != bits(found)
@@ -125,10 +129,9 @@ def test_the_documented_code_runs_without_this_package(home):
     ran = run_python(home / "run.py")
     assert ran.returncode == 0, ran.stderr
     found = fcos.load_detector(home / "checkpoint")(home / "cloud.npy")
-    classes = [TINY_CONFIG.classes[label] for label in found.labels[found.valid]]
     lines = [line for line in ran.stdout.splitlines() if line[:1].isalpha()]
-    assert [line.split()[0] for line in lines] == classes
-    assert [np.float32(line.split()[1]) for line in lines] == list(found.scores[found.valid])
+    assert [line.split()[0] for line in lines] == found.names.tolist()
+    assert [np.float32(line.split()[1]) for line in lines] == list(found.scores)
 
 
 def test_detect_accepts_an_exported_detector_with_its_batch_size(home, tmp_path, capsys):

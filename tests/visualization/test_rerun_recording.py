@@ -13,6 +13,17 @@ BOXES = np.array([[8, 5, 0, 6, 3, 2, 0.4, 0, 0], [-10, -6, -1, 8, 3, 3, 2, 1, 0]
 FOUND = BOXES, np.array([1, 0]), np.array([0.5, 0.25], np.float32)
 
 
+def read(chunk, path):
+    """Values by entity and component."""
+    columns = {}
+    for each in chunk.RrdReader(path).stream():
+        batch = each.to_record_batch()
+        for name, values in zip(batch.schema.names, batch.columns, strict=True):
+            if name != "log_time":
+                columns.setdefault((each.entity_path, name.split(":")[-1]), []).extend(values.to_pylist())
+    return columns
+
+
 def test_recordings_survive_a_round_trip(tmp_path):
     chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
     path, pose = tmp_path / "drive.rrd", np.eye(4)
@@ -22,12 +33,7 @@ def test_recordings_survive_a_round_trip(tmp_path):
         record(POINTS[:0], tuple(a[:0] for a in FOUND), name="second", time_us=10)
         assert not path.exists()
     assert [file.name for file in tmp_path.iterdir()] == ["drive.rrd"]
-    columns = {}
-    for each in chunk.RrdReader(path).stream():
-        batch = each.to_record_batch()
-        for name, values in zip(batch.schema.names, batch.columns, strict=True):
-            if name != "log_time":
-                columns.setdefault((each.entity_path, name.split(":")[-1]), []).extend(values.to_pylist())
+    columns = read(chunk, path)
 
     def array(entity, name, row):
         return np.array(columns[entity, name][row])
@@ -42,6 +48,17 @@ def test_recordings_survive_a_round_trip(tmp_path):
     np.testing.assert_array_equal(array("/sensor", "translation", 0), [[1, 2, 3]])
     assert columns["/sensor/boxes", "frame"] == [0, 1]
     assert [time.microsecond for time in columns["/sensor/boxes", "time"]] == [5, 10]
+
+
+def test_boxes_of_low_score_are_left_out_and_truth_is_recorded(tmp_path):
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    with rerun_recording(tmp_path / "a.rrd", ("car", "bus"), min_score=0.3) as record:
+        record(POINTS, FOUND, name="a", ids=np.array([7, 9]), truth=(BOXES[::-1], FOUND[1][::-1]))
+    columns = read(chunk, tmp_path / "a.rrd")
+    assert columns["/sensor/boxes", "labels"] == [["bus 0.50 #7"]]
+    np.testing.assert_array_equal(columns["/sensor/boxes", "centers"][0], BOXES[:1, :3])
+    assert columns["/sensor/truth", "labels"] == [["car, truth", "bus, truth"]]
+    np.testing.assert_array_equal(columns["/sensor/truth", "centers"][0], BOXES[::-1, :3])
 
 
 def test_a_failed_recording_leaves_no_file(tmp_path):

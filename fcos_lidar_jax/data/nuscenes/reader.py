@@ -167,9 +167,10 @@ class NuScenes:
             raise ValueError(f"{self.root}: scene {scene}: found no file of {len(rows)} sweeps, expected some")
         return map(self._read, present)
 
-    def keyframe_times_us(self, scene: str) -> frozenset[int]:
-        """Times of a scene's keyframes; errors as in :meth:`drive`."""
-        return frozenset(self.index.sweep_time_us[self._keyframe_rows(scene)].tolist())
+    def keyframe_tokens(self, scene: str) -> dict[int, str]:
+        """Time of a scene's keyframes -> sample token; errors as in :meth:`drive`."""
+        tokens = dict(zip(self.index.sample_sweep.tolist(), self._sample_row, strict=True))
+        return {int(self.index.sweep_time_us[row]): tokens[row] for row in self._keyframe_rows(scene)}
 
     def _keyframe_rows(self, scene: str) -> list[int]:
         names = self.index.scene_name.astype(str).tolist()

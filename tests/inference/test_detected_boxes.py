@@ -1,0 +1,90 @@
+"""What a detector answers: the boxes that there are, as arrays, a table, JSON and a picture."""
+
+import base64
+import io
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from fcos_lidar_jax.data.cloud_policy import make_cloud
+from fcos_lidar_jax.inference import DetectedBox, DetectedBoxes, load_detector
+from fcos_lidar_jax.simulation.frame_set import unseen_frames
+
+CLASSES = ("car", "traffic<cone>")
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Thirty boxes in a row, alternating classes, scores from 0.9 down."""
+    boxes = np.zeros((30, 9), np.float32)
+    boxes[:, 0], boxes[:, 3:6] = np.arange(30), 1
+    scores, labels = np.linspace(0.9, 0.03, 30, dtype=np.float32), np.arange(30, dtype=np.int32) % 2
+    return DetectedBoxes(boxes, scores, labels, CLASSES, np.zeros((0, 5), np.float32), {"num_points": 7}, 40.0)
+
+
+def test_a_detector_answers_with_the_boxes_that_there_are():
+    detector = load_detector("quickstart")
+    frame = unseen_frames(detector.sensor, 1).frame(0)
+    padded = detector.detect(make_cloud(frame.points, detector.config, sensor=detector.sensor))
+    found = detector(frame.points)
+    number = int(padded.valid.sum())
+    assert 0 < len(found) == number < len(padded.valid)
+    for name in ("boxes", "scores", "labels"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(padded, name)[padded.valid])
+    assert found.names.tolist() == [detector.classes[k] for k in padded.labels[:number]]
+    first, *_, last = found
+    assert isinstance(first, DetectedBox)
+    assert (first.name, first.score) == (found.names[0], padded.scores[0])
+    np.testing.assert_array_equal(last.box, padded.boxes[number - 1])
+    record = json.loads(json.dumps(found.to_dict()))
+    assert record["num_points"] == len(frame.points)
+    assert [box["box"] for box in record["boxes"]] == found.boxes.tolist()
+    assert "file" not in record
+
+
+def test_boxes_print_as_a_table_of_the_best(made):
+    title, head, *rows, rest = str(made).splitlines()
+    assert (title, rest) == ("30 boxes", "... and 10 more")
+    assert head.split() == ["class", "score", *"xyzlwh", "yaw", "vx", "vy"]
+    assert len(rows) == 20
+    name, *numbers = rows[3].split()
+    assert name == "traffic<cone>"
+    np.testing.assert_allclose([float(v) for v in numbers], [0.81, 3, 0, 0, 1, 1, 1, 0, 0, 0], atol=0.005)
+    assert len({len(row) for row in (head, *rows)}) == 1
+    assert str(made.select(min_score=1)).startswith("0 boxes\n")
+
+
+def test_selection_by_score_and_class(made):
+    some = made.select(min_score=0.5, labels=["car"])
+    assert [box.score for box in some] == [float(s) for s in made.scores[::2] if s >= 0.5]
+    assert set(some.names) == {"car"}
+    assert some.to_dict() == {
+        "num_points": 7,
+        "boxes": [b for b in made.to_dict()["boxes"][::2] if b["score"] >= 0.5],
+    }
+
+
+def test_boxes_draw_themselves_in_a_notebook(made):
+    shown = made._repr_html_()
+    assert "traffic&lt;cone&gt;" in shown
+    assert "<cone>" not in shown
+    assert "of score 0.3 and more, of 30" in shown
+    png = base64.b64decode(re.findall(r"base64,([^\"]+)", shown)[0])
+    assert png == made.picture(min_score=0.3) != made.picture(min_score=0)
+    assert made.picture() != made.picture(truth=(made.boxes, made.labels))
+    assert Image.open(io.BytesIO(png)).width > 500
+
+
+def test_matplotlib_is_imported_to_draw_only():
+    code = (
+        "import sys, numpy as np; from fcos_lidar_jax.inference import DetectedBoxes; "
+        "none = np.zeros(0, int); found = DetectedBoxes(np.zeros((0, 9)), none, none, ('car',), none, {}, 9.0); "
+        "str(found); print('matplotlib' in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "False\n"
