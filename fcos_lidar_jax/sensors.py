@@ -37,8 +37,8 @@ class Sensor:
             point column, for stacked sensors whose inclinations overlap.
         azimuth_limits_rad: right and left end of the covered sector, counter-clockwise and at most a turn apart,
             with the right end in [-pi, pi]; None for a full turn. Points outside the sector are dropped.
-        forward_rad: azimuth of the ego vehicle's heading in the frame of the points, in [-pi, pi]: 0 where x points
-            forward, pi/2 where y does. None if unknown; then clouds are never turned.
+        forward_rad: azimuth of the ego vehicle's heading in the frame of the points, in [-pi, pi]: 0 where x
+            points forward, pi/2 where y does. None if unknown; then clouds are never turned.
 
     Raises:
         ValueError: at construction, naming the field, the found and the expected value.
@@ -302,8 +302,8 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     """Create a sensor from a JSON object with the fields of :class:`Sensor`.
 
     ``inclinations_rad`` is a list of beams. Evenly spaced beams can be given as
-    ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the heading is
-    that of the preset of the same name, else unknown.
+    ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the
+    heading is that of the preset of the same name, else unknown.
 
     Args:
         record, where: the parsed JSON value, and the name of its source in error messages.

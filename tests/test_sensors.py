@@ -82,7 +82,7 @@ def test_a_sector_keeps_the_column_width_and_survives_a_round_trip(tmp_path, mid
 
 
 def test_the_heading_of_files_without_it_is_that_of_the_preset_of_the_same_name():
-    for name, sensor in PRESETS.items():
+    for sensor in PRESETS.values():
         record = sensor_to_json(sensor)
         assert "forward_rad" not in record  # files, checkpoints and fingerprints stay as they were
         assert sensor_from_json(record).forward_rad == sensor.forward_rad
