@@ -14,6 +14,7 @@ from fcos_lidar_jax.namespaces import own_names
 __dir__ = own_names(__name__)
 
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
+_SAME_HEADING_RAD = 1e-3  # headings typed with few digits are the same
 _MAX_ROWS = 4096  # Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.
 
 
@@ -39,6 +40,8 @@ class Sensor:
             point column, for stacked sensors whose inclinations overlap.
         azimuth_limits_rad: right and left end of the covered sector, counter-clockwise and at most a turn apart,
             with the right end in [-pi, pi]; None for a full turn. Points outside the sector are dropped.
+        forward_rad: azimuth of the ego vehicle's heading in the frame of the points, in [-pi, pi]: 0 where x
+            points forward, pi/2 where y does. None if unknown; then clouds are never turned.
 
     Raises:
         ValueError: at construction, naming the field, the found and the expected value.
@@ -56,6 +59,8 @@ class Sensor:
     intensity_scale: float = 1.0
     row_source: Literal["inclination", "laser"] = "inclination"
     azimuth_limits_rad: tuple[float, float] | None = None
+    # Not in `repr`, which fingerprints of frames contain: it changes no point that is read.
+    forward_rad: float | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check_hashable(self)
@@ -79,6 +84,8 @@ class Sensor:
             within = len(ends) == 2 and abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
             expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
             check(within, "azimuth_limits_rad", ends, expected)
+        known = self.forward_rad is None or abs(self.forward_rad) <= math.pi
+        check(known, "forward_rad", self.forward_rad, "an angle in [-pi, pi], or none")
 
     @property
     def first_azimuth_rad(self) -> float:
@@ -145,7 +152,56 @@ def sector(sensor: Sensor, middle_rad: float, num_columns: int) -> Sensor:
     return dataclasses.replace(sensor, name=name, num_columns=num_columns, azimuth_limits_rad=limits)
 
 
-NUSCENES_HDL32E = Sensor("nuscenes_hdl32e", even_inclinations(-30.67, 10.67, 32), 1086)
+def turn_between(data: Sensor, other: Sensor) -> float:
+    """Rotation about z, radians, from the frame of a sensor's points to that of another sensor's.
+
+    It brings the heading of the ego vehicle in one frame to that in the other; 0 if one of them is unknown.
+
+    >>> turn_between(KITTI_HDL64E, NUSCENES_HDL32E) == math.pi / 2, turn_between(VLP16, NUSCENES_HDL32E)
+    (True, 0.0)
+    """
+    if data.forward_rad is None or other.forward_rad is None:
+        return 0.0
+    turn = math.remainder(other.forward_rad - data.forward_rad, 2 * math.pi)
+    return turn if abs(turn) > _SAME_HEADING_RAD else 0.0
+
+
+def in_frame_of(sensor: Sensor, data: Sensor | None, yaw_rad: float | None = None) -> Sensor:
+    """A sensor's range image in the frame and the units of points that another sensor recorded.
+
+    Args:
+        sensor: gives rows, columns and limits.
+        data: gives the heading, the position of the sensor and the scale of the intensity; None if it is unknown:
+            the points are then the sensor's own, except for the rotation.
+        yaw_rad: rotation about z from the frame of the points to the sensor's; default: :func:`turn_between`.
+
+    >>> image = in_frame_of(NUSCENES_HDL32E, KITTI_HDL64E)
+    >>> image.num_rows, image.intensity_scale, image.forward_rad
+    (32, 255.0, 0.0)
+    """
+    if data is None:
+        if not yaw_rad:
+            return sensor
+        x, y, z = sensor.origin_m
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        heading = sensor.forward_rad and math.remainder(sensor.forward_rad - yaw_rad, 2 * math.pi)
+        data = dataclasses.replace(sensor, origin_m=(cos * x + sin * y, cos * y - sin * x, z), forward_rad=heading)
+    turn = turn_between(data, sensor) if yaw_rad is None else yaw_rad
+    limits, rise = sensor.azimuth_limits_rad, data.origin_m[2] - sensor.origin_m[2]
+    if limits is not None and turn:
+        right = math.remainder(limits[0] - turn, 2 * math.pi)
+        limits = right, right + limits[1] - limits[0]
+    return dataclasses.replace(
+        sensor,
+        origin_m=data.origin_m,
+        limit_z_m=(sensor.limit_z_m[0] + rise, sensor.limit_z_m[1] + rise),
+        intensity_scale=data.intensity_scale,
+        azimuth_limits_rad=limits,
+        forward_rad=data.forward_rad,
+    )
+
+
+NUSCENES_HDL32E = Sensor("nuscenes_hdl32e", even_inclinations(-30.67, 10.67, 32), 1086, forward_rad=math.pi / 2)
 """nuScenes ``LIDAR_TOP`` (paper, section 3.1): frame x right, y forward, z up."""
 
 KITTI_HDL64E = Sensor(
@@ -155,6 +211,7 @@ KITTI_HDL64E = Sensor(
     2048,
     limit_xy_m=75.0,
     intensity_scale=255.0,
+    forward_rad=0.0,
 )
 """KITTI's HDL-64E, nominal beam table; intensity in the files is 0-1."""
 
@@ -166,6 +223,7 @@ WAYMO_TOP = Sensor(
     limit_xy_m=75.0,
     limit_z_m=(-3.0, 5.0),
     intensity_scale=255.0,
+    forward_rad=0.0,
 )
 """Waymo's top LiDAR, points in the vehicle frame, nominal beam table. Put the table of a real calibration in a
 sensor file."""
@@ -178,6 +236,7 @@ ARGOVERSE2 = Sensor(
     limit_xy_m=100.0,
     limit_z_m=(-3.0, 5.0),
     row_source="laser",
+    forward_rad=0.0,
 )
 """Argoverse 2: two stacked 32-beam sensors with overlapping inclinations; the row is the laser number 0-63."""
 
@@ -196,10 +255,11 @@ _PANDAR64_DEG = [15, 11, 8, 5, 3, *(2 - np.arange(49) / 6), *range(-7, -15, -1),
 PANDAR64 = Sensor("pandar64", tuple(float(v) for v in np.radians(_PANDAR64_DEG)), 1800)
 """Hesai Pandar64 at 10 Hz: nominal channel distribution, 0.2 degrees between columns (user manual)."""
 
-TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, limit_xy_m=25.0)
+_SIMULATED = {"limit_xy_m": 25.0, "forward_rad": math.pi / 2}
+TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, **_SIMULATED)
 """A 16-beam sensor with a short reach, for tests."""
 
-SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 128, limit_xy_m=25.0)
+SHORT_RANGE = Sensor("short_range", even_inclinations(-30.0, 10.0, 32), 128, **_SIMULATED)
 """The quickstart's sensor: 32 beams, few columns, for short range."""
 
 _REAL = (NUSCENES_HDL32E, KITTI_HDL64E, WAYMO_TOP, ARGOVERSE2, VLP16, OS1_64, OS1_128, PANDAR64)
@@ -216,7 +276,15 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     record = dataclasses.asdict(sensor)
     if sensor.azimuth_limits_rad is None:  # keeps the JSON of full-turn sensors as it was before sectors existed
         del record["azimuth_limits_rad"]
+    if sensor.forward_rad == _usual_heading(sensor.name):  # and so for sensors from before the heading was known
+        del record["forward_rad"]
     return record
+
+
+def _usual_heading(name: object) -> float | None:
+    """The heading that a sensor without the field has: that of the preset of its name."""
+    preset = PRESETS.get(name) if isinstance(name, str) else None
+    return None if preset is None else preset.forward_rad
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,7 +305,8 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     """Create a sensor from a JSON object with the fields of :class:`Sensor`.
 
     ``inclinations_rad`` is a list of beams. Evenly spaced beams can be given as
-    ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead.
+    ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the
+    heading is that of the preset of the same name, else unknown.
 
     Args:
         record, where: the parsed JSON value, and the name of its source in error messages.
@@ -249,7 +318,16 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     >>> sensor_from_json({"name": "mine", "num_columns": 1024, "inclinations_deg": beams}).num_rows
     64
     """
-    if isinstance(record, dict) and "inclinations_deg" in record:
+    if not isinstance(record, dict):
+        return from_json(Sensor, record, where)  # refused
+    known = ("inclinations_deg", *(field.name for field in dataclasses.fields(Sensor)))
+    if unknown := [name for name in record if name not in known]:
+        raise ValueError(f"{where}: {unknown[0]}: unknown field, expected one of {', '.join(known)}")
+    if ("inclinations_deg" in record) == ("inclinations_rad" in record):
+        found = "both" if "inclinations_deg" in record else "missing"
+        raise ValueError(f"{where}: inclinations_deg, inclinations_rad: {found}, expected one of them")
+    record = {"forward_rad": _usual_heading(record.get("name")), **record}
+    if "inclinations_deg" in record:
         beams = from_json(_EvenBeams, record["inclinations_deg"], f"{where}: inclinations_deg")
         table = even_inclinations(beams.lowest, beams.highest, beams.rows)
         others = {name: value for name, value in record.items() if name != "inclinations_deg"}

@@ -7,10 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from fcos_lidar_jax.projection import image_cells
 from fcos_lidar_jax.sensors import (
     PRESETS,
     TINY,
     Sensor,
+    in_frame_of,
     load_sensor,
     sector,
     sensor_from_json,
@@ -79,6 +81,41 @@ def test_a_sector_keeps_the_column_width_and_survives_a_round_trip(tmp_path, mid
     assert "azimuth_limits_rad" not in sensor_to_json(TINY)  # the JSON of full-turn sensors is unchanged
 
 
+def test_the_heading_of_files_without_it_is_that_of_the_preset_of_the_same_name():
+    for sensor in PRESETS.values():
+        record = sensor_to_json(sensor)
+        assert "forward_rad" not in record  # files, checkpoints and fingerprints stay as they were
+        assert sensor_from_json(record).forward_rad == sensor.forward_rad
+        assert sensor_from_json({**record, "name": "mine"}).forward_rad is None
+        for heading in (None, -1.0):
+            other = dataclasses.replace(sensor, forward_rad=heading)
+            assert sensor_from_json(json.loads(json.dumps(sensor_to_json(other)))) == other
+            assert repr(other) == repr(sensor)
+    headings = {name: sensor.forward_rad for name, sensor in PRESETS.items()}
+    assert [headings[name] for name in ("nuscenes_hdl32e", "kitti_hdl64e", "vlp16")] == [math.pi / 2, 0, None]
+
+
+def test_an_image_in_another_frame_has_the_same_cells():
+    """Points that NumPy's matrices move to the sensor's frame fall into the same cells."""
+    rng = np.random.default_rng(0)
+    data = dataclasses.replace(TINY, origin_m=(1.4, -0.3, 1.6), forward_rad=-2.0, intensity_scale=255.0)
+    expected = dataclasses.replace(sector(TINY, 1.0, 100), origin_m=(0.2, 0.5, -0.4))
+    here = in_frame_of(expected, data)
+    assert (here.origin_m, here.forward_rad, here.intensity_scale) == (data.origin_m, -2.0, 255.0)
+    turn = np.pi / 2 + 2.0
+    matrix = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    directions = rng.uniform((-8, -8, -3), (8, 8, 1), (2000, 3))
+    points = np.pad(directions, ((0, 0), (0, 2))).astype(np.float32)
+    there = np.pad(directions @ matrix.T + expected.origin_m, ((0, 0), (0, 2))).astype(np.float32)
+    points[:, :3] += data.origin_m
+    valid = np.ones(2000, bool)
+    cells, others = (
+        np.asarray(image_cells(*each)[0]) for each in ((points, valid, here), (there, valid, expected))
+    )
+    assert (cells == others).mean() > 0.99  # but for points on the edge of a cell
+    assert 100 < (cells < 1600).sum() < 1500
+
+
 def test_evenly_spaced_beams_can_be_given_in_degrees():
     beams = {"lowest": -25, "highest": 3, "rows": 64}
     sensor = sensor_from_json({"name": "a", "num_columns": 1024, "inclinations_deg": beams})
@@ -87,10 +124,15 @@ def test_evenly_spaced_beams_can_be_given_in_degrees():
 
 
 GOOD = {"name": "a", "num_columns": 8, "inclinations_rad": [0.1, 0.0]}
+BEAMLESS = {"name": "a", "num_columns": 8}
 BAD = [
     ([1], "got list, expected a JSON object"),
-    ({**GOOD, "colour": 1}, "colour: unknown field"),
-    ({"name": "a", "num_columns": 8}, "inclinations_rad: missing"),
+    (
+        {**GOOD, "colour": 1},
+        "colour: unknown field, expected one of inclinations_deg, name, inclinations_rad, num_c",
+    ),
+    (BEAMLESS, "inclinations_deg, inclinations_rad: missing, expected one of them"),
+    ({**GOOD, "inclinations_deg": {}}, "inclinations_deg, inclinations_rad: both, expected one of them"),
     ({**GOOD, "num_columns": "many"}, "num_columns: got 'many'"),
     ({**GOOD, "num_columns": 1}, "num_columns: got 1"),
     ({**GOOD, "num_columns": True}, "num_columns: got True"),
@@ -99,9 +141,9 @@ BAD = [
     ({**GOOD, "inclinations_rad": [3.0, 0.0]}, "within"),
     ({**GOOD, "inclinations_rad": "0.1 0.0"}, "expected a list"),
     ({**GOOD, "inclinations_rad": [None, 0.0]}, r"inclinations_rad\[0\]: got None, expected float"),
-    ({**GOOD, "inclinations_deg": {"lowest": 1}}, "inclinations_deg.highest: missing"),
-    ({**GOOD, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 1}}, "rows: got 1"),
-    ({**GOOD, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 2**32}}, "rows: got 4294967296"),
+    ({**BEAMLESS, "inclinations_deg": {"lowest": 1}}, "inclinations_deg.highest: missing"),
+    ({**BEAMLESS, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 1}}, "rows: got 1"),
+    ({**BEAMLESS, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 2**32}}, "rows: got 4294967296"),
     ({**GOOD, "azimuth_limits_rad": 1}, "azimuth_limits_rad: got 1, expected a list"),
     ({**GOOD, "azimuth_limits_rad": [1]}, "azimuth_limits_rad: got 1 values, expected 2"),
     ({**GOOD, "azimuth_limits_rad": [1, 1]}, r"azimuth_limits_rad: got \(1\.0, 1\.0\), expected \(right, left\)"),
@@ -114,11 +156,12 @@ BAD = [
     ({**GOOD, "limit_xy_m": 1e31}, "limit_xy_m: got 1e"),
     ({**GOOD, "limit_xy_m": math.nan}, "limit_xy_m: got nan"),
     ({**GOOD, "limit_z_m": [0, math.inf]}, "limit_z_m: got .*expected finite"),
-    ({**GOOD, "inclinations_deg": {"lowest": -math.inf, "highest": 1, "rows": 2}}, "lowest: got -inf"),
+    ({**BEAMLESS, "inclinations_deg": {"lowest": -math.inf, "highest": 1, "rows": 2}}, "lowest: got -inf"),
     ({**GOOD, "origin_m": [1, 2]}, "origin_m"),
     ({**GOOD, "limit_xy_m": -1}, "limit_xy_m: got -1"),
     ({**GOOD, "limit_z_m": [3, 1]}, "limit_z_m"),
     ({**GOOD, "intensity_scale": 0}, "intensity_scale: got 0"),
+    ({**GOOD, "forward_rad": 90}, "forward_rad: got 90.0, expected an angle in"),
     ({**GOOD, "row_source": "ring"}, "row_source: got 'ring'"),
     ({**GOOD, "name": 3}, "name: got 3"),
 ]

@@ -87,7 +87,7 @@ class Simulated:
             "num_objects": self.num_objects,
             "reach_m": self.reach_m,
             "min_points": self.min_points,
-            "sensor": dataclasses.asdict(self.sensor),
+            "sensor": {k: v for k, v in dataclasses.asdict(self.sensor).items() if k != "forward_rad"},
             "train_frames": self.train_frames,
             "test_frames": self.test_frames,
             "sweeps": self.base.num_sweeps,

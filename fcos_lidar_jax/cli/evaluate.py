@@ -165,7 +165,8 @@ def _open(args: Evaluate) -> Task:
         frames = args.data.open(config, split=split, samples=args.samples, sensor=sensor)
         if split is None and args.samples is None:
             tell(f"{data.root}: no splits: evaluating all {len(frames)} frames; {too_high}")
-        return Task(name, compare_by_distance(frames, config.ranges_m), sensor, detector, frames)
+        # The report's range images are in the frame of the data.
+        return Task(name, compare_by_distance(frames, config.ranges_m), frames.sensor, detector, frames)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
     assert isinstance(frames, NuScenesFrames)
     if args.samples is not None:

@@ -108,4 +108,6 @@ def _description(frames: FrameSet) -> dict[str, Any]:
         fields = json.loads(json.dumps(dataclasses.asdict(frames)))
     except TypeError as error:
         raise ValueError(f"frames: {kind.__name__}: expected fields that JSON can hold: {error}") from None
+    if isinstance(sensor := fields.get("sensor"), dict):
+        sensor.pop("forward_rad", None)  # changes no frame
     return {"version": __version__, "kind": kind.__qualname__, **fields}

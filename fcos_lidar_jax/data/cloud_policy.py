@@ -1,7 +1,7 @@
 """The cloud policy of training and inference: which points are removed, truncated and reported."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -212,16 +212,21 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
         points = points[behind < sensor.num_columns * sensor.column_rad]
     if len(points) < _MIN_ROWS:
         return None
-    reason = _mismatch(points, sensor)
-    return reason and f"points hardly of {about}: {reason}; expect poor detections"
+    reason = "; ".join(_mismatch(points, sensor))
+    return None if not reason else f"points hardly of {about}: {reason}; expect poor detections"
 
 
-def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
+def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
+    """All findings, except for those that too few points within the sensor's limits cannot show."""
+    if points[:, 3].max() <= 1:
+        yield "no intensity is above 1, expected 0 to 255: multiply them by 255"
     low, high = sensor.limit_z_m
     within = (np.abs(points[:, :2]) < sensor.limit_xy_m).all(axis=1) & (points[:, 2] > low) & (points[:, 2] < high)
     beyond = 1 - within.mean()
     if beyond > _MAX_BEYOND:
-        return f"{beyond:.0%} of the points lie beyond its limits, {_limits(sensor)}"
+        yield f"{beyond:.0%} of the points lie beyond its limits, {_limits(sensor)}"
+        if within.sum() < _MIN_ROWS:
+            return
     # Padded to a power of two, so that clouds of any length need few compilations.
     padding = (0, (1 << (len(points) - 1).bit_length()) - len(points))
     valid = np.pad(within, padding)
@@ -229,16 +234,15 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     cells = np.bincount(cell[valid], minlength=sensor.num_rows * sensor.num_columns + 1)
     outside = cells[-1] / within.sum()
     if outside > _MAX_OUTSIDE:
-        return f"{outside:.0%} of the points lie outside its vertical field of view"
+        yield f"{outside:.0%} of the points lie outside its vertical field of view"
+    if not cells[:-1].any():
+        return
     filled = cells[:-1].reshape(sensor.num_rows, sensor.num_columns) > 0
     density = cells[:-1].sum() / filled.sum()
     if density > _MAX_DENSITY:
-        return f"{density:.1f} of the points share a cell, expected about one, with the origin in the sensor"
+        yield f"{density:.1f} of the points share a cell, expected about one, with the origin in the sensor"
     beside = (filled & np.roll(filled, 1, axis=1)).sum() / filled.sum()
     below = (filled[1:] & filled[:-1]).sum() / filled.sum()
     for share, what in ((beside, "column"), (below, "row")):
         if share < _MIN_NEIGHBOURS:
-            return f"{share:.0%} of the points have a neighbour in the next {what}, expected most"
-    if points[:, 3].max() <= 1:
-        return "no intensity is above 1, expected 0 to 255: multiply them by 255"
-    return None
+            yield f"{share:.0%} of the points have a neighbour in the next {what}, expected most"

@@ -18,6 +18,7 @@ from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
+from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.types import Detections
@@ -35,7 +36,7 @@ class Prediction:
     """
 
     index: int  # index of the frame
-    detections: Detections  # NumPy arrays
+    detections: Detections  # NumPy arrays, in the frame of the data
     frame: Frame | None  # the frame; None if another process has read it
     cloud: Cloud | None  # input of the network, with counts of dropped points; None if another process has read it
 
@@ -49,6 +50,9 @@ def predict(
     devices: Sequence[Any] | None = None,
 ) -> Iterator[Prediction]:
     """Detect boxes in frames, in order.
+
+    Clouds are turned and shifted to the frame that the detector expects, as far as the sensors of frames and
+    detector tell, which one line on standard error says; boxes are in the frame of the data.
 
     Every device runs the program for a single cloud, so the boxes are bit-identical for any number of devices and
     processes. Threads read frames while the devices work.
@@ -98,6 +102,9 @@ def predict_groups(
     if batch_size < 1:
         raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
+    aligned = Alignment(frames.sensor, sensor)
+    if (line := aligned.describe()) and jax.process_index() == 0:
+        print(line, file=sys.stderr, flush=True)
     program = detector.program(mesh, batch_size)
     todo = list(range(len(frames)) if indices is None else indices)
     size = batch_size * mesh.size
@@ -111,9 +118,10 @@ def predict_groups(
         for slot, row in enumerate(own_rows):
             if row < len(group):
                 frame = frames.frame(group[row])
-                if group is groups[0] and slot == 0 and (line := sensor_mismatch(frame.points, sensor)):
+                given = aligned.points(frame.points)
+                if group is groups[0] and slot == 0 and (line := sensor_mismatch(given, sensor)):
                     print(f"warning: {line}", file=sys.stderr, flush=True)
-                cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close)
+                cloud = make_cloud(given, config, sensor=sensor, num_close=frame.num_close)
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud
         return loaded, (points, valid)
@@ -122,7 +130,9 @@ def predict_groups(
         arrays = multihost_utils.process_allgather(outputs, tiled=True) if jax.process_count() > 1 else outputs
         arrays = jax.device_get(arrays)
         rows = (jax.tree.map(lambda leaf, row=row: leaf[row], arrays) for row in range(len(group)))
-        return [Prediction(group[r], each, *loaded.get(r, (None, None))) for r, each in enumerate(rows)]
+        return [
+            Prediction(group[r], aligned.back(each), *loaded.get(r, (None, None))) for r, each in enumerate(rows)
+        ]
 
     with ThreadPoolExecutor(_AHEAD) as pool:
         reading = deque(pool.submit(read, group) for group in groups[:_AHEAD])

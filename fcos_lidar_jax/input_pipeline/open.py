@@ -16,7 +16,7 @@ from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
 from fcos_lidar_jax.simulation.frame_set import SIMULATED_SPLITS, simulated_split
 
 Format = Literal["nuscenes", "kitti", "argoverse2", "folder", "simulated"]
@@ -41,6 +41,7 @@ class Reader:
     splits: Callable[["DataSet", str | Path | None], list[str]]
     open: Callable[..., FrameSet]
     options: tuple[str, ...] = ()
+    recorded_by_sensor: bool = False  # heading, position and intensity scale are always those of ``sensor``
 
 
 READERS = (
@@ -58,6 +59,7 @@ READERS = (
         KITTI_HDL64E,
         lambda data, _: sorted(file.stem for file in (data.root / "ImageSets").glob("*.txt")),
         lambda data, **how: KittiFrames(data.root, **how),
+        recorded_by_sensor=True,
     ),
     Reader(
         "argoverse2",
@@ -65,6 +67,7 @@ READERS = (
         ARGOVERSE2,
         lambda data, _: find_splits(data.root),
         lambda data, **how: Argoverse2Frames(data.root, **how),
+        recorded_by_sensor=True,
     ),
     Reader(
         "folder",
@@ -209,7 +212,8 @@ def open_frames(
             recognised.
         version: version of nuScenes; may be omitted if there is only one.
         split: name of a split; default: all frames. See also :func:`default_split`.
-        sensor: sensor that recorded the points; default: the format's.
+        sensor: gives the range image; default: the sensor that recorded the points. KITTI and Argoverse 2 keep
+            the heading, the position and the intensity scale of their own sensors.
         num_sweeps: maximum number of sweeps to fuse, including the current one; default: ``reading``'s.
         reading: how clouds are read, such as ``config.reading``; default: ``CloudReading()``.
         class_map: name in the data -> name to use instead; None drops objects, other names stay.
@@ -245,6 +249,8 @@ def open_frames(
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
+    if sensor is not None and data.reader.recorded_by_sensor and data.reader.sensor is not None:
+        sensor = in_frame_of(sensor, data.reader.sensor)
     frames = data.reader.open(data, split=split, sensor=sensor or data.reader.sensor, reading=reading, **options)
     if class_map is None:
         return frames

@@ -203,6 +203,13 @@ def test_the_warning_describes_the_mismatch(clouds):
         assert re.search(finding, sensor_mismatch(points, PRESETS[sensor]) or "")
 
 
+def test_the_warning_has_all_findings(clouds):
+    shares = clouds["nuscenes_hdl32e"] * np.array([1, 1, 1, 1 / 255, 1], np.float32)
+    line = sensor_mismatch(shares, PRESETS["short_range"]) or ""
+    assert "no intensity is above 1" in line
+    assert "of the points share a cell" in line
+
+
 def test_too_few_points_give_no_warning():
     assert sensor_mismatch(np.ones((400, 5), np.float32) * 9, TINY) is None
     assert sensor_mismatch(np.zeros((0, 3), np.float32), TINY) is None

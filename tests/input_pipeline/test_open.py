@@ -22,7 +22,7 @@ from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.input_pipeline.open import default_split, find_data_set, open_frames
-from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
+from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
 
@@ -97,7 +97,15 @@ def test_options_are_passed_to_the_readers(roots):
         assert kept + close[0].num_close == all_of_them + close[1].num_close
         assert kept < all_of_them
         sensor = dataclasses.replace(open_frames(roots[format]).sensor, origin_m=(1000.0, 0.0, 0.0))
-        assert open_frames(roots[format], reading=readings[0], sensor=sensor).frame(0).num_close == 0
+        far = open_frames(roots[format], reading=readings[0], sensor=sensor).frame(0)
+        assert (far.num_close == 0) == (format in ("nuscenes", "folder"))  # the others know where their sensor is
+
+
+def test_data_keep_their_units_and_axes_with_another_sensor(roots):
+    own = open_frames(roots["kitti"])
+    frames = open_frames(roots["kitti"], sensor=NUSCENES_HDL32E)
+    np.testing.assert_array_equal(frames.frame(0).points, own.frame(0).points)  # intensities times 255 too
+    assert (frames.sensor.forward_rad, frames.sensor.intensity_scale, frames.sensor.num_rows) == (0, 255, 32)
 
 
 def test_a_class_map_renames_and_drops_classes(roots):

@@ -1,0 +1,55 @@
+"""Clouds of other axes: turned and shifted for the detector, and boxes brought back."""
+
+import dataclasses
+
+import numpy as np
+
+import fcos_lidar_jax as fcos
+from fcos_lidar_jax.data.frame import InMemoryFrames
+from fcos_lidar_jax.inference.alignment import Alignment
+from fcos_lidar_jax.inference.prediction import predict
+from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E, TINY, VLP16
+from fcos_lidar_jax.simulation.frame_set import unseen_frames
+from fcos_lidar_jax.types import Detections
+
+
+def test_boxes_are_brought_back_by_the_inverse_of_rotation_matrices():
+    data = dataclasses.replace(TINY, forward_rad=0.4, origin_m=(1.0, 2.0, 0.5))
+    detector = dataclasses.replace(TINY, forward_rad=-1.1, origin_m=(0.0, -1.0, 0.2))
+    cos, sin = np.cos(-1.5), np.sin(-1.5)
+    matrix = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-9, 9, (20, 5)).astype(np.float32)
+    aligned = Alignment(data, detector)
+    expected = (points[:, :3] - data.origin_m) @ matrix.T + detector.origin_m
+    np.testing.assert_allclose(aligned.points(points)[:, :3], expected, atol=1e-5)
+    boxes = rng.uniform(-3, 3, (6, 9)).astype(np.float32)
+    back = aligned.back(Detections(boxes, np.ones(6), np.zeros(6, int), np.ones(6, bool), np.int32(0))).boxes
+    np.testing.assert_allclose(back[:, :3], (boxes[:, :3] - detector.origin_m) @ matrix + data.origin_m, atol=1e-5)
+    np.testing.assert_array_equal(back[:, 3:6], boxes[:, 3:6])
+    np.testing.assert_allclose(np.exp(1j * back[:, 6]), np.exp(1j * (boxes[:, 6] + 1.5)), atol=1e-5)
+    np.testing.assert_allclose(back[:, 7:], boxes[:, 7:] @ matrix[:2, :2], atol=1e-5)
+
+
+def test_one_line_says_what_is_done():
+    line = Alignment(KITTI_HDL64E, NUSCENES_HDL32E).describe()
+    assert line == "clouds turned by 90 degrees, and boxes brought back: the detector expects y ahead"
+    assert Alignment(VLP16, NUSCENES_HDL32E).describe() == "" == Alignment(TINY, NUSCENES_HDL32E).describe()
+
+
+def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(capsys):
+    detector = fcos.load_detector("quickstart")
+    frame = unseen_frames(detector.sensor, 1).frame(0)
+    points = np.column_stack([frame.points[:, 1], -frame.points[:, 0], frame.points[:, 2:]])
+    ahead = dataclasses.replace(detector.sensor, forward_rad=0.0)
+    [expected], [found] = (
+        list(predict(detector, InMemoryFrames((dataclasses.replace(frame, points=p),), sensor, ("car",))))
+        for p, sensor in ((frame.points, detector.sensor), (points, ahead))
+    )
+    assert capsys.readouterr().err.count("clouds turned by 90 degrees") == 1
+    valid = np.asarray(expected.detections.valid)
+    assert valid.any()
+    np.testing.assert_array_equal(found.detections.scores, expected.detections.scores)
+    a, b = np.asarray(expected.detections.boxes)[valid], np.asarray(found.detections.boxes)[valid]
+    np.testing.assert_allclose(b[:, :3], np.stack([a[:, 1], -a[:, 0], a[:, 2]], -1), atol=1e-5)
+    np.testing.assert_allclose(b[:, 7:], np.stack([a[:, 8], -a[:, 7]], -1), atol=1e-5)
