@@ -255,7 +255,7 @@ _PANDAR64_DEG = [15, 11, 8, 5, 3, *(2 - np.arange(49) / 6), *range(-7, -15, -1),
 PANDAR64 = Sensor("pandar64", tuple(float(v) for v in np.radians(_PANDAR64_DEG)), 1800)
 """Hesai Pandar64 at 10 Hz: nominal channel distribution, 0.2 degrees between columns (user manual)."""
 
-_SIMULATED = {"limit_xy_m": 25.0, "forward_rad": math.pi / 2}
+_SIMULATED: dict[str, Any] = {"limit_xy_m": 25.0, "forward_rad": math.pi / 2}
 TINY = Sensor("tiny", even_inclinations(-24.0, 6.0, 16), 256, **_SIMULATED)
 """A 16-beam sensor with a short reach, for tests."""
 

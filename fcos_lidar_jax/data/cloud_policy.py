@@ -25,7 +25,8 @@ _MAX_OUTSIDE = 0.3
 _MAX_DENSITY = 1.7
 _MIN_NEIGHBOURS = 0.3
 """The four bounds of :func:`sensor_mismatch`. A sensor's own clouds reach at most 0.17, 0.01, 1.05, and at least
-0.84; for every pair of different presets at least one figure lies clearly on the other side."""
+0.84. For most pairs of presets, one figure lies clearly on the other side; some have beams that are too alike,
+such as the VLP-16 in place of the HDL-32E."""
 
 
 @dataclasses.dataclass(frozen=True)

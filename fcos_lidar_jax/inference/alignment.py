@@ -56,7 +56,7 @@ class Alignment:
         if (shift := pose[:3, 3]).any():
             steps.append(f"shifted by ({', '.join(f'{v:.2f}' for v in shift)}) m")
         ahead = self.detector.forward_rad
-        axes = {0: "x", 90: "y", 180: "-x", -180: "-x", -90: "-y"}
+        axes = {0.0: "x", 90.0: "y", 180.0: "-x", -180.0: "-x", -90.0: "-y"}
         axis = None if ahead is None else axes.get(round(math.degrees(ahead), 2))
         why = f": the detector expects {axis} ahead" if turn and axis else ""
         return f"clouds {' and '.join(steps)}, and boxes brought back{why}"
