@@ -9,10 +9,10 @@ import pytest
 from refusal import refused
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli.detect import as_records
 from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.folder import FolderFrames
+from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.sensors import KITTI_HDL64E, TINY, sensor_to_json
 from fcos_lidar_jax.types import Detections
 
