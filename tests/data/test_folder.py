@@ -216,7 +216,7 @@ BAD = {
     "sensor": (
         lambda r: write(r / "sensor.json", {"name": "mine", "num_columns": 8}),
         "sensor.json",
-        "sensor.json: inclinations_rad: missing, expected a list",
+        "sensor.json: inclinations_deg, inclinations_rad: missing, expected one of them",
     ),
     "no sensor": (lambda r: (r / "sensor.json").unlink(), "sensor.json", "no such file"),
     "preset": (lambda r: write(r / "sensor.json", '"tinny"'), "sensor.json", "got 'tinny', expected tiny"),
