@@ -239,5 +239,5 @@ def test_bad_results_get_one_line(tmp_path):
             evaluate_texts(tmp_path, [(line(), result)])
     (labels / "000000.txt").unlink()
     (tmp_path / "results" / "000000.txt").write_text(line(score=0.5))
-    with refused(f"{labels / '000000.txt'}: cannot be read"):
+    with refused(f"{labels / '000000.txt'}: no such file, expected text"):
         evaluate_kitti(tmp_path / "results", labels)

@@ -207,7 +207,7 @@ def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, field
             "--rows: got ['base'], expected none unless --tables names one table",
         ),
         (["--scale", "nuscenes"], "--data-root: missing, expected the data set for --scale nuscenes"),
-        (["--scale", "nuscenes", "--data-root", "nowhere"], "nowhere: no such folder, expected a data root"),
+        (["--scale", "nuscenes", "--data-root", "nowhere"], "nowhere: no such folder, expected a data set"),
     ],
 )
 def test_a_users_mistake_is_one_line_before_training(monkeypatch, capsys, tmp_path, options, message):
