@@ -34,20 +34,8 @@ _HOME = {
     "train": "training",
 }
 _MODULES = (
-    *(
-        "assignment",
-        "augment",
-        "coding",
-        "collectives",
-        "config",
-        "geometry",
-        "iou",
-        "locations",
-        "losses",
-        "nms",
-        "packing",
-    ),
-    *("presets", "projection", "sensors", "types"),
+    *("assignment", "augment", "coding", "collectives", "config", "geometry", "iou", "locations", "losses", "nms"),
+    *("packing", "presets", "projection", "sensors", "types"),
     *("checkpoints", "data", "devices", "evaluation", "inference", "input_pipeline", "models", "simulation"),
     *("training", "visualization"),
 )

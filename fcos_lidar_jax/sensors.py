@@ -85,7 +85,7 @@ class Sensor:
             expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
             check(within, "azimuth_limits_rad", ends, expected)
         known = self.forward_rad is None or abs(self.forward_rad) <= math.pi
-        check(known, "forward_rad", self.forward_rad, "an angle in [-pi, pi], or none")
+        check(known, "forward_rad", self.forward_rad, "an angle in [-pi, pi], or null")
 
     @property
     def first_azimuth_rad(self) -> float:
@@ -166,29 +166,19 @@ def turn_between(data: Sensor, other: Sensor) -> float:
     return turn if abs(turn) > _SAME_HEADING_RAD else 0.0
 
 
-def in_frame_of(sensor: Sensor, data: Sensor | None, yaw_rad: float | None = None) -> Sensor:
+def in_frame_of(sensor: Sensor, data: Sensor) -> Sensor:
     """A sensor's range image in the frame and the units of points that another sensor recorded.
 
     Args:
         sensor: gives rows, columns and limits.
-        data: gives the heading, the position of the sensor and the scale of the intensity; None if it is unknown:
-            the points are then the sensor's own, except for the rotation.
-        yaw_rad: rotation about z from the frame of the points to the sensor's; default: :func:`turn_between`.
+        data: gives the heading, the position of the sensor and the scale of the intensity.
 
     >>> image = in_frame_of(NUSCENES_HDL32E, KITTI_HDL64E)
     >>> image.num_rows, image.intensity_scale, image.forward_rad
     (32, 255.0, 0.0)
     """
-    if data is None:
-        if not yaw_rad:
-            return sensor
-        x, y, z = sensor.origin_m
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        heading = sensor.forward_rad and math.remainder(sensor.forward_rad - yaw_rad, 2 * math.pi)
-        data = dataclasses.replace(sensor, origin_m=(cos * x + sin * y, cos * y - sin * x, z), forward_rad=heading)
-    turn = turn_between(data, sensor) if yaw_rad is None else yaw_rad
-    limits, rise = sensor.azimuth_limits_rad, data.origin_m[2] - sensor.origin_m[2]
-    if limits is not None and turn:
+    turn, rise = turn_between(data, sensor), data.origin_m[2] - sensor.origin_m[2]
+    if (limits := sensor.azimuth_limits_rad) is not None and turn:
         right = math.remainder(limits[0] - turn, 2 * math.pi)
         limits = right, right + limits[1] - limits[0]
     return dataclasses.replace(

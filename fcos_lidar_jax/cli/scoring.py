@@ -32,7 +32,7 @@ from fcos_lidar_jax.visualization.rerun_recording import rerun_recording
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What is compared with what."""
+    """A detector or its results, and the truth to compare them with."""
 
     name: str  # of the truth, for the report
     comparison: Comparison

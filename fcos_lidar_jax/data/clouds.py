@@ -9,7 +9,7 @@ import numpy as np
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames, drop_close, files_fingerprint, no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
-from fcos_lidar_jax.data.sweeps import about_z, read_sweeps, turned
+from fcos_lidar_jax.data.sweeps import about_z, read_sweeps, sensor_before_rotation, turned
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.sensors import Sensor
 
@@ -56,9 +56,13 @@ class CloudFiles(FrameSet):
 
 @dataclasses.dataclass(frozen=True)
 class TurnedClouds(WrappedFrames):
-    """Clouds of a frame set, rotated about z after the removal of close points."""
+    """Clouds of a frame set, and its sensor, rotated about z after the removal of close points."""
 
     yaw_rad: float  # counter-clockwise, seen from above
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "sensor", sensor_before_rotation(self.frames.sensor, -self.yaw_rad))
 
     def frame(self, index: int) -> Frame:
         frame = self.frames.frame(index)

@@ -25,7 +25,7 @@ def write_openlabel(path: str | Path, records: Iterable[dict[str, Any]], *, anno
     Args:
         path: JSON file.
         records: lines of ``fcos-lidar stream``, or entries of ``fcos-lidar detect``; iterated twice.
-        annotator: what has made the boxes.
+        annotator: name of the program and the detector that made the boxes.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "labels.json"

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from fcos_lidar_jax.data.sweeps import about_z
+from fcos_lidar_jax.data.sweeps import about_z, turned
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.sensors import Sensor, turn_between
 from fcos_lidar_jax.types import Detections
@@ -35,8 +35,8 @@ class Alignment:
         """Points f32[n, c] of the data in the detector's frame; other columns stay."""
         if (pose := self.pose) is None:
             return points
-        moved = np.array(points)
-        moved[:, :3] = moved[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+        moved = turned(points, pose)
+        moved[:, :3] += pose[:3, 3]
         return moved
 
     def back(self, detections: Detections) -> Detections:

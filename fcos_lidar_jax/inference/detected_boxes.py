@@ -48,9 +48,7 @@ class DetectedBoxes:
     labels: np.ndarray  # i32[m], index into ``classes``
     classes: tuple[str, ...]  # of the detector
     points: np.ndarray  # f32[n, c], what the detector has seen of the cloud
-    counts: dict[
-        str, Any
-    ]  # numbers of points and, for a point file, its name, as ``fcos-lidar detect`` writes them
+    counts: dict[str, Any]  # numbers of points and the name of a point file, as in the JSON of ``detect``
     limit_m: float  # half the side of the square in which the detector finds objects
 
     @property

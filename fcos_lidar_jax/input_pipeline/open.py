@@ -1,6 +1,7 @@
 """One function to open any data set; a table has one row per format."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -250,7 +251,10 @@ def open_frames(
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
     if sensor is not None and data.reader.recorded_by_sensor and data.reader.sensor is not None:
-        sensor = in_frame_of(sensor, data.reader.sensor)
+        given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, data.reader.sensor)
+        if sensor.intensity_scale != given_scale:
+            told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
+            print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
     frames = data.reader.open(data, split=split, sensor=sensor or data.reader.sensor, reading=reading, **options)
     if class_map is None:
         return frames

@@ -15,6 +15,7 @@ from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps, sensor_before_rotatio
 from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.inference.detector import _split_detect
+from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.inference.stream import detect_stream
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.sensors import TINY
@@ -110,6 +111,8 @@ def test_close_points_of_rotated_sweeps_are_removed_as_from_a_list_of_sweeps(tmp
     assert frame.num_close == found.cloud.num_close >= 10
     cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close)
     assert bits((cloud.points, cloud.valid)) == bits((found.cloud.points, found.cloud.valid))
+    [prediction] = predict(detector, TurnedClouds(files, yaw))  # does not shift what has been turned
+    assert bits(prediction.cloud.points) == bits(found.cloud.points)
 
 
 def turned(points, turn):

@@ -101,9 +101,11 @@ def test_options_are_passed_to_the_readers(roots):
         assert (far.num_close == 0) == (format in ("nuscenes", "folder"))  # the others know where their sensor is
 
 
-def test_data_keep_their_units_and_axes_with_another_sensor(roots):
+def test_data_keep_their_units_and_axes_with_another_sensor(roots, capsys):
     own = open_frames(roots["kitti"])
+    assert not capsys.readouterr().err
     frames = open_frames(roots["kitti"], sensor=NUSCENES_HDL32E)
+    assert "kitti: intensities are scaled by 255, as for all data of format kitti" in capsys.readouterr().err
     np.testing.assert_array_equal(frames.frame(0).points, own.frame(0).points)  # intensities times 255 too
     assert (frames.sensor.forward_rad, frames.sensor.intensity_scale, frames.sensor.num_rows) == (0, 255, 32)
 
