@@ -12,7 +12,7 @@ from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CHANNELS
 from fcos_lidar_jax.visualization.bev import bev_on, class_legend
 from fcos_lidar_jax.visualization.evaluation_report import Example
-from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
+from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set_title
 
 _SIZE_IN = (8.0, 9.6)
 _DPI = 90
@@ -65,9 +65,9 @@ def draw_drive(
         figure = new_figure(*_SIZE_IN)
         strip, view = figure.subplots(2, 1, height_ratios=(1, 7.4))
         _draw_ranges(strip, scene.points, size, sensor)
-        bev_on(view, scene.points, limit_m=limit_m, detections=found, truth=scene.truth, scores=False)
+        bev_on(view, scene.points, limit_m=limit_m, classes=classes, detections=found, truth=scene.truth)
         class_legend(figure, sorted(labels), classes, detections=True, truth=True)
-        strip.set_title(f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
+        set_title(strip, f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
         save_png(figure, file, dpi=_DPI)
         with Image.open(file) as picture:
             pictures.append(picture.convert("RGB").quantize(_COLORS))

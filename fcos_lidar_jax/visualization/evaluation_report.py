@@ -12,6 +12,7 @@ import numpy as np
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.examples import sensor_boxes
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.bev import draw_bev
@@ -228,15 +229,17 @@ def _draw_examples(
             detections=example.detections,
             truth=example.truth,
         )
-        caption = f"The {kind} sample by hits and misses at 2 m ({example.name}): detections, truth dashed."
+        shown = f"detections of score {SHOWN_SCORE:g} and more, truth dashed"
+        caption = f"The {kind} sample by hits and misses at 2 m ({example.name}): {shown}."
         views.append((caption, view))
         if len(points):
             projected = project_points(points, np.ones(len(points), bool), sensor, num_rounds=1)
             draw_range_image(
                 projected,
                 image,
-                boxes=example.truth[0],
-                detections=example.detections[0],
+                classes=list(ranges_m),
+                truth=example.truth,
+                detections=example.detections,
                 azimuth_limits_rad=sensor.azimuth_limits_rad,
             )
             images.append((f"The {kind} sample's range image: truth above, detections below.", image))
