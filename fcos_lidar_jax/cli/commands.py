@@ -79,8 +79,9 @@ def _parse(argv: Sequence[str]) -> Any:
         Annotated[kind, tyro.conf.subcommand(name, description=line if listed else None)]
         for name, (kind, _, line) in _COMMANDS.items()
     )
+    command: Any = reduce(or_, commands)
     return tyro.cli(
-        reduce(or_, commands),
+        command,
         prog="fcos-lidar",
         description="FCOS-LiDAR in JAX: 3D object detection on LiDAR range images.\n\n"
         "fcos-lidar COMMAND --help lists the options of a command, fcos-lidar --version prints the version.",

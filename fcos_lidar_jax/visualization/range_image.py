@@ -155,12 +155,13 @@ def _outline(
         rows_in, columns_in = np.divmod(cells, columns)
         top, bottom = rows_in.min(), rows_in.max() + 1
         spans = _spans(columns_in, columns) if view.full_turn else [(columns_in.min(), columns_in.max())]
-        for first, last in spans:
-            left, width = view.left - degrees * first, -degrees * (last + 1 - first)
+        edges = [(view.left - degrees * first, view.left - degrees * (last + 1)) for first, last in spans]
+        for left, right in edges:
             style = {"edgecolor": class_color(labels[index]), "linewidth": 1.4}
-            around = axis.add_patch(Rectangle((left, top), width, bottom - top, fill=False, **style))
+            around = axis.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, **style))
             around.set_path_effects([withStroke(linewidth=2.6, foreground="white")])
-        place = np.array([left + width / 2, (top + bottom) / 2]), np.array([-width, bottom - top]) / 2
+        left, right = edges[-1]
+        place = np.array([left + right, top + bottom]) / 2, np.array([left - right, bottom - top]) / 2
         drawn.append((*place, int(labels[index]), float(scores[0][index]) if scores else None))
     width_pt, height_pt = 0.88 * 72 * _WIDTH_IN, 0.8 * 72 * _PANEL_IN
     write_labels(axis, drawn, classes, (degrees * columns / width_pt, features.shape[0] / height_pt))
