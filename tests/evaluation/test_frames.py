@@ -218,11 +218,10 @@ def test_scores_and_warnings_name_the_metric():
     errors = list(evaluation.summary["tp_errors"])
     assert header == ["class", "AP", *errors]
     assert len({len(line) for line in lines[3:]}) == 1
-    for name, cells in zip(OWN, table, strict=True):
+    for name, cells in zip(OWN[:2], table, strict=True):
         own = evaluation.summary["label_tp_errors"][name]
         values = evaluation.summary["mean_dist_aps"][name], *(own.get(error, np.nan) for error in errors)
         assert cells == [name, *("-" if np.isnan(value) else f"{value:.4f}" for value in values)]
-    assert table[0][1] != "-" == table[-1][1]
     absent = ", ".join(OWN[2:])
     assert warnings(evaluation, 9) == [f"no ground truth is evaluated for {absent}: excluded from the means"]
     invalid = [dataclasses.replace(d, valid=d.valid & False) for d in found]
