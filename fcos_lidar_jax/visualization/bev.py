@@ -61,7 +61,7 @@ def bev_on(
     present: set[int] = set()
     for box, label in zip(*(truth or ()), strict=True):
         if _in_view(box, limit_m):
-            axis.fill(*_corners(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
+            axis.fill(*corners_from_above(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
             _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
             present.add(int(label))
     visible = [d for d in zip(*(detections or ()), strict=True) if _in_view(d[0], limit_m)]
@@ -70,7 +70,9 @@ def bev_on(
         present.add(int(label))
     axis.set(xlim=(-limit_m, limit_m), ylim=(-limit_m, limit_m), aspect="equal")
     point_m = 2 * limit_m / (0.88 * 72 * axis.get_figure().get_figwidth())
-    labels = ((box[:2], np.ptp(_corners(box), axis=1) / 2, label, score) for box, label, score in visible)
+    labels = (
+        (box[:2], np.ptp(corners_from_above(box), axis=1) / 2, label, score) for box, label, score in visible
+    )
     write_labels(axis, labels, classes, (point_m, point_m))
     axis.set(xlabel="x [m]", ylabel="y [m]")  # the forward axis depends on the data set
     axis.grid(color="#eeeeee", linewidth=0.6)
@@ -99,7 +101,7 @@ def _in_view(box: np.ndarray, limit_m: float) -> bool:
     return bool(np.isfinite(box[:7]).all() and np.abs(box[:2]).max() < limit_m + reach)
 
 
-def _corners(box: np.ndarray) -> np.ndarray:
+def corners_from_above(box: np.ndarray) -> np.ndarray:
     """x and y of the closed outline from above, f64[2, 5], metres."""
     x, y, _, l, w, _, yaw = map(float, box[:7])
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -108,7 +110,7 @@ def _corners(box: np.ndarray) -> np.ndarray:
 
 
 def _outline(axis: Any, box: np.ndarray, limit_m: float, **style: Any) -> None:
-    axis.plot(*_corners(box), **style)
+    axis.plot(*corners_from_above(box), **style)
     # The heading line extends beyond the front to stay visible on small boxes.
     x, y, reach, yaw = float(box[0]), float(box[1]), float(box[3]) / 2 + 0.008 * limit_m, float(box[6])
     axis.plot([x, x + np.cos(yaw) * reach], [y, y + np.sin(yaw) * reach], **{**style, "linestyle": "-"})
