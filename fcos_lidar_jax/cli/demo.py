@@ -16,7 +16,6 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
 from fcos_lidar_jax.evaluation.metrics import Evaluation
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.input_pipeline import open_frames
 from fcos_lidar_jax.progress import Progress
@@ -117,7 +116,6 @@ def _draw(out: Path, title: str, evaluation: Evaluation, frames: FrameSet) -> No
         sensor=sensor,
         classes=classes,
         title=title,
-        min_score=SHOWN_SCORE,
         limit_m=min(sensor.limit_xy_m, _MAX_LIMIT_M),
         report=Progress("pictures", len(scenes)).show,
     )

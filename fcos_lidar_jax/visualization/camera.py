@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -51,22 +50,17 @@ def draw_camera(
     axis.set_axis_off()
     axis.set(xlim=(0, width), ylim=(height, 0))
     for box, label in zip(*truth, strict=True):
-        _outline(axis, _edges(box, to_image), color=class_color(label), linewidth=1.0, linestyle="--")
+        axis.plot(*_edges(box, to_image).T, color=class_color(label), linewidth=1.0, linestyle="--")
     labels = []
     for box, label, score in zip(*detections, strict=True):
         edges = _edges(box, to_image)
-        _outline(axis, edges, color=class_color(label), linewidth=1.6)
+        axis.plot(*edges.T, color=class_color(label), linewidth=1.6)
         low, high = np.clip([edges.min((0, 1)), edges.max((0, 1))], 0, (width, height)) if len(edges) else (0, 0)
         if np.all(high > low):
             labels.append(((low + high) / 2, (high - low) / 2, int(label), float(score)))
     point = width / (72 * _WIDTH_IN)
     write_labels(axis, labels, classes, (point, point))
     save_png(figure, path)
-
-
-def _outline(axis: Any, edges: np.ndarray, **style: Any) -> None:
-    for edge in edges:
-        axis.plot(*edge.T, **style)
 
 
 def _edges(box: np.ndarray, to_image: np.ndarray) -> np.ndarray:
