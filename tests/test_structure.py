@@ -52,7 +52,7 @@ def test_which_close_points_go_has_one_default_and_is_handed_on_whole():
 
 
 def test_no_command_imports_another():
-    commands = {kind.__module__ for kind, _ in _COMMANDS.values()}
+    commands = {kind.__module__ for kind, *_ in _COMMANDS.values()}
     for file, node in nodes("fcos_lidar_jax/cli"):
         own = file.removesuffix(".py").replace("/", ".")
         if own in commands and isinstance(node, ast.ImportFrom):

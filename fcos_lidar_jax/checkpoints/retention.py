@@ -6,7 +6,6 @@ older checkpoint, and lets two processes write into one folder (``tests/checkpoi
 
 import shutil
 import sys
-from importlib.resources import files
 from pathlib import Path
 
 from fcos_lidar_jax.checkpoints.storage import (
@@ -17,6 +16,7 @@ from fcos_lidar_jax.checkpoints.storage import (
     read_description,
     save_checkpoint,
     save_score,
+    shipped_checkpoints,
 )
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.types import TrainState
@@ -108,13 +108,3 @@ def find_checkpoint(folder: Path) -> Path:
         return run_best or shipped.get(str(folder), folder)
     paths = Checkpoints(folder / CHECKPOINTS).paths()
     return paths[-1] if paths else folder
-
-
-def shipped_checkpoints() -> dict[str, Path]:
-    """Names and folders of the checkpoints that come with the package.
-
-    >>> "quickstart" in shipped_checkpoints()
-    True
-    """
-    folder = Path(str(files("fcos_lidar_jax") / "weights"))
-    return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()} if folder.is_dir() else {}

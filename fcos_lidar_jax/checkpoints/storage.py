@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import tempfile
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -268,8 +269,11 @@ def _hashes(folder: Path) -> dict[str, str]:
 def _verify(folder: Path) -> dict[str, Any]:
     """Check the hashes of all files of a checkpoint, and return its description."""
     if not folder.is_dir():
-        kind = "a file" if folder.exists() else "nothing"
-        raise CheckpointError(f"{folder}: found {kind}, expected a checkpoint folder")
+        if folder.exists():
+            raise CheckpointError(f"{folder}: found a file, expected a checkpoint folder")
+        names = ", ".join(shipped_checkpoints())
+        places = f"a checkpoint folder, the folder of a run, or the name of shipped weights: {names}"
+        raise CheckpointError(f"{folder}: found nothing, expected {places}")
     description = read_description(folder)
     expected, hashes = description["files"], _hashes(folder)
     for name in sorted(expected.keys() | hashes.keys()):
@@ -290,7 +294,8 @@ def read_description(folder: Path) -> dict[str, Any]:
     """
     file = folder / _DESCRIPTION
     if not file.is_file():
-        raise CheckpointError(f"{folder}: no {_DESCRIPTION} in it, expected a checkpoint folder")
+        places = "a checkpoint folder, or the folder of a run that has saved one"
+        raise CheckpointError(f"{folder}: no {_DESCRIPTION} in it, expected {places}")
     try:
         description = read_json(file)
     except ValueError as error:
@@ -345,3 +350,13 @@ def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:
         if shapes.get(name) != got.get(name):
             difference = f"got {got.get(name, 'nothing')}, expected {shapes.get(name, 'nothing')}"
             raise CheckpointError(f"{where}: {name}: {difference}: the arrays do not belong to {whose}")
+
+
+def shipped_checkpoints() -> dict[str, Path]:
+    """Names and folders of the checkpoints that come with the package.
+
+    >>> "quickstart" in shipped_checkpoints()
+    True
+    """
+    folder = Path(str(files("fcos_lidar_jax") / "weights"))
+    return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()} if folder.is_dir() else {}

@@ -9,16 +9,20 @@ import signal
 import sys
 import tempfile
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import NoReturn, TextIO
+
+from fcos_lidar_jax import __version__
 
 _LESS_MEMORY = (
     "for training, --optimizer.accumulate N splits each batch into N parts, --model.precision bfloat16 halves the "
     "activations, and --model.remat recomputes the largest ones; other commands need the least with --batch-size 1"
 )
 _MAX_LINE = 1000
+_REPEATED_S = 1.0  # `timeout` and schedulers may send a signal to a process and its group, that is, twice at once
 _CLOSED_CONNECTION = "closed by peer|reset by peer|Broken pipe|Read error|Write error"
 _CLOSED_PIPE = 128 + signal.SIGPIPE
 
@@ -30,10 +34,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         the exit code, see :func:`exit_code`; usage errors exit with 2.
     """
 
+    words = sys.argv[1:] if argv is None else [*argv]
+
     def work() -> None:
+        if words == ["--version"]:
+            print(f"fcos-lidar {__version__}")
+            return
         with _importing("fcos-lidar"):
             from fcos_lidar_jax.cli.commands import parse
-        parse(argv)()
+        parse(words)()
 
     return exit_code("fcos-lidar", work)
 
@@ -42,7 +51,8 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     """Call ``work`` and explain a failure in one line on standard error, which starts with the program's name.
 
     Unexpected exceptions are treated as bugs: the line names a file with the full report. SIGTERM and SIGHUP raise
-    an exception in ``work``, so that it leaves no half-written files.
+    an exception in ``work``, so that it leaves no half-written files. A second signal, at least a second later,
+    ends the process at once, even while a program is compiled.
 
     Returns:
         0; 1 after a failure; 130 after Ctrl-C; 141 if the reader of the output has gone.
@@ -55,7 +65,7 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     """
     stopped = None
     try:
-        with _ending_signals():
+        with _ending_signals() as numbers, _ended_by_a_second(numbers, program):
             code = _attempt(program, work)
     except BrokenPipeError:
         code = _CLOSED_PIPE
@@ -151,8 +161,11 @@ def _flush(stream: TextIO) -> OSError | None:
 
 
 @contextlib.contextmanager
-def _ending_signals() -> Iterator[None]:
-    """Raise SystemExit in the main thread for SIGTERM and SIGHUP, unless they have handlers already."""
+def _ending_signals() -> Iterator[list[signal.Signals]]:
+    """Raise SystemExit in the main thread for SIGTERM and SIGHUP, unless they have handlers already.
+
+    Yields the signals that end the work, Ctrl-C too.
+    """
     is_main = threading.current_thread() is threading.main_thread()
     numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if is_main and signal.getsignal(n) is signal.SIG_DFL]
 
@@ -161,11 +174,51 @@ def _ending_signals() -> Iterator[None]:
 
     for number in numbers:
         signal.signal(number, end)
+    interrupts = is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     try:
-        yield
+        yield [*numbers, *([signal.SIGINT] if interrupts else [])]
     finally:
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def _ended_by_a_second(numbers: Sequence[signal.Signals], program: str) -> Iterator[None]:
+    """End the process at the second of the signals.
+
+    Python calls handlers only when the main thread returns from C, where XLA may compile for minutes. But it
+    writes the number of each signal to a pipe at once, which another thread reads.
+    """
+    if not numbers:
+        yield
+        return
+    read, write = os.pipe()
+
+    def watch() -> None:
+        first_s = None
+        while number := os.read(read, 1):
+            if number[0] in numbers:
+                first_s, now_s = first_s or time.monotonic(), time.monotonic()
+                if now_s - first_s > _REPEATED_S:
+                    _end(program, number[0])
+
+    os.set_blocking(write, False)
+    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    (watching := threading.Thread(target=watch, daemon=True)).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(write)
+        watching.join()
+        os.close(read)
+
+
+def _end(program: str, number: int) -> NoReturn:
+    """End the process without cleaning up."""
+    if number == signal.SIGINT:
+        os.write(2, f"{program}: interrupted\n".encode())
+    os._exit(128 + number)
 
 
 @contextlib.contextmanager
@@ -215,11 +268,7 @@ def _importing(program: str) -> Iterator[None]:
         yield
         return
 
-    def end(*_: object) -> NoReturn:
-        os.write(2, f"{program}: interrupted\n".encode())
-        os._exit(130)
-
-    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGINT, lambda number, _: _end(program, number))
     try:
         yield
     finally:

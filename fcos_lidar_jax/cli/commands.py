@@ -26,22 +26,20 @@ from fcos_lidar_jax.cli import (
 from fcos_lidar_jax.files import local_path
 
 _COMMANDS = {
-    "demo": (demo.Demo, demo.run),
-    "synthesize": (synthesize.Synthesize, synthesize.run),
-    "prepare": (prepare.Prepare, prepare.run),
-    "train": (train.Train, train.run),
-    "evaluate": (evaluate.Evaluate, evaluate.run),
-    "detect": (detect.Detect, detect.run),
-    "stream": (stream.Stream, stream.run),
-    "project": (project.Project, project.run),
-    "export": (export.Export, export.run),
-    "benchmark": (benchmark.Benchmark, benchmark.run),
-}  # name -> (options, function)
-
-Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _) in _COMMANDS.items()))
+    "demo": (demo.Demo, demo.run, "detect in a simulated drive; needs no data"),
+    "synthesize": (synthesize.Synthesize, synthesize.run, "write simulated streets in the nuScenes layout"),
+    "prepare": (prepare.Prepare, prepare.run, "collect the objects that training pastes; index nuScenes"),
+    "train": (train.Train, train.run, "train a detector, or resume a run"),
+    "evaluate": (evaluate.Evaluate, evaluate.run, "write metrics, a report and a page of frames"),
+    "detect": (detect.Detect, detect.run, "write the boxes of point files"),
+    "stream": (stream.Stream, stream.run, "write the boxes of a drive, sweep by sweep"),
+    "project": (project.Project, project.run, "write the range image of a point file"),
+    "export": (export.Export, export.run, "write a detector as a file of its own, or as ONNX"),
+    "benchmark": (benchmark.Benchmark, benchmark.run, "time a detector, stage by stage"),
+}  # name -> (options, function, line of the list of commands)
 
 
-def parse(argv: Sequence[str] | None) -> Callable[[], object]:
+def parse(argv: Sequence[str]) -> Callable[[], object]:
     """Parse the arguments; returns the command, ready to run. Usage errors exit with 2.
 
     Raises:
@@ -58,7 +56,7 @@ def parse(argv: Sequence[str] | None) -> Callable[[], object]:
     if command is None:
         command = _parse(argv)  # again, to print the help or the usage error
     _check_paths(command)
-    run = next(run for kind, run in _COMMANDS.values() if isinstance(command, kind))
+    run = next(run for kind, run, _ in _COMMANDS.values() if isinstance(command, kind))
     return partial(run, command)
 
 
@@ -74,11 +72,19 @@ def _check_paths(value: Any) -> None:
             _check_paths(getattr(value, field.name))
 
 
-def _parse(argv: Sequence[str] | None) -> Any:
+def _parse(argv: Sequence[str]) -> Any:
+    # A description would replace the docstring in the help of the command itself.
+    listed = not argv or argv[0] not in _COMMANDS
+    commands = (
+        Annotated[kind, tyro.conf.subcommand(name, description=line if listed else None)]
+        for name, (kind, _, line) in _COMMANDS.items()
+    )
+    command: Any = reduce(or_, commands)
     return tyro.cli(
-        Command,
+        command,
         prog="fcos-lidar",
-        description="FCOS-LiDAR in JAX: 3D object detection on LiDAR range images.",
+        description="FCOS-LiDAR in JAX: 3D object detection on LiDAR range images.\n\n"
+        "fcos-lidar COMMAND --help lists the options of a command, fcos-lidar --version prints the version.",
         args=argv,
         config=(tyro.conf.CascadeSubcommandArgs,),  # options of a command may follow its preset
     )  # type: ignore[call-overload]

@@ -15,7 +15,6 @@ from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, wr
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
-from fcos_lidar_jax.evaluation.examples import choose_examples
 from fcos_lidar_jax.evaluation.metrics import Evaluation
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.input_pipeline import open_frames
@@ -95,7 +94,6 @@ def _simulate(args: Demo, detector: CloudDetector) -> NuScenesFrames:
 
 def _draw(out: Path, title: str, evaluation: Evaluation, frames: FrameSet) -> None:
     """Draw the animation, and write the page that plays the drive."""
-    min_score = choose_examples(evaluation).min_score
     rows = {name: row for row, name in enumerate(evaluation.tokens)}
     origins = np.zeros((len(rows), 3))
     scenes = list(make_examples(evaluation, frames, origins, rows, min_score=0, all_sweeps=True))
@@ -111,14 +109,13 @@ def _draw(out: Path, title: str, evaluation: Evaluation, frames: FrameSet) -> No
         for row, scene in enumerate(scenes)
     ]
     classes, sensor = evaluation.metric.classes, frames.sensor
-    write_page(out / _PAGE, page_frames, classes=classes, title=title, min_score=min_score)
+    write_page(out / _PAGE, page_frames, classes=classes, title=title)
     draw_drive(
         out / _GIF,
         scenes,
         sensor=sensor,
         classes=classes,
         title=title,
-        min_score=min_score,
         limit_m=min(sensor.limit_xy_m, _MAX_LIMIT_M),
         report=Progress("pictures", len(scenes)).show,
     )

@@ -106,13 +106,12 @@ def write_reports(
         for each in make_examples(*source, examples.extremes, min_score=0, all_sweeps=True)
     ]
     if frames:
-        options = {"classes": evaluation.metric.classes, "min_score": examples.min_score}
-        write_page(out / PAGE, frames, title=title, **options)
+        write_page(out / PAGE, frames, title=title, classes=evaluation.metric.classes)
     write_evaluation_report(
         out,
         title=title,
         num_samples=len(compared.truth.tokens),
-        examples=make_examples(*source, examples.rows, min_score=examples.min_score),
+        examples=make_examples(*source, examples.rows, min_score=SHOWN_SCORE),
         sensor=task.sensor,
         pictures=pictures,
         links=[*links, *([("Look at the worst and the best frames", PAGE)] if frames else [])],

@@ -99,6 +99,10 @@ class FrameSet(Protocol):
         """Time of the current sweep in microseconds; None if unknown."""
         return None
 
+    def camera(self, index: int) -> tuple[Path, np.ndarray] | None:
+        """An image of the frame, and f64[3, 4] from the points' frame to homogeneous pixels; None without one."""
+        return None
+
     def scene(self, index: int) -> str:
         """Name of the frame's drive; ``""`` if unknown."""
         return ""
@@ -174,6 +178,9 @@ class WrappedFrames(FrameSet):
 
     def time_us(self, index: int) -> int | None:
         return self.frames.time_us(self._source(index))
+
+    def camera(self, index: int) -> tuple[Path, np.ndarray] | None:
+        return self.frames.camera(self._source(index))
 
     def scene(self, index: int) -> str:
         return self.frames.scene(self._source(index))

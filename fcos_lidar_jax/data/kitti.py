@@ -110,6 +110,12 @@ class KittiFrames(FrameSet):
     def name(self, index: int) -> str:
         return self.names[index]
 
+    def camera(self, index: int) -> tuple[Path, np.ndarray] | None:
+        """The left colour image, ``training/image_2/NAME.png``, if there is one."""
+        image = self.root / "training" / "image_2" / f"{self.names[index]}.png"
+        calibration = read_calibration(self._file("calib", self.names[index]))
+        return (image, calibration["P2"] @ calibration["velo_to_rect"]) if image.is_file() else None
+
     def fingerprint(self) -> str:
         files = (self._file(kind, name) for kind in ("velodyne", "label_2", "calib") for name in self.names)
         reading = self.names, self.sensor, self.image_size, self.reading.remove_close, self.reading.close_m

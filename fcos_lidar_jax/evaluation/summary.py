@@ -99,7 +99,7 @@ def write_evaluation(
 
 
 def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None) -> str:
-    """Text lines of the scores and, if given, their intervals."""
+    """Text lines of the scores and, if given, their intervals, and a table of the classes; "-" for undefined."""
     summary, benchmark = evaluation.summary, evaluation.metric.benchmark
     names = {"nd_score": "NDS", "mean_ap": "mAP"} if benchmark else {"mean_ap": "mAP by centre distance"}
     scores = "  ".join(f"{name} {summary[key]:.4f}" for key, name in names.items())
@@ -108,7 +108,20 @@ def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None)
     if intervals is not None:
         spans = (f"{n} {intervals[k]['low']:.4f} to {intervals[k]['high']:.4f}" for k, n in names.items())
         lines.append(f"{intervals['level']:.0%} intervals over samples: {'; '.join(spans)}")
-    return "\n".join(filter(None, lines))
+    return "\n".join(filter(None, [*lines, *_class_table(summary)]))
+
+
+def _class_table(summary: Mapping[str, Any]) -> list[str]:
+    """Lines of a table: average precision and errors of each class."""
+    errors, names = list(summary["tp_errors"]), list(summary["mean_dist_aps"])
+    header = "".join(f"  {name:>8}" for name in ("AP", *errors))
+    lines, width = [], max(map(len, ["class", *names]))
+    for name in names:
+        own = summary["label_tp_errors"][name]
+        values = summary["mean_dist_aps"][name], *(own.get(error, float("nan")) for error in errors)
+        cells = zip(("AP", *errors), ("-" if v != v else f"{v:.4f}" for v in values), strict=True)
+        lines.append(f"{name:<{width}}" + "".join(f"  {cell:>{max(8, len(head))}}" for head, cell in cells))
+    return [f"{'class':<{width}}{header}", *lines]
 
 
 def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None = None) -> list[str]:

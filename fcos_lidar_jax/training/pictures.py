@@ -4,11 +4,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.evaluation.records import confident
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, confident
 from fcos_lidar_jax.inference.prediction import Prediction
 from fcos_lidar_jax.training.metrics_log import read_metrics
-
-_SHOWN_SCORE = 0.2  # minimum score of detections in pictures; scores are low early in training
 
 
 def draw_metrics(folder: Path) -> None:
@@ -43,8 +41,8 @@ def draw_predictions(
             paths[-1],
             limit_m=frames.sensor.limit_xy_m,
             classes=frames.classes,
-            detections=confident(prediction.detections, _SHOWN_SCORE),
+            detections=confident(prediction.detections, SHOWN_SCORE),
             truth=(frame.boxes, frame.labels),
-            title=f"{title} {prediction.index}: scores of at least {_SHOWN_SCORE}, truth dashed",
+            title=f"{title} {prediction.index}: scores of at least {SHOWN_SCORE}, truth dashed",
         )
     return paths

@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, set_title
+from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, set_title, write_labels
 
 _SIZE_IN = 9.0
 _DASHES = (0, (3, 2))
-_TEXT_POINTS = 7.0
 _LEGEND_CLASSES = 30
 _HIGH_M = 3.0  # height above ground from which points have the darkest colour
 
@@ -27,9 +26,9 @@ def draw_bev(
 ) -> None:
     """Plot a cloud from above: x to the right, y up, higher points darker, a cross at the origin.
 
-    Detections have solid outlines in the colour of their class, with scores where there is room, highest scores
-    first. Truth has thin dashed black outlines filled with the colour of its class. A line from the centre through
-    the front marks the heading.
+    Detections have solid outlines in the colour of their class, with class and score, or only the score, where
+    there is room, highest scores first. Truth has thin dashed black outlines filled with the colour of its class.
+    A line from the centre through the front marks the heading.
 
     Args:
         points: f32[n, >= 3], metres; non-finite rows are omitted.
@@ -39,7 +38,7 @@ def draw_bev(
         truth: boxes f32[m, 9], labels i32[m].
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
-    options = {"limit_m": limit_m, "detections": detections, "truth": truth}
+    options = {"limit_m": limit_m, "classes": classes, "detections": detections, "truth": truth}
     present = bev_on(figure.add_subplot(), points, **options)
     class_legend(figure, sorted(present), classes, detections=detections is not None, truth=truth is not None)
     if title:
@@ -52,26 +51,29 @@ def bev_on(
     points: np.ndarray,
     *,
     limit_m: float,
+    classes: Sequence[str],
     detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     truth: tuple[np.ndarray, np.ndarray] | None = None,
-    scores: bool = True,
 ) -> set[int]:
-    """Plot the view of :func:`draw_bev` on an axis, optionally without scores; returns the visible labels."""
+    """Plot the view of :func:`draw_bev` on an axis; returns the visible labels."""
     _draw_points(axis, points, limit_m)
     axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
     present: set[int] = set()
     for box, label in zip(*(truth or ()), strict=True):
         if _in_view(box, limit_m):
-            axis.fill(*_corners(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
+            axis.fill(*corners_from_above(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
             _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
             present.add(int(label))
     visible = [d for d in zip(*(detections or ()), strict=True) if _in_view(d[0], limit_m)]
     for box, label, _ in visible:
         _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
         present.add(int(label))
-    if scores:
-        _write_scores(axis, visible, limit_m)
     axis.set(xlim=(-limit_m, limit_m), ylim=(-limit_m, limit_m), aspect="equal")
+    point_m = 2 * limit_m / (0.88 * 72 * axis.get_figure().get_figwidth())
+    labels = (
+        (box[:2], np.ptp(corners_from_above(box), axis=1) / 2, label, score) for box, label, score in visible
+    )
+    write_labels(axis, labels, classes, (point_m, point_m))
     axis.set(xlabel="x [m]", ylabel="y [m]")  # the forward axis depends on the data set
     axis.grid(color="#eeeeee", linewidth=0.6)
     axis.set_axisbelow(True)
@@ -99,7 +101,7 @@ def _in_view(box: np.ndarray, limit_m: float) -> bool:
     return bool(np.isfinite(box[:7]).all() and np.abs(box[:2]).max() < limit_m + reach)
 
 
-def _corners(box: np.ndarray) -> np.ndarray:
+def corners_from_above(box: np.ndarray) -> np.ndarray:
     """x and y of the closed outline from above, f64[2, 5], metres."""
     x, y, _, l, w, _, yaw = map(float, box[:7])
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -108,27 +110,10 @@ def _corners(box: np.ndarray) -> np.ndarray:
 
 
 def _outline(axis: Any, box: np.ndarray, limit_m: float, **style: Any) -> None:
-    axis.plot(*_corners(box), **style)
+    axis.plot(*corners_from_above(box), **style)
     # The heading line extends beyond the front to stay visible on small boxes.
     x, y, reach, yaw = float(box[0]), float(box[1]), float(box[3]) / 2 + 0.008 * limit_m, float(box[6])
     axis.plot([x, x + np.cos(yaw) * reach], [y, y + np.sin(yaw) * reach], **{**style, "linestyle": "-"})
-
-
-def _write_scores(axis: Any, detections: list[tuple[np.ndarray, int, float]], limit_m: float) -> None:
-    """Write scores beside their boxes, highest first; omits scores without room."""
-    from matplotlib.patheffects import withStroke
-
-    half = np.array([1.5, 0.7]) * _TEXT_POINTS * 2 * limit_m / (0.9 * 72 * _SIZE_IN)  # half a label, metres
-    placed: list[np.ndarray] = []
-    for box, _, score in sorted(detections, key=lambda d: -d[2]):
-        reach = np.ptp(_corners(box), axis=1) / 2 + half
-        beside = (box[:2] + reach * side for side in ((1, 0), (-1, 0), (0, 1), (0, -1)))
-        inside = (p for p in beside if (np.abs(p) + half < limit_m).all())
-        place = next((p for p in inside if all((np.abs(p - q) > 2 * half).any() for q in placed)), None)
-        if place is not None:
-            placed.append(place)
-            text = axis.text(*place, f"{score:.2f}", fontsize=_TEXT_POINTS, ha="center", va="center", zorder=6)
-            text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
 def class_legend(

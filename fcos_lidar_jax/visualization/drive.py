@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CHANNELS
 from fcos_lidar_jax.visualization.bev import bev_on, class_legend
 from fcos_lidar_jax.visualization.evaluation_report import Example
-from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png
+from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set_title
 
 _SIZE_IN = (8.0, 9.6)
 _DPI = 90
@@ -27,7 +28,6 @@ def draw_drive(
     classes: Sequence[str],
     title: str,
     limit_m: float,
-    min_score: float,
     seconds_a_scene: float = 0.5,
     report: Callable[[int], object] = lambda done: None,
 ) -> list[Path]:
@@ -42,7 +42,6 @@ def draw_drive(
         classes: class names by label.
         title: begins the title of each picture.
         limit_m: half the side of the bird's-eye view.
-        min_score: threshold of the detections.
         seconds_a_scene: duration of each scene.
         report: called with the number of finished scenes.
 
@@ -53,21 +52,18 @@ def draw_drive(
 
     path = Path(path)
     files = [path.with_name(f"{path.stem}_{number:02d}.png") for number in range(len(scenes))]
-    shown = [
-        (boxes[scores >= min_score], labels[scores >= min_score], scores[scores >= min_score])
-        for boxes, labels, scores in (scene.detections for scene in scenes)
-    ]
+    shown = list[Any]([part[s.detections[2] >= SHOWN_SCORE] for part in s.detections] for s in scenes)
     labels = {int(k) for scene, found in zip(scenes, shown, strict=True) for k in (*found[1], *scene.truth[1])}
-    title = f"{title}: score {min_score:.2f} and more, truth dashed"
+    title = f"{title}: score {SHOWN_SCORE:g} and more, truth dashed"
     size = max(len(scene.points) for scene in scenes)  # one size, so that the projection is compiled once
     pictures = []
     for number, (scene, found, file) in enumerate(zip(scenes, shown, files, strict=True)):
         figure = new_figure(*_SIZE_IN)
         strip, view = figure.subplots(2, 1, height_ratios=(1, 7.4))
         _draw_ranges(strip, scene.points, size, sensor)
-        bev_on(view, scene.points, limit_m=limit_m, detections=found, truth=scene.truth, scores=False)
+        bev_on(view, scene.points, limit_m=limit_m, classes=classes, detections=found, truth=scene.truth)
         class_legend(figure, sorted(labels), classes, detections=True, truth=True)
-        strip.set_title(f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
+        set_title(strip, f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
         save_png(figure, file, dpi=_DPI)
         with Image.open(file) as picture:
             pictures.append(picture.convert("RGB").quantize(_COLORS))

@@ -12,9 +12,11 @@ import numpy as np
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.examples import sensor_boxes
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.bev import draw_bev
+from fcos_lidar_jax.visualization.camera import draw_camera
 from fcos_lidar_jax.visualization.figure import LINE_COLORS, new_axis, save_png
 from fcos_lidar_jax.visualization.range_image import draw_range_image
 from fcos_lidar_jax.visualization.report import Cell, Picture, write_report
@@ -40,6 +42,7 @@ class Example:
     points: np.ndarray  # f32[n, >= 5]: the cloud; if it is empty, there is no range image
     detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f64[d, 9], labels and scores
     truth: tuple[np.ndarray, np.ndarray]  # boxes f64[m, 9] and labels
+    camera: tuple[Path, np.ndarray] | None = None  # image, and f64[3, 4] from the sensor's frame to it
 
 
 def make_examples(
@@ -56,15 +59,16 @@ def make_examples(
     Without frames they are in the global frame, around their ``centres`` f64[samples, 3], and without points.
     """
     for kind, row in rows.items():
-        pose, points = np.eye(4), np.zeros((0, 5), np.float32)
+        pose, points, camera = np.eye(4), np.zeros((0, 5), np.float32), None
         pose[:3, 3] = centres[row]
         if frames is not None:
             points = frames.frame(row).points
             points = points if all_sweeps else points[points[:, 4] == 0]
             own_pose = frames.pose(row) if evaluation.metric is NUSCENES_METRIC else None
             pose = np.eye(4) if own_pose is None else own_pose
+            camera = frames.camera(row)
         found, truth = sensor_boxes(evaluation, row, pose, min_score=min_score)
-        yield Example(kind, evaluation.tokens[row], points, found, truth)
+        yield Example(kind, evaluation.tokens[row], points, found, truth, camera)
 
 
 def write_evaluation_report(
@@ -124,7 +128,7 @@ def clear_report(out: Path) -> None:
     for name in ("report.html", PAGE):
         (out / name).unlink(missing_ok=True)
     for file in (out / "pictures").glob("*.png"):
-        if re.fullmatch(r"(precision|errors)_\d+_.*|(best|typical|worst)_(bev|range)\.png", file.name):
+        if re.fullmatch(r"(precision|errors)_\d+_.*|(best|typical|worst)_(bev|range|camera)\.png", file.name):
             file.unlink()
 
 
@@ -215,30 +219,22 @@ def _save(figure: Any, path: str | Path, y_label: str, **legend: Any) -> None:
 def _draw_examples(
     folder: Path, examples: Iterable[Example], ranges_m: Mapping[str, float], sensor: Sensor
 ) -> tuple[list[Picture], list[Picture]]:
-    """Plot bird's-eye views of samples, and their range images if they have points."""
+    """Plot bird's-eye views of samples, and, where they have them, range images and boxes in camera images."""
     views, images = list[Picture](), list[Picture]()
     for example in examples:
         points, kind = example.points, example.kind
-        view, image = folder / f"{kind}_bev.png", folder / f"{kind}_range.png"
-        draw_bev(
-            points,
-            view,
-            limit_m=max(ranges_m.values()) + _MARGIN_M,
-            classes=list(ranges_m),
-            detections=example.detections,
-            truth=example.truth,
-        )
-        caption = f"The {kind} sample by hits and misses at 2 m ({example.name}): detections, truth dashed."
+        view, image, photo = (folder / f"{kind}_{name}.png" for name in ("bev", "range", "camera"))
+        boxes = {"classes": list(ranges_m), "truth": example.truth, "detections": example.detections}
+        draw_bev(points, view, limit_m=max(ranges_m.values()) + _MARGIN_M, **boxes)
+        shown = f"detections of score {SHOWN_SCORE:g} and more, truth dashed"
+        caption = f"The {kind} sample by hits and misses at 2 m ({example.name}): {shown}."
         views.append((caption, view))
+        if example.camera is not None:
+            draw_camera(example.camera[0], photo, example.camera[1], **boxes)
+            images.append((f"The {kind} sample's camera image.", photo))
         if len(points):
             projected = project_points(points, np.ones(len(points), bool), sensor, num_rounds=1)
-            draw_range_image(
-                projected,
-                image,
-                boxes=example.truth[0],
-                detections=example.detections[0],
-                azimuth_limits_rad=sensor.azimuth_limits_rad,
-            )
+            draw_range_image(projected, image, azimuth_limits_rad=sensor.azimuth_limits_rad, **boxes)
             images.append((f"The {kind} sample's range image: truth above, detections below.", image))
     return views, images
 

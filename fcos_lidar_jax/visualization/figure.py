@@ -1,8 +1,12 @@
 """Matplotlib figures without a display or global state, and the colours of all figures."""
 
 import colorsys
+import textwrap
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from fcos_lidar_jax.files import atomic_write
 
@@ -13,6 +17,7 @@ _CLASS_COLORS = (
     *("#1f77b4", "#d62728", "#9467bd", "#8c564b", "#e6a000"),
     *("#e377c2", "#17becf", "#2ca02c", "#ff6f00", "#5b5b5b"),
 )
+_LABEL_POINTS = 7.0
 _GOLDEN = 0.6180339887  # hue step, the golden ratio, for which hues never repeat
 
 
@@ -45,10 +50,58 @@ def new_axis(width_in: float, height_in: float) -> tuple[Any, Any]:
     return figure, axis
 
 
-def set_title(place: Any, title: str, **style: Any) -> None:
-    """Set the title of a figure or an axis verbatim: no math after ``$``, and any file name is valid."""
+def set_title(place: Any, title: str, *, fontsize: float, **style: Any) -> None:
+    """Set the title of a figure or an axis, in as many lines as it needs to fit into the figure.
+
+    The title is written verbatim: no math after ``$``, and any file name is valid.
+    """
     write = place.suptitle if hasattr(place, "suptitle") else place.set_title
-    write(title.encode("utf-8", "replace").decode(), **style).set_parse_math(False)
+    width = 0.85 * 72 * place.get_figure(root=True).get_figwidth()
+    title = title.encode("utf-8", "replace").decode()
+    wrapped = (textwrap.wrap(title, n, break_on_hyphens=False) for n in range(len(title), 0, -1))
+    lines = next((ls for ls in wrapped if all(_text_width(line, fontsize) <= width for line in ls)), [title])
+    write("\n".join(lines), fontsize=fontsize, **style).set_parse_math(False)
+
+
+def write_labels(
+    axis: Any,
+    boxes: Iterable[tuple[np.ndarray, np.ndarray, int, float | None]],
+    classes: Sequence[str],
+    point: tuple[float, float],
+) -> None:
+    """Write class and score beside boxes where there is room, else the score, best first; without room nothing.
+
+    Args:
+        boxes: centre and half the size in units of the axis, f64[2], label, and score, None for the truth.
+        classes: class names by label.
+        point: width and height of a typographic point in units of the axis.
+    """
+    from matplotlib.patheffects import withStroke
+
+    low, high = np.sort([axis.get_xlim(), axis.get_ylim()]).T
+    placed: list[tuple[np.ndarray, np.ndarray]] = []
+    for centre, reach, label, score in sorted(boxes, key=lambda box: -(box[3] or 0)):
+        name, number = classes[label].replace("_", " "), "" if score is None else f"{score:.2f}"
+        for text in filter(None, (f"{name} {number}".strip(), number)):
+            half = np.array([_text_width(text, _LABEL_POINTS) / 2 + 1.5, 0.7 * _LABEL_POINTS]) * point
+            beside = [centre + (reach + half) * side for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+            inside = [p for p in beside if (p - half > low).all() and (p + half < high).all()]
+            free = [p for p in inside if all((np.abs(p - q) > half + other).any() for q, other in placed)]
+            if free:
+                placed.append((free[0], half))
+                style = {"fontsize": _LABEL_POINTS, "color": class_color(label), "zorder": 6}
+                written = axis.text(*free[0], text, ha="center", va="center", parse_math=False, **style)
+                written.set_path_effects([withStroke(linewidth=2, foreground="white")])
+                break
+
+
+def _text_width(text: str, fontsize: float) -> float:
+    """Width in points."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(size=fontsize)
+    return text_to_path.get_text_width_height_descent(text, font, ismath=False)[0]
 
 
 def save_png(figure: Any, path: str | Path, *, dpi: int = 110) -> None:

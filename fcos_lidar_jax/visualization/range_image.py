@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.types import CHANNELS, RangeImage
-from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set_title
+from fcos_lidar_jax.visualization.figure import EMPTY, class_color, new_figure, save_png, set_title, write_labels
 
 _RANGE, _INCLINATION, _INTENSITY, _EXISTENCE, _LAG = (
     CHANNELS.index(c) for c in ("range", "inclination", "intensity", "existence", "time_lag")
 )
-_BOX = "#ff1f1f"  # outlines of boxes, distinct from the range colours and empty cells
+_WIDTH_IN, _PANEL_IN = 13.0, 1.5  # of the figure, and of a panel with its title
 
 
 def draw_range_image(
@@ -23,8 +23,9 @@ def draw_range_image(
     path: str | Path,
     *,
     title: str | None = None,
-    boxes: np.ndarray | None = None,
-    detections: np.ndarray | None = None,
+    classes: Sequence[str] = (),
+    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     azimuth_limits_rad: tuple[float, float] | None = None,
 ) -> None:
     """Plot the range of each round, and intensity and time lag of the first round.
@@ -34,20 +35,22 @@ def draw_range_image(
     are current.
 
     Args:
-        boxes: f32[m, >= 7], metres, in the frame of the points. Each box is outlined in round 1 around the cells
-            whose points lie in it; boxes without such a cell are not visible.
-        detections: same format as ``boxes``, in a separate panel.
+        classes: class names by label.
+        truth: boxes f32[m, >= 7], metres, in the frame of the points, and labels i32[m]. Each box is outlined in
+            round 1, in the colour of its class, around the cells whose points lie in it; boxes without such a cell
+            are not visible.
+        detections: boxes f32[d, >= 7], labels i32[d] and scores f32[d], in a separate panel.
         azimuth_limits_rad: sector of the sensor.
     """
     view = _View.of(azimuth_limits_rad)
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
     lags = features[:, :, _LAG].any()
-    outlines = [(k, given) for k, given in (("boxes", boxes), ("detections", detections)) if given is not None]
+    outlines = [(k, given) for k, given in (("truth", truth), ("detections", detections)) if given is not None]
     panels = [(_RANGE, 0, outline) for outline in outlines or [None]]
     panels += [(channel, 0, None) for channel in (_INTENSITY, _LAG) if channel == _INTENSITY or lags]
     panels += [(_RANGE, r, None) for r in range(1, rounds)]
-    figure = new_figure(13, 1.5 * len(panels) + 0.6)
+    figure = new_figure(_WIDTH_IN, _PANEL_IN * len(panels) + 0.6)
     if title:
         set_title(figure, title, fontsize=12)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -55,12 +58,14 @@ def draw_range_image(
     degrees = np.degrees(_row_inclinations(features))[ticks]
     for axis, (channel, r, outline) in zip(axes, panels, strict=True):
         name = _draw_channel(figure, axis, features, channel, r, view)
-        if outline is not None:
-            kind, given = outline
-            name += f"; {_outline(axis, features, given, view)} of {len(given)} {kind} have a cell"
-        axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
         axis.set_ylabel("inclination", fontsize=9)
         axis.set(xlim=(view.left, view.right), ylim=(rows, 0))
+        if outline is not None:
+            kind, boxes = outline
+            name += (
+                f"; {kind}: {_outline(axis, features, boxes, classes, view)} of {len(boxes[0])} boxes have a cell"
+            )
+        axis.set_title(f"Round {r + 1}: {name}", fontsize=10, loc="left")
         axis.set_xticks(view.ticks, [f"{v - 360 if v > 180 else v}°" for v in view.ticks])
         axis.set_yticks(ticks + 0.5, [f"{round(v)}°" for v in degrees])
         axis.tick_params(labelsize=9)
@@ -131,23 +136,36 @@ def _row_inclinations(features: np.ndarray) -> np.ndarray:
     return np.interp(rows, known, medians) + beyond * step
 
 
-def _outline(axis: Any, features: np.ndarray, boxes: np.ndarray, view: _View) -> int:
+def _outline(
+    axis: Any, features: np.ndarray, given: tuple[np.ndarray, ...], classes: Sequence[str], view: _View
+) -> int:
     """Draw rectangles around the first-round cells of each box; returns the number of boxes with cells."""
     from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import withStroke
 
     columns = features.shape[1]
     first_round = features[..., 0].reshape(-1, features.shape[2])
     filled = np.flatnonzero(first_round[:, _EXISTENCE] > 0)
-    boxes_cells = [filled[rows] for rows in points_in_boxes(first_round[filled, :3], boxes) if len(rows)]
-    for cells in boxes_cells:
+    boxes, labels, *scores = given
+    boxes_cells = [filled[rows] for rows in points_in_boxes(first_round[filled, :3], boxes)]
+    degrees, drawn = (view.left - view.right) / columns, []
+    for index, cells in enumerate(boxes_cells):
+        if not len(cells):
+            continue
         rows_in, columns_in = np.divmod(cells, columns)
         top, bottom = rows_in.min(), rows_in.max() + 1
         spans = _spans(columns_in, columns) if view.full_turn else [(columns_in.min(), columns_in.max())]
-        degrees = (view.left - view.right) / columns
-        for first, last in spans:
-            left, width = view.left - degrees * first, -degrees * (last + 1 - first)
-            axis.add_patch(Rectangle((left, top), width, bottom - top, fill=False, edgecolor=_BOX, linewidth=1.2))
-    return len(boxes_cells)
+        edges = [(view.left - degrees * first, view.left - degrees * (last + 1)) for first, last in spans]
+        for left, right in edges:
+            style = {"edgecolor": class_color(labels[index]), "linewidth": 1.4}
+            around = axis.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, **style))
+            around.set_path_effects([withStroke(linewidth=2.6, foreground="white")])
+        left, right = edges[-1]
+        place = np.array([left + right, top + bottom]) / 2, np.array([left - right, bottom - top]) / 2
+        drawn.append((*place, int(labels[index]), float(scores[0][index]) if scores else None))
+    width_pt, height_pt = 0.88 * 72 * _WIDTH_IN, 0.8 * 72 * _PANEL_IN
+    write_labels(axis, drawn, classes, (degrees * columns / width_pt, features.shape[0] / height_pt))
+    return len(drawn)
 
 
 def _spans(columns_in: np.ndarray, columns: int) -> Iterator[tuple[int, int]]:

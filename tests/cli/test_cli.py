@@ -15,6 +15,7 @@ from commands import assert_one_line_error, command, mistakes, page_content
 from PIL import Image
 from tiny_run import TINY_CONFIG, bits, untrained
 
+from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import demo, demo_training, main
@@ -258,9 +259,9 @@ detect HOME/s.json => s.json: expected a point file, or --sweeps before a list o
 detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
 detect HOME/good.npy --out OUT --page OUT/../.out.resume_log => --page: .*the same file as
 detect --sweeps HOME/s.json => s.json: no such file
-detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a checkpoint folder
+detect HOME/good.npy --checkpoint HOME/none => none: found nothing, expected a check.*weights: hdl32e, quickstart$
 detect HOME/good.npy --checkpoint HOME/good.npy => found a file, expected a checkpoint folder
-detect HOME/good.npy --checkpoint HOME => no checkpoint.json in it
+detect HOME/good.npy --checkpoint HOME => no checkpoint.json in it, expected a .*, or the folder of a run
 detect HOME/good.npy --checkpoint HOME/foreign => foreign: params/.*: got \(.*\), expected \(.*\): the arrays do
 detect HOME/good.npy --checkpoint HOME/damaged => damaged.*: damaged
 detect HOME/good.npy --checkpoint HOME/garbled => checkpoint.json: not JSON
@@ -316,6 +317,21 @@ def test_usage_error_names_the_nearest_option(capsys):
         main(["detect", "x.npy", "--out", "a", "--chekpoint", "b"])
     printed = capsys.readouterr()
     assert "--checkpoint" in printed.err + printed.out
+
+
+def test_help_has_one_line_per_command(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    listed = capsys.readouterr().out.partition("(required)")[2].splitlines()
+    lines = [line.strip("│╰╯─ ") for line in listed]
+    assert [line.split()[:2] for line in filter(None, lines)] == [["•", name] for name in _COMMANDS]
+
+
+def test_version_is_printed(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"fcos-lidar {__version__}\n"
 
 
 @pytest.mark.parametrize("name", _COMMANDS)

@@ -4,6 +4,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +134,54 @@ def test_a_signal_leaves_no_temporary_file(tmp_path, number):
     done = run_python("-c", TERMINATED, tmp_path / "a.json", int(number))
     assert (done.returncode, done.stderr) == (128 + number, "")
     assert list(tmp_path.iterdir()) == []
+
+
+BLOCKED = """
+import hashlib, sys
+from fcos_lidar_jax.cli import exit_code
+def work():
+    print("working", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # minutes without any Python
+sys.exit(exit_code("program", work))
+"""
+
+
+def ticks(process):
+    """Hundredths of a second for which a process has computed."""
+    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_the_process_while_c_code_blocks_the_main_thread(number):
+    """A signal that is sent twice at once, as by `timeout`, does not."""
+    words = [sys.executable, "-c", BLOCKED]
+    with subprocess.Popen(words, env=child_environment(), stdout=-1, stderr=-1, text=True) as process:
+        try:
+            assert process.stdout.readline() == "working\n"
+            began = ticks(process.pid)
+            while ticks(process.pid) < began + 10:
+                time.sleep(0.02)
+            for _ in range(2):
+                process.send_signal(number)
+                time.sleep(0.1)
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(1.1)
+            process.send_signal(number)
+            assert process.wait(60) == 128 + number
+        finally:
+            process.kill()
+        assert process.stderr.read() == ("program: interrupted\n" if number == signal.SIGINT else "")
+
+
+def test_the_watch_for_a_second_signal_leaves_nothing_behind():
+    def state():
+        descriptor = signal.set_wakeup_fd(-1)
+        signal.set_wakeup_fd(descriptor)
+        return descriptor, threading.active_count(), len(os.listdir("/proc/self/fd"))
+
+    before = state()
+    assert exit_code("program", lambda: None) == 0
+    assert state() == before
 
 
 IN_A_CALLBACK = """

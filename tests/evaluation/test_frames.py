@@ -214,6 +214,14 @@ def test_scores_and_warnings_name_the_metric():
     assert lines[0] == f"mAP by centre distance {evaluation.summary['mean_ap']:.4f}  on 8 frames"
     assert lines[1].startswith("trans_err ")
     assert re.fullmatch(r"95% intervals over samples: mAP by centre distance 0\.\d+ to 0\.\d+", lines[2])
+    header, *table = (line.split() for line in lines[3:])
+    errors = list(evaluation.summary["tp_errors"])
+    assert header == ["class", "AP", *errors]
+    assert len({len(line) for line in lines[3:]}) == 1
+    for name, cells in zip(OWN[:2], table, strict=True):
+        own = evaluation.summary["label_tp_errors"][name]
+        values = evaluation.summary["mean_dist_aps"][name], *(own.get(error, np.nan) for error in errors)
+        assert cells == [name, *("-" if np.isnan(value) else f"{value:.4f}" for value in values)]
     absent = ", ".join(OWN[2:])
     assert warnings(evaluation, 9) == [f"no ground truth is evaluated for {absent}: excluded from the means"]
     invalid = [dataclasses.replace(d, valid=d.valid & False) for d in found]

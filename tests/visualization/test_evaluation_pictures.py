@@ -1,12 +1,16 @@
 """Check the contents of evaluation pictures by inspecting the figures."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.visualization import bev, evaluation_report, range_image
+from fcos_lidar_jax.visualization.figure import class_color
 
 RECALL = np.linspace(0, 1, 101).tolist()
 
@@ -51,12 +55,67 @@ def test_error_curves_span_the_evaluated_recalls(drawn):
 def test_truth_and_detections_have_separate_panels(drawn):
     frame = make_frame(0, TINY)
     image = project_points(frame.points, np.ones(len(frame.points), bool), TINY, num_rounds=1)
-    range_image.draw_range_image(image, "x.png", boxes=frame.boxes, detections=frame.boxes[:2])
+    truth, scores = (frame.boxes, frame.labels), np.array([0.7, 0.4])
+    detections = frame.boxes[:2], frame.labels[:2], scores
+    range_image.draw_range_image(image, "x.png", classes=NUSCENES_CLASSES, truth=truth, detections=detections)
     titles = [axis.get_title(loc="left") for axis in drawn[0].axes if axis.get_title(loc="left")]
     assert len(titles) == 3
-    assert f"of {len(frame.boxes)} boxes have a cell" in titles[0]
-    assert "2 of 2 detections have a cell" in titles[1]
+    assert f"of {len(frame.boxes)} boxes have a cell" in titles[0].partition("truth: ")[2]
+    assert titles[1].endswith("detections: 2 of 2 boxes have a cell")
     assert "intensity" in titles[2]
+    names = [NUSCENES_CLASSES[label].replace("_", " ") for label in frame.labels]
+    above, below = ([text.get_text() for text in axis.texts] for axis in drawn[0].axes[:2])
+    assert set(above) <= set(names)
+    assert below == [f"{names[0]} 0.70", f"{names[1]} 0.40"]
+
+
+def boxes_at(*places):
+    boxes = np.tile([0.0, 0, 0, 4, 2, 1.5, 0, 0, 0], (len(places), 1))
+    boxes[:, :2] = places
+    return boxes
+
+
+def test_class_and_score_stand_beside_boxes_without_overlaps(drawn):
+    """Of six boxes in one place, the best have class and score; those without room have no text."""
+    boxes = boxes_at(*[(0, 0)] * 6, (-20, 15))
+    labels, scores = np.array([8] * 6 + [2]), np.array([0.31, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4])
+    bev.draw_bev(
+        np.zeros((0, 3)), "x.png", limit_m=25, classes=NUSCENES_CLASSES, detections=(boxes, labels, scores)
+    )
+    [figure] = drawn
+    figure.canvas.draw()
+    texts = figure.axes[0].texts
+    written = [text.get_text() for text in texts]
+    assert written[:2] == ["traffic cone 0.90", "traffic cone 0.80"]
+    assert written[-1] == "bus 0.40"
+    assert texts[-1].get_color() == class_color(2)
+    assert 3 <= len(written) < 7
+    spans = [text.get_window_extent() for text in texts]
+    assert not any(a.overlaps(b) for i, a in enumerate(spans) for b in spans[:i])
+    centre, half = figure.axes[0].transData.transform([(-20, 15), (-18, 16)])
+    beside = np.abs(np.array(spans[-1].min + spans[-1].max) / 2 - centre)
+    assert (beside > half - centre).any()
+    assert beside.max() < 80  # pixels
+
+
+@pytest.mark.parametrize(
+    "name", ["a word after another " * 12, "n015__LIDAR_TOP__" * 12, "W$^{MW}_$" * 25, "ÄÖ\udcff" * 60, ""]
+)
+@pytest.mark.parametrize("kind", ["bev", "range image"])
+def test_long_titles_are_whole(drawn, name, kind):
+    if kind == "bev":
+        bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=10, classes=(), title=name)
+    else:
+        image = SimpleNamespace(features=np.zeros((8, 16, 9, 1), np.float32))
+        range_image.draw_range_image(image, "x.png", title=name)
+    [figure] = drawn
+    figure.canvas.draw()
+    title = figure.axes[0].title if kind == "bev" else figure._suptitle
+    if name:
+        low, high = title.get_window_extent().get_points()
+        assert (low >= 0).all()
+        assert (high <= figure.bbox.max).all()
+        assert "".join(title.get_text().split()) == "".join(name.replace("\udcff", "?").split())
 
 
 def test_axis_labels_do_not_name_a_forward_direction(drawn):

@@ -21,7 +21,7 @@ from fcos_lidar_jax.visualization.range_image import _row_inclinations, draw_ran
 from fcos_lidar_jax.visualization.report import write_report
 
 CAR, BICYCLE = NUSCENES_CLASSES.index("car"), NUSCENES_CLASSES.index("bicycle")
-LIMIT_M, RED = 25.0, "#ff1f1f"
+LIMIT_M, GREEN = 25.0, class_color(BICYCLE)
 
 
 def pixels(path):
@@ -161,17 +161,21 @@ def test_boxes_are_outlined_around_their_cells(tmp_path):
     image = small_image([(2, 4), (3, 5)])
     around = np.array([[10, 0, 0, 1, 1, 1, 0, 0, 0], [-10, 0, 0, 1, 1, 1, 0, 0, 0]], np.float32)
     for boxes in (None, around[1:]):
-        assert not len(places(draw(tmp_path, image, boxes=boxes)[0], RED))
-    picture, [(top, bottom, left, right), _] = draw(tmp_path, image, boxes=around)
-    red = places(picture, RED)
-    cells = (red - (top, left)) / (bottom - top, right - left) * (8, 16)
-    np.testing.assert_allclose([cells.min(0), cells.max(0)], [[2, 4], [4, 6]], atol=0.15)
+        truth = None if boxes is None else (boxes, [BICYCLE])
+        assert not len(places(draw(tmp_path, image, truth=truth, classes=NUSCENES_CLASSES)[0], GREEN))
+    truth = around, [BICYCLE, CAR]
+    picture, [(top, bottom, left, right), _] = draw(tmp_path, image, truth=truth, classes=[" "] * 10)
+    green = places(picture, GREEN)
+    cells = (green - (top, left)) / (bottom - top, right - left) * (8, 16)
+    np.testing.assert_allclose([cells.min(0), cells.max(0)], [[2, 4], [4, 6]], atol=0.2)
 
 
 def test_a_box_across_azimuth_pi_is_outlined_at_both_ends(tmp_path):
     box = np.array([[10, 0, 0, 1, 1, 1, 0]], np.float32)
-    picture, [(_, _, left, right), _] = draw(tmp_path, small_image([(2, 0), (2, 15)]), boxes=box)
-    columns = (places(picture, RED)[:, 1] - left) / (right - left) * 16
+    picture, [(_, _, left, right), _] = draw(
+        tmp_path, small_image([(2, 0), (2, 15)]), truth=(box, [BICYCLE]), classes=[" "] * 10
+    )
+    columns = (places(picture, GREEN)[:, 1] - left) / (right - left) * 16
     assert columns.min() < 1.2
     assert columns.max() > 14.8
     assert not ((columns > 1.2) & (columns < 14.8)).any()
@@ -181,9 +185,11 @@ def test_boxes_in_a_sector_have_a_single_outline(tmp_path):
     """The outline spans the picture from the first to the last column."""
     box = np.array([[10, 0, 0, 1, 1, 1, 0]], np.float32)
     image = small_image([(2, 0), (2, 15)])
-    picture, [(_, _, left, right), _] = draw(tmp_path, image, boxes=box, azimuth_limits_rad=(3.0, 4.5))
-    reddish = (picture[..., 0].astype(int) - picture[..., 1:].max(-1) > 50).any(axis=0)
-    assert reddish[left + 2 : right - 2].all()
+    picture, [(_, _, left, right), _] = draw(
+        tmp_path, image, truth=(box, [CAR]), classes=[" "], azimuth_limits_rad=(3.0, 4.5)
+    )
+    outline = (np.abs(picture - rgb(class_color(CAR))).max(-1) < 40).any(axis=0)
+    assert outline[left + 2 : right - 2].all()
 
 
 def test_rows_are_labelled_with_the_inclination_of_their_points():
@@ -197,7 +203,7 @@ def test_empty_and_full_range_images_are_drawn(tmp_path):
     empty, _ = draw(tmp_path, small_image([]))
     frame = make_frame(0, TINY)
     image = project_points(frame.points, np.ones(len(frame.points), bool), TINY, num_rounds=2)
-    whole, _ = draw(tmp_path, image, title="t", boxes=frame.boxes)
+    whole, _ = draw(tmp_path, image, title="t", truth=(frame.boxes, frame.labels), classes=NUSCENES_CLASSES)
     assert len(places(empty, EMPTY)) > len(places(whole, EMPTY))
 
 
