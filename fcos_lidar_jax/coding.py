@@ -16,10 +16,13 @@ from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.geometry import atan2, wrap_angle
 from fcos_lidar_jax.namespaces import own_names
+from fcos_lidar_jax.types import check_columns
 
 __dir__ = own_names(__name__)
 
 Axes = Literal["lidar", "ray"]
+
+_VALUES = "dx, dy, dz, log l, log w, log h, sin, cos, vx, vy"
 
 LOG_SIZE_LIMIT = 5.0  # Log sizes are clipped to +-LOG_SIZE_LIMIT so that exp of an untrained output is finite.
 
@@ -49,6 +52,7 @@ def encode(
     >>> encode(box, jnp.array([1.0, 0, 0]), jnp.float32(0.5)).tolist()
     [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0, 0.0]
     """
+    check_columns("boxes", boxes, "x, y, z, l, w, h, yaw, vx, vy")
     yaw = boxes[..., 6] - azimuth_rad
     offset, velocity = boxes[..., :2] - points[..., :2], boxes[..., 7:9]
     if axes == "ray":
@@ -97,6 +101,7 @@ def decode_oriented(
     >>> decode_oriented(numbers, jnp.zeros(3), jnp.float32(0)).tolist()
     [1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0]
     """
+    check_columns("regression", regression, _VALUES)
     sin, cos = _unit(regression[..., 6], regression[..., 7])
     base_sin, base_cos = jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
     heading = jnp.stack([base_cos * cos - base_sin * sin, base_sin * cos + base_cos * sin], axis=-1)
@@ -118,6 +123,7 @@ def decode(
     >>> bool(jnp.allclose(decode(encode(box, here, angle), here, angle), box, atol=1e-6))
     True
     """
+    check_columns("regression", regression, _VALUES)
     yaw = wrap_angle(atan2(regression[..., 6], regression[..., 7]) + azimuth_rad)
     ray = jnp.sin(azimuth_rad), jnp.cos(azimuth_rad)
     velocity = _turn(regression[..., 8:10], *ray) if axes == "ray" else regression[..., 8:10]

@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int32
 
 from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.types import BOX, check_columns
 
 __dir__ = own_names(__name__)
 
@@ -136,6 +137,8 @@ def points_in_box(
     >>> bool(points_in_box(jnp.array([2.0, 1.0, 0.0]), jnp.array([0, 0, 0, 4, 2, 2, 0.0])))
     True
     """
+    check_columns("points", points, "x, y, z")
+    check_columns("boxes", box, BOX)
     xp = jnp if isinstance(points, Array) else np
     dx, dy, dz = (points[..., i] - box[..., i] for i in range(3))
     cos, sin = xp.cos(box[..., 6]), xp.sin(box[..., 6])

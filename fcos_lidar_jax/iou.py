@@ -16,6 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from fcos_lidar_jax.namespaces import own_names
+from fcos_lidar_jax.types import BOX, check_columns
 
 __dir__ = own_names(__name__)
 
@@ -134,6 +135,7 @@ def oriented(boxes: Float[Array | np.ndarray, "*m c"]) -> Float[Array, "*m 8"]:
     [0.0, 0.0, 0.0, 4.0, 2.0, 1.0, 1.0, 0.0]
     """
     boxes = jnp.asarray(boxes)
+    check_columns("boxes", boxes, BOX)
     yaw = boxes[..., 6:7]
     return jnp.concatenate([boxes[..., :6], jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
 
@@ -149,6 +151,8 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
     >>> [float(v) for v in oriented_overlap(box, box, vertical=True)]
     [8.0, 8.0]
     """
+    for name, boxes in (("a", a), ("b", b)):
+        check_columns(name, boxes, "x, y, z, l, w, h, cos yaw, sin yaw")
     common = jnp.promote_types(a.dtype, b.dtype)
     a, b = jnp.broadcast_arrays(a.astype(common), b.astype(common))
     # Slice: indexing with an array would turn the gradient into a scatter.
@@ -185,8 +189,11 @@ def rotated_iou_bev(
 ) -> Float[Array, "*o"]:
     """IoU in the ground plane, elementwise with broadcasting; differentiable in forward and reverse mode.
 
-    Boxes are ``x, y, z, l, w, h, yaw, ...`` in metres and radians. Values lie in [0, 1] and are 0 where both areas
-    are zero. Gradients are finite everywhere.
+    Boxes are ``x, y, z, l, w, h, yaw, ...`` in metres and radians; sizes are not negative. Values lie in
+    [0, 1] and are 0 where both areas are zero. Gradients are finite everywhere.
+
+    Raises:
+        ValueError: at trace time, if boxes have fewer than seven columns.
 
     >>> a, b = jnp.array([0, 0, 0, 4, 2, 1, 0.0]), jnp.array([2, 0, 0, 4, 2, 1, 0.0])
     >>> round(float(rotated_iou_bev(a, b)), 4)

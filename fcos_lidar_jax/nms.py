@@ -59,6 +59,8 @@ def rotated_nms(
     >>> compiled(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)[0].tolist()
     [1, 2, 0]
     """
+    if not len(scores):
+        return jnp.zeros(max_outputs, jnp.int32), jnp.zeros(max_outputs, bool)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     scores = jnp.where(usable, scores, -jnp.inf)
     labels = jnp.zeros(scores.shape, jnp.int32) if labels is None else jnp.asarray(labels)
@@ -101,6 +103,8 @@ def merge_boxes(
     >>> merge_boxes(boxes, jnp.array([0.8, 0.4]), valid, *best, iou_threshold=0.3)[0, 0].round(3).tolist()
     0.10000000149011612
     """
+    if not len(scores):
+        return jnp.zeros((*kept.shape, boxes.shape[1]), jnp.float32)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
     labels = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)

@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
 from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.namespaces import own_names
@@ -208,7 +209,7 @@ def project_points(
         the image; ``point_index`` refers to rows of ``points``.
 
     Raises:
-        ValueError: at trace time, if ``points`` has fewer columns than the sensor needs.
+        ValueError: at trace time, if ``points`` has fewer columns than the sensor needs, or without a round.
 
     >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0]], np.float32)
     >>> image = project_points(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2)
@@ -222,8 +223,11 @@ def project_points(
         raise ValueError(
             f"points: got {points.shape[1]} columns, expected {sensor.point_columns} for sensor {sensor.name!r}"
         )
+    check(num_rounds >= 1, "num_rounds", num_rounds, "at least 1")
     rows, columns = sensor.num_rows, sensor.num_columns
-    points, valid = jnp.asarray(points), jnp.asarray(valid)
+    if not points.shape[0]:  # one row of padding, because no row can be gathered from none
+        points, valid = np.zeros((1, points.shape[1]), np.float32), np.zeros(1, bool)
+    points, valid = jnp.asarray(points, jnp.float32), jnp.asarray(valid)
     cell, polar = image_cells(points, valid, sensor)
     keys = priority_keys(polar[0], points[:, 4], prioritize_current=prioritize_current)
     index = winners(cell, keys, num_cells=rows * columns, num_rounds=num_rounds)

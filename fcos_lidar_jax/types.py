@@ -12,6 +12,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import Array, Bool, Float32, Int32, UInt8, UInt16
 
 from fcos_lidar_jax.namespaces import own_names
@@ -20,6 +21,30 @@ __dir__ = own_names(__name__)
 
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
 """The nine channel types of a range image (paper, section 3.1)."""
+BOX = "x, y, z, l, w, h, yaw, ..."
+"""Columns of boxes that functions need; more may follow."""
+
+
+def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:
+    """Refuse arrays without the expected columns: JAX clamps indices, so results would be wrong without an error.
+
+    Args:
+        name: of the array, for the message.
+        array: of any shape [..., columns].
+        columns: names of the columns; ``"..."`` at the end allows more.
+
+    Raises:
+        ValueError: too few or too many columns.
+
+    >>> check_columns("box", np.zeros(5), "x, y, z, l, w, h, yaw, ...")
+    Traceback (most recent call last):
+    ValueError: box: got shape (5,), expected columns x, y, z, l, w, h, yaw, ...
+    """
+    names = columns.split(", ")
+    number, found = len(names) - (names[-1] == "..."), array.shape[-1] if array.shape else 0
+    fits = found == number or (found > number and names[-1] == "...")
+    if not fits:
+        raise ValueError(f"{name}: got shape {array.shape}, expected columns {columns}")
 
 
 @jax.tree_util.register_dataclass

@@ -1,5 +1,8 @@
 """The documents do what they say: code runs, commands exist, every public function has an example."""
 
+import ast
+import builtins
+import doctest
 import importlib
 import importlib.util
 import inspect
@@ -7,6 +10,7 @@ import json
 import pkgutil
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +86,30 @@ def test_every_public_function_and_class_has_an_example():
     missing = [name for name, value in listed.items() if ">>>" not in (value.__doc__ or "")]
     assert len(listed) > 100
     assert missing == []
+
+
+def belongs_to(module, value) -> bool:
+    return not inspect.ismodule(value) and getattr(value, "__module__", module.__name__) == module.__name__
+
+
+def test_examples_use_the_imports_of_the_reference():
+    exec(blocks(DOCS / "api" / "index.md", "python")[0], given := {})
+    missing = {}
+    for name, value in referred().items():
+        module = sys.modules[value.__module__]
+        own = {other.rpartition(".")[2] for other in referred() if other.startswith(f"{name.rpartition('.')[0]}.")}
+        own |= {n for n, v in vars(module).items() if belongs_to(module, v)}
+        for example in doctest.DocTestFinder(recurse=False).find(value, name, module=module):
+            tree = ast.parse("".join(step.source for step in example.examples))
+            named = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+            made = {node.id for node in named if isinstance(node.ctx, ast.Store)}
+            made |= {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
+            made |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+            made |= {(a.asname or a.name) for n in ast.walk(tree) for a in getattr(n, "names", [])}
+            used = {node.id for node in named if isinstance(node.ctx, ast.Load)}
+            if rest := used - made - own - given.keys() - set(dir(builtins)):
+                missing[name] = rest
+    assert missing == {}
 
 
 def test_the_reference_holds_the_core_and_whatever_a_package_exports():

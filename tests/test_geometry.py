@@ -7,6 +7,7 @@ import oracles
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fcos_lidar_jax import assignment, iou, nms
 from fcos_lidar_jax.geometry import (
     atan2,
     image_columns,
@@ -18,6 +19,7 @@ from fcos_lidar_jax.geometry import (
     wrap_angle,
 )
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
+from fcos_lidar_jax.types import check_columns
 
 
 def awkward_pairs():
@@ -120,3 +122,34 @@ def test_rotations_and_poses_match_scipy():
     moved = Rotation.from_quat(rotation, scalar_first=True).apply(points[:, :3]) + translation
     np.testing.assert_allclose((poses @ points[:, :, None])[:, :3, 0], moved, atol=1e-14)
     np.testing.assert_array_equal(poses[:, 3], np.tile([0, 0, 0, 1.0], (50, 1)))
+
+
+FLAT = np.array([[0, 0, 4, 2, 0]], np.float32)  # x, y, l, w, yaw
+BOX = np.array([[0, 0, 0, 4, 2, 1, 0]], np.float32)
+ONE = np.ones(1, np.float32)
+NMS = {"iou_threshold": 0.2, "max_outputs": 1}
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: points_in_box(np.zeros((1, 3), np.float32), FLAT),
+        lambda: iou.rotated_iou_bev(FLAT, FLAT),
+        lambda: iou.rotated_iou_3d(BOX, FLAT),
+        lambda: nms.rotated_nms(FLAT, ONE, ONE > 0, **NMS),
+        lambda: nms.merge_boxes(FLAT, ONE, ONE > 0, jnp.zeros(1, jnp.int32), jnp.asarray(ONE > 0), iou_threshold=0.2),
+        lambda: assignment.owners(np.zeros((1, 3), np.float32), ONE > 0, FLAT, ONE > 0, form="loop"),
+        lambda: assignment.owners(np.zeros((1, 3), np.float32), ONE > 0, FLAT, ONE > 0, form="reduction"),
+    ],
+)
+def test_boxes_of_another_layout_are_refused(call):
+    with pytest.raises(ValueError, match=r"boxes: got shape .*5,?\), expected columns x, y, z, l, w, h, yaw, "):
+        call()
+
+
+def test_columns_may_only_follow_where_the_layout_says_so():
+    check_columns("box", np.zeros((2, 9)), "x, y, z, ...")
+    with pytest.raises(ValueError, match=r"value: got shape \(2, 9\), expected columns x, y, z"):
+        check_columns("value", np.zeros((2, 9)), "x, y, z")
+    with pytest.raises(ValueError, match=r"box: got shape \(\)"):
+        check_columns("box", np.zeros(()), "x, ...")

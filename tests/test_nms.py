@@ -221,3 +221,13 @@ def test_boxes_with_zero_size_or_score_are_unchanged_and_gradients_are_finite(fo
     tangents = jnp.ones((2, 4, 9)), jnp.ones((2, 4))
     _, slope = jax.jvp(loss, (np.stack([boxes] * 2), np.stack([np.nan_to_num(scores)] * 2)), tangents)
     assert bool(jnp.isfinite(slope))
+
+
+@pytest.mark.parametrize("form", ["rows", "matrix"])
+def test_nothing_is_found_in_no_boxes(form):
+    none, scores = np.zeros((0, 7), np.float32), np.zeros(0, np.float32)
+    kept, used = rotated_nms(none, scores, scores > 0, iou_threshold=0.2, max_outputs=3, form=form)
+    merged = merge_boxes(none, scores, scores > 0, kept, used, iou_threshold=0.2, form=form)
+    assert kept.tolist() == [0, 0, 0]
+    assert not used.any()
+    assert merged.tolist() == np.zeros((3, 7)).tolist()

@@ -225,6 +225,17 @@ def test_a_cloud_of_padding_gives_an_empty_image():
     assert int(image.num_dropped) == 0
 
 
+def test_no_points_give_an_empty_image():
+    image = project_points(np.zeros((0, 5), np.float32), np.zeros(0, bool), SMALL, num_rounds=2)
+    assert (np.asarray(image.point_index) == -1).all()
+    assert image.features.shape == (SMALL.num_rows, SMALL.num_columns, 9, 2)
+
+
+def test_no_rounds_are_rejected():
+    with pytest.raises(ValueError, match="num_rounds: got 0, expected at least 1"):
+        project_points(cloud(0), np.ones(400, bool), SMALL, num_rounds=0)
+
+
 def test_too_few_columns_for_the_sensor_are_rejected():
     with pytest.raises(ValueError, match="got 5 columns, expected 6 for sensor 'laser'"):
         project_points(cloud(0), np.ones(400, bool), LASER)

@@ -33,7 +33,6 @@ from experiments.script import Options, run_script, save
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
-from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
@@ -111,7 +110,7 @@ def train(args: Args, work: Path) -> dict[str, Any]:
 
 def training_record(run: Path) -> dict[str, Any]:
     """Summarise the training of a run."""
-    config = load_checkpoint(find_checkpoint(run)).config
+    config = load_checkpoint(run).config
     spec, records = read_json(run / "run.json", dict[str, Any]), read_metrics(run)
     done = max((r["step"] for r in records if "seconds" in r), default=0)
     batch = config.optimizer.batch_size
@@ -173,7 +172,7 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     """Write the weights of the newest checkpoint and their model card; returns training and scores."""
     folder, training = SHIPPED / args.name, training_record(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
-    checkpoint = with_todays_inference(load_checkpoint(find_checkpoint(work)), args.name)
+    checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     save_checkpoint(folder, half_precision(checkpoint))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     if size > _MAX_BYTES:

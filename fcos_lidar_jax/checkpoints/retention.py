@@ -11,9 +11,9 @@ from pathlib import Path
 from fcos_lidar_jax.checkpoints.storage import (
     Checkpoint,
     CheckpointError,
-    load_checkpoint,
-    load_state,
+    read_checkpoint,
     read_description,
+    read_state,
     save_checkpoint,
     save_score,
     shipped_checkpoints,
@@ -72,7 +72,7 @@ class Checkpoints:
         paths = self.paths()
         for path in reversed(paths):
             try:
-                return load_checkpoint(path), load_state(path, like)
+                return read_checkpoint(path), read_state(path, like)
             except CheckpointError as error:
                 print(f"warning: {error}: going back to the checkpoint before", file=sys.stderr)
         if paths:
@@ -108,3 +108,45 @@ def find_checkpoint(folder: Path) -> Path:
         return run_best or shipped.get(str(folder), folder)
     paths = Checkpoints(folder / CHECKPOINTS).paths()
     return paths[-1] if paths else folder
+
+
+def load_checkpoint(checkpoint: str | Path) -> Checkpoint:
+    """Read a checkpoint after checking the hashes of its files and the shapes of its arrays.
+
+    Args:
+        checkpoint: path or name, see :func:`find_checkpoint`.
+
+    Raises:
+        CheckpointError: names the folder, what was found and what was expected.
+
+    >>> load_checkpoint("quickstart").sensor.name
+    'short_range'
+    """
+    return read_checkpoint(find_checkpoint(Path(checkpoint)))
+
+
+def load_state(checkpoint: str | Path, like: TrainState) -> TrainState:
+    """Read the state of a training, bit-identical to the saved one.
+
+    Args:
+        checkpoint: path or name, see :func:`find_checkpoint`.
+        like: any state of the same run, such as the initial one.
+
+    Raises:
+        CheckpointError: see :func:`load_checkpoint`; also if the checkpoint has no state.
+
+    >>> import tempfile
+    >>> import jax
+    >>> from fcos_lidar_jax.checkpoints import save_checkpoint
+    >>> from fcos_lidar_jax.models import build_detector
+    >>> from fcos_lidar_jax.training import make_optimizer, make_state
+    >>> shipped, key = load_checkpoint("quickstart"), jax.random.key(0)
+    >>> detector = build_detector(shipped.config, shipped.sensor)
+    >>> optimizer = make_optimizer(shipped.config.optimizer, num_steps=100)
+    >>> state = make_state(detector, optimizer, key, variables=shipped.variables)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_checkpoint(f"{folder}/mine", shipped, state=state)
+    ...     int(load_state(f"{folder}/mine", state).step)
+    0
+    """
+    return read_state(find_checkpoint(Path(checkpoint)), like)

@@ -67,7 +67,7 @@ class Checkpoint:
 
     config: Config
     sensor: Sensor
-    variables: Variables  # ``params`` and ``batch_stats``
+    variables: Variables = dataclasses.field(repr=False)  # ``params`` and ``batch_stats``
     step: int  # number of updates
     data: str = ""  # description of the training data; a run resumes only with the same data
     score: float | None = None  # mean average precision; None if it was not evaluated
@@ -83,11 +83,11 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
         NonFiniteStateError: a value is not finite; nothing is written.
         OSError: writing failed; the message is one line.
 
-    >>> from fcos_lidar_jax.inference import load_trained
-    >>> detector = load_trained("quickstart")
+    >>> import tempfile
+    >>> from fcos_lidar_jax.checkpoints import load_checkpoint
+    >>> shipped = load_checkpoint("quickstart")
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     mine = Checkpoint(detector.config, detector.sensor, detector.variables, step=7)
-    ...     save_checkpoint(f"{folder}/mine", mine)
+    ...     save_checkpoint(f"{folder}/mine", dataclasses.replace(shipped, step=7))
     ...     load_checkpoint(f"{folder}/mine").step
     7
     """
@@ -152,16 +152,8 @@ def _with_hash(description: dict[str, Any]) -> str:
     return json.dumps({**description, "hash": checksum(_canonical(description))}, indent=1)
 
 
-def load_checkpoint(folder: str | Path) -> Checkpoint:
-    """Read a checkpoint after checking the hashes of its files and the shapes of its arrays.
-
-    Raises:
-        CheckpointError: names the folder, what was found and what was expected.
-
-    >>> load_checkpoint("/no/such/folder")
-    Traceback (most recent call last):
-    fcos_lidar_jax.checkpoints.storage.CheckpointError: /no/such/folder: found nothing, ...
-    """
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """Read the checkpoint in a folder, see :func:`~fcos_lidar_jax.checkpoints.load_checkpoint`."""
     folder = local_path(folder).absolute()
     description = _verify(folder)
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
@@ -173,12 +165,8 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     )
 
 
-def load_state(folder: str | Path, like: TrainState) -> TrainState:
-    """Read the bit-identical state to resume from; ``like`` is any state of the same run.
-
-    Raises:
-        CheckpointError: see :func:`load_checkpoint`; also if the checkpoint has no state.
-    """
+def read_state(folder: Path, like: TrainState) -> TrainState:
+    """Read the state in the folder of a checkpoint, see :func:`~fcos_lidar_jax.checkpoints.load_state`."""
     folder = local_path(folder).absolute()
     description = _verify(folder)
     if not (folder / _STATE).is_dir():

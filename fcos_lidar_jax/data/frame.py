@@ -24,7 +24,7 @@ class Frame:
         boxes: f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
         labels: i32[m]: index into the ``classes`` of the frame set.
         num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box.
-        num_close: points on the ego vehicle that the reader removed, over all sweeps.
+        num_close: points on the ego vehicle that the reader removed, over all sweeps, see :func:`drop_close`.
 
     >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
     >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
@@ -229,7 +229,14 @@ def size_and_time(file: Path) -> tuple[int, ...]:
 
 
 def drop_close(points: np.ndarray, sensor: Sensor, reading: CloudReading) -> tuple[np.ndarray, int]:
-    """Remove the points on the ego vehicle from f32[n, c]; also returns their number."""
+    """Remove the points on the ego vehicle from f32[n, c]; also returns their number.
+
+    >>> from fcos_lidar_jax.sensors import TINY
+    >>> points = np.array([[9, 0, 0, 50, 0], [0.5, 0, 0, 9, 0]], np.float32)
+    >>> far, num_close = drop_close(points, TINY, CloudReading(remove_close="all"))
+    >>> far[:, 0].tolist(), num_close
+    ([9.0], 1)
+    """
     kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, reading))
     return points[kept], len(points) - int(kept.sum())
 

@@ -27,7 +27,7 @@ def write_openlabel(path: str | Path, records: Iterable[dict[str, Any]], *, anno
         records: lines of ``fcos-lidar stream``, or entries of ``fcos-lidar detect``; iterated twice.
         annotator: name of the program and the detector that made the boxes.
 
-    >>> import tempfile
+    >>> import json, tempfile
     >>> file = Path(tempfile.mkdtemp()) / "labels.json"
     >>> box = {"label": "car", "score": 0.5, "box": [8, 0, 0, 4, 2, 1, 0, 3, 0]}
     >>> write_openlabel(file, [{"file": "a.npy", "boxes": [box]}])

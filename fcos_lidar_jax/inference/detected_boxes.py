@@ -6,7 +6,7 @@ import html
 import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -39,8 +39,8 @@ class DetectedBoxes:
     1 box
     class  score       x       y       z      l      w      h    yaw     vx     vy
     bus     0.50    8.00    0.00    0.00   4.00   2.00   1.50   0.00   3.00   0.00
-    >>> len(found), found[0].name, found.names.tolist(), found.select(min_score=0.6).boxes.shape
-    (1, 'bus', ['bus'], (0, 9))
+    >>> len(found), found[0].name, len(found[:5]), found.names.tolist(), found.select(min_score=0.6).boxes.shape
+    (1, 'bus', 1, ['bus'], (0, 9))
     """
 
     boxes: np.ndarray  # f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy, see :mod:`fcos_lidar_jax.types`
@@ -59,18 +59,29 @@ class DetectedBoxes:
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def __getitem__(self, index: int) -> DetectedBox:
+    @overload
+    def __getitem__(self, index: int) -> DetectedBox: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "DetectedBoxes": ...
+
+    def __getitem__(self, index: int | slice) -> "DetectedBox | DetectedBoxes":
+        if isinstance(index, slice):
+            return self._rows(index)
         return DetectedBox(self.classes[self.labels[index]], float(self.scores[index]), self.boxes[index])
 
     def __iter__(self) -> Iterator[DetectedBox]:
-        return map(self.__getitem__, range(len(self)))
+        return (self[index] for index in range(len(self)))
 
     def select(self, *, min_score: float = 0.0, labels: Collection[str] = ()) -> "DetectedBoxes":
         """The boxes that reach a score, of some classes; of all classes by default."""
         kept = self.scores >= min_score
         if labels:
             kept &= np.isin(self.names, list(labels))
-        arrays = {name: getattr(self, name)[kept] for name in ("boxes", "scores", "labels")}
+        return self._rows(kept)
+
+    def _rows(self, rows: np.ndarray | slice) -> "DetectedBoxes":
+        arrays = {name: getattr(self, name)[rows] for name in ("boxes", "scores", "labels")}
         return dataclasses.replace(self, **arrays)
 
     def to_dict(self) -> dict[str, Any]:

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Literal, get_args
 
-from fcos_lidar_jax.checkpoints.retention import find_checkpoint
-from fcos_lidar_jax.checkpoints.storage import load_checkpoint
+from fcos_lidar_jax.checkpoints.retention import find_checkpoint, load_checkpoint
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
 from fcos_lidar_jax.inference.export import load_exported
 from fcos_lidar_jax.inference.openvino import with_openvino
@@ -44,5 +43,5 @@ def load_trained(checkpoint: str | Path) -> TrainedDetector:
     >>> load_trained("quickstart").config.name
     'quickstart'
     """
-    loaded = load_checkpoint(find_checkpoint(Path(checkpoint)))
+    loaded = load_checkpoint(checkpoint)
     return TrainedDetector(build_detector(loaded.config, loaded.sensor), loaded.variables)

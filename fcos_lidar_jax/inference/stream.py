@@ -48,6 +48,7 @@ def detect_stream(
         ValueError: names a sweep that is not later than the sweep before, or has no usable points.
 
     >>> import numpy as np
+    >>> from fcos_lidar_jax.data.sweeps import Sweep
     >>> from fcos_lidar_jax.inference import load_detector
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame

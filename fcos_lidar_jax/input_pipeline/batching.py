@@ -5,8 +5,10 @@ from typing import Any, cast
 
 import numpy as np
 
+from fcos_lidar_jax.data.box_geometry import check_boxes
 from fcos_lidar_jax.data.cloud_policy import usable_rows, write_points
 from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.types import Batch
 
 _NUM_INSPECTED = 20  # frames in which check_counts looks for points
@@ -79,10 +81,12 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
         max_boxes: rows of boxes of each sample, such as ``config.max_boxes``.
 
     Returns:
-        NumPy arrays. Rows of points that are not finite or beyond physical limits are left out.
+        NumPy arrays. Rows of points that are not finite or beyond physical limits are left out. Points on the ego
+        vehicle stay: readers remove them, and :func:`~fcos_lidar_jax.data.frame.drop_close` from your own arrays.
 
     Raises:
-        ValueError: no frame, or one that is too large; nothing is truncated.
+        ValueError: no frame, arrays that do not fit each other, an implausible box, or a frame that is too large;
+            nothing is truncated.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -95,7 +99,9 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     """
     if not frames:
         raise ValueError("frames: got none, expected at least one")
-    columns = frames[0].points.shape[1]
+    columns = frames[0].points.shape[-1]
+    for row, frame in enumerate(frames):
+        _check_frame(f"frame {row}", frame, columns)
     batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
     for row, frame in enumerate(frames):
         for name, rows, limit in (("points", frame.points, max_points), ("boxes", frame.boxes, max_boxes)):
@@ -103,6 +109,21 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
                 raise ValueError(f"frame {row}: {name}: got {len(rows)}, expected at most {limit}")
         fill_row(batch, row, [frame])
     return batch
+
+
+def _check_frame(where: str, frame: Frame, columns: int) -> None:
+    """Refuse a frame whose arrays do not fit each other, or with an implausible box or label."""
+    number = len(frame.boxes)
+    for name, shape in (("boxes", (number, 9)), ("labels", (number,)), ("num_points", (number,))):
+        check(
+            getattr(frame, name).shape == shape, f"{where}: {name}: shape", getattr(frame, name).shape, f"{shape}"
+        )
+    fits = frame.points.ndim == 2 and columns in (5, 6) and frame.points.shape[1] == columns
+    expected = "[n, 5], or [n, 6] with laser numbers, as the other frames"
+    check(fits, f"{where}: points: shape", frame.points.shape, expected)
+    check_boxes(frame.boxes, lambda box: f"{where}: box {box}")
+    least = int(frame.labels.min(initial=0))
+    check(least >= 0, f"{where}: labels", least, "indices of classes, from 0")
 
 
 def spread_indices(size: int, number: int) -> list[int]:

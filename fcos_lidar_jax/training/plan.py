@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 
 from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
-from fcos_lidar_jax.checkpoints.storage import CheckpointError, check_arrays, load_checkpoint, with_later_fields
+from fcos_lidar_jax.checkpoints.storage import CheckpointError, check_arrays, read_checkpoint, with_later_fields
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
@@ -37,7 +37,7 @@ RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """Schedule of the checkpoints and evaluations of a run.
+    """Steps of a run at which it saves checkpoints and evaluates.
 
     >>> Schedule(save_every=100).keep
     2
@@ -228,7 +228,7 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
     if not isinstance(weights, str | Path):
         return weights
     folder = find_checkpoint(Path(weights))
-    checkpoint = load_checkpoint(folder)
+    checkpoint = read_checkpoint(folder)
     classes, expected = checkpoint.config.classes, detector.config.classes
     if classes != expected:
         raise CheckpointError(f"{folder}: classes: got {classes}, expected the classes to be trained, {expected}")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from tiny_run import CONFIG, SENSOR, bits
 
-from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, save_checkpoint
-from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError, load_state
+from fcos_lidar_jax.checkpoints import Checkpoint, CheckpointError, load_checkpoint, load_state, save_checkpoint
+from fcos_lidar_jax.checkpoints.storage import NonFiniteStateError
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.training import make_optimizer, make_state

@@ -11,8 +11,7 @@ from tiny_run import bits
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.centerpoint import CenterPointConfig
-from fcos_lidar_jax.checkpoints.retention import find_checkpoint
-from fcos_lidar_jax.checkpoints.storage import load_checkpoint
+from fcos_lidar_jax.checkpoints import load_checkpoint
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.metrics_log import read_metrics
@@ -52,7 +51,7 @@ def test_evaluates_and_detects(home, tmp_path):
 
 def test_checkpoint_and_exported_file_hold_the_detector(home):
     trained = load_trained(home / "run")
-    checkpoint = load_checkpoint(find_checkpoint(home / "run"))
+    checkpoint = load_checkpoint(home / "run")
     assert checkpoint.config == trained.config
     assert type(checkpoint.config) is CenterPointConfig
     assert bits(checkpoint.variables) == bits(trained.variables)

@@ -1,5 +1,7 @@
 """Batches of given frames."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -19,3 +21,24 @@ def test_frames_are_padded_and_nothing_is_truncated():
         fcos.input_pipeline.make_batch(frames, max_points=9, max_boxes=64)
     with pytest.raises(ValueError, match=r"^frames: got none"):
         fcos.input_pipeline.make_batch([], max_points=9, max_boxes=64)
+
+
+FRAME = SimulatedFrames(TINY, 1).frame(0)
+NUMBER = len(FRAME.boxes)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"boxes": FRAME.boxes[:, :7]}, rf"boxes: shape: got \({NUMBER}, 7\), expected \({NUMBER}, 9\)"),
+        ({"boxes": FRAME.boxes * np.nan}, "box 0: x: got nan, expected a finite number"),
+        ({"boxes": FRAME.boxes * -1}, "box 0: l: got -.*, expected a size above 0 m"),
+        ({"labels": FRAME.labels[1:]}, rf"labels: shape: got \({NUMBER - 1},\), expected \({NUMBER},\)"),
+        ({"labels": FRAME.labels - 99}, "labels: got -.*, expected indices of classes, from 0"),
+        ({"num_points": FRAME.num_points[1:]}, "num_points: shape"),
+        ({"points": FRAME.points[:, :4]}, r"points: shape: got .*, 4\), expected \[n, 5\]"),
+    ],
+)
+def test_frames_that_would_train_something_else_are_refused(fields, message):
+    with pytest.raises(ValueError, match=f"^frame 0: {message}"):
+        fcos.input_pipeline.make_batch([dataclasses.replace(FRAME, **fields)], max_points=4096, max_boxes=64)

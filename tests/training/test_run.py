@@ -18,8 +18,7 @@ from event_files import summaries
 from PIL import Image
 from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
 
-from fcos_lidar_jax.checkpoints import load_checkpoint
-from fcos_lidar_jax.checkpoints.storage import load_state
+from fcos_lidar_jax.checkpoints import load_checkpoint, load_state
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
