@@ -1,6 +1,7 @@
 """The entry point of the command line, which turns each failure into one line and an exit code."""
 
 import contextlib
+import io
 import os
 import platform
 import re
@@ -65,6 +66,9 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     >>> exit_code("example", lambda: 0)
     0
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # standard error shows what it cannot encode already
+        with contextlib.suppress(OSError):  # a full disk is reported below
+            sys.stdout.reconfigure(errors="replace")
     stopped = None
     try:
         with _ending_signals() as numbers, _ended_by_a_second(numbers, program):

@@ -1,5 +1,6 @@
 """Every failure ends in one line and an exit code: expected failures, bugs, signals, closed pipes."""
 
+import json
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from refusal import refused
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.checkpoints import load_checkpoint
 from fcos_lidar_jax.cli import exit_code, main
+from fcos_lidar_jax.cli.commands import _COMMANDS
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import atomic_write, folder_lock, local_path
 from fcos_lidar_jax.input_pipeline.open import find_data_set
@@ -233,6 +235,29 @@ def test_a_library_cannot_hide_a_signal_behind_its_own_error():
             raise ValueError("cannot be read") from error
 
     assert exit_code("program", work) == 130
+
+
+ALL = """
+import json, sys
+from fcos_lidar_jax.cli import main
+def code(words):
+    try:
+        return main(words)
+    except SystemExit as leaving:
+        return leaving.code or 0
+codes = [code(words) for words in json.loads(sys.argv[1])]
+print(json.dumps(codes))
+"""
+C_LOCALE = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+
+
+@pytest.mark.parametrize("variables", [{"PYTHONIOENCODING": "ascii"}, C_LOCALE], ids=["encoding", "locale"])
+def test_helps_and_errors_are_shown_on_a_terminal_without_unicode(variables):
+    helps = [[*words, "--help"] for words in ([], *([name] for name in _COMMANDS))]
+    done = run_python("-c", ALL, json.dumps([*helps, ["detect", "--grösse"], ["project", "grösse"]]), **variables)
+    assert json.loads(done.stdout.splitlines()[-1]) == [0] * len(helps) + [2, 2], done.stderr
+    assert "? quickstart " in done.stdout
+    assert "--gr" in done.stdout + done.stderr
 
 
 def test_a_closed_output_pipe_ends_in_silence():
