@@ -66,7 +66,7 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     >>> exit_code("example", lambda: 0)
     0
     """
-    if isinstance(sys.stdout, io.TextIOWrapper):  # standard error shows what it cannot encode already
+    if isinstance(sys.stdout, io.TextIOWrapper):  # standard error already escapes what it cannot encode
         with contextlib.suppress(OSError):  # a full disk is reported below
             sys.stdout.reconfigure(errors="replace")
     stopped = None

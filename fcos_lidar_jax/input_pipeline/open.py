@@ -48,7 +48,7 @@ class Reader:
 
     @property
     def named_maps(self) -> str:
-        """Part of a message."""
+        """The names of the class maps, as part of a message."""
         return f"the class maps of format {self.name}: {', '.join(self.class_maps) or '(none)'}"
 
 
