@@ -41,8 +41,9 @@ TO_NUSCENES = {
     "BICYCLE": "bicycle",
     "CONSTRUCTION_CONE": "traffic_cone",
 }
-"""Class map to the ten nuScenes classes; None drops the object. Riders are dropped, because their bicycles have
-boxes of their own. A pickup, which is a truck in nuScenes, is a regular vehicle here and so becomes a car."""
+"""Class map from Argoverse 2's classes to the ten nuScenes classes; None drops the object. Riders are dropped,
+because their bicycles have boxes of their own. A pickup, a truck in nuScenes, is a regular vehicle here and so a
+car."""
 
 
 class Argoverse2Frames(FrameSet):
