@@ -19,9 +19,11 @@ class StopRequest:
 
 @contextlib.contextmanager
 def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a request that the run checks between steps; a second one ends it.
+    """Turn the first Ctrl-C or SIGTERM into a request that the run checks between steps; a second Ctrl-C ends it.
 
-    Signals keep their handlers with ``active=False`` and outside the main thread, where Python delivers none.
+    Further SIGTERMs change nothing, because clusters may send two within a second; the entry point of the command
+    line ends the process at one that comes later. Signals keep their handlers with ``active=False`` and outside
+    the main thread, where Python delivers none.
     """
     request = StopRequest()
     in_main_thread = threading.current_thread() is threading.main_thread()
@@ -32,8 +34,8 @@ def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
             signal.signal(number, handler)
 
     def ask(number: int, _: FrameType | None) -> None:
-        request.signal = number
-        restore()
+        request.signal = request.signal or number
+        signal.signal(signal.SIGINT, handlers[signal.SIGINT])
 
     for number in handlers:
         signal.signal(number, ask)

@@ -1,6 +1,7 @@
 """The entry point of the command line, which turns each failure into one line and an exit code."""
 
 import contextlib
+import io
 import os
 import platform
 import re
@@ -22,7 +23,9 @@ _LESS_MEMORY = (
     "activations, and --model.remat recomputes the largest ones; other commands need the least with --batch-size 1"
 )
 _MAX_LINE = 1000
-_REPEATED_S = 1.0  # `timeout` and schedulers may send a signal to a process and its group, that is, twice at once
+_REPEATED_S = {signal.SIGINT: 1.0, signal.SIGTERM: 5.0, signal.SIGHUP: 5.0}
+"""Until then a signal belongs to the first one: `timeout` and schedulers send signals twice, to a process and its
+group, and clusters may repeat them."""
 _CLOSED_CONNECTION = "closed by peer|reset by peer|Broken pipe|Read error|Write error"
 _CLOSED_PIPE = 128 + signal.SIGPIPE
 
@@ -51,8 +54,8 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     """Call ``work`` and explain a failure in one line on standard error, which starts with the program's name.
 
     Unexpected exceptions are treated as bugs: the line names a file with the full report. SIGTERM and SIGHUP raise
-    an exception in ``work``, so that it leaves no half-written files. A second signal, at least a second later,
-    ends the process at once, even while a program is compiled.
+    an exception in ``work``, so that it leaves no half-written files. A second Ctrl-C at least a second later, or
+    another signal at least five seconds later, ends the process at once, even while a program is compiled.
 
     Returns:
         0; 1 after a failure; 130 after Ctrl-C; 141 if the reader of the output has gone.
@@ -63,6 +66,9 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
     >>> exit_code("example", lambda: 0)
     0
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # standard error already escapes what it cannot encode
+        with contextlib.suppress(OSError):  # a full disk is reported below
+            sys.stdout.reconfigure(errors="replace")
     stopped = None
     try:
         with _ending_signals() as numbers, _ended_by_a_second(numbers, program):
@@ -170,6 +176,8 @@ def _ending_signals() -> Iterator[list[signal.Signals]]:
     numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if is_main and signal.getsignal(n) is signal.SIG_DFL]
 
     def end(number: int, _: object) -> NoReturn:
+        for repeated in numbers:
+            signal.signal(repeated, lambda *_: None)  # it would interrupt the removal of half-written files
         raise SystemExit(128 + number)
 
     for number in numbers:
@@ -198,8 +206,9 @@ def _ended_by_a_second(numbers: Sequence[signal.Signals], program: str) -> Itera
         first_s = None
         while number := os.read(read, 1):
             if number[0] in numbers:
-                first_s, now_s = first_s or time.monotonic(), time.monotonic()
-                if now_s - first_s > _REPEATED_S:
+                now_s = time.monotonic()
+                first_s = now_s if first_s is None else first_s
+                if now_s - first_s > _REPEATED_S[signal.Signals(number[0])]:
                     _end(program, number[0])
 
     os.set_blocking(write, False)

@@ -11,7 +11,15 @@ from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.files import read_json
-from fcos_lidar_jax.input_pipeline.open import DataSet, Format, default_split, find_data_set, open_frames
+from fcos_lidar_jax.input_pipeline.open import (
+    CLASS_MAPS,
+    DataSet,
+    Format,
+    Reader,
+    default_split,
+    find_data_set,
+    open_frames,
+)
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 
 _FORMATS = f"{{{','.join(get_args(Format))}}}"
@@ -30,8 +38,9 @@ class DataOptions:
     """Folder that `fcos-lidar prepare` writes: the objects and, for nuScenes, the index."""
     splits: Annotated[Path | None, option("FILE", default="those of the data")] = None
     """JSON file with custom splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
-    class_map: Annotated[Path | None, option("FILE")] = None
-    """JSON file that renames classes: {name in the data: new name, or null to leave out its objects}."""
+    class_map: Annotated[str | None, option("NAME|FILE")] = None
+    """Renames classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes, or a JSON file:
+    {name in the data: new name, or null to leave out its objects}."""
     follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.
 
@@ -64,7 +73,10 @@ class DataOptions:
         frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:
             frames = SelectedFrames(frames, tuple(parse_ranges(samples, len(frames), option)))
-        mapped = MappedFrames(frames, config.classes)
+        try:
+            mapped = MappedFrames(frames, config.classes)
+        except ValueError as error:
+            raise ValueError(f"{error}; {self.find().reader.named_maps}") from None
         if left_out := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
             counts = ", ".join(f"{count} {name}" for name, count in left_out.items())
             tell(f"left out boxes of classes that the detector does not have: {counts}")
@@ -90,7 +102,7 @@ class DataOptions:
             split=split,
             sensor=data.reader.sensor and sensor,
             reading=reading,
-            class_map=read_class_map(self.class_map),
+            class_map=read_class_map(self.class_map, data.reader),
             index=self.index if data.tables else None,
             splits=self.splits,
             allow_missing_sweeps=self.allow_missing_sweeps,
@@ -103,9 +115,15 @@ class DataOptions:
         return frames
 
 
-def read_class_map(file: Path | None) -> ClassMap | None:
-    """Read a JSON file that renames classes; None stays None."""
-    return None if file is None else read_json(file, dict[str, str | None], what="a translation of class names")
+def read_class_map(given: str | None, reader: Reader) -> ClassMap | str | None:
+    """Read a JSON file that renames classes; the name of a class map stays, and so does None.
+
+    A file that is called like a class map must be given with its folder, such as ``./nuscenes``.
+    """
+    if given is None or given in CLASS_MAPS:
+        return given
+    what = f"a translation of class names or one of {reader.named_maps}"
+    return read_json(Path(given), dict[str, str | None], what=what)
 
 
 def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]:

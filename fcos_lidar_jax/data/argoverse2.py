@@ -30,6 +30,21 @@ _POSE = {"timestamp_ns": "iu", **dict.fromkeys((*_ROTATION, *_TRANSLATION), "fiu
 _BOX = {**_POSE, **dict.fromkeys(_SIZE, "fiu"), "num_interior_pts": "iu", "track_uuid": "O", "category": "O"}
 """Column -> NumPy's type letters that it may have."""
 
+TO_NUSCENES = {
+    **dict.fromkeys(ARGOVERSE2_CLASSES),
+    "REGULAR_VEHICLE": "car",
+    **dict.fromkeys(("LARGE_VEHICLE", "TRUCK", "BOX_TRUCK", "TRUCK_CAB"), "truck"),
+    **dict.fromkeys(("BUS", "SCHOOL_BUS", "ARTICULATED_BUS"), "bus"),
+    **dict.fromkeys(("VEHICULAR_TRAILER", "MESSAGE_BOARD_TRAILER"), "trailer"),
+    "PEDESTRIAN": "pedestrian",
+    "MOTORCYCLE": "motorcycle",
+    "BICYCLE": "bicycle",
+    "CONSTRUCTION_CONE": "traffic_cone",
+}
+"""Class map from Argoverse 2's classes to the ten nuScenes classes; None drops the object. Riders are dropped,
+because their bicycles have boxes of their own. A pickup, a truck in nuScenes, is a regular vehicle here and so a
+car."""
+
 
 class Argoverse2Frames(FrameSet):
     """All sweeps of some logs, by log and time: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.

@@ -2,17 +2,17 @@
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
+from fcos_lidar_jax.data import argoverse2, kitti
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes, unknown_name
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes.index import default_index
+from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
 from fcos_lidar_jax.data.splits import own_splits
@@ -34,6 +34,7 @@ class Reader:
         splits: ``(data set, file of own splits) -> names of the splits``.
         open: ``(data set, *, split, sensor, reading, **options) -> frames``.
         options: further options of :func:`open_frames` that this format takes.
+        class_maps: name -> class map to the classes of another data set.
     """
 
     name: Format
@@ -43,6 +44,12 @@ class Reader:
     open: Callable[..., FrameSet]
     options: tuple[str, ...] = ()
     recorded_by_sensor: bool = False  # heading, position and intensity scale are always those of ``sensor``
+    class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)
+
+    @property
+    def named_maps(self) -> str:
+        """The names of the class maps, as part of a message."""
+        return f"the class maps of format {self.name}: {', '.join(self.class_maps) or '(none)'}"
 
 
 READERS = (
@@ -53,22 +60,25 @@ READERS = (
         lambda data, file: list(own_splits(data.root / data.version, file) or OFFICIAL),
         lambda data, **how: open_keyframes(data.root, data.version, **how),
         ("version", "index", "splits", "allow_missing_sweeps", "follow_links"),
+        class_maps={"kitti": TO_KITTI},
     ),
     Reader(
         "kitti",
         ("training/velodyne",),
         KITTI_HDL64E,
         lambda data, _: sorted(file.stem for file in (data.root / "ImageSets").glob("*.txt")),
-        lambda data, **how: KittiFrames(data.root, **how),
+        lambda data, **how: kitti.KittiFrames(data.root, **how),
         recorded_by_sensor=True,
+        class_maps={"nuscenes": kitti.TO_NUSCENES},
     ),
     Reader(
         "argoverse2",
         ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar"),
         ARGOVERSE2,
-        lambda data, _: find_splits(data.root),
-        lambda data, **how: Argoverse2Frames(data.root, **how),
+        lambda data, _: argoverse2.find_splits(data.root),
+        lambda data, **how: argoverse2.Argoverse2Frames(data.root, **how),
         recorded_by_sensor=True,
+        class_maps={"nuscenes": argoverse2.TO_NUSCENES},
     ),
     Reader(
         "folder",
@@ -84,8 +94,12 @@ READERS = (
         NUSCENES_HDL32E,
         lambda data, _: list(SIMULATED_SPLITS),
         lambda data, split, **how: simulated_split(split or "train", **how),
+        class_maps={"kitti": TO_KITTI},
     ),
 )
+
+CLASS_MAPS = frozenset(name for reader in READERS for name in reader.class_maps)
+"""Names of the class maps of all formats."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,7 +213,7 @@ def open_frames(
     sensor: Sensor | None = None,
     num_sweeps: int | None = None,
     reading: CloudReading | None = None,
-    class_map: ClassMap | None = None,
+    class_map: ClassMap | str | None = None,
     index: str | Path | None = None,
     splits: str | Path | None = None,
     allow_missing_sweeps: bool = False,
@@ -217,7 +231,8 @@ def open_frames(
             the heading, the position and the intensity scale of their own sensors.
         num_sweeps: maximum number of sweeps to fuse, including the current one; default: ``reading``'s.
         reading: how clouds are read, such as ``config.reading``; default: ``CloudReading()``.
-        class_map: name in the data -> name to use instead; None drops objects, other names stay.
+        class_map: name in the data -> name to use instead; None drops objects, other names stay. Or the name of a
+            class map: ``"nuscenes"`` (KITTI and Argoverse 2), ``"kitti"`` (nuScenes and simulated frames).
         index: folder of the index that ``prepare`` wrote (nuScenes).
         splits: JSON file of own splits, ``{"name": [...]}`` of scenes (nuScenes) or frames (folder).
         allow_missing_sweeps: skip older sweeps with a missing file (nuScenes).
@@ -246,6 +261,10 @@ def open_frames(
         "follow_links": follow_links,
     }
     _refuse(data, **given)
+    if isinstance(class_map, str):
+        if class_map not in data.reader.class_maps:
+            raise ValueError(f"class map: got {class_map!r}, expected one of {data.reader.named_maps}")
+        class_map = data.reader.class_maps[class_map]
     reading = reading or CloudReading()
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)

@@ -215,7 +215,7 @@ def test_classes_without_truth_are_named(home, tmp_path, capsys):
 
 def test_with_a_class_map_the_metric_is_not_the_official_one(home, tmp_path):
     (tmp_path / "map.json").write_text(json.dumps(dict.fromkeys(NUSCENES_CLASSES[1:], None)))
-    data = dataclasses.replace(place(home)["data"], class_map=tmp_path / "map.json")
+    data = dataclasses.replace(place(home)["data"], class_map=str(tmp_path / "map.json"))
     run(Evaluate(data, tmp_path / "out", split=SPLIT, checkpoint=home / "checkpoint", report=False))
     summary = read(tmp_path / "out" / "metrics_summary.json")
     assert "nd_score" not in summary

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from commands import command
+from commands import assert_one_line_error, command
 from made_argoverse2 import make_argoverse2
 from made_folder import make_folder
 from made_kitti import make_kitti
@@ -21,6 +21,7 @@ from tiny_run import NETWORK_OPTIONS, SENSOR
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES
+from fcos_lidar_jax.data.argoverse2 import TO_NUSCENES
 from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.input_pipeline.open import Format
@@ -108,6 +109,26 @@ def test_prepares_trains_evaluates_and_detects(make, tmp_path, capsys):
     [record] = json.loads(boxes.read_text())["files"]
     assert record["num_points"] > 100
     assert {box["label"] for box in record["boxes"]} <= set(classes)
+
+
+def test_a_class_map_by_name_trains_on_the_same_frames_as_its_file(tmp_path, monkeypatch, capsys):
+    data, preset, *_ = argoverse2(tmp_path / "data")
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", trained := Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.chdir(tmp_path)
+    Path("map.json").write_text(json.dumps(TO_NUSCENES))
+    Path("nuscenes").write_text(json.dumps({"PEDESTRIAN": "car"}))
+    line = f"{preset.replace('argoverse2', 'quickstart', 1)} {data} --no-copy-paste --out run"
+    frames = []
+    for given in ("nuscenes", "map.json", "./nuscenes"):
+        with pytest.raises(AssertionError):  # interrupted
+            command("train", line, "--class-map", given)
+        frames.append(trained.call_args.args[1])
+    by_name, by_file, by_own_file = ([f.labels(i).tolist() for i in range(len(f))] for f in frames)
+    assert frames[0].fingerprint() == frames[1].fingerprint()
+    assert by_name == by_file != by_own_file
+    known = "the class maps of format argoverse2: nuscenes$"
+    for given, message in (("", "a class map; "), ("--class-map nuscens", "no such file, expected .* one of ")):
+        assert_one_line_error(capsys, f"train {line} {given}".split(), message + known)
 
 
 def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import inside_box
-from fcos_lidar_jax.data.kitti import CLASSES, TO_NUSCENES, KittiFrames, read_calibration, read_labels, to_lidar
+from fcos_lidar_jax.data.kitti import CLASSES, KittiFrames, read_calibration, read_labels, to_lidar
 from fcos_lidar_jax.input_pipeline.open import open_frames
 from fcos_lidar_jax.sensors import TINY
 
@@ -129,7 +129,7 @@ def test_types_are_classes_and_can_be_mapped_to_those_of_nuscenes(root):
     boxes, labels = read_labels(root / L)
     assert [CLASSES[i] for i in labels] == kinds[:-1]
     np.testing.assert_array_equal(boxes, np.repeat(boxes[:1], 8, axis=0))
-    frames = open_frames(root, class_map=TO_NUSCENES)
+    frames = open_frames(root, class_map="nuscenes")
     assert frames.classes == ("car", "truck", "pedestrian", "bicycle", "bus")
     found = [frames.classes[i] for i in frames.frame(1).labels]
     assert found == ["car", "car", "truck", "pedestrian", "pedestrian", "bicycle", "bus"]

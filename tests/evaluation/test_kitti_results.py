@@ -1,6 +1,7 @@
 """KITTI's result files: boxes come back, their rectangles in the image, and the metric that evaluate writes."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from made_kitti import AXES, MOUNTED, P2, RECTIFIED, calibration_text, label_tex
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.frame import SelectedFrames
-from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration, to_lidar
+from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, TO_NUSCENES, KittiFrames, read_calibration, to_lidar
 from fcos_lidar_jax.evaluation.frames import write_detections
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
 from fcos_lidar_jax.evaluation.kitti_results import image_boxes, read_result, to_camera, write_kitti, write_result
@@ -163,15 +164,21 @@ def test_a_class_map_is_undone_and_names_match_in_lower_case(root, tmp_path):
     assert types == ["Car"] * 9 + ["Pedestrian"]
 
 
+TIME = '"eval_time": [0-9.e-]*'
+
+
 def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
-    names = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
-    write(tmp_path / "map.json", json.dumps(names))
-    frames = MappedFrames(KittiFrames(root), fcos.load_detector("quickstart").classes, names)
+    write(tmp_path / "map.json", json.dumps(TO_NUSCENES))
+    frames = MappedFrames(KittiFrames(root), fcos.load_detector("quickstart").classes, TO_NUSCENES)
     records = [json.dumps(as_records(found, frames.classes)).encode() for found in perfect(frames)]
     named = [(frames.name(i), record) for i, record in enumerate(records)]
     write_detections(tmp_path / "given.json", named, frames.classes)
-    data = f"--data-root {root} --class-map {tmp_path}/map.json --checkpoint quickstart"
-    command("evaluate", data, f"--no-report --results {tmp_path}/given.json --out {tmp_path}/out")
+    for given, out in (("nuscenes", "out"), (tmp_path / "map.json", "by_file")):
+        data = f"--data-root {root} --class-map {given} --checkpoint quickstart"
+        command("evaluate", data, f"--no-report --results {tmp_path}/given.json --out {tmp_path}/{out}")
+    for name in ("metrics_summary.json", "metrics_kitti.json", "results_kitti/000003.txt"):
+        by_name, by_file = ((tmp_path / out / name).read_text() for out in ("out", "by_file"))
+        assert re.sub(TIME, "", by_name) == re.sub(TIME, "", by_file)
     metrics = json.loads((tmp_path / "out" / "metrics_kitti.json").read_text())
     assert metrics["classes"]["Car"]["3d"] == {"easy": 100.0, "moderate": 100.0, "hard": 100.0}
     assert list(metrics["classes"]) == ["Car", "Pedestrian", "Cyclist"]

@@ -49,6 +49,7 @@ from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.inference.export import load_exported
 from fcos_lidar_jax.input_pipeline.database import open_database, prepare_database
+from fcos_lidar_jax.input_pipeline.open import READERS
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import (
     ARGOVERSE2,
@@ -321,7 +322,7 @@ def _read_sensor(folder: Path, name: str) -> None:
 
 
 def _read_class_map(folder: Path, name: str) -> None:
-    found = read_class_map(folder / name)
+    found = read_class_map(str(folder / name), READERS[0])
     expect(isinstance(found, dict) and all(v is None or isinstance(v, str) for v in found.values()), "no map")
 
 

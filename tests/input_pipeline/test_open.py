@@ -14,14 +14,16 @@ from made_kitti import make_kitti
 from made_nuscenes import VERSION, make_tables, token, write
 from refusal import refused
 
+from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data import kitti
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.input_pipeline.open import default_split, find_data_set, open_frames
+from fcos_lidar_jax.input_pipeline.open import READERS, default_split, find_data_set, open_frames
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
@@ -122,6 +124,49 @@ def test_a_class_map_renames_and_drops_classes(roots):
     assert MappedFrames(frames, ("vehicle",)).left_out().keys() == {"pole"}
 
 
+def test_class_maps_cover_all_classes_and_lead_to_classes_of_the_other_data():
+    classes = {"nuscenes": NUSCENES_CLASSES, "kitti": kitti.CLASSES, "argoverse2": ARGOVERSE2_CLASSES}
+    left_out = {}
+    for reader in READERS:
+        for name, names in reader.class_maps.items():
+            assert list(names) == list(classes[reader.name if reader.marks else "nuscenes"])
+            assert {new for new in names.values() if new is not None} <= set(classes[name])
+            left_out[reader.name, name] = [old for old, new in names.items() if new is None]
+    to_kitti = ["bus", "trailer", "construction_vehicle", "motorcycle", "traffic_cone", "barrier"]
+    assert left_out.pop(("nuscenes", "kitti")) == left_out.pop(("simulated", "kitti")) == to_kitti
+    assert left_out.pop(("kitti", "nuscenes")) == ["Misc"]
+    signs_and_riders = left_out.pop(("argoverse2", "nuscenes"))
+    assert len(signs_and_riders) == 12
+    assert {"SIGN", "STOP_SIGN", "BOLLARD", "BICYCLIST", "MOTORCYCLIST", "WHEELED_RIDER"} < set(signs_and_riders)
+    assert not left_out
+
+
+WORDS = {
+    "kitti": {"car": "Car Van", "bus": "Tram", "pedestrian": "Pedestrian Person_sitting", "bicycle": "Cyclist"},
+    "nuscenes": {"Car": "car", "Truck": "truck", "Pedestrian": "pedestrian", "Cyclist": "bicycle"},
+    "argoverse2": {
+        "car": "REGULAR_VEHICLE",
+        "truck": "LARGE_VEHICLE TRUCK BOX_TRUCK TRUCK_CAB",
+        "bus": "BUS SCHOOL_BUS ARTICULATED_BUS",
+        "trailer": "VEHICULAR_TRAILER MESSAGE_BOARD_TRAILER",
+    },
+}
+"""Format -> class of the other data -> its classes."""
+
+
+@pytest.mark.parametrize("format", WORDS)
+def test_a_class_map_can_be_chosen_by_name(roots, format):
+    name = "kitti" if format == "nuscenes" else "nuscenes"
+    plain, mapped = open_frames(roots[format]), open_frames(roots[format], class_map=name)
+    for i in range(len(plain)):
+        own = [plain.classes[label] for label in plain.labels(i)]
+        new = [mapped.classes[label] for label in mapped.labels(i)]
+        for to, of in WORDS[format].items():
+            assert new.count(to) == sum(map(own.count, of.split()))
+    assert set(WORDS[format]) <= set(mapped.classes)
+    assert mapped.labels(0).size > 0
+
+
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_fingerprint_depends_on_files_and_options(roots, tmp_path, format):
     root = shutil.copytree(roots[format], tmp_path / "copy")
@@ -151,6 +196,11 @@ BAD = {
     "no such version": ({"root": "nuscenes", "version": "v9"}, "v9: no such folder, expected one of v1.0-made"),
     "sweeps": ({"root": "kitti", "num_sweeps": 0}, "num_sweeps: got 0, expected at least 1"),
     "class map": ({"root": "kitti", "class_map": {"Lorry": "truck"}}, "class map: got 'Lorry', expected Car"),
+    "map of a folder": (
+        {"root": "folder", "class_map": "nuscenes"},
+        "class map: got 'nuscenes', expected one of the class maps of format folder: (none)",
+    ),
+    "map of other data": ({"root": "kitti", "class_map": "kitti"}, "class maps of format kitti: nuscenes"),
     "other reader": ({"root": "kitti", "format": "folder"}, "no such folder, expected one with .pcd.bin"),
 }
 

@@ -20,6 +20,13 @@ CATEGORY_TO_CLASS = {
 }
 """Category -> class; all other categories are background."""
 
+TO_KITTI = {
+    **dict.fromkeys(NUSCENES_CLASSES),
+    **{"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian", "bicycle": "Cyclist"},
+}
+"""Class map from nuScenes' classes to KITTI's types; None drops the object. A bicycle need not have a rider,
+which a cyclist has."""
+
 BICYCLE_RACK = "static_object.bicycle_rack"  # the evaluation ignores boxes in a rack
 
 
