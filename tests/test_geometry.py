@@ -137,7 +137,7 @@ NMS = {"iou_threshold": 0.2, "max_outputs": 1}
         lambda: iou.rotated_iou_bev(FLAT, FLAT),
         lambda: iou.rotated_iou_3d(BOX, FLAT),
         lambda: nms.rotated_nms(FLAT, ONE, ONE > 0, **NMS),
-        lambda: nms.merge_boxes(FLAT, ONE, ONE > 0, jnp.zeros(1, jnp.int32), jnp.asarray(ONE > 0), iou_threshold=0.2),
+        lambda: nms.merge_boxes(FLAT, ONE, ONE > 0, jnp.zeros(1, jnp.int32), jnp.array([True]), iou_threshold=0.2),
         lambda: assignment.owners(np.zeros((1, 3), np.float32), ONE > 0, FLAT, ONE > 0, form="loop"),
         lambda: assignment.owners(np.zeros((1, 3), np.float32), ONE > 0, FLAT, ONE > 0, form="reduction"),
     ],
