@@ -30,8 +30,13 @@ def check_score_and_angle(args: Any) -> None:
     """Reject a ``min_score`` outside of 0 to 1 and a ``yaw_deg`` that is not finite."""
     if args.min_score is not None and not 0 <= args.min_score <= 1:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
-    if not math.isfinite(args.yaw_deg):
-        raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
+    check_angle(args.yaw_deg)
+
+
+def check_angle(yaw_deg: float | None) -> None:
+    """Reject an angle that is not finite; None passes."""
+    if yaw_deg is not None and not math.isfinite(yaw_deg):
+        raise ValueError(f"--yaw-deg: got {yaw_deg:g}, expected an angle in degrees")
 
 
 def check_out_folder(out: Path, option: str = "--out") -> None:

@@ -98,10 +98,30 @@ Page = Annotated[
     Path | None, option("FILE.html", text="Also write a page for a browser, one file that works offline.")
 ]
 Sensor = Annotated[str, option("SENSOR", text="Sensor preset, or a sensor file.")]
-Yaw = Annotated[
-    float,
+DataSensor = Annotated[
+    str | None,
     option(
-        text="Turn the clouds by this angle about z before detection, and the boxes back. Use 90 if x points "
-        "forward and the detector expects y forward, as hdl32e does."
+        "SENSOR",
+        default="known for files in the folders of KITTI and Argoverse 2, else the detector's",
+        text="Sensor that recorded the clouds, a preset or a sensor file: its intensities are scaled, and clouds "
+        "are turned and shifted for the detector, and boxes back. The detector's own sensor changes nothing.",
+    ),
+]
+Yaw = Annotated[
+    float | None,
+    option(
+        "DEGREES",
+        default="as the sensor of the data tells, else 0",
+        text="Turn the clouds by this angle about z before detection, and the boxes back, instead of the turn "
+        "that the sensor of the data tells. Use 90 if x points forward and the detector expects y forward, as "
+        "hdl32e does.",
+    ),
+]
+IntensityScale = Annotated[
+    float | None,
+    option(
+        "FACTOR",
+        default="as the sensor of the data tells",
+        text="Factor that brings the intensities in files to 0-255: 255 if they are from 0 to 1.",
     ),
 ]

@@ -1,6 +1,7 @@
 """One function to open any data set; a table has one row per format."""
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +12,11 @@ from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames, find_splits
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes, unknown_name
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.data.kitti import KittiFrames
+from fcos_lidar_jax.data.kitti import IMAGE_SIZE, KittiFrames
 from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
+from fcos_lidar_jax.data.recorded import RECORDED_BY, check_scale
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
@@ -42,7 +44,11 @@ class Reader:
     splits: Callable[["DataSet", str | Path | None], list[str]]
     open: Callable[..., FrameSet]
     options: tuple[str, ...] = ()
-    recorded_by_sensor: bool = False  # heading, position and intensity scale are always those of ``sensor``
+
+    @property
+    def recorded_by_sensor(self) -> bool:
+        """Whether heading, position and intensity scale are always those of ``sensor``."""
+        return self.sensor in RECORDED_BY.values()
 
 
 READERS = (
@@ -59,8 +65,10 @@ READERS = (
         ("training/velodyne",),
         KITTI_HDL64E,
         lambda data, _: sorted(file.stem for file in (data.root / "ImageSets").glob("*.txt")),
-        lambda data, **how: KittiFrames(data.root, **how),
-        recorded_by_sensor=True,
+        lambda data, full_turn=False, **how: KittiFrames(
+            data.root, image_size=None if full_turn else IMAGE_SIZE, **how
+        ),
+        ("full_turn", "intensity_scale"),
     ),
     Reader(
         "argoverse2",
@@ -68,7 +76,7 @@ READERS = (
         ARGOVERSE2,
         lambda data, _: find_splits(data.root),
         lambda data, **how: Argoverse2Frames(data.root, **how),
-        recorded_by_sensor=True,
+        ("intensity_scale",),
     ),
     Reader(
         "folder",
@@ -76,7 +84,7 @@ READERS = (
         None,
         lambda data, file: list(own_splits(data.root, file)),
         lambda data, **how: FolderFrames(data.root, **how),
-        ("splits", "follow_links"),
+        ("splits", "follow_links", "intensity_scale"),
     ),
     Reader(
         "simulated",
@@ -204,6 +212,8 @@ def open_frames(
     splits: str | Path | None = None,
     allow_missing_sweeps: bool = False,
     follow_links: bool = False,
+    full_turn: bool = False,
+    intensity_scale: float | None = None,
 ) -> FrameSet:
     """Open a data set in any supported format.
 
@@ -222,6 +232,9 @@ def open_frames(
         splits: JSON file of own splits, ``{"name": [...]}`` of scenes (nuScenes) or frames (folder).
         allow_missing_sweeps: skip older sweeps with a missing file (nuScenes).
         follow_links: also read files outside the root to which links lead (nuScenes, folder).
+        full_turn: keep the points outside the camera's image, where no objects are labelled (KITTI).
+        intensity_scale: factor from the intensity in files to the scale 0-255 (KITTI, Argoverse 2, folder); by
+            default the sensor's.
 
     Returns:
         frames with labels of their own classes; :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames` maps them
@@ -244,18 +257,23 @@ def open_frames(
         "splits": splits,
         "allow_missing_sweeps": allow_missing_sweeps,
         "follow_links": follow_links,
+        "full_turn": full_turn,
     }
-    _refuse(data, **given)
+    _refuse(data, **given, intensity_scale=intensity_scale)
+    check_scale(intensity_scale, data.root.rglob("*.pcd.bin"))
     reading = reading or CloudReading()
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
     if sensor is not None and data.reader.recorded_by_sensor and data.reader.sensor is not None:
         given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, data.reader.sensor)
-        if sensor.intensity_scale != given_scale:
+        if intensity_scale is None and sensor.intensity_scale != given_scale:
             told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
             print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
-    frames = data.reader.open(data, split=split, sensor=sensor or data.reader.sensor, reading=reading, **options)
+    open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
+    frames = open_with(sensor=sensor or data.reader.sensor)
+    if intensity_scale is not None:  # opened again, because only the frames know the sensor of a folder
+        frames = open_with(sensor=dataclasses.replace(frames.sensor, intensity_scale=intensity_scale))
     if class_map is None:
         return frames
     return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
