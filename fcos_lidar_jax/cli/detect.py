@@ -14,16 +14,15 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.alignment import alignment_of, radians
 from fcos_lidar_jax.cli.checks import (
     check_at_least,
     check_out_file,
     check_out_folder,
     check_outputs,
     check_outside,
-    check_score_and_angle,
+    check_score,
 )
-from fcos_lidar_jax.cli.options import option
+from fcos_lidar_jax.cli.options import alignment_of, option, radians
 from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
 from fcos_lidar_jax.data.cloud_policy import expect_points
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
@@ -114,7 +113,7 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected either point files or --sweeps")
     check_at_least(args, 1, "batch_size", "max_file_points")
-    check_score_and_angle(args)
+    check_score(args)
     for file in args.files:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
@@ -164,7 +163,7 @@ def _resume_log(args: Detect, detector: CloudDetector, aligned: Alignment) -> It
     """The log of the files that an interrupted call with the same options has finished; deleted in the end."""
     file = _log_file(args)
     same = args.remove_close, args.columns, args.dtype, args.min_score, args.labels, args.batch_size
-    same = *same, sensor_to_json(aligned.data), aligned.yaw_rad
+    same += sensor_to_json(aligned.data), aligned.yaw_rad
     with file_lock(file) as held:
         if not held:
             raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")

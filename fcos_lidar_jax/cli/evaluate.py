@@ -12,9 +12,7 @@ import tyro
 from fcos_lidar_jax.checkpoints.preemption import take_sigterm_back
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.alignment import radians
 from fcos_lidar_jax.cli.checks import (
-    check_angle,
     check_at_least,
     check_out_file,
     check_out_folder,
@@ -22,7 +20,7 @@ from fcos_lidar_jax.cli.checks import (
     option_name,
 )
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
-from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option
+from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.cli.scoring import Task, write_detections, write_recording, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -127,7 +125,7 @@ def _check(args: Evaluate) -> None:
         raise ValueError(f"--backend: got {args.backend} with several processes, expected xla")
     check_at_least(args, 1, "batch_size")
     check_at_least(args, 0, "bootstrap")
-    check_angle(args.yaw_deg)
+    radians(args.yaw_deg)  # refuses
     for name in ("backend", "batch_size", "yaw_deg"):
         if args.results is not None and (value := getattr(args, name)) != getattr(Evaluate, name):
             raise ValueError(

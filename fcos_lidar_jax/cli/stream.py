@@ -15,9 +15,8 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.alignment import alignment_of
-from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score_and_angle, option_name
-from fcos_lidar_jax.cli.options import option
+from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score, option_name
+from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.result_files import FORMATS, check_result_files, check_results, result_files
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.clouds import find_clouds
@@ -229,7 +228,7 @@ class _Timing(contextlib.AbstractContextManager):
 def _find(args: Stream) -> Recording:
     """The kind of the drive; rejects options that do not fit it, and outputs that would replace inputs."""
     check_at_least(args, 1, "max_file_points")
-    check_score_and_angle(args)
+    check_score(args)
     if args.data_root is not None and args.intensity_scale is not None:
         raise ValueError("--intensity-scale: expected none with --data-root: nuScenes has intensities of 0 to 255")
     if args.source is not None and not args.source.exists():

@@ -125,11 +125,7 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
 
 
 def check_time_lags(points: np.ndarray, where: str = "points") -> None:
-    """Refuse points [n, c] whose fifth column holds whole numbers above 1: rings instead of time lags.
-
-    Raises:
-        ValueError: with ``where``, the found and the expected value.
-    """
+    """Refuse points [n, c] with whole numbers above 1 in the fifth column: rings instead of time lags."""
     lag = points[:, 4:5]
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
     if len(lag) and lag.max() > 1 and not (lag % 1).any():

@@ -1,43 +1,40 @@
-"""The sensors that recorded the point files of known data sets, and the scale of intensities."""
+"""The sensors that recorded the point files of known data sets."""
 
-import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor
 
 RECORDED_BY = {
     "training/velodyne/*.bin": KITTI_HDL64E,
     "testing/velodyne/*.bin": KITTI_HDL64E,
-    "training/velodyne/*/*.bin": KITTI_HDL64E,  # tracking benchmark
-    "testing/velodyne/*/*.bin": KITTI_HDL64E,
-    "velodyne_points/data/*.bin": KITTI_HDL64E,  # raw drives
+    "velodyne_points/data/*.bin": KITTI_HDL64E,
     "sensors/lidar/*.feather": ARGOVERSE2,
 }
 """Ends of paths -> the sensor whose heading, position and intensity scale the files have."""
 
 
-def recorded_by(path: Path) -> Sensor | None:
-    """The sensor that recorded a point file, or the files of a recording's folder; None if the path does not tell.
+def recorded_by(paths: Iterable[Path]) -> Sensor | None:
+    """The sensor that recorded point files, or recordings in folders, as far as their paths tell.
 
-    >>> recorded_by(Path("KITTI/training/velodyne/000000.bin")).name, recorded_by(Path("000000.bin"))
+    Raises:
+        ValueError: different sensors recorded them.
+
+    >>> recorded_by([Path("KITTI/training/velodyne/000000.bin")]).name, recorded_by([Path("000000.bin")])
     ('kitti_hdl64e', None)
     """
-    path = Path(os.path.abspath(path))
-    found = (sensor for end, sensor in RECORDED_BY.items() if path.match(end) or any(path.glob(end)))
-    return next(found, None)
+    found: dict[Sensor | None, Path] = {}
+    for path in {(path.parent, path.suffix): Path(os.path.abspath(path)) for path in paths}.values():
+        known = (sensor for end, sensor in RECORDED_BY.items() if path.match(end) or any(path.glob(end)))
+        found[next(known, None)] = path
+    if len(found) > 1:
+        files = " and ".join(f"{path} of {sensor.name if sensor else 'another'}" for sensor, path in found.items())
+        raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")
+    return next(iter(found), None)
 
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:
-    """Refuse a factor for intensities that is not positive, or that files would not use.
-
-    Raises:
-        ValueError: with the factor, and a ``.pcd.bin`` file: its intensities are always from 0 to 255.
-    """
-    if intensity_scale is None:
-        return
-    check(0 < intensity_scale < math.inf, "intensity scale", intensity_scale, "a positive number")
-    if file := next((file for file in files if file.name.lower().endswith(".pcd.bin")), None):
+    """Refuse a factor for the intensities of a ``.pcd.bin``, which are always from 0 to 255."""
+    if intensity_scale is not None and (file := next((f for f in files if f.name.lower().endswith(".pcd.bin")), None)):
         raise ValueError(f"{file}: intensity scale: got {intensity_scale:g}, expected none: it is 1 in .pcd.bin")

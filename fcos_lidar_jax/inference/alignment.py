@@ -4,12 +4,12 @@ import dataclasses
 import functools
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
-from fcos_lidar_jax.data.recorded import recorded_by
+from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.sensors import Sensor, in_frame_of, turn_between
@@ -81,62 +81,43 @@ class Alignment:
 
 def align(
     detector: Sensor,
-    recorded: Sensor | None = None,
+    sensor: Sensor | None = None,
     *,
+    paths: Collection[Path] = (),
     yaw_rad: float | None = None,
     intensity_scale: float | None = None,
 ) -> Alignment:
-    """The alignment of points to a detector; read the points with its ``data``.
+    """The alignment of points, read with its ``data``, to a detector.
 
     Args:
         detector: sensor that the detector expects.
-        recorded: gives heading, position and intensity scale of the data; None for those of the detector's sensor.
-        yaw_rad: rotation from the data to the detector, counter-clockwise, instead of the one between headings.
-        intensity_scale: factor from the intensity in files to the scale 0-255; None for the sensor's.
+        sensor: gives heading, position and intensity scale of the points; None for the one that the paths tell,
+            which one line on standard error says, or else the detector's.
+        paths: point files, or recordings in folders.
+        yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the one between headings.
+        intensity_scale: factor from the intensity in files to the scale 0-255, instead of the sensor's.
+
+    Raises:
+        ValueError: files of different sensors, or an intensity scale for files that have their own.
 
     >>> from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E
     >>> aligned = align(NUSCENES_HDL32E, KITTI_HDL64E)
     >>> aligned.data.num_rows, aligned.data.intensity_scale, round(aligned.turn_rad, 4)
     (32, 255.0, 1.5708)
     """
+    check_scale(intensity_scale, paths)
+    recorded = recorded_by(paths) if sensor is None else sensor
     if recorded is not None:
         data = in_frame_of(detector, recorded)
-    else:  # the same place on the ego vehicle, in the axes of the data
+    else:  # the same place on the ego vehicle, in the axes of the points
         origin = np.array(detector.origin_m) @ about_z(yaw_rad or 0.0)[:3, :3]
         data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()))
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
+    if sensor is None and recorded is not None and data != detector:
+        told = f"recorded by {recorded.name}, as the path tells, unless --data-sensor names another"
+        _tell_once(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}")
     return Alignment(data, detector, yaw_rad)
-
-
-def align_files(
-    paths: Iterable[Path],
-    detector: Sensor,
-    *,
-    yaw_rad: float | None = None,
-    intensity_scale: float | None = None,
-) -> Alignment:
-    """:func:`align` for point files, by the sensor that recorded them, which one line on standard error tells.
-
-    Args:
-        paths: point files, or folders of recordings, for :func:`~fcos_lidar_jax.data.recorded.recorded_by`.
-        detector, yaw_rad, intensity_scale: as for :func:`align`.
-
-    Raises:
-        ValueError: different sensors recorded the files.
-    """
-    found: dict[Alignment, tuple[Path, Sensor | None]] = {}
-    for path in {(path.parent, path.suffix): path for path in paths}.values():
-        sensor = recorded_by(path)
-        found[align(detector, sensor, yaw_rad=yaw_rad, intensity_scale=intensity_scale)] = path, sensor
-    if len(found) > 1:
-        files = " and ".join(f"{path} of {'any' if s is None else s.name}" for path, s in found.values())
-        raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")
-    [(aligned, (path, sensor))] = found.items()
-    if sensor is not None and aligned.data != detector:
-        told = f"{path if path.is_dir() else path.parent}: recorded by {sensor.name}, as the path tells"
-        _tell_once(f"{told} (--data-sensor names another): intensities times {aligned.data.intensity_scale:g}")
-    return aligned
 
 
 @functools.cache

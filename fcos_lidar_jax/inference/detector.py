@@ -19,7 +19,7 @@ from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
-from fcos_lidar_jax.inference.alignment import align, align_files
+from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
 from fcos_lidar_jax.models import Detector, Variables, build_detector
@@ -88,8 +88,7 @@ class CloudDetector(abc.ABC):
             ValueError: invalid shape or type, or a fifth column that contains rings instead of time lags.
         """
         is_file = isinstance(points, str | Path)
-        recognised = is_file and sensor is None
-        aligned = align_files([Path(points)], self.sensor) if recognised else align(self.sensor, sensor)  # type: ignore[arg-type]
+        aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())  # type: ignore[arg-type]
         rows = (read_points if is_file else points_from_array)(points, aligned.data)  # type: ignore[arg-type]
         rows, num_close = drop_close(rows, aligned.data, self.config.reading)
         rows = aligned.points(rows)

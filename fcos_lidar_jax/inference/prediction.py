@@ -156,12 +156,7 @@ def predict_groups(
 
 
 def evaluate(
-    detector: CloudDetector,
-    frames: FrameSet,
-    *,
-    batch_size: int = 1,
-    devices: Sequence[Any] | None = None,
-    yaw_rad: float | None = None,
+    detector: CloudDetector, frames: FrameSet, *, batch_size: int = 1, devices: Sequence[Any] | None = None
 ) -> Evaluation:
     """Evaluate detections in all frames by centre distance; arguments as for :func:`predict`.
 
@@ -179,7 +174,7 @@ def evaluate(
     mapped = MappedFrames(frames, detector.classes)
     progress = Progress("test frames", len(mapped))
     found, truths = list[Detections](), list[Frame]()
-    for group in predict_groups(detector, mapped, batch_size=batch_size, devices=devices, yaw_rad=yaw_rad):
+    for group in predict_groups(detector, mapped, batch_size=batch_size, devices=devices):
         with agreed("cannot read its boxes"):
             # Without points: the clouds of a data set need not fit into memory.
             truths += [mapped.truth(p.index) if p.frame is None else without_points(p.frame) for p in group]

@@ -45,11 +45,6 @@ class Reader:
     open: Callable[..., FrameSet]
     options: tuple[str, ...] = ()
 
-    @property
-    def recorded_by_sensor(self) -> bool:
-        """Whether heading, position and intensity scale are always those of ``sensor``."""
-        return self.sensor in RECORDED_BY.values()
-
 
 READERS = (
     Reader(
@@ -265,8 +260,9 @@ def open_frames(
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
-    if sensor is not None and data.reader.recorded_by_sensor and data.reader.sensor is not None:
-        given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, data.reader.sensor)
+    recorded = data.reader.sensor if data.reader.sensor in RECORDED_BY.values() else None
+    if sensor is not None and recorded is not None:
+        given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, recorded)
         if intensity_scale is None and sensor.intensity_scale != given_scale:
             told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
             print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
