@@ -36,5 +36,7 @@ def recorded_by(paths: Iterable[Path]) -> Sensor | None:
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:
     """Refuse a factor for the intensities of a ``.pcd.bin``, which are always from 0 to 255."""
-    if intensity_scale is not None and (file := next((f for f in files if f.name.lower().endswith(".pcd.bin")), None)):
+    if intensity_scale is not None and (
+        file := next((f for f in files if f.name.lower().endswith(".pcd.bin")), None)
+    ):
         raise ValueError(f"{file}: intensity scale: got {intensity_scale:g}, expected none: it is 1 in .pcd.bin")

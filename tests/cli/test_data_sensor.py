@@ -100,7 +100,9 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
     for found in (by_path, again, by_sensor):
         assert found.to_dict()["boxes"] == boxes
         assert found.points[:, 3].max() > 1
-        np.testing.assert_allclose(found.points[:, :4], raw * [1, 1, 1, 255], atol=1e-4)  # in the frame of the file
+        np.testing.assert_allclose(
+            found.points[:, :4], raw * [1, 1, 1, 255], atol=1e-4
+        )  # in the frame of the file
     assert moved.to_dict()["boxes"] != boxes
 
     for source in (drive, drive / "velodyne_points" / "data"):
@@ -172,10 +174,20 @@ def test_what_cannot_be_meant_is_refused_in_one_line(kitti, tmp_path, capsys):
         (f"detect {inside} {copy}", "got .*bin of .* and .*bin of .*, expected files of one sensor"),
         (f"detect {copy} --data-sensor sonar", "sonar: no such sensor file"),
         (f"detect {copy} --intensity-scale -1", "intensity_scale: got -1.*, expected a positive number"),
-        (f"detect {tmp_path}/cloud.pcd.bin --intensity-scale 9", "cloud.pcd.bin: intensity scale: got 9, expected"),
+        (
+            f"detect {tmp_path}/cloud.pcd.bin --intensity-scale 9",
+            "cloud.pcd.bin: intensity scale: got 9, expected",
+        ),
         (f"stream {tmp_path} --intensity-scale 9", "cloud.pcd.bin: intensity scale: got 9, expected none"),
-        ("stream --data-root x --scene a --intensity-scale 9", "--intensity-scale: expected none with --data-root"),
+        (
+            "stream --data-root x --scene a --intensity-scale 9",
+            "--intensity-scale: expected none with --data-root",
+        ),
     ):
         assert_one_line_error(capsys, [*words.split(), *HDL32E.split(), str(tmp_path / "out")], message)
-    results = f"evaluate --data-root {kitti} --results {kitti}/map.json --checkpoint hdl32e --out {tmp_path}/scores"
-    assert_one_line_error(capsys, [*results.split(), "--yaw-deg", "9"], "--yaw-deg: got 9.0, expected none with --res")
+    results = (
+        f"evaluate --data-root {kitti} --results {kitti}/map.json --checkpoint hdl32e --out {tmp_path}/scores"
+    )
+    assert_one_line_error(
+        capsys, [*results.split(), "--yaw-deg", "9"], "--yaw-deg: got 9.0, expected none with --res"
+    )
