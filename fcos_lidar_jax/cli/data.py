@@ -33,8 +33,7 @@ class DataOptions:
     """JSON file with custom splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
     class_map: Annotated[Path | None, option("FILE")] = None
     """JSON file that renames classes: {name in the data: new name, or null to leave out its objects}."""
-    full_turn: bool = False
-    """KITTI: keep the points outside the camera's image, where no objects are labelled."""
+    full_turn: bool = False  # KITTI: keep the points outside of the camera's image, where nothing is labelled.
     intensity_scale: options.IntensityScale = None
     follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.

@@ -193,9 +193,8 @@ def _detect(
     progress = Progress("files", len(clouds))
     if done := len(states) - len(todo):
         progress.show(done, "detected before")
-    how: dict[str, Any] = {"batch_size": args.batch_size, "yaw_rad": radians(args.yaw_deg)}
-    predictions = predict(detector, clouds, indices=todo, **how)
-    for number, prediction in enumerate(predictions, done + 1):
+    found = predict(detector, clouds, indices=todo, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
+    for number, prediction in enumerate(found, done + 1):
         index, detections, cloud = prediction.index, prediction.detections, prediction.cloud
         assert prediction.frame is not None
         assert cloud is not None

@@ -87,12 +87,11 @@ def align(
     yaw_rad: float | None = None,
     intensity_scale: float | None = None,
 ) -> Alignment:
-    """The alignment of points, read with its ``data``, to a detector.
+    """The alignment to a detector of points, which are read with its ``data``.
 
     Args:
         detector: sensor that the detector expects.
-        sensor: gives heading, position and intensity scale of the points; None for the one that the paths tell,
-            which one line on standard error says, or else the detector's.
+        sensor: recorded the points. By default the one that the paths tell, which a line says, or the detector's.
         paths: point files, or recordings in folders.
         yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the one between headings.
         intensity_scale: factor from the intensity in files to the scale 0-255, instead of the sensor's.

@@ -76,13 +76,11 @@ class CloudDetector(abc.ABC):
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
                 in metres, intensity, time lag in seconds, laser number, as in an array file.
-            sensor: sensor that recorded the points: scales the intensity, and if its heading or position differs
-                from the detector's, points are turned and shifted for the detector, and boxes back. By default the
-                detector's or, for files in the folders of KITTI and Argoverse 2, theirs.
+            sensor: sensor that recorded the points, which gives their heading, position and intensity scale. By
+                default the detector's or, for files in the folders of KITTI and Argoverse 2, theirs.
 
         Returns:
-            the boxes, best score first, at most ``config.inference.max_detections``, without padding, in the frame
-            of the points.
+            the boxes, best score first, at most ``config.inference.max_detections``, without padding.
 
         Raises:
             ValueError: invalid shape or type, or a fifth column that contains rings instead of time lags.

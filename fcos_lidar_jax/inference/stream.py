@@ -42,8 +42,7 @@ def detect_stream(
         reading: number of sweeps to fuse and points to drop; by default as in training. Use one sweep if the poses
             are unknown.
         at_us: times of the sweeps to detect in; other sweeps are only fused into later ones. By default all.
-        sensor: sensor that recorded the sweeps, by default the detector's. If its heading or position differs,
-            sweeps are turned and shifted for the detector, which one line on standard error says, and boxes back.
+        sensor: sensor that recorded the sweeps, by default the detector's. Those of others are turned and shifted.
         yaw_rad: rotation of the sweeps about z before detection, undone for the boxes, instead of the one between
             the headings: pi / 2 if x points forward in the sweeps and y in the training data. Detection degrades
             for orientations absent from training.

@@ -228,8 +228,7 @@ def open_frames(
         allow_missing_sweeps: skip older sweeps with a missing file (nuScenes).
         follow_links: also read files outside the root to which links lead (nuScenes, folder).
         full_turn: keep the points outside the camera's image, where no objects are labelled (KITTI).
-        intensity_scale: factor from the intensity in files to the scale 0-255 (KITTI, Argoverse 2, folder); by
-            default the sensor's.
+        intensity_scale: replaces the sensor's (KITTI, Argoverse 2, folder).
 
     Returns:
         frames with labels of their own classes; :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames` maps them
