@@ -200,7 +200,9 @@ def project_points(
 
     Args:
         points: x, y, z (metres), intensity (0-255), time lag (seconds, exactly 0 for the current sweep), and the
-            laser number as a sixth column for sensors with ``row_source="laser"``.
+            laser number as a sixth column for sensors with ``row_source="laser"``. A compiled function cannot
+            refuse values: a ring in the fifth column would make current points old.
+            :func:`~fcos_lidar_jax.data.cloud_policy.make_cloud` and detectors refuse it.
         valid: False for padding.
         sensor, num_rounds: geometry and number of rounds of the image (static).
         prioritize_current: points of the current sweep win every collision with older points (static).

@@ -1,6 +1,5 @@
 """Checks that several commands make before they begin to work. Each raises ValueError or OSError."""
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -26,12 +25,10 @@ def check_at_least(args: object, least: int, *fields: str) -> None:
             raise ValueError(f"{option_name(field)}: got {value}, expected at least {least}")
 
 
-def check_score_and_angle(args: Any) -> None:
-    """Reject a ``min_score`` outside of 0 to 1 and a ``yaw_deg`` that is not finite."""
+def check_score(args: Any) -> None:
+    """Reject a ``min_score`` outside of 0 to 1."""
     if args.min_score is not None and not 0 <= args.min_score <= 1:
         raise ValueError(f"--min-score: got {args.min_score:g}, expected a score of 0 to 1")
-    if not math.isfinite(args.yaw_deg):
-        raise ValueError(f"--yaw-deg: got {args.yaw_deg:g}, expected an angle in degrees")
 
 
 def check_out_folder(out: Path, option: str = "--out") -> None:

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.cli.processes import tell
 from fcos_lidar_jax.config import CloudReading, Config
@@ -41,6 +42,8 @@ class DataOptions:
     class_map: Annotated[str | None, option("NAME|FILE")] = None
     """Renames classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes, or a JSON file:
     {name in the data: new name, or null to leave out its objects}."""
+    full_turn: bool = False  # KITTI: keep the points outside of the camera's image, where nothing is labelled.
+    intensity_scale: options.IntensityScale = None
     follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.
 
@@ -107,6 +110,8 @@ class DataOptions:
             splits=self.splits,
             allow_missing_sweeps=self.allow_missing_sweeps,
             follow_links=self.follow_links,
+            full_turn=self.full_turn,
+            intensity_scale=self.intensity_scale,
         )
         if report_missing and isinstance(frames, NuScenesFrames):
             number = frames.nuscenes.missing_sweeps(list(frames.tokens), reading.num_sweeps)

@@ -20,24 +20,25 @@ from fcos_lidar_jax.cli.checks import (
     check_out_folder,
     check_outputs,
     check_outside,
-    check_score_and_angle,
+    check_score,
 )
-from fcos_lidar_jax.cli.options import option
+from fcos_lidar_jax.cli.options import alignment_of, option, radians
 from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
 from fcos_lidar_jax.data.cloud_policy import expect_points
-from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds, find_clouds
+from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import MAX_POINTS
-from fcos_lidar_jax.data.sweeps import about_z, read_list, sensor_before_rotation, turned
+from fcos_lidar_jax.data.sweeps import read_list
 from fcos_lidar_jax.evaluation.json_io import write_lines
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, read_boxes, select
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
+from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.inference.prediction_log import detections_fingerprint
-from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.sensors import Sensor, sensor_to_json
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
@@ -62,7 +63,9 @@ class Detect:
     calibration: options.Calibration = None
     sweeps: Annotated[Path | None, option("FILE.json")] = None
     """Sweeps to fuse, instead of INPUT: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], newest first."""
-    yaw_deg: options.Yaw = 0.0
+    data_sensor: options.DataSensor = None
+    yaw_deg: options.Yaw = None
+    intensity_scale: options.IntensityScale = None
     min_score: options.MinScore = None
     labels: options.Labels = None
     remove_close: options.Close = None
@@ -88,9 +91,10 @@ def run(args: Detect) -> None:
         if len(parts) > num_sweeps:
             line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
             print(f"{file}: {line}", file=sys.stderr)
-    clouds = _clouds(args, inputs, detector)
+    aligned = alignment_of(args, detector.sensor, [*itertools.chain(*inputs.values())] or inputs)
+    clouds = _clouds(args, inputs, detector, aligned.data)
     states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
-    with _resume_log(args, detector) as log:
+    with _resume_log(args, detector, aligned) as log:
         _detect(args, detector, clouds, states, log)
         lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
         if args.output_format == "json":
@@ -109,7 +113,7 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected either point files or --sweeps")
     check_at_least(args, 1, "batch_size", "max_file_points")
-    check_score_and_angle(args)
+    check_score(args)
     for file in args.files:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
@@ -138,11 +142,11 @@ def _place(sweeps: Path) -> dict[str, Any]:
     return {**msgspec.to_builtins(current), "file": str(sweeps.parent / current.file)}
 
 
-def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector) -> CloudFiles:
+def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector, sensor: Sensor) -> CloudFiles:
     reading = detector.config.reading
     return CloudFiles(
         tuple(files),
-        sensor_before_rotation(detector.sensor, np.deg2rad(args.yaw_deg)),
+        sensor,
         dataclasses.replace(reading, remove_close=args.remove_close or reading.remove_close),
         columns=args.columns,
         dtype=args.dtype,
@@ -155,10 +159,11 @@ def _log_file(args: Detect) -> Path:
 
 
 @contextlib.contextmanager
-def _resume_log(args: Detect, detector: CloudDetector) -> Iterator[ResumeLog]:
+def _resume_log(args: Detect, detector: CloudDetector, aligned: Alignment) -> Iterator[ResumeLog]:
     """The log of the files that an interrupted call with the same options has finished; deleted in the end."""
     file = _log_file(args)
-    same = args.remove_close, args.columns, args.dtype, args.yaw_deg, args.min_score, args.labels, args.batch_size
+    same = args.remove_close, args.columns, args.dtype, args.min_score, args.labels, args.batch_size
+    same += sensor_to_json(aligned.data), aligned.yaw_rad
     with file_lock(file) as held:
         if not held:
             raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")
@@ -185,20 +190,15 @@ def _detect(
         for index, (state, picture) in enumerate(zip(states, pictures, strict=True))
         if state not in log or (picture is not None and not picture.exists())
     ]
-    progress, turn_back = Progress("files", len(clouds)), about_z(-np.deg2rad(args.yaw_deg))
+    progress = Progress("files", len(clouds))
     if done := len(states) - len(todo):
         progress.show(done, "detected before")
-    frames = TurnedClouds(clouds, np.deg2rad(args.yaw_deg)) if args.yaw_deg else clouds
-    predictions = predict(detector, frames, indices=todo, batch_size=args.batch_size)
-    for number, prediction in enumerate(predictions, done + 1):
+    found = predict(detector, clouds, indices=todo, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
+    for number, prediction in enumerate(found, done + 1):
         index, detections, cloud = prediction.index, prediction.detections, prediction.cloud
         assert prediction.frame is not None
         assert cloud is not None
         file, points = clouds.files[index], prediction.frame.points
-        if args.yaw_deg:
-            points = turned(points, turn_back)
-            boxes = to_world(np.asarray(detections.boxes), turn_back).astype(np.float32)
-            detections = dataclasses.replace(detections, boxes=boxes)
         expect_points(file, cloud, int(detections.num_dropped), detector.sensor)
         detections = select(detections, detector.classes, min_score=args.min_score, labels=args.labels)
         shown_score = SHOWN_SCORE if args.min_score is None else args.min_score

@@ -20,7 +20,7 @@ from fcos_lidar_jax.cli.checks import (
     option_name,
 )
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
-from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option
+from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
 from fcos_lidar_jax.cli.scoring import Task, write_detections, write_recording, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -60,6 +60,7 @@ class Evaluate:
     """Results to evaluate: an official results file, or detections.json with the --checkpoint it came from."""
     ground_truth: Annotated[Path | None, option("FILE")] = None
     """Truth instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
+    yaw_deg: options.Yaw = None
     batch_size: options.BatchSize = 1
     backend: options.Backend = "xla"
     bootstrap: Annotated[int, option("N")] = 0
@@ -85,7 +86,7 @@ def run(args: Evaluate) -> None:
             if is_main_process:
                 locked.enter_context(folder_lock(args.out, "evaluating"))
         if compared is None:
-            write_detections(task, args.out, batch_size=args.batch_size)
+            write_detections(task, args.out, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
             take_sigterm_back()
         with agreed("cannot evaluate"):
             if is_main_process:  # the others wait, because the first one would report their exit
@@ -124,7 +125,8 @@ def _check(args: Evaluate) -> None:
         raise ValueError(f"--backend: got {args.backend} with several processes, expected xla")
     check_at_least(args, 1, "batch_size")
     check_at_least(args, 0, "bootstrap")
-    for name in ("backend", "batch_size"):
+    radians(args.yaw_deg)  # refuses
+    for name in ("backend", "batch_size", "yaw_deg"):
         if args.results is not None and (value := getattr(args, name)) != getattr(Evaluate, name):
             raise ValueError(
                 f"{option_name(name)}: got {value}, expected none with --results, since nothing is detected"

@@ -1,12 +1,15 @@
 """Options that several commands have, with one help text for each."""
 
+import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from fcos_lidar_jax import inference
+from fcos_lidar_jax import inference, sensors
 from fcos_lidar_jax.cli import result_files
+from fcos_lidar_jax.inference.alignment import Alignment, align
 
 
 def option(metavar: str | None = None, *, default: str | None = None, text: str | None = None) -> Any:
@@ -98,10 +101,37 @@ Page = Annotated[
     Path | None, option("FILE.html", text="Also write a page for a browser, one file that works offline.")
 ]
 Sensor = Annotated[str, option("SENSOR", text="Sensor preset, or a sensor file.")]
-Yaw = Annotated[
-    float,
+DataSensor = Annotated[
+    str | None,
     option(
-        text="Turn the clouds by this angle about z before detection, and the boxes back. Use 90 if x points "
-        "forward and the detector expects y forward, as hdl32e does."
+        "SENSOR",
+        default="KITTI's or Argoverse 2's for files in their folders, else the detector's",
+        text="Sensor, a preset or a sensor file, whose heading, position and intensity scale the clouds have.",
     ),
 ]
+Yaw = Annotated[
+    float | None,
+    option(
+        "DEGREES",
+        default="the turn between the headings of the two sensors, if known",
+        text="Turn the clouds by this angle about z before detection, instead of the turn that is known, and the "
+        "boxes back. Use 90 if x points forward and the detector expects y forward, as hdl32e does.",
+    ),
+]
+IntensityScale = Annotated[
+    float | None, option("FACTOR", default="the sensor's", text="Factor from intensities in files to 0-255.")
+]
+
+
+def radians(degrees: float | None) -> float | None:
+    """The angle of ``yaw_deg`` in radians; None stays None."""
+    if degrees is not None and not math.isfinite(degrees):
+        raise ValueError(f"--yaw-deg: got {degrees:g}, expected an angle in degrees")
+    return None if degrees is None else math.radians(degrees)
+
+
+def alignment_of(args: Any, detector: sensors.Sensor, paths: Collection[Path]) -> Alignment:
+    """The alignment of point files, or a recording, by the three options above, else by the paths."""
+    sensor = None if args.data_sensor is None else sensors.load_sensor(args.data_sensor)
+    how = {"yaw_rad": radians(args.yaw_deg), "intensity_scale": args.intensity_scale}
+    return align(detector, sensor, paths=paths, **how)

@@ -41,7 +41,7 @@ class Task:
     frames: FrameSet | None = None  # None if the report has no points
 
 
-def write_detections(task: Task, out: Path, *, batch_size: int = 1) -> None:
+def write_detections(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float | None = None) -> None:
     """Write the detections, and count the removed points, except for close ones."""
     assert task.detector is not None
     assert task.frames is not None
@@ -53,6 +53,7 @@ def write_detections(task: Task, out: Path, *, batch_size: int = 1) -> None:
         entries=comparison.entries,
         write=comparison.write,
         batch_size=batch_size,
+        yaw_rad=yaw_rad,
     )
     if removed["truncated"]:
         tell(f"{removed['truncated']} points truncated: more than the detector's max_points")

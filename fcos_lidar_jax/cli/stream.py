@@ -15,10 +15,11 @@ import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
-from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score_and_angle, option_name
-from fcos_lidar_jax.cli.options import option
+from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score, option_name
+from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.result_files import FORMATS, check_result_files, check_results, result_files
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
+from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.sweeps import Sweep
@@ -28,6 +29,7 @@ from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, Recording, find_recording
+from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
@@ -76,7 +78,9 @@ class Stream:
     follow_links: bool = False  # With --data-root: follow links that lead out of DATA_ROOT.
     page: options.Page = None
     rrd: options.Rrd = None
-    yaw_deg: options.Yaw = 0.0
+    data_sensor: options.DataSensor = None
+    yaw_deg: options.Yaw = None
+    intensity_scale: options.IntensityScale = None
     track: bool = False  # Give each box the number of its object over time. Needs poses.
     min_score: Annotated[
         float | None,
@@ -98,7 +102,9 @@ def run(args: Stream) -> None:
         args = dataclasses.replace(args, min_score=_TRACKED_SCORE)
     kind = _find(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
-    drive = _open(args, kind, detector)
+    source = args.source or args.data_root or Path()
+    aligned = alignment_of(args, detector.sensor, find_clouds((source,)) if kind is FOLDER else [source])
+    drive = _open(args, kind, detector, aligned.data)
     _tell(drive.notes)
     frames: list[PageFrame] = []
     tracks, before_us = Tracks(), None
@@ -108,7 +114,7 @@ def run(args: Stream) -> None:
         _write_lines(args, detector.classes) as write_line,
         _Timing() as timing,
     ):
-        how: dict[str, Any] = {"yaw_rad": np.deg2rad(args.yaw_deg), "at_us": drive.at_us}
+        how: dict[str, Any] = {"sensor": aligned.data, "yaw_rad": aligned.yaw_rad, "at_us": drive.at_us}
         if not drive.posed:
             how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
         detect = functools.partial(detect_stream, detector=detector, **how)
@@ -222,7 +228,9 @@ class _Timing(contextlib.AbstractContextManager):
 def _find(args: Stream) -> Recording:
     """The kind of the drive; rejects options that do not fit it, and outputs that would replace inputs."""
     check_at_least(args, 1, "max_file_points")
-    check_score_and_angle(args)
+    check_score(args)
+    if args.data_root is not None and args.intensity_scale is not None:
+        raise ValueError("--intensity-scale: expected none with --data-root: nuScenes has intensities of 0 to 255")
     if args.source is not None and not args.source.exists():
         raise ValueError(f"{args.source}: no such file or folder")
     if (args.source is None) == (args.data_root is None):
@@ -249,11 +257,11 @@ def _find(args: Stream) -> Recording:
     return kind
 
 
-def _open(args: Stream, kind: Recording, detector: CloudDetector) -> Drive:
+def _open(args: Stream, kind: Recording, detector: CloudDetector, sensor: Sensor) -> Drive:
     options: dict[str, Any] = {name: getattr(args, field) for field, name in _OPTIONS.items()}
     options |= {"scene": args.scene, "num_sweeps": detector.config.num_sweeps}
     given = {name: options[name] for name in kind.options}
-    drive = kind.open(args.source or args.data_root, detector.sensor, **given)
+    drive = kind.open(args.source or args.data_root, sensor, **given)
     if args.track and not drive.posed:
         raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
     check_results(args, detector.classes, posed=drive.posed)

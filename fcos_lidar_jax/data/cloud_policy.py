@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.data.point_files import check_time_lags
 from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
 
@@ -66,11 +67,11 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
             lags become 0; columns that the sensor does not use are dropped.
         config: gives ``max_points`` and ``reading``.
         sensor: sensor that recorded the points.
-        num_close: points on the ego vehicle that the reader removed, in each sweep's own frame; None to remove
-            them here.
+        num_close: points on the ego vehicle that the reader removed, in each sweep's own frame; None for points
+            of no reader: those are removed here, and the time lags checked.
 
     Raises:
-        ValueError: wrong number of columns.
+        ValueError: wrong number of columns; for points of no reader also rings instead of time lags.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -79,6 +80,8 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
     ((4096, 5), [True, False, False], 1, 1)
     """
     points = _with_columns(points, sensor)
+    if num_close is None:
+        check_time_lags(points)
     valid = usable_rows(points)
     num_invalid = int((~valid).sum())
     kept = np.asarray(valid if num_close is not None else remove_close(points, valid, sensor, config.reading))

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames, drop_close, files_fingerprint, no_points
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
-from fcos_lidar_jax.data.sweeps import about_z, read_sweeps, sensor_before_rotation, turned
-from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.sensors import Sensor
 
 
@@ -52,24 +51,6 @@ class CloudFiles(FrameSet):
     def fingerprint(self) -> str:
         reading = self.reading, self.columns, self.dtype
         return files_fingerprint([file.absolute() for file in self.files], Path("/"), reading)
-
-
-@dataclasses.dataclass(frozen=True)
-class TurnedClouds(WrappedFrames):
-    """Clouds of a frame set, and its sensor, rotated about z after the removal of close points."""
-
-    yaw_rad: float  # counter-clockwise, seen from above
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "sensor", sensor_before_rotation(self.frames.sensor, -self.yaw_rad))
-
-    def frame(self, index: int) -> Frame:
-        frame = self.frames.frame(index)
-        return dataclasses.replace(frame, points=turned(frame.points, about_z(self.yaw_rad)))
-
-    def fingerprint(self) -> str:
-        return checksum(repr((self.frames.fingerprint(), self.yaw_rad)).encode())
 
 
 def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:

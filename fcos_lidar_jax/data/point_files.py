@@ -119,15 +119,20 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
         raise ValueError(f"{where}: dtype: got {found}, expected real numbers")
     fits = array.ndim == 2 and array.shape[1] in _RAW_COLUMNS
     check(fits, f"{where}: shape", array.shape, "N x 3, 4, 5 or 6")
-    lag = array[:, 4] if array.shape[1] > 4 else np.zeros(0)
+    check_time_lags(array, where)
+    names = ("x", "y", "z", "intensity", "time_lag", "laser")
+    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
+
+
+def check_time_lags(points: np.ndarray, where: str = "points") -> None:
+    """Refuse points [n, c] with whole numbers above 1 in the fifth column: rings instead of time lags."""
+    lag = points[:, 4:5]
     lag = lag[np.isfinite(lag)]  # rows of NaN stand for missing returns
     if len(lag) and lag.max() > 1 and not (lag % 1).any():
         raise ValueError(
             f"{where}: fifth column: got whole numbers up to {lag.max():g}, which look like a ring, expected the "
             "time lag in seconds: leave the column out, or put 0 into it and the ring into a sixth"
         )
-    names = ("x", "y", "z", "intensity", "time_lag", "laser")
-    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
 
 
 def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_POINTS) -> dict[str, np.ndarray]:

@@ -181,20 +181,6 @@ def about_z(yaw_rad: float) -> np.ndarray:
     return pose
 
 
-def sensor_before_rotation(sensor: Sensor, yaw_rad: float) -> Sensor:
-    """The sensor as it is in the frame before a rotation about z.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> ahead = dataclasses.replace(TINY, origin_m=(0.0, 1.0, 2.0))
-    >>> np.round(sensor_before_rotation(ahead, np.pi / 2).origin_m, 3).tolist()
-    [1.0, 0.0, 2.0]
-    """
-    if yaw_rad == 0:
-        return sensor
-    origin = np.array(sensor.origin_m) @ about_z(yaw_rad)[:3, :3]
-    return dataclasses.replace(sensor, origin_m=tuple(origin.tolist()))
-
-
 def turned(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Rotate points f32[n, c] by a pose f64[4, 4] without its translation; other columns stay.
 

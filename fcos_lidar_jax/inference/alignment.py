@@ -1,14 +1,21 @@
 """The way from the frame of a data set to the frame that a detector expects, and back."""
 
 import dataclasses
+import functools
 import math
+import sys
+from collections.abc import Collection
+from pathlib import Path
 
 import numpy as np
 
+from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
 from fcos_lidar_jax.inference.tracks import to_world
-from fcos_lidar_jax.sensors import Sensor, turn_between
+from fcos_lidar_jax.sensors import Sensor, in_frame_of, turn_between
 from fcos_lidar_jax.types import Detections
+
+_SAME = 1e-9  # smaller angles and shifts are rounding
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,13 +30,23 @@ class Alignment:
 
     data: Sensor  # sensor that recorded the points
     detector: Sensor  # sensor that the detector expects
+    yaw_rad: float | None = None  # rotation, counter-clockwise; None for the one between the sensors' headings
+
+    @property
+    def turn_rad(self) -> float:
+        return turn_between(self.data, self.detector) if self.yaw_rad is None else self.yaw_rad
 
     @property
     def pose(self) -> np.ndarray | None:
         """f64[4, 4] from the frame of the data to the detector's; None if they are the same."""
-        pose = about_z(turn_between(self.data, self.detector))
-        pose[:3, 3] = self.detector.origin_m - pose[:3, :3] @ self.data.origin_m
-        return None if np.abs(pose - np.eye(4)).max() < 1e-9 else pose
+        pose = about_z(self.turn_rad)
+        shift = self.detector.origin_m - pose[:3, :3] @ self.data.origin_m
+        pose[:3, 3] = np.where(np.abs(shift) < _SAME, 0, shift)
+        return None if np.abs(pose - np.eye(4)).max() < _SAME else pose
+
+    @property
+    def inverse(self) -> "Alignment":
+        return Alignment(self.detector, self.data, -self.turn_rad)
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Points f32[n, c] of the data in the detector's frame; other columns stay."""
@@ -41,17 +58,17 @@ class Alignment:
 
     def back(self, detections: Detections) -> Detections:
         """NumPy detections of the detector, with valid boxes in the frame of the data."""
-        if (pose := self.pose) is None:
+        if (pose := self.inverse.pose) is None:
             return detections
         boxes, valid = np.array(detections.boxes), np.asarray(detections.valid)
-        boxes[valid] = to_world(boxes[valid], np.linalg.inv(pose))
+        boxes[valid] = to_world(boxes[valid], pose)
         return dataclasses.replace(detections, boxes=boxes)
 
     def describe(self) -> str:
         """One line about what is done to the clouds; ``""`` for nothing."""
         if (pose := self.pose) is None:
             return ""
-        turn = math.degrees(turn_between(self.data, self.detector))
+        turn = math.degrees(self.turn_rad)
         steps = [f"turned by {turn:g} degrees"] if turn else []
         if (shift := pose[:3, 3]).any():
             steps.append(f"shifted by ({', '.join(f'{v:.2f}' for v in shift)}) m")
@@ -60,3 +77,48 @@ class Alignment:
         axis = None if ahead is None else axes.get(round(math.degrees(ahead), 2))
         why = f": the detector expects {axis} ahead" if turn and axis else ""
         return f"clouds {' and '.join(steps)}, and boxes brought back{why}"
+
+
+def align(
+    detector: Sensor,
+    sensor: Sensor | None = None,
+    *,
+    paths: Collection[Path] = (),
+    yaw_rad: float | None = None,
+    intensity_scale: float | None = None,
+) -> Alignment:
+    """The alignment to a detector of points, which are read with its ``data``.
+
+    Args:
+        detector: sensor that the detector expects.
+        sensor: recorded the points. By default the one that the paths tell, which a line says, or the detector's.
+        paths: point files, or recordings in folders.
+        yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the one between headings.
+        intensity_scale: factor from the intensity in files to the scale 0-255, instead of the sensor's.
+
+    Raises:
+        ValueError: files of different sensors, or an intensity scale for files that have their own.
+
+    >>> from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E
+    >>> aligned = align(NUSCENES_HDL32E, KITTI_HDL64E)
+    >>> aligned.data.num_rows, aligned.data.intensity_scale, round(aligned.turn_rad, 4)
+    (32, 255.0, 1.5708)
+    """
+    check_scale(intensity_scale, paths)
+    recorded = recorded_by(paths) if sensor is None else sensor
+    if recorded is not None:
+        data = in_frame_of(detector, recorded)
+    else:  # the same place on the ego vehicle, in the axes of the points
+        origin = np.array(detector.origin_m) @ about_z(yaw_rad or 0.0)[:3, :3]
+        data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()))
+    if intensity_scale is not None:
+        data = dataclasses.replace(data, intensity_scale=intensity_scale)
+    if sensor is None and recorded is not None and data != detector:
+        told = f"recorded by {recorded.name}, as the path tells, unless --data-sensor names another"
+        _tell_once(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}")
+    return Alignment(data, detector, yaw_rad)
+
+
+@functools.cache
+def _tell_once(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

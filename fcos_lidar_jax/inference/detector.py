@@ -15,9 +15,11 @@ from jax.sharding import Mesh, PartitionSpec
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
+from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
+from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
 from fcos_lidar_jax.models import Detector, Variables, build_detector
@@ -66,7 +68,7 @@ class CloudDetector(abc.ABC):
             ``batch_size`` times the number of devices, split over the devices.
         """
 
-    def __call__(self, points: np.ndarray | str | Path) -> DetectedBoxes:
+    def __call__(self, points: np.ndarray | str | Path, *, sensor: Sensor | None = None) -> DetectedBoxes:
         """Detect boxes in one cloud of any length; compiled once.
 
         Warns in one line if the cloud does not fit the sensor of the detector.
@@ -74,6 +76,8 @@ class CloudDetector(abc.ABC):
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
                 in metres, intensity, time lag in seconds, laser number, as in an array file.
+            sensor: sensor that recorded the points, which gives their heading, position and intensity scale. By
+                default the detector's or, for files in the folders of KITTI and Argoverse 2, theirs.
 
         Returns:
             the boxes, best score first, at most ``config.inference.max_detections``, without padding.
@@ -81,17 +85,19 @@ class CloudDetector(abc.ABC):
         Raises:
             ValueError: invalid shape or type, or a fifth column that contains rings instead of time lags.
         """
-        sensor = self.sensor
         is_file = isinstance(points, str | Path)
-        rows = (read_points if is_file else points_from_array)(points, sensor)  # type: ignore[arg-type]
-        if line := sensor_mismatch(rows, sensor):
+        aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())  # type: ignore[arg-type]
+        rows = (read_points if is_file else points_from_array)(points, aligned.data)  # type: ignore[arg-type]
+        rows, num_close = drop_close(rows, aligned.data, self.config.reading)
+        rows = aligned.points(rows)
+        if line := sensor_mismatch(rows, self.sensor):
             warnings.warn(line, stacklevel=2)
-        cloud = make_cloud(rows, self.config, sensor=sensor)
-        found = self.detect(cloud)
+        cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
+        found = aligned.back(self.detect(cloud))
         boxes, labels, scores = confident(found, 0.0)
         counts = ({"file": str(points)} if is_file else {}) | point_counts(found, cloud)
-        used = cloud.points[cloud.valid]
-        return DetectedBoxes(boxes, scores, labels, self.classes, used, counts, sensor.limit_xy_m)
+        used = aligned.inverse.points(cloud.points[cloud.valid])
+        return DetectedBoxes(boxes, scores, labels, self.classes, used, counts, self.sensor.limit_xy_m)
 
     def detect(self, cloud: Cloud) -> Detections:
         """Detect boxes in a cloud from :func:`~fcos_lidar_jax.data.cloud_policy.make_cloud`, as NumPy arrays.

@@ -48,6 +48,7 @@ def predict(
     indices: Sequence[int] | None = None,
     batch_size: int = 1,
     devices: Sequence[Any] | None = None,
+    yaw_rad: float | None = None,
 ) -> Iterator[Prediction]:
     """Detect boxes in frames, in order.
 
@@ -64,6 +65,8 @@ def predict(
         batch_size: number of clouds per device; more than one changes scores and boxes by rounding, at most 1e-4.
         devices: devices to use; by default all, including those of other processes. Then every process makes the
             same call, reads its share of the frames, and gets all predictions.
+        yaw_rad: rotation of the clouds about z before detection, undone for the boxes, counter-clockwise; by
+            default the one between the headings that the sensors tell.
 
     Raises:
         ValueError: a batch size below 1, or a frame that cannot be read.
@@ -74,7 +77,8 @@ def predict(
     >>> [found.detections.boxes.shape for found in predict(detector, unseen_frames(detector.sensor, 2))]
     [(500, 9), (500, 9)]
     """
-    for group in predict_groups(detector, frames, indices=indices, batch_size=batch_size, devices=devices):
+    how: dict[str, Any] = {"batch_size": batch_size, "devices": devices, "yaw_rad": yaw_rad}
+    for group in predict_groups(detector, frames, indices=indices, **how):
         yield from group
 
 
@@ -85,6 +89,7 @@ def predict_groups(
     indices: Sequence[int] | None = None,
     batch_size: int = 1,
     devices: Sequence[Any] | None = None,
+    yaw_rad: float | None = None,
 ) -> Iterator[list[Prediction]]:
     """Like :func:`predict`, in groups of frames that the devices process together, so that processes can
     synchronise between two groups.
@@ -102,7 +107,7 @@ def predict_groups(
     if batch_size < 1:
         raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
-    aligned = Alignment(frames.sensor, sensor)
+    aligned = Alignment(frames.sensor, sensor, yaw_rad)
     if (line := aligned.describe()) and jax.process_index() == 0:
         print(line, file=sys.stderr, flush=True)
     program = detector.program(mesh, batch_size)

@@ -33,6 +33,7 @@ def write_predictions(
     entries: Callable[[int, Detections], list[dict[str, Any]]],
     write: Callable[[Path, Iterator[tuple[str, bytes]]], None],
     batch_size: int = 1,
+    yaw_rad: float | None = None,
 ) -> dict[str, int]:
     """Detect boxes in all frames and write a results file.
 
@@ -46,7 +47,7 @@ def write_predictions(
         path: results file.
         entries: converts the index of a frame and its detections to the entries of the file.
         write: writes the file from names of frames with entries as JSON.
-        batch_size: see :func:`fcos_lidar_jax.inference.prediction.predict`.
+        batch_size, yaw_rad: see :func:`fcos_lidar_jax.inference.prediction.predict`.
 
     Returns:
         number of points removed by all processes in this run, by reason: ``close``, ``invalid``, ``truncated``.
@@ -62,15 +63,16 @@ def write_predictions(
         log = None
         with agreed("cannot detect"):
             names = [frames.name(index) for index in range(len(frames))]
-            shared = detections_fingerprint(detector, names, batch_size)
+            shared = detections_fingerprint(detector, names, batch_size, yaw_rad)
             if jax.process_index() == 0:
-                log = held.enter_context(ResumeLog(file, _fingerprint(detector, frames, batch_size)))
+                log = held.enter_context(ResumeLog(file, _fingerprint(detector, frames, batch_size, yaw_rad)))
         check_same(shared, "detector, frames or batch size")
         done = multihost_utils.broadcast_one_to_all(np.array([log is not None and name in log for name in names]))
         progress = Progress("frames", len(frames))
         if log is not None:
             progress.show(len(log))
-        groups = predict_groups(detector, frames, indices=np.flatnonzero(~done).tolist(), batch_size=batch_size)
+        how: dict[str, Any] = {"batch_size": batch_size, "yaw_rad": yaw_rad}
+        groups = predict_groups(detector, frames, indices=np.flatnonzero(~done).tolist(), **how)
         number = 0
         for number, group in enumerate(groups, 1):
             removed = [sum(counts) for counts in zip(removed, *map(_removed, group), strict=True)]
@@ -116,6 +118,6 @@ def detections_fingerprint(detector: CloudDetector, *others: object) -> str:
     return checksum(json.dumps(inputs, sort_keys=True).encode())
 
 
-def _fingerprint(detector: CloudDetector, frames: FrameSet, batch_size: int) -> str:
-    data = frames.fingerprint(), frames.clouds_fingerprint(range(len(frames)))
-    return detections_fingerprint(detector, *data, batch_size)
+def _fingerprint(detector: CloudDetector, frames: FrameSet, batch_size: int, yaw_rad: float | None) -> str:
+    data = frames.fingerprint(), frames.clouds_fingerprint(range(len(frames))), sensor_to_json(frames.sensor)
+    return detections_fingerprint(detector, *data, batch_size, yaw_rad)

@@ -1,16 +1,16 @@
 """Detection in a drive, sweep by sweep, with a rolling window of sweeps and one compiled program."""
 
 import dataclasses
+import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
-import numpy as np
-
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud
-from fcos_lidar_jax.data.sweeps import Sweep, about_z, fuse_sweeps, sensor_before_rotation, turned
+from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
+from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detector import CloudDetector
-from fcos_lidar_jax.inference.tracks import to_world
+from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
 
@@ -29,7 +29,8 @@ def detect_stream(
     *,
     reading: CloudReading | None = None,
     at_us: Collection[int] | None = None,
-    yaw_rad: float = 0.0,
+    sensor: Sensor | None = None,
+    yaw_rad: float | None = None,
 ) -> Iterator[Found]:
     """Detect boxes in every sweep as it arrives, fused with the sweeps before it.
 
@@ -41,8 +42,10 @@ def detect_stream(
         reading: number of sweeps to fuse and points to drop; by default as in training. Use one sweep if the poses
             are unknown.
         at_us: times of the sweeps to detect in; other sweeps are only fused into later ones. By default all.
-        yaw_rad: rotation of the sweeps about z before detection, undone for the boxes: pi / 2 if x points forward
-            in the sweeps and y in the training data. Detection degrades for orientations absent from training.
+        sensor: sensor that recorded the sweeps, by default the detector's. Those of others are turned and shifted.
+        yaw_rad: rotation of the sweeps about z before detection, undone for the boxes, instead of the one between
+            the headings: pi / 2 if x points forward in the sweeps and y in the training data. Detection degrades
+            for orientations absent from training.
 
     Raises:
         ValueError: names a sweep that is not later than the sweep before, or has no usable points.
@@ -56,10 +59,11 @@ def detect_stream(
     >>> [found.sweep.time_us for found in detect_stream(sweeps, load_detector("quickstart"))]
     [0, 1]
     """
-    reading, sensor = reading or detector.config.reading, detector.sensor
+    reading, aligned = reading or detector.config.reading, align(detector.sensor, sensor, yaw_rad=yaw_rad)
+    if line := aligned.describe():
+        print(line, file=sys.stderr, flush=True)
     window: deque[Sweep] = deque(maxlen=reading.num_sweeps)
     before: Sweep | None = None
-    turn, unturned = about_z(yaw_rad), sensor_before_rotation(sensor, yaw_rad)
     for sweep in sweeps:
         if before is not None and sweep.time_us <= before.time_us:
             raise ValueError(
@@ -70,13 +74,9 @@ def detect_stream(
         before = sweep
         if at_us is not None and sweep.time_us not in at_us:
             continue
-        points, num_close = fuse_sweeps(window, unturned, reading)
-        if yaw_rad:
-            points = turned(points, turn)
-        cloud = make_cloud(points, detector.config, sensor=sensor, num_close=num_close)
+        points, num_close = fuse_sweeps(window, aligned.data, reading)
+        points = aligned.points(points)
+        cloud = make_cloud(points, detector.config, sensor=detector.sensor, num_close=num_close)
         detections = detector.detect(cloud)
-        expect_points(sweep.name, cloud, int(detections.num_dropped), sensor)
-        if yaw_rad:
-            boxes = to_world(np.asarray(detections.boxes), turn.T).astype(np.float32)
-            detections = dataclasses.replace(detections, boxes=boxes)
-        yield Found(sweep, cloud, detections)
+        expect_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
+        yield Found(sweep, cloud, aligned.back(detections))

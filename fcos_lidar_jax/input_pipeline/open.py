@@ -1,6 +1,7 @@
 """One function to open any data set; a table has one row per format."""
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,6 +16,7 @@ from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
+from fcos_lidar_jax.data.recorded import RECORDED_BY, check_scale
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
@@ -43,7 +45,6 @@ class Reader:
     splits: Callable[["DataSet", str | Path | None], list[str]]
     open: Callable[..., FrameSet]
     options: tuple[str, ...] = ()
-    recorded_by_sensor: bool = False  # heading, position and intensity scale are always those of ``sensor``
     class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)
 
     @property
@@ -67,8 +68,10 @@ READERS = (
         ("training/velodyne",),
         KITTI_HDL64E,
         lambda data, _: sorted(file.stem for file in (data.root / "ImageSets").glob("*.txt")),
-        lambda data, **how: kitti.KittiFrames(data.root, **how),
-        recorded_by_sensor=True,
+        lambda data, full_turn=False, **how: kitti.KittiFrames(
+            data.root, image_size=None if full_turn else kitti.IMAGE_SIZE, **how
+        ),
+        ("full_turn", "intensity_scale"),
         class_maps={"nuscenes": kitti.TO_NUSCENES},
     ),
     Reader(
@@ -77,7 +80,7 @@ READERS = (
         ARGOVERSE2,
         lambda data, _: argoverse2.find_splits(data.root),
         lambda data, **how: argoverse2.Argoverse2Frames(data.root, **how),
-        recorded_by_sensor=True,
+        ("intensity_scale",),
         class_maps={"nuscenes": argoverse2.TO_NUSCENES},
     ),
     Reader(
@@ -86,7 +89,7 @@ READERS = (
         None,
         lambda data, file: list(own_splits(data.root, file)),
         lambda data, **how: FolderFrames(data.root, **how),
-        ("splits", "follow_links"),
+        ("splits", "follow_links", "intensity_scale"),
     ),
     Reader(
         "simulated",
@@ -218,6 +221,8 @@ def open_frames(
     splits: str | Path | None = None,
     allow_missing_sweeps: bool = False,
     follow_links: bool = False,
+    full_turn: bool = False,
+    intensity_scale: float | None = None,
 ) -> FrameSet:
     """Open a data set in any supported format.
 
@@ -237,6 +242,8 @@ def open_frames(
         splits: JSON file of own splits, ``{"name": [...]}`` of scenes (nuScenes) or frames (folder).
         allow_missing_sweeps: skip older sweeps with a missing file (nuScenes).
         follow_links: also read files outside the root to which links lead (nuScenes, folder).
+        full_turn: keep the points outside the camera's image, where no objects are labelled (KITTI).
+        intensity_scale: replaces the sensor's (KITTI, Argoverse 2, folder).
 
     Returns:
         frames with labels of their own classes; :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames` maps them
@@ -259,8 +266,10 @@ def open_frames(
         "splits": splits,
         "allow_missing_sweeps": allow_missing_sweeps,
         "follow_links": follow_links,
+        "full_turn": full_turn,
     }
-    _refuse(data, **given)
+    _refuse(data, **given, intensity_scale=intensity_scale)
+    check_scale(intensity_scale, data.root.rglob("*.pcd.bin"))
     if isinstance(class_map, str):
         if class_map not in data.reader.class_maps:
             raise ValueError(f"class map: got {class_map!r}, expected one of {data.reader.named_maps}")
@@ -269,12 +278,16 @@ def open_frames(
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
-    if sensor is not None and data.reader.recorded_by_sensor and data.reader.sensor is not None:
-        given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, data.reader.sensor)
-        if sensor.intensity_scale != given_scale:
+    recorded = data.reader.sensor if data.reader.sensor in RECORDED_BY.values() else None
+    if sensor is not None and recorded is not None:
+        given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, recorded)
+        if intensity_scale is None and sensor.intensity_scale != given_scale:
             told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
             print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
-    frames = data.reader.open(data, split=split, sensor=sensor or data.reader.sensor, reading=reading, **options)
+    open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
+    frames = open_with(sensor=sensor or data.reader.sensor)
+    if intensity_scale is not None:  # opened again, because only the frames know the sensor of a folder
+        frames = open_with(sensor=dataclasses.replace(frames.sensor, intensity_scale=intensity_scale))
     if class_map is None:
         return frames
     return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)

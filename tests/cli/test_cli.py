@@ -175,7 +175,11 @@ def test_pages_and_pictures_show_boxes_from_one_score(home, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    "change", ["--min-score 0.3", "--labels car", "--yaw-deg 90", "--remove-close none", "other clouds"]
+    "change",
+    [
+        *("--min-score 0.3", "--labels car", "--yaw-deg 90", "--remove-close none", "other clouds"),
+        *("--intensity-scale 2", "--data-sensor kitti_hdl64e"),
+    ],
 )
 def test_detect_does_not_resume_with_other_options_or_clouds(home, tmp_path, capsys, change):
     clouds = [shutil.copy(home / "good.npy", tmp_path / f"{name}.npy") for name in "abc"]

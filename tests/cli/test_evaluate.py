@@ -173,7 +173,11 @@ def test_a_resume_log_of_another_detector_is_not_used(home):
     tokens = tuple(data.split(SPLIT))
     frames, fewer = (NuScenesFrames(data, part, sensor=TINY) for part in (tokens, tokens[1:]))
     other = dataclasses.replace(detector, variables=jax.tree.map(lambda leaf: leaf + 1, detector.variables))
-    runs = ((detector, frames, 1), (other, frames, 1), (detector, fewer, 1), (detector, frames, 2))
+    ahead = dataclasses.replace(frames, sensor=dataclasses.replace(TINY, forward_rad=0.0))
+    runs = (
+        *((detector, frames, 1, None), (other, frames, 1, None), (detector, fewer, 1, None)),
+        *((detector, frames, 2, None), (detector, frames, 1, 0.1), (detector, ahead, 1, None)),
+    )
     fingerprints = {_fingerprint(*run) for run in runs}
     assert len(fingerprints) == len(runs)
     os.utime(home / next(iter(data.sweep_files(tokens[0], 1))))  # as if the cloud was written again

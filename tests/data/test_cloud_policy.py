@@ -30,6 +30,16 @@ def cloud_of(points, size=200, *, sensor=TINY, remove="all", close_m=1.0, **opti
     return make_cloud(points, config, sensor=sensor, **options)
 
 
+def test_rings_in_place_of_time_lags_are_refused_in_points_of_no_reader():
+    rings = numbered(np.arange(32, dtype=np.float32))
+    with refused(
+        "points: fifth column: got whole numbers up to 31, which look like a ring, expected the time lag"
+    ):
+        cloud_of(rings)
+    seconds = numbered(np.arange(3, dtype=np.float32))
+    assert cloud_of(seconds, num_close=0).valid.sum() == 3  # a reader's sweeps may be whole seconds apart
+
+
 def numbered(lags=LAGS, *, columns=5):
     """Rows that are numbered by x, with the sweeps in mixed order."""
     points = np.full((len(lags), columns), 9, np.float32)

@@ -10,10 +10,11 @@ from refusal import refused
 from tiny_run import TINY_CONFIG, bits, untrained
 
 from fcos_lidar_jax.data.cloud_policy import make_cloud
-from fcos_lidar_jax.data.clouds import CloudFiles, TurnedClouds
-from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps, sensor_before_rotation
+from fcos_lidar_jax.data.clouds import CloudFiles
+from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.inference import TrainedDetector
+from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detector import _split_detect
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.inference.stream import detect_stream
@@ -94,7 +95,10 @@ def test_close_points_of_rotated_sweeps_are_removed_as_from_a_list_of_sweeps(tmp
     config = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
     config = dataclasses.replace(config, projection=dataclasses.replace(config.projection, remove_close="all"))
     detector = TrainedDetector(build_detector(config, sensor), untrained(config, sensor))
-    here = sensor_before_rotation(sensor, yaw).origin_m[:2]
+    aligned = align(sensor, yaw_rad=yaw)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    here = np.array([[cos, sin], [-sin, cos]]) @ sensor.origin_m[:2]  # before the rotation
+    np.testing.assert_allclose(aligned.data.origin_m[:2], here)
     sweeps = [
         dataclasses.replace(s, points=np.concatenate([s.points, s.points[:5] * 0 + np.float32([*here, 0, 1, 0])]))
         for s in drive(2)
@@ -106,13 +110,12 @@ def test_close_points_of_rotated_sweeps_are_removed_as_from_a_list_of_sweeps(tmp
         entries.insert(0, {"file": f"{i}.npy", **pose})
     (tmp_path / "sweeps.json").write_text(json.dumps(entries))
     *_, found = detect_stream(sweeps, detector, yaw_rad=yaw)
-    files = CloudFiles((tmp_path / "sweeps.json",), sensor_before_rotation(sensor, yaw), config.reading)
-    frame = TurnedClouds(files, yaw).frame(0)
-    assert frame.num_close == found.cloud.num_close >= 10
-    cloud = make_cloud(frame.points, config, sensor=sensor, num_close=frame.num_close)
-    assert bits((cloud.points, cloud.valid)) == bits((found.cloud.points, found.cloud.valid))
-    [prediction] = predict(detector, TurnedClouds(files, yaw))  # does not shift what has been turned
-    assert bits(prediction.cloud.points) == bits(found.cloud.points)
+    files = CloudFiles((tmp_path / "sweeps.json",), aligned.data, config.reading)
+    [prediction] = predict(detector, files, yaw_rad=yaw)
+    assert prediction.cloud.num_close == found.cloud.num_close >= 10
+    assert bits((prediction.cloud.points, prediction.detections)) == bits((found.cloud.points, found.detections))
+    rotated = files.frame(0).points[:1000, :2] @ np.array([[cos, sin], [-sin, cos]])
+    np.testing.assert_allclose(found.cloud.points[:1000, :2], rotated, atol=1e-5)  # and not shifted
 
 
 def turned(points, turn):

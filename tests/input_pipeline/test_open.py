@@ -112,6 +112,31 @@ def test_data_keep_their_units_and_axes_with_another_sensor(roots, capsys):
     assert (frames.sensor.forward_rad, frames.sensor.intensity_scale, frames.sensor.num_rows) == (0, 255, 32)
 
 
+def test_intensities_are_brought_to_the_scale_of_the_network_by_a_given_factor(roots, tmp_path):
+    for format in ("kitti", "argoverse2", "folder"):
+        plain, times = open_frames(roots[format]), open_frames(roots[format], intensity_scale=8.0)
+        expected = plain.frame(0).points
+        expected[:, 3] *= 8 / plain.sensor.intensity_scale
+        np.testing.assert_allclose(times.frame(0).points, expected, rtol=1e-6)
+        assert times.sensor == dataclasses.replace(plain.sensor, intensity_scale=8.0)
+        assert times.fingerprint() != plain.fingerprint()
+    root = shutil.copytree(roots["folder"], tmp_path / "folder")
+    for file in (root / "clouds").iterdir():
+        file.unlink()
+        np.full((4, 5), 9, np.float32).tofile(file.with_suffix(".pcd.bin"))
+    with refused(".pcd.bin: intensity scale: got 8, expected none"):
+        open_frames(root, intensity_scale=8.0)
+
+
+def test_kitti_is_cropped_to_the_image_unless_the_full_turn_is_wanted(roots):
+    cropped, whole = open_frames(roots["kitti"]), open_frames(roots["kitti"], full_turn=True)
+    raw = np.fromfile(roots["kitti"] / "training" / "velodyne" / "000000.bin", np.float32).reshape(-1, 4)
+    np.testing.assert_array_equal(whole.frame(0).points[:, :3], raw[:, :3])
+    assert (whole.frame(0).points[:, 0] < 0).any()
+    assert (cropped.frame(0).points[:, 0] > 0).all()
+    assert cropped.fingerprint() != whole.fingerprint()
+
+
 def test_a_class_map_renames_and_drops_classes(roots):
     frames = open_frames(roots["folder"], class_map={"person": None, "post": "pole"})
     assert frames.classes == ("pole", "vehicle")
@@ -194,6 +219,9 @@ BAD = {
     "splits of kitti": ({"root": "kitti", "splits": "x"}, "splits: got x, expected none"),
     "missing sweeps": ({"root": "kitti", "allow_missing_sweeps": True}, "allow_missing_sweeps: got True"),
     "no such version": ({"root": "nuscenes", "version": "v9"}, "v9: no such folder, expected one of v1.0-made"),
+    "full turn": ({"root": "argoverse2", "full_turn": True}, "full_turn: got True, expected none"),
+    "scale": ({"root": "nuscenes", "intensity_scale": 2.0}, "intensity_scale: got 2.0, expected none"),
+    "no scale": ({"root": "folder", "intensity_scale": -2.0}, "intensity_scale: got -2.0, expected a positive"),
     "sweeps": ({"root": "kitti", "num_sweeps": 0}, "num_sweeps: got 0, expected at least 1"),
     "class map": ({"root": "kitti", "class_map": {"Lorry": "truck"}}, "class map: got 'Lorry', expected Car"),
     "map of a folder": (

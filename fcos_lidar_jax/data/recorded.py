@@ -1,0 +1,42 @@
+"""The sensors that recorded the point files of known data sets."""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor
+
+RECORDED_BY = {
+    "training/velodyne/*.bin": KITTI_HDL64E,
+    "testing/velodyne/*.bin": KITTI_HDL64E,
+    "velodyne_points/data/*.bin": KITTI_HDL64E,
+    "sensors/lidar/*.feather": ARGOVERSE2,
+}
+"""Ends of paths -> the sensor whose heading, position and intensity scale the files have."""
+
+
+def recorded_by(paths: Iterable[Path]) -> Sensor | None:
+    """The sensor that recorded point files, or recordings in folders, as far as their paths tell.
+
+    Raises:
+        ValueError: different sensors recorded them.
+
+    >>> recorded_by([Path("KITTI/training/velodyne/000000.bin")]).name, recorded_by([Path("000000.bin")])
+    ('kitti_hdl64e', None)
+    """
+    found: dict[Sensor | None, Path] = {}
+    for path in {(path.parent, path.suffix): Path(os.path.abspath(path)) for path in paths}.values():
+        known = (sensor for end, sensor in RECORDED_BY.items() if path.match(end) or any(path.glob(end)))
+        found[next(known, None)] = path
+    if len(found) > 1:
+        files = " and ".join(f"{path} of {sensor.name if sensor else 'another'}" for sensor, path in found.items())
+        raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")
+    return next(iter(found), None)
+
+
+def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:
+    """Refuse a factor for the intensities of a ``.pcd.bin``, which are always from 0 to 255."""
+    if intensity_scale is not None and (
+        file := next((f for f in files if f.name.lower().endswith(".pcd.bin")), None)
+    ):
+        raise ValueError(f"{file}: intensity scale: got {intensity_scale:g}, expected none: it is 1 in .pcd.bin")

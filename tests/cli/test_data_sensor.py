@@ -1,0 +1,193 @@
+"""Clouds of other sensors: the same boxes from every command and from Python, whose units and axes are told."""
+
+import dataclasses
+import json
+import shutil
+import warnings
+
+import numpy as np
+import pytest
+from commands import assert_one_line_error, command
+from made_argoverse2 import make_log
+from made_folder import make_folder
+from made_kitti import make_kitti
+
+import fcos_lidar_jax as fcos
+from fcos_lidar_jax.data.kitti import TO_NUSCENES
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E
+
+HDL32E = "--checkpoint hdl32e --out"
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory):
+    """Two frames of KITTI, a copy of the first cloud elsewhere, a raw drive of it, and a class map."""
+    root = make_kitti(
+        tmp_path_factory.mktemp("data") / "kitti",
+        train=1,
+        val=1,
+        sensor=dataclasses.replace(KITTI_HDL64E, num_columns=512),
+    )
+    (root / "map.json").write_text(json.dumps(TO_NUSCENES))
+    (root / "elsewhere").mkdir()
+    cloud = root / "training" / "velodyne" / "000000.bin"
+    shutil.copy(cloud, root / "elsewhere" / "cloud.bin")
+    drive = root / "day" / "drive"
+    for name in ("velodyne_points/data", "oxts/data"):
+        (drive / name).mkdir(parents=True)
+    shutil.copy(cloud, drive / "velodyne_points" / "data" / "0000000000.bin")
+    (drive / "oxts" / "data" / "0000000000.txt").write_text("49 8.4 110 0 0 0")
+    (drive / "velodyne_points" / "timestamps.txt").write_text("2011-09-26 13:02:25.594360375\n")
+    (root / "day" / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n")
+    return root
+
+
+def detect(out, *words):
+    """Boxes of the first file."""
+    command("detect", *words, HDL32E, out)
+    return json.loads(out.read_text())["files"][0]["boxes"]
+
+
+def stream(out, *words):
+    """Boxes of the first sweep."""
+    command("stream", *words, HDL32E, out)
+    return json.loads(out.read_text().splitlines()[0])["boxes"]
+
+
+def as_nuscenes(points, origin=(0, 0, 0)):
+    """Points [n, 4] with x ahead, of a sensor at a place on the ego vehicle, with y ahead of the sensor."""
+    x, y, z = (points[:, :3] - np.array(origin, np.float32)).T
+    return np.column_stack([-y, x, z, points[:, 3]])
+
+
+def assert_turned_back(boxes, expected, origin=(0, 0, 0)):
+    """Assert that boxes with x ahead are those of :func:`as_nuscenes`."""
+    assert len(boxes) == len(expected) > 20
+    for one, other in zip(boxes, expected, strict=True):
+        assert one["label"] == other["label"]
+        assert one["score"] == pytest.approx(other["score"], abs=1e-5)
+        x, y, z, *size, yaw, vx, vy = other["box"]
+        place = np.array([y, -x, z]) + origin
+        np.testing.assert_allclose(one["box"][:6], [*place, *size], atol=1e-4)
+        np.testing.assert_allclose(np.exp(1j * one["box"][6]), np.exp(1j * (yaw - np.pi / 2)), atol=1e-4)
+        np.testing.assert_allclose(one["box"][7:], [vy, -vx], atol=1e-4)
+
+
+def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
+    folder, drive = kitti / "training" / "velodyne", kitti / "day" / "drive"
+    boxes = detect(tmp_path / "boxes.json", folder)
+    told = capsys.readouterr().err
+    assert told.count("recorded by kitti_hdl64e") == told.count("intensities times 255") == 1  # of two files
+    assert told.count("clouds turned by 90 degrees") == 1
+    assert "no intensity is above 1" not in told
+
+    raw = np.fromfile(folder / "000000.bin", np.float32).reshape(-1, 4)
+    np.save(tmp_path / "by_hand.npy", as_nuscenes(raw * np.float32([1, 1, 1, 255])))
+    assert_turned_back(boxes, detect(tmp_path / "by_hand.json", tmp_path / "by_hand.npy"))
+
+    data = f"--data-root {kitti} --format kitti --split train --full-turn --class-map {kitti}/map.json"
+    command("evaluate", data, "--no-report", HDL32E, tmp_path / "scores")
+    [evaluated] = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
+    assert evaluated["boxes"] == boxes
+
+    detector = fcos.load_detector("hdl32e")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "points hardly of sensor")  # it has 64 beams
+        capsys.readouterr()
+        by_path, again = (detector(folder / "000000.bin") for _ in range(2))
+        assert capsys.readouterr().err.count("recorded by kitti_hdl64e") <= 1  # not for every file
+        by_sensor, moved = detector(raw, sensor=KITTI_HDL64E), detector(kitti / "elsewhere" / "cloud.bin")
+    for found in (by_path, again, by_sensor):
+        assert found.to_dict()["boxes"] == boxes
+        assert found.points[:, 3].max() > 1
+        np.testing.assert_allclose(
+            found.points[:, :4], raw * [1, 1, 1, 255], atol=1e-4
+        )  # in the frame of the file
+    assert moved.to_dict()["boxes"] != boxes
+
+    for source in (drive, drive / "velodyne_points" / "data"):
+        capsys.readouterr()
+        assert stream(tmp_path / "boxes.jsonl", source) == boxes
+        told = capsys.readouterr().err
+        assert told.count("clouds turned by 90 degrees") == 1
+
+
+def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):
+    inside, copy = kitti / "training" / "velodyne" / "000000.bin", kitti / "elsewhere" / "cloud.bin"
+    out = tmp_path / "boxes.json"
+    boxes, plain = detect(out, inside), detect(out, copy)
+    assert boxes != plain
+    capsys.readouterr()
+    assert detect(out, inside, "--data-sensor nuscenes_hdl32e") == plain
+    assert "recorded by" not in capsys.readouterr().err
+    assert detect(out, copy, "--data-sensor kitti_hdl64e") == boxes
+    assert detect(out, copy, "--yaw-deg 90 --intensity-scale 255") == boxes
+    # An angle takes the place of the turn between the sensors, and a factor that of their scale.
+    assert detect(out, inside, "--yaw-deg 0") == detect(out, copy, "--intensity-scale 255") != boxes
+    assert detect(out, inside, "--yaw-deg 0 --intensity-scale 1") == plain
+    assert stream(out, copy, "--data-sensor kitti_hdl64e") == boxes
+    assert stream(out, copy, "--yaw-deg 90 --intensity-scale 255") == boxes
+
+
+def test_argoverse2_is_turned_and_shifted(tmp_path):
+    log = make_log(tmp_path / "log", 0, sweeps=1, sensor=dataclasses.replace(ARGOVERSE2, num_columns=256))
+    boxes = detect(tmp_path / "boxes.json", log / "sensors" / "lidar")
+    assert stream(tmp_path / "boxes.jsonl", log) == boxes
+    points = fcos.open_frames(log).frame(0).points[:, :4]
+    np.save(tmp_path / "by_hand.npy", as_nuscenes(points, (1.35, 0, 1.64)))
+    by_hand = detect(tmp_path / "by_hand.json", tmp_path / "by_hand.npy")
+    assert_turned_back(boxes, by_hand, (1.35, 0, 1.64))
+
+
+def test_evaluates_own_data_of_other_axes_and_units(tmp_path):
+    """The same data with x ahead, and intensities of a quarter."""
+    right = make_folder(tmp_path / "right", sensor=fcos.load_sensor("short_range"), train=0, val=2)
+    ahead = shutil.copytree(right, tmp_path / "ahead")
+    (ahead / "sensor.json").write_text((ahead / "sensor.json").read_text().replace("short_range", "mine"))
+    for file in (ahead / "clouds").iterdir():
+        points = np.load(file)
+        np.save(file, np.column_stack([points[:, 1], -points[:, 0], points[:, 2], points[:, 3] / 4]))
+    for file in (ahead / "boxes").iterdir():
+        record = json.loads(file.read_text())
+        for box in record["boxes"]:
+            x, y, z, length, width, height, yaw, vx, vy = box["box"]
+            speed = (None, None) if vx is None else (vy, -vx)
+            box["box"] = [y, -x, z, length, width, height, yaw - np.pi / 2, *speed]
+        file.write_text(json.dumps(record))
+    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
+    scores, found = [], []
+    for root, more in ((right, ""), (ahead, "--yaw-deg 90 --intensity-scale 4")):
+        out = tmp_path / f"scores_{root.name}"
+        how = f"--class-map {tmp_path}/map.json --checkpoint quickstart --no-report"
+        command("evaluate --data-root", root, how, more, "--out", out)
+        scores.append(json.loads((out / "metrics_summary.json").read_text())["mean_ap"])
+        found.append(json.loads((out / "detections.json").read_text())["frames"][0]["boxes"])
+    assert_turned_back(found[1], found[0])
+    assert scores[1] == pytest.approx(scores[0], abs=1e-6)
+    assert scores[0] > 0.01
+
+
+def test_what_cannot_be_meant_is_refused_in_one_line(kitti, tmp_path, capsys):
+    inside, copy = kitti / "training" / "velodyne" / "000000.bin", kitti / "elsewhere" / "cloud.bin"
+    np.zeros((9, 5), np.float32).tofile(tmp_path / "cloud.pcd.bin")
+    for words, message in (
+        (f"detect {inside} {copy}", "got .*bin of .* and .*bin of .*, expected files of one sensor"),
+        (f"detect {copy} --data-sensor sonar", "sonar: no such sensor file"),
+        (f"detect {copy} --intensity-scale -1", "intensity_scale: got -1.*, expected a positive number"),
+        (
+            f"detect {tmp_path}/cloud.pcd.bin --intensity-scale 9",
+            "cloud.pcd.bin: intensity scale: got 9, expected",
+        ),
+        (f"stream {tmp_path} --intensity-scale 9", "cloud.pcd.bin: intensity scale: got 9, expected none"),
+        (
+            "stream --data-root x --scene a --intensity-scale 9",
+            "--intensity-scale: expected none with --data-root",
+        ),
+    ):
+        assert_one_line_error(capsys, [*words.split(), *HDL32E.split(), str(tmp_path / "out")], message)
+    results = (
+        f"evaluate --data-root {kitti} --results {kitti}/map.json --checkpoint hdl32e --out {tmp_path}/scores"
+    )
+    assert_one_line_error(
+        capsys, [*results.split(), "--yaw-deg", "9"], "--yaw-deg: got 9.0, expected none with --res"
+    )
