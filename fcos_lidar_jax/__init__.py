@@ -36,7 +36,17 @@ _HOME = {
 _MODULES = (
     *("assignment", "augment", "coding", "collectives", "config", "geometry", "iou", "locations", "losses", "nms"),
     *("packing", "presets", "projection", "sensors", "types"),
-    *("checkpoints", "data", "devices", "evaluation", "inference", "input_pipeline", "models", "simulation"),
+    *(
+        "centerpoint",
+        "checkpoints",
+        "data",
+        "devices",
+        "evaluation",
+        "inference",
+        "input_pipeline",
+        "models",
+        "simulation",
+    ),
     *("training", "visualization"),
 )
 

@@ -14,7 +14,7 @@ from fcos_lidar_jax.namespaces import own_names
 
 __dir__ = own_names(__name__)
 
-Tree = TypeVar("Tree")
+_Tree = TypeVar("_Tree")
 
 
 def mapped_axes() -> tuple[str, ...]:
@@ -36,7 +36,7 @@ def device_index() -> Array | int:
     return lax.axis_index(axes) if axes else 0
 
 
-def sum_over_devices(tree: Tree) -> Tree:
+def sum_over_devices(tree: _Tree) -> _Tree:
     """Add the leaves of a tree over the mapped axes.
 
     >>> import jax
@@ -47,7 +47,7 @@ def sum_over_devices(tree: Tree) -> Tree:
     return lax.psum(tree, axes) if axes else tree
 
 
-def varying(tree: Tree) -> Tree:
+def varying(tree: _Tree) -> _Tree:
     """Mark equal leaves as values of one device each, so that their gradients are of one device as well.
 
     Without the mark, ``jax.shard_map`` adds up the gradients of replicated leaves by itself, unlike ``jax.pmap``.

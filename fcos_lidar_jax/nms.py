@@ -17,8 +17,8 @@ from fcos_lidar_jax.namespaces import own_names
 
 __dir__ = own_names(__name__)
 
-T = TypeVar("T")
-Mean = Callable[..., Array]
+_T = TypeVar("_T")
+_Mean = Callable[..., Array]
 _COMMON_COUNTS = (1024, 2048)  # Numbers of slots that usually suffice for all valid boxes, of thousands of slots.
 _MAX_TURN_RAD = np.pi / 3  # Merged boxes must agree on the heading within this angle.
 
@@ -139,7 +139,7 @@ def _weighted_mean(
 
 
 def _merged_by_rows(
-    mean: Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
+    mean: _Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
     """Merge the kept boxes one at a time."""
     kept_boxes, kept_labels = boxes[kept], labels[kept]
@@ -156,7 +156,7 @@ def _merged_by_rows(
 
 
 def _merged_by_matrix(
-    mean: Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
+    mean: _Mean, boxes: Array, weights: Array, labels: Array, usable: Array, kept: Array, used: Array
 ) -> Array:
     """Merge all kept boxes in one reduction over [kept, n]."""
     candidates = boxes, oriented(boxes), weights, labels
@@ -170,7 +170,7 @@ def _overlaps(a: Array, b: Array, threshold: float, vertical: bool) -> Array:
     return intersection > threshold * union
 
 
-def _on_valid(compute: Callable[[Array], T], order: Array, valid: Array) -> T:
+def _on_valid(compute: Callable[[Array], _T], order: Array, valid: Array) -> _T:
     """Call ``compute`` on a prefix of ``order``, valid boxes first, that contains all valid boxes."""
     counts = [*(count for count in _COMMON_COUNTS if count < len(order)), len(order)]
     branches = [functools.partial(lambda count: compute(order[:count]), count) for count in counts]

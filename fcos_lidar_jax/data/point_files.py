@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fcos_lidar_jax.data.npy_files import npz_names, parse_npy, parse_npz
 from fcos_lidar_jax.data.pcd import parse_pcd
@@ -99,11 +100,11 @@ def read_points(
     return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
-def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") -> np.ndarray:
+def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -> np.ndarray:
     """Convert an array to the columns that :func:`read_points` returns.
 
     Args:
-        array: [n, 3 to 6]: x, y, z, intensity, time lag, laser number.
+        array: [n, 3 to 6], of NumPy or JAX, or a list: x, y, z, intensity, time lag, laser number.
         sensor: as in :func:`read_points`.
         where: name of the array for error messages.
 
@@ -114,9 +115,14 @@ def points_from_array(array: np.ndarray, sensor: Sensor, where: str = "points") 
     >>> points_from_array(np.array([[8, 1, -1]]), TINY).tolist()
     [[8.0, 1.0, -1.0, 0.0, 0.0]]
     """
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        found = getattr(array, "dtype", type(array).__name__)
-        raise ValueError(f"{where}: dtype: got {found}, expected real numbers")
+    kind = type(array).__name__
+    try:
+        array = np.asarray(array)
+    except (TypeError, ValueError):
+        hint = "; under jax.jit, call the function of make_detect" if kind.endswith("Tracer") else ""
+        raise ValueError(f"{where}: got {kind}, expected an array of real numbers{hint}") from None
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{where}: dtype: got {array.dtype}, expected real numbers")
     fits = array.ndim == 2 and array.shape[1] in _RAW_COLUMNS
     check(fits, f"{where}: shape", array.shape, "N x 3, 4, 5 or 6")
     check_time_lags(array, where)

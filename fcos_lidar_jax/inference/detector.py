@@ -27,7 +27,7 @@ from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class CloudDetector(abc.ABC):
     """A detector from a checkpoint or an exported file, which maps point clouds to boxes.
 
@@ -38,6 +38,9 @@ class CloudDetector(abc.ABC):
     """
 
     model: Detector  # functions of the network, with its configuration and sensor
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.config.name!r}, {self.sensor.name!r}, classes={self.classes!r})"
 
     @property
     def config(self) -> Config:
@@ -75,7 +78,8 @@ class CloudDetector(abc.ABC):
 
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
-                in metres, intensity, time lag in seconds, laser number, as in an array file.
+                in metres, intensity, time lag in seconds, laser number, as in an array file. Under ``jax.jit``, call
+                the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
             sensor: sensor that recorded the points, which gives their heading, position and intensity scale. By
                 default the detector's or, for files in the folders of KITTI and Argoverse 2, theirs.
 
@@ -109,7 +113,7 @@ class CloudDetector(abc.ABC):
         return jax.tree.map(lambda leaf: leaf[0], jax.device_get(found))
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class TrainedDetector(CloudDetector):
     """A network with its weights.
 

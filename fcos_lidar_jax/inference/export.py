@@ -57,7 +57,7 @@ class _Record(TypedDict):
     config: dict[str, Any]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ExportedDetector(CloudDetector):
     """A detector from a file of ``fcos-lidar export``, see :func:`load_exported`."""
 

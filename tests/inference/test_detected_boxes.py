@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -88,3 +89,22 @@ def test_matplotlib_is_imported_to_draw_only():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout == "False\n"
+
+
+def test_a_slice_holds_boxes(made):
+    assert [(box.name, box.score) for box in made[3:5]] == [(made[i].name, made[i].score) for i in (3, 4)]
+
+
+def test_a_detector_takes_arrays_of_jax_and_lists_and_prints_in_one_line():
+    detector = load_detector("quickstart")
+    points = np.random.default_rng(0).uniform(-9, 9, (600, 4)).astype(np.float32)
+    expected = detector(points)
+    for same in (jax.numpy.asarray(points), points.tolist()):
+        np.testing.assert_array_equal(detector(same).boxes, expected.boxes)
+    assert repr(detector).startswith("TrainedDetector('quickstart', 'short_range', classes=('car', ")
+    with pytest.raises(
+        ValueError, match="points: got DynamicJaxprTracer, expected an array .*; under jax.jit, call"
+    ):
+        jax.jit(detector)(points)
+    with pytest.raises(ValueError, match="points: got list, expected an array of real numbers$"):
+        detector([[1, 2, 3], [4, 5]])
