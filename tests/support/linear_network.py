@@ -4,6 +4,7 @@ A training step is traced and compiled in a third of the time. Range images, los
 """
 
 import contextlib
+import math
 from collections.abc import Iterator
 
 import flax.linen as nn
@@ -17,7 +18,7 @@ from fcos_lidar_jax.types import Outputs
 
 
 class LinearNetwork(nn.Module):
-    """Normalises the image and maps each location's pixel linearly to its predictions."""
+    """Normalises the image and maps each location's pixel linearly to its predictions, mostly background."""
 
     config: ModelConfig
     num_classes: int
@@ -29,6 +30,8 @@ class LinearNetwork(nn.Module):
         numbers = nn.Dense(12 * k + 1, name="predictions")(image)
         levels = [numbers[:, ::stride, ::stride].reshape(len(image), -1, 12 * k + 1) for stride in STRIDES]
         logits, regression, iou = jnp.split(jnp.concatenate(levels, axis=1), (k + 1, 11 * k + 1), axis=2)
+        prior = math.log(k * self.config.background_prior / (1 - self.config.background_prior))
+        logits += jnp.pad(jnp.full(1, prior, logits.dtype), (k, 0))
         return Outputs(logits, regression.reshape(*regression.shape[:2], 10, k), iou)
 
 
