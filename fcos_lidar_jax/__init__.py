@@ -36,18 +36,8 @@ _HOME = {
 _MODULES = (
     *("assignment", "augment", "coding", "collectives", "config", "geometry", "iou", "locations", "losses", "nms"),
     *("packing", "presets", "projection", "sensors", "types"),
-    *(
-        "centerpoint",
-        "checkpoints",
-        "data",
-        "devices",
-        "evaluation",
-        "inference",
-        "input_pipeline",
-        "models",
-        "simulation",
-    ),
-    *("training", "visualization"),
+    *("centerpoint", "checkpoints", "data", "devices", "evaluation", "inference", "input_pipeline", "models"),
+    *("simulation", "training", "visualization"),
 )
 
 

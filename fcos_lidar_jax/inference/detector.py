@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import hashlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
+
+Rows = np.ndarray | jax.Array | Sequence[Any]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -71,15 +73,15 @@ class CloudDetector(abc.ABC):
             ``batch_size`` times the number of devices, split over the devices.
         """
 
-    def __call__(self, points: np.ndarray | str | Path, *, sensor: Sensor | None = None) -> DetectedBoxes:
+    def __call__(self, points: Rows | str | Path, *, sensor: Sensor | None = None) -> DetectedBoxes:
         """Detect boxes in one cloud of any length; compiled once.
 
         Warns in one line if the cloud does not fit the sensor of the detector.
 
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
-                in metres, intensity, time lag in seconds, laser number, as in an array file. Under ``jax.jit``, call
-                the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
+                in metres, intensity, time lag in seconds, laser number, as in an array file. Under ``jax.jit``,
+                call the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
             sensor: sensor that recorded the points, which gives their heading, position and intensity scale. By
                 default the detector's or, for files in the folders of KITTI and Argoverse 2, theirs.
 

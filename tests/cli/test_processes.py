@@ -12,9 +12,10 @@ from unittest.mock import Mock
 
 import jax
 import pytest
-from commands import assert_one_line_error, command, in_use, mistakes, run_python
+from commands import assert_one_line_error, command, in_use, mistakes
 from forked import Forked, signal_at
-from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
+from linear_network import linear_network, use
+from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
@@ -118,12 +119,14 @@ def test_mistakes_get_one_line(tmp_path, capsys, line, message, monkeypatch):
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """Two scenes of six keyframes, one for training and one for tests, with an index; a checkpoint beside them."""
+    """Two scenes of six keyframes, one for training and one for tests, with an index; checkpoints beside them."""
     home = tmp_path_factory.mktemp("home")
     (home / "sensor.json").write_text(json.dumps(sensor_to_json(SENSOR)))
     command("synthesize --scenes 2 --keyframes 6 --out", home / "data", "--sensor", home / "sensor.json")
     command("prepare --num-sweeps 1 --data-root", home / "data")
     save_checkpoint(home / "start", Checkpoint(CONFIG, SENSOR, weights(), 1))
+    with linear_network():
+        save_checkpoint(home / "linear", Checkpoint(CONFIG, SENSOR, untrained(CONFIG, SENSOR), 1))
     return home / "data"
 
 
@@ -133,20 +136,19 @@ def free_port() -> str:
         return str(free.getsockname()[1])
 
 
-def start_two(how: str, *args: list[str], last: Callable[[], object] = int) -> list[Forked]:
+def start_two(how: str, *args: list[str], before: tuple[Callable[[], object], ...] = (int, int)) -> list[Forked]:
     """Start the command as two processes, each with its own arguments, connected by ``how``.
 
-    The second process calls ``last`` first.
+    Each process calls its function of ``before`` first.
     """
     port = free_port()
 
     def one(index: int) -> Forked:
-        before = last if index else int
         if how == "coordinator":
             place = ["--coordinator", f"localhost:{port}", "--num-processes", "2", "--process-index", str(index)]
-            return Forked([*args[index], *place], before)
+            return Forked([*args[index], *place], before[index])
         own = {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index), "JAX_COORDINATOR_PORT": port}
-        return Forked([*args[index], "--distributed"], before, **SRUN, **own)
+        return Forked([*args[index], "--distributed"], before[index], **SRUN, **own)
 
     return [one(index) for index in range(2)]
 
@@ -260,7 +262,7 @@ def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path, 
     frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
     args = ["evaluate", *frames, "--checkpoint", str(root.parent / "start"), "--out", str(tmp_path / "all")]
     stop = functools.partial(signal_at, f"{SimulatedFrames.__module__}.SimulatedFrames.frame", signal.SIGTERM, 40)
-    processes = start_one(args, stop) if number == 1 else start_two("coordinator", args, args, last=stop)
+    processes = start_one(args, stop) if number == 1 else start_two("coordinator", args, args, before=(int, stop))
     for code, _, errors in ended(processes):
         assert (code, error_lines(errors)) == (143, []), errors
     done = (tmp_path / "all" / "detections.resume_log").read_bytes().count(b"\n") - 1
@@ -278,7 +280,7 @@ def test_sigterm_ends_the_scoring_too(root, tmp_path):
 
 def train(data: Path, out: Path) -> list[str]:
     """Four steps of batches of two with objects cut from these frames, and an evaluation at the end."""
-    where = ["--data-root", str(data), "--out", str(out), "--weights", str(data.parent / "start")]
+    where = ["--data-root", str(data), "--out", str(out), "--weights", str(data.parent / "linear")]
     sensor = ["--sensor", str(data.parent / "sensor.json"), "--max-points", "1024", "--samples", "0:6"]
     often = ["--steps", str(STEPS), "--save-every", str(STEPS), "--evaluate-every", str(STEPS)]
     return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often]
@@ -297,10 +299,17 @@ _NOT_SHARED = {"seconds", "waiting_seconds", "samples_per_second"}
 _NOT_SHARED |= {"pasted_objects", "truncated_points", "truncated_boxes", "invalid_points"}  # per process
 
 
+def use_two_devices() -> None:
+    use()
+    jax.config.update("jax_num_cpu_devices", 2)
+    assert jax.device_count() == 2
+
+
 def test_two_processes_train_like_one_with_two_devices(root, tmp_path):
-    alone = run_python("-m", "fcos_lidar_jax", *train(root, tmp_path / "alone"), JAX_NUM_CPU_DEVICES="2")
-    assert alone.returncode == 0, alone.stderr
-    first, second = ended(start_two("coordinator", *[train(root, tmp_path / "run")] * 2))
+    """With the linear network; ``tests/equivalence`` compares the gradients of the whole network."""
+    code, _, errors = Forked(train(root, tmp_path / "alone"), use_two_devices).end()
+    assert code == 0, errors
+    first, second = ended(start_two("coordinator", *[train(root, tmp_path / "run")] * 2, before=(use, use)))
     assert (first[0], second[0]) == (0, 0), first[2] + second[2]
     metrics = read_metrics(tmp_path / "run")
     assert len(metrics) == STEPS + 1

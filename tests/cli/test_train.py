@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from commands import assert_one_line_error, command, in_use, mistakes
 from forked import Forked
-from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, weights
+from linear_network import linear_network, use
+from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
 
 from fcos_lidar_jax import cli
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
@@ -22,6 +23,7 @@ from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 VERSION = "v1.0-synthetic"
+MANY = 20_000  # steps of runs that are stopped
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +34,8 @@ def root(tmp_path_factory) -> Path:
     command("synthesize --scenes 2 --keyframes 2 --out", home / "data", "--sensor", home / "sensor.json")
     command("prepare --num-sweeps 1 --data-root", home / "data", "--version", VERSION)
     save_checkpoint(home / "start", Checkpoint(CONFIG, SENSOR, weights(), 1))
+    with linear_network():
+        save_checkpoint(home / "linear", Checkpoint(CONFIG, SENSOR, untrained(CONFIG, SENSOR), 1))
     return home / "data"
 
 
@@ -67,11 +71,11 @@ def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys)
 
 @pytest.fixture
 def child():
-    """``child(args)`` starts the command as a process."""
+    """``child(args)`` starts the command, with the linear network, as a process."""
     started = []
 
     def start(args: list[str]) -> Forked:
-        started.append(Forked(args))
+        started.append(Forked(args, use))
         return started[-1]
 
     yield start
@@ -94,8 +98,8 @@ def wait_for_a_step(process: Forked, out: Path, beyond: int = 0) -> None:
 
 def long(root: Path) -> list[str]:
     """Options of a run that the test stops."""
-    more = ["--weights", str(root.parent / "start"), "--no-copy-paste", "--steps", "2000", "--val-split", "none"]
-    return [*more, "--save-every", "2000"]
+    steps = ["--steps", str(MANY), "--save-every", str(MANY), "--val-split", "none"]
+    return ["--weights", str(root.parent / "linear"), "--no-copy-paste", *steps]
 
 
 def stop(process: Forked, number: int, out: Path, beyond: int = 0) -> tuple[int, str, int]:
@@ -116,7 +120,7 @@ def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
     for text in (errors, resumed_errors):
         assert "Traceback" not in text
         assert "which is saved\nthe same command with --resume continues\n" in text
-    assert 0 < stopped_at < end < 2000
+    assert 0 < stopped_at < end < MANY
     assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, end)]
     # No step was repeated or left out.
     assert [line["step"] for line in read_metrics(out)] == list(range(1, end + 1))
@@ -137,7 +141,7 @@ def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, 
         assert code == 143, errors
         assert "Traceback" not in errors
     steps = len(read_metrics(out))
-    assert 0 < steps < 2000
+    assert 0 < steps < MANY
     assert checkpoints(out) == [f"{steps:08d}"]
 
 

@@ -6,6 +6,7 @@ import json
 import jax
 import pytest
 import tiny_run
+from linear_network import linear_network
 
 from experiments.studies import ladder
 from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, measure
@@ -31,6 +32,13 @@ def test_an_unknown_trial_is_refused_before_anything_is_trained(monkeypatch):
         measure(Args(trials=("base", "magic")))
 
 
+@pytest.fixture
+def _linear():
+    with linear_network():
+        yield
+
+
+@pytest.mark.usefixtures("_linear")
 def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys):
     """Four steps on four frames with a tiny network: that everything is there, not what it is."""
     model = dataclasses.replace(tiny_run.CONFIG.model, local_geometry=True)

@@ -101,22 +101,36 @@ def test_scores_of_a_span_are_those_of_its_boxes_alone():
     assert record["interval"][0] <= record["mAP"] <= record["interval"][1]
 
 
-@pytest.fixture
-def shipped(tmp_path, monkeypatch):
-    """A run of three steps whose weights are exported into a package elsewhere; returns the package's folder."""
-    run, package = tmp_path / "run", tmp_path / "weights"
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> Path:
+    """A run of three steps, its weights exported into a package elsewhere, and the record of their scores."""
+    home = tmp_path_factory.mktemp("home")
+    run = home / "run"
     (run / "checkpoints").mkdir(parents=True)
-    package.mkdir()
-    for module in (shipped_weights, model_card):
-        monkeypatch.setattr(module, "SHIPPED", package)
+    (home / "weights").mkdir()
     weights = jax.tree.map(lambda leaf: leaf + np.float32(1e-4), untrained(CONFIG, TINY))
     save_checkpoint(run / "checkpoints" / "00000003", Checkpoint(CONFIG, TINY, weights, 3))
     (run / "run.json").write_text(json.dumps({"seed": 4, "weights": None, "steps": 9}))
     lines = ({"step": s, "loss/total": 1.0, "seconds": 2.0} for s in (1, 2, 3))
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    monkeypatch.setattr(shipped_weights, "RESULTS", tmp_path / "results")
-    shipped_weights.main(shipped_weights.Args(name="hdl32e", work=run, export=True, test_frames=2))
-    return package, json.loads((tmp_path / "results" / "hdl32e.json").read_text())
+    with pytest.MonkeyPatch.context() as patch:
+        place_package(patch, home)
+        shipped_weights.main(shipped_weights.Args(name="hdl32e", work=run, export=True, test_frames=2))
+    return home
+
+
+def place_package(patch: pytest.MonkeyPatch, home: Path) -> None:
+    for module in (shipped_weights, model_card):
+        patch.setattr(module, "SHIPPED", home / "weights")
+    patch.setattr(shipped_weights, "RESULTS", home / "results")
+
+
+@pytest.fixture
+def shipped(exported, tmp_path, monkeypatch):
+    """A copy of the run and its exported weights; returns the package's folder and the record."""
+    shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
+    place_package(monkeypatch, tmp_path)
+    return tmp_path / "weights", json.loads((tmp_path / "results" / "hdl32e.json").read_text())
 
 
 def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):

@@ -10,7 +10,8 @@ from typing import Any
 import jax
 from jax._src import compiler, lru_cache
 
-_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+_LEVEL = "xla_backend_optimization_level"
+_OPTIONS = {_LEVEL: 0, "xla_cpu_use_fusion_emitters": False}
 _compile_options = compiler.get_compile_options
 
 # Tracing makes so many objects that Python would look for garbage in a quarter of its time.
@@ -31,11 +32,15 @@ def is_quick() -> bool:
     return jax.config.read("jax_disable_most_optimizations")
 
 
-def environment(quick: bool) -> dict[str, str]:
-    """Environment variables that turn quick compilation on or off in another process."""
-    flags = [f"--{name}={str(value).lower()}" for name, value in _known_options().items()] if quick else []
+def environment(quick: bool, level: int = 0) -> dict[str, str]:
+    """Environment variables that turn quick compilation on or off in another process.
+
+    A higher level of optimisation takes longer and rounds as XLA does by default.
+    """
+    options = {name: level if name == _LEVEL else value for name, value in _known_options().items()}
+    flags = [f"--{name}={str(value).lower()}" for name, value in options.items()] if quick else []
     return {
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": str(int(quick)),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": str(int(quick and not level)),
         "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]),
     }
 

@@ -262,21 +262,40 @@ def test_processes_with_other_data_or_packing_are_refused_before_the_run_starts(
     assert list(tmp_path.iterdir()) == []
 
 
-KILLED = """
-import os, signal, sys
+STOPPED = """
+import os, resource, signal, sys
 from tiny_run import train_tiny, weights
+from fcos_lidar_jax.cli import exit_code
+from fcos_lidar_jax.training import run
+full, killed = sys.argv[1:]
+make_train_step, made = run.make_train_step, {}
+run.make_train_step = lambda *given: made.setdefault("step", make_train_step(*given))  # compiled once
+limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+def fill(step, _):
+    if step == 3:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
+assert exit_code("program", lambda: train_tiny(full, weights=weights(), hooks=[fill])) == 1
+resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 # Called when the third checkpoint is written and not yet in its place.
 os.chmod = lambda path, mode: ".00000003." in str(path) and os.kill(os.getpid(), signal.SIGKILL)
-train_tiny(sys.argv[1], weights=weights())
+train_tiny(killed, weights=weights())
 """
 
 
-def test_a_run_that_is_killed_while_saving_resumes_bit_identical(finished, tmp_path):
-    killed = run_python("-c", KILLED, tmp_path)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert [name[:9] for name in checkpoint_names(tmp_path)] == [".00000003", "00000001", "00000002"]
-    assert bits(train_tiny(tmp_path, resume=True)) == bits(finished[1])
-    assert checkpoint_names(tmp_path) == ["00000003", "00000004"]
+@pytest.fixture(scope="module")
+def stopped(finished, tmp_path_factory) -> tuple[Path, Path, list[str]]:
+    """The folders of two runs of one process, and its messages: the disk was full, and the process was killed."""
+    full, killed = (tmp_path_factory.mktemp(name) for name in ("full", "killed"))
+    done = run_python("-c", STOPPED, full, killed)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    return full, killed, done.stderr.splitlines()
+
+
+def test_a_run_that_is_killed_while_saving_resumes_bit_identical(finished, stopped):
+    _, folder, _ = stopped
+    assert [name[:9] for name in checkpoint_names(folder)] == [".00000003", "00000001", "00000002"]
+    assert bits(train_tiny(folder, resume=True)) == bits(finished[1])
+    assert checkpoint_names(folder) == ["00000003", "00000004"]
 
 
 def test_a_run_that_is_killed_before_its_first_checkpoint_resumes_with_the_initial_weights(finished, begun):
@@ -285,25 +304,14 @@ def test_a_run_that_is_killed_before_its_first_checkpoint_resumes_with_the_initi
     assert checkpoint_names(begun) == checkpoint_names(finished[0])
 
 
-FULL = """
-import resource, sys
-from tiny_run import train_tiny, weights
-from fcos_lidar_jax.cli import exit_code
-def fill(step, _):
-    if step == 3:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, 2**20))
-sys.exit(exit_code("program", lambda: train_tiny(sys.argv[1], weights=weights(), hooks=[fill])))
-"""
-
-
-def test_a_full_disk_is_reported_in_one_line_and_loses_no_checkpoint(finished, tmp_path):
+def test_a_full_disk_is_reported_in_one_line_and_loses_no_checkpoint(stopped):
     """A limit of the file size, from the third checkpoint on, fails as a full disk does."""
-    done = run_python("-c", FULL, tmp_path)
-    lines = [line for line in done.stderr.splitlines() if not line.startswith(("compiling ", "steps "))]
+    folder, _, messages = stopped
+    lines = [line for line in messages if not line.startswith(("compiling ", "steps "))]
     lines = [line for line in lines if "cpu_aot_loader.cc" not in line]  # jaxlib 0.10.1 about its own cache
-    refused = tmp_path / "checkpoints" / "00000003"
-    assert (done.returncode, lines) == (1, [f"program: error: {refused}: cannot be written: File too large"])
-    assert checkpoint_names(tmp_path) == ["00000001", "00000002"]
+    refused = folder / "checkpoints" / "00000003"
+    assert lines == [f"program: error: {refused}: cannot be written: File too large"]
+    assert checkpoint_names(folder) == ["00000001", "00000002"]
     assert [load_checkpoint(path).step for path in sorted(refused.parent.iterdir())] == [1, 2]
 
 
