@@ -182,7 +182,7 @@ class NuScenesLayout:
     learning_rate: float = NUSCENES.optimizer.peak_learning_rate  # Peak learning rate.
     precision: Literal["float32", "bfloat16"] = "float32"  # Precision of the convolutions after the first.
     remat: bool = False  # Recompute the largest activations, for less memory.
-    threads: int = 2  # Threads that prepare batches.
+    threads: int | None = None  # Threads that prepare batches; default: as fcos-lidar train.
     workers: int = 0  # Additional processes that prepare batches.
 
     @property
@@ -193,14 +193,10 @@ class NuScenesLayout:
         """Fill in the defaults.
 
         Raises:
-            ValueError: data, index or splits are missing.
+            ValueError: data, index or splits are missing, also those of --test-version.
         """
         if self.data_root is None:
             raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")
-        if self.test_version is not None:
-            tables = self.data_root / self.test_version
-            if not tables.is_dir():
-                raise ValueError(f"--test-version: {tables}: no such folder, expected the version's tables")
         data = find_data_set(self.data_root, "nuscenes", self.version)
         index = self.index or data.index
         if (self.data_root / data.version).is_dir() and not has_index(index):
@@ -209,6 +205,11 @@ class NuScenesLayout:
         splits = {"train_split": self.train_split or split("train"), "val_split": self.val_split or split("val")}
         whole = dataclasses.replace(self, version=data.version, index=index, **splits)
         whole.describe()
+        if self.test_version is not None:  # before days of training
+            try:
+                whole.frames("test", whole.base, self.test_version).frame(0)
+            except ValueError as error:
+                raise ValueError(f"--test-version: {error}") from None
         return whole
 
     @property
@@ -271,6 +272,7 @@ class NuScenesLayout:
         steps = self.steps or config.optimizer.epochs * steps_per_epoch(frames, config)
         objects = None if config.copy_paste is None else self.objects(frames)
         options = {"devices": jax.devices(), "threads": self.threads, "workers": self.workers}
+        options |= {"schedule": Schedule()}  # saves like fcos-lidar train, since a cell takes hours
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
         file = folder / f"results_{self.val_split}.json"
         write_submission(detector, tests, file)

@@ -16,6 +16,7 @@ from fcos_lidar_jax.evaluation.results import write_results
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
+from fcos_lidar_jax.training import Schedule
 
 
 def test_one_sweep_and_ten_see_the_same_streets(tmp_path):
@@ -94,6 +95,7 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
     ((folder, wanted, frames, options),), ((detector, tests),) = asked, submitted
     assert (folder, wanted, detector) == (tmp_path / "run", config, "the detector")
     assert (options["steps"], options["seed"], options["workers"]) == (5, 3, 2)
+    assert (options["threads"], options["schedule"]) == (None, Schedule()), "as of fcos-lidar train"
     assert {frames.scene(i) for i in range(3)} == {"scene-0001"}
     assert {tests.scene(i) for i in range(3)} == {"scene-0002"}
     assert (frames.reading.num_sweeps, tests.reading.num_sweeps) == (3, 3)
@@ -105,3 +107,16 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
         other.objects(frames)
     with pytest.raises(ValueError, match="wrong"):
         dataclasses.replace(layout, val_split="wrong").checked()
+    # The test split is opened before the first cell is trained.
+    with pytest.raises(ValueError, match=r"^--test-version: .*v9: no such folder"):
+        dataclasses.replace(layout, test_version="v9").checked()
+    testing = dataclasses.replace(layout, test_version="v1.0-mini")
+    with pytest.raises(ValueError, match=r"^--test-version: split 'test': not found in .*splits.json"):
+        testing.checked()
+    splits.write_text(splits.read_text().replace("}", ', "test": ["scene-0002"]}'))
+    assert testing.checked().test_version == "v1.0-mini"
+    for cloud in (tmp_path / "one" / "samples" / "LIDAR_TOP").iterdir():
+        cloud.unlink()
+    NuScenesLayout._data.cache_clear()
+    with pytest.raises(ValueError, match=r"^--test-version: .*\.pcd\.bin: no such file"):
+        testing.checked()
