@@ -42,7 +42,6 @@ from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
-
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
 

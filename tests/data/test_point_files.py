@@ -120,7 +120,7 @@ def test_every_ending_is_read_and_named_in_the_help(tmp_path, points, capsys, mo
             main([command, "--help"])
         assert ", ".join(contents) in " ".join(capsys.readouterr().out.replace("│", " ").split())
     monkeypatch.setattr(point_files, "ENDINGS", (".xyz",))
-    with pytest.raises(NotImplementedError, match="^.xyz is in ENDINGS, but read_points does not"):
+    with pytest.raises(NotImplementedError, match=r"^\.xyz is in ENDINGS, but read_points does not"):
         read_points(save(tmp_path / "a.xyz", b"1 2 3"), NUSCENES_HDL32E)
 
 
