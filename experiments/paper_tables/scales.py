@@ -12,10 +12,11 @@ import functools
 import math
 import operator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
+import tyro
 
 from experiments.changes import change
 from experiments.real_frames import scores_by_range
@@ -177,11 +178,14 @@ class NuScenesLayout:
     """Version, such as v1.0-test, for whose split test table 8 writes a results file."""
     allow_missing_sweeps: bool = False  # Use fewer sweeps if files of older sweeps are missing.
     steps: int | None = None  # Updates of each cell, instead of the preset's epochs.
-    accumulate: int = 1  # Micro-batches per step, if a batch does not fit; only batch norm changes.
+    accumulate: Annotated[int, tyro.conf.arg(aliases=("--optimizer.accumulate",))] = 1
+    """Micro-batches per step, if a batch does not fit; only batch norm changes."""
     batch_size: int = NUSCENES.optimizer.batch_size  # Samples per step.
     learning_rate: float = NUSCENES.optimizer.peak_learning_rate  # Peak learning rate.
-    precision: Literal["float32", "bfloat16"] = "float32"  # Precision of the convolutions after the first.
-    remat: bool = False  # Recompute the largest activations, for less memory.
+    precision: Annotated[Literal["float32", "bfloat16"], tyro.conf.arg(aliases=("--model.precision",))] = "float32"
+    """Precision of the convolutions after the first."""
+    remat: Annotated[bool, tyro.conf.arg(aliases=("--model.remat",))] = False
+    """Recompute the largest activations, for less memory."""
     threads: int | None = None  # Threads that prepare batches; default: as fcos-lidar train.
     workers: int = 0  # Additional processes that prepare batches.
 

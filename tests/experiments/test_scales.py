@@ -5,18 +5,28 @@ import re
 
 import numpy as np
 import pytest
+import tyro
 
 from experiments.changes import change
 from experiments.paper_tables import scales
+from experiments.paper_tables.__main__ import TablesArgs
 from experiments.paper_tables.paper_rows import PAPER_TABLES
 from experiments.paper_tables.scales import NuScenesLayout, quarter, smoke
-from fcos_lidar_jax.cli import prepare
+from fcos_lidar_jax.cli import _explain, prepare
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.evaluation.results import write_results
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.training import Schedule
+
+
+def test_the_options_of_the_advice_about_memory_are_known():
+    values = {"optimizer.accumulate": ["4"], "model.precision": ["bfloat16"], "model.remat": []}
+    advised = re.findall(r"--((?:optimizer|model)[\w.]+)", str(_explain(MemoryError())))
+    words = [word for name in advised for word in (f"--{name}", *values[name])]
+    given = tyro.cli(TablesArgs, args=words).nuscenes
+    assert (given.accumulate, given.precision, given.remat) == (4, "bfloat16", True)
 
 
 def test_one_sweep_and_ten_see_the_same_streets(tmp_path):
