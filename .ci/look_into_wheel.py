@@ -13,6 +13,7 @@ NEEDED = (
     "weights/quickstart/checkpoint.json",
     "weights/hdl32e/checkpoint.json",
     "weights/hdl32e/README.md",
+    "data/nuscenes/splits.toml",
     "simulation/objects.toml",
     "simulation/clutter.toml",
     "visualization/page.html",

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float32
 from fcos_lidar_jax.config import ModelConfig
 from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import Locations, RangeImage
+from fcos_lidar_jax.types import CHANNELS, Locations, RangeImage
 
 __dir__ = own_names(__name__)
 
@@ -135,6 +135,6 @@ def locate(image: RangeImage, layout: ImageLayout) -> Locations:
     0
     """
     cells = location_cells(layout)
-    first_round = image.features[..., 0].reshape(layout.rows * layout.columns, 9)
+    first_round = image.features[..., 0].reshape(layout.rows * layout.columns, len(CHANNELS))
     pixel = jnp.where((cells >= 0)[:, None], first_round[np.maximum(cells, 0)], 0.0)
     return Locations(pixel[:, :3], azimuth_rad=pixel[:, 4], cell=jnp.asarray(cells), occupied=pixel[:, 7] > 0)

@@ -23,7 +23,7 @@ from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import RangeImage
+from fcos_lidar_jax.types import CHANNELS, RangeImage
 
 __dir__ = own_names(__name__)
 
@@ -235,7 +235,7 @@ def project_points(
     index = winners(cell, keys, num_cells=rows * columns, num_rounds=num_rounds)
     features = _gather_channels(points, polar, index)
     return RangeImage(
-        features=features.reshape(rows, columns, 9, num_rounds),
+        features=features.reshape(rows, columns, len(CHANNELS), num_rounds),
         point_index=index.reshape(rows, columns, num_rounds),
         num_dropped=jnp.sum(valid & (cell == rows * columns), dtype=jnp.int32),
     )

@@ -155,6 +155,18 @@ def test_the_commands_of_a_page_exist(page):
             assert importlib.util.find_spec(module), line
 
 
+def test_the_profile_of_the_paper_s_training_starts_and_stops_once(monkeypatch):
+    calls: list[str] = []
+    for name in ("start_trace", "stop_trace"):
+        monkeypatch.setattr(f"jax.profiler.{name}", lambda *_, name=name: calls.append(name))
+    exec(blocks(DOCS / "paper_training.md", "python")[0], given := {})
+    for step in range(1, 201):
+        given["profile"](step, {"loss/total": 1.0})
+        if step % 10 == 0:  # hooks are called after an evaluation again
+            given["profile"](step, {"loss/total": 1.0, "test/mAP": 0.1})
+    assert calls == ["start_trace", "stop_trace"]
+
+
 def test_json_of_the_pages_parses():
     for page in PAGES:
         for block in blocks(page, "json"):

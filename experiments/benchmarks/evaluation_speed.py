@@ -28,7 +28,7 @@ import numpy as np
 
 from experiments.benchmarks.made_tables import Row, annotations, class_of, write_tables
 from experiments.script import Options, run_script, save
-from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
+from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.evaluation.boxes import CLASS_ATTRIBUTES
 from fcos_lidar_jax.evaluation.results import LIDAR_META
 
@@ -45,7 +45,7 @@ class Args(Options):
 
 
 def _make_files(root: Path, samples: int) -> None:
-    names = scenes_of_split(SPLIT, root / VERSION)
+    names = official_splits()[SPLIT]
     keyframes = [len(part) for part in np.array_split(np.arange(samples), len(names))]
     write_tables(root / VERSION, dict(zip(names, keyframes, strict=True)), objects=TRUTHS)
     rng = np.random.default_rng(0)

@@ -12,10 +12,11 @@ import functools
 import math
 import operator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
+import tyro
 
 from experiments.changes import change
 from experiments.real_frames import scores_by_range
@@ -177,12 +178,15 @@ class NuScenesLayout:
     """Version, such as v1.0-test, for whose split test table 8 writes a results file."""
     allow_missing_sweeps: bool = False  # Use fewer sweeps if files of older sweeps are missing.
     steps: int | None = None  # Updates of each cell, instead of the preset's epochs.
-    accumulate: int = 1  # Micro-batches per step, if a batch does not fit; only batch norm changes.
+    accumulate: Annotated[int, tyro.conf.arg(aliases=("--optimizer.accumulate",))] = 1
+    """Micro-batches per step, if a batch does not fit; only batch norm changes."""
     batch_size: int = NUSCENES.optimizer.batch_size  # Samples per step.
     learning_rate: float = NUSCENES.optimizer.peak_learning_rate  # Peak learning rate.
-    precision: Literal["float32", "bfloat16"] = "float32"  # Precision of the convolutions after the first.
-    remat: bool = False  # Recompute the largest activations, for less memory.
-    threads: int = 2  # Threads that prepare batches.
+    precision: Annotated[Literal["float32", "bfloat16"], tyro.conf.arg(aliases=("--model.precision",))] = "float32"
+    """Precision of the convolutions after the first."""
+    remat: Annotated[bool, tyro.conf.arg(aliases=("--model.remat",))] = False
+    """Recompute the largest activations, for less memory."""
+    threads: int | None = None  # Threads that prepare batches; default: as fcos-lidar train.
     workers: int = 0  # Additional processes that prepare batches.
 
     @property
@@ -193,14 +197,10 @@ class NuScenesLayout:
         """Fill in the defaults.
 
         Raises:
-            ValueError: data, index or splits are missing.
+            ValueError: data, index or splits are missing, also those of --test-version.
         """
         if self.data_root is None:
             raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")
-        if self.test_version is not None:
-            tables = self.data_root / self.test_version
-            if not tables.is_dir():
-                raise ValueError(f"--test-version: {tables}: no such folder, expected the version's tables")
         data = find_data_set(self.data_root, "nuscenes", self.version)
         index = self.index or data.index
         if (self.data_root / data.version).is_dir() and not has_index(index):
@@ -209,6 +209,11 @@ class NuScenesLayout:
         splits = {"train_split": self.train_split or split("train"), "val_split": self.val_split or split("val")}
         whole = dataclasses.replace(self, version=data.version, index=index, **splits)
         whole.describe()
+        if self.test_version is not None:  # before days of training
+            try:
+                whole.frames("test", whole.base, self.test_version).frame(0)
+            except ValueError as error:
+                raise ValueError(f"--test-version: {error}") from None
         return whole
 
     @property
@@ -271,6 +276,7 @@ class NuScenesLayout:
         steps = self.steps or config.optimizer.epochs * steps_per_epoch(frames, config)
         objects = None if config.copy_paste is None else self.objects(frames)
         options = {"devices": jax.devices(), "threads": self.threads, "workers": self.workers}
+        options |= {"schedule": Schedule()}  # saves like fcos-lidar train, since a cell takes hours
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
         file = folder / f"results_{self.val_split}.json"
         write_submission(detector, tests, file)

@@ -27,7 +27,7 @@ from fcos_lidar_jax.cli.result_files import check_result_files, check_results, r
 from fcos_lidar_jax.data.cloud_policy import expect_points
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
-from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.sweeps import read_list
 from fcos_lidar_jax.evaluation.json_io import write_lines
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, read_boxes, select
@@ -43,6 +43,8 @@ from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
+_INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
+
 
 @dataclasses.dataclass(frozen=True)
 class Detect:
@@ -55,8 +57,7 @@ class Detect:
     removed since. A file that is given twice is processed once.
     """
 
-    files: tyro.conf.Positional[Annotated[tuple[Path, ...], option("INPUT")]]
-    """Point files (.pcd.bin, .bin, .npy, .npz, .pcd, .feather), one cloud per file, or folders of them."""
+    files: tyro.conf.Positional[Annotated[tuple[Path, ...], option("INPUT", text=_INPUT)]]
     checkpoint: options.Detector
     out: Annotated[Path, option("FILE")]  # File to write.
     output_format: options.OutputFormat = "json"

@@ -16,6 +16,8 @@ from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
+from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
+from fcos_lidar_jax.data.nuscenes.tables import SampleAnnotation, Scene, read_table
 from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
@@ -59,19 +61,33 @@ def run(args: Prepare) -> None:
 
 def _prepare(args: Prepare, data: DataSet, folder: Path) -> dict[str, Any]:
     record: dict[str, Any] = {"folder": str(folder)}
+    split = _training_split(args, data)
     if data.tables is not None:
         index = _make_index(data.tables, folder)
         record |= {"scenes": len(index.scene_name), "keyframes": len(index.sample_token)}
         record |= {"sweeps": len(index.sweep_file), "annotations": len(index.box_token)}
         if not record["annotations"]:
             return record
-    split = args.train_split or args.data.split("train")
     frames = args.data.open_whole(split, cut_reading(args.num_sweeps))
     progress = Progress("frames", len(frames))
     objects = objects_folder(folder, split)
     options = {"min_points": args.min_points, "workers": args.workers}
     database = prepare_database(frames, objects, **options, report=lambda done, _: progress.show(done))
     return record | {"train_split": split, "frames": len(frames), "objects": len(database)}
+
+
+def _training_split(args: Prepare, data: DataSet) -> str | None:
+    """The split to cut objects from, checked before the index of nuScenes is made, which takes minutes."""
+    tables = data.tables
+    if tables is None or not tables.is_dir():
+        return args.train_split or args.data.split("train")
+    if not any(read_table(tables, SampleAnnotation)):  # reads up to the first annotation
+        return None
+    split = args.train_split or args.data.split("train")
+    assert split is not None
+    scenes = {scene.name for piece in read_table(tables, Scene) for scene in piece}
+    scenes_of_split(split, tables, scenes, file=args.data.splits)
+    return split
 
 
 def _make_index(tables: Path, folder: Path) -> Index:

@@ -15,7 +15,7 @@ from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
 from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
-from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
+from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import load_sensor
@@ -29,8 +29,7 @@ class Project:
     inclination, intensity, existence, time lag) and the counts to a .npz file, and prints the counts as JSON.
     """
 
-    file: tyro.conf.Positional[Annotated[Path, option("FILE")]]
-    """Point file: .pcd.bin, .bin, .npy, .npz, .pcd or .feather."""
+    file: tyro.conf.Positional[Annotated[Path, option("FILE", text=f"Point file: {', '.join(ENDINGS)}.")]]
     out: Annotated[Path, option("FILE.npz")]  # File for the range image.
     png: Annotated[Path | None, option("FILE.png")] = None  # Also draw the range image, one panel per round.
     sensor: options.Sensor = "nuscenes_hdl32e"

@@ -19,12 +19,13 @@ from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_p
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
-from fcos_lidar_jax.devices.agreement import agreed
+from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.training import Schedule, train
+from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.training.run import run_folder
 
 _ABOUT = {
@@ -73,6 +74,8 @@ class Train:
     val_samples: Annotated[str | None, option("FIRST:LAST,...", default="all")] = None
     """Ranges of the frames of --val-split, LAST excluded."""
     resume: bool = False  # Continue from the newest checkpoint in OUT.
+    auto_resume: bool = False
+    """Continue if OUT holds a run, otherwise start one: the same command for a job that a cluster restarts."""
     weights: Annotated[Path | None, option("C", default="random weights")] = None
     """Start from the weights of a checkpoint, of the last checkpoint of a run, or from shipped weights."""
     steps: Annotated[int | None, option("N", default="--optimizer.epochs passes over the frames")] = None
@@ -105,12 +108,16 @@ def run(args: Train) -> None:
     is_main_process = jax.process_index() == 0
     with agreed("cannot train"):
         task = _open(args)
+    resume = args.resume or (args.auto_resume and (args.out / RUN_SPEC).is_file())
+    check_same(f"{resume:02d}", f"--auto-resume: a run in {args.out}")
+    if args.auto_resume and not resume:
+        tell(f"{args.out}: no run to resume, starting one")
     checkpoints = Checkpoints(args.out / CHECKPOINTS)
     try:
         with contextlib.ExitStack() as held:
             with agreed("cannot train"):
                 if task.cuts_objects and is_main_process:  # the other processes open the result
-                    held.enter_context(run_folder(args.out, resume=args.resume))
+                    held.enter_context(run_folder(args.out, resume=resume))
                     assert task.config.copy_paste is not None
                     min_points = task.config.copy_paste.min_points
                     database.prepare_database(task.frames, args.out / _OBJECTS, min_points=min_points)
@@ -125,11 +132,12 @@ def run(args: Train) -> None:
                 objects=objects,
                 schedule=schedule,
                 packing=False if args.no_packing else None,
-                **{name: getattr(args, name) for name in ("seed", "resume", "weights", "threads", "workers")},
+                resume=resume,
+                **{name: getattr(args, name) for name in ("seed", "weights", "threads", "workers")},
             )
     except (KeyboardInterrupt, SystemExit):
         if checkpoints.paths():
-            tell("the same command with --resume continues")
+            tell(f"the same command {'' if args.auto_resume else 'with --resume '}continues")
         raise
     if is_main_process:
         paths = checkpoints.paths()

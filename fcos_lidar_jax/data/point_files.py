@@ -88,8 +88,10 @@ def read_points(
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return assemble_points(path, sensor, table)
-    if not kind.endswith(".bin"):
+    if kind in (".npy", ".npz"):
         return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
+    if not kind.endswith(".bin"):
+        raise NotImplementedError(f"{kind} is in ENDINGS, but read_points does not read it")
     columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
     if (number := len(content) // (columns * np.dtype(dtype).itemsize)) > max_points:
         raise ValueError(f"{path}: got {number} points, expected at most {max_points}")

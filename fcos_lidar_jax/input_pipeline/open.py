@@ -15,7 +15,7 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
-from fcos_lidar_jax.data.nuscenes.splits import OFFICIAL
+from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.data.recorded import RECORDED_BY, check_scale
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
@@ -58,7 +58,7 @@ READERS = (
         "nuscenes",
         ("*/sample.json",),
         NUSCENES_HDL32E,
-        lambda data, file: list(own_splits(data.root / data.version, file) or OFFICIAL),
+        lambda data, file: list(own_splits(data.root / data.version, file) or official_splits()),
         lambda data, **how: open_keyframes(data.root, data.version, **how),
         ("version", "index", "splits", "allow_missing_sweeps", "follow_links"),
         class_maps={"kitti": TO_KITTI},

@@ -22,7 +22,7 @@ from fcos_lidar_jax.models.modality import Stem
 from fcos_lidar_jax.models.objective import make_sums
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import Batch, Outputs, RangeImage, Sums
+from fcos_lidar_jax.types import CHANNELS, Batch, Outputs, RangeImage, Sums
 
 Variables = dict[str, Any]  # ``params`` and ``batch_stats``, plain dicts of arrays.
 
@@ -135,7 +135,7 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
 
     def init(key: Any) -> Variables:
         # Parameters do not depend on the image's size; the forward pass is not computed.
-        image = jax.ShapeDtypeStruct((1, 32, 32, 9 * num_rounds), jnp.float32)
+        image = jax.ShapeDtypeStruct((1, 32, 32, len(CHANNELS) * num_rounds), jnp.float32)
         return network.lazy_init(key, image, train=False)  # type: ignore[return-value]
 
     def apply(variables: Variables, images: RangeImage, *, train: bool = False) -> tuple[Outputs, Any]:

@@ -12,6 +12,7 @@ from jax import lax
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.models.convolution import FULL, Image, Kernel, convolve, pointwise
 from fcos_lidar_jax.models.layers import BatchNorm, kernel_init, pieces
+from fcos_lidar_jax.types import CHANNELS
 
 Form = Literal["split", "dense", "grouped"]  # Formulation of the stem's convolutions, see :class:`Stem`.
 _MODALITIES = (3, 3, 1, 1, 1)
@@ -28,8 +29,9 @@ def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]
     """
     width = config.channels_per_type
     if not config.group_rounds:
-        return [(1, width // num_rounds)] * (9 * num_rounds)
-    types = {"types": (1,) * 9, "modalities": _MODALITIES, "all": (9,)}[config.groups]
+        return [(1, width // num_rounds)] * (len(CHANNELS) * num_rounds)
+    number = len(CHANNELS)
+    types = {"types": (1,) * number, "modalities": _MODALITIES, "all": (number,)}[config.groups]
     return [(count * num_rounds, count * width) for count in types]
 
 

@@ -94,7 +94,7 @@ def train(
         OSError: another process trains in the folder, or writing failed.
         NonFiniteLossError, NonFiniteStateError: a value is not finite; earlier checkpoints remain.
         KeyboardInterrupt: after Ctrl-C, once the state is saved.
-        SystemExit: after SIGTERM, once the state is saved.
+        SystemExit: after SIGTERM, once the state is saved; both also if the signal came during the last step.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.simulation.frame_set import fresh_streets
@@ -216,7 +216,7 @@ def train(
                     metrics.close()
         if is_main_process:
             draw_metrics(run.folder)
-    if done < steps:
+    if done < steps or request.signal is not None:
         print(f"stopped after step {done}, which is saved", file=sys.stderr)
         if request.signal == signal.SIGINT:
             raise KeyboardInterrupt

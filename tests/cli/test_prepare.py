@@ -137,6 +137,36 @@ def test_mistakes_get_one_line(root, tmp_path, capsys, more, expected):
     assert_one_line_error(capsys, prepare(root, tmp_path / "i", *more.split()), expected)
 
 
+@pytest.mark.parametrize(
+    ("splits", "more", "expected"),
+    [
+        (None, "--train-split train", "split 'train': scene-0001: no such scene in"),
+        (None, "--train-split other", "split 'other': not found in"),
+        ({"train": ["scene-99"]}, "--train-split train", "split 'train': scene-99: no such scene in"),
+        ({"train": []}, "--train-split train", "splits.json: train: got no scene, expected at least one"),
+    ],
+)
+def test_a_wrong_split_is_refused_before_the_index_is_made(root, tmp_path, capsys, splits, more, expected):
+    copy = shutil.copytree(root, tmp_path / "copy")
+    (copy / VERSION / "splits.json").unlink()
+    if splits is not None:
+        (copy / VERSION / "splits.json").write_text(json.dumps(splits))
+    assert_one_line_error(capsys, prepare(copy, tmp_path / "i", *more.split()), expected)
+    assert [file.name for file in (tmp_path / "i").iterdir()] == [".lock"]
+
+
+def test_a_version_without_annotations_only_gets_an_index(root, tmp_path, capsys):
+    copy = shutil.copytree(root, tmp_path / "copy")
+    for table in ("sample_annotation", "instance"):
+        (copy / VERSION / f"{table}.json").write_text("[]")
+    (copy / VERSION / "splits.json").unlink()
+    command(*prepare(copy, tmp_path / "i"))
+    record = json.loads(capsys.readouterr().out)
+    assert (record["annotations"], "objects" in record) == (0, False)
+    assert not (tmp_path / "i" / "objects").exists()
+    assert len(NuScenes(copy, VERSION, index=tmp_path / "i").sample_tokens) == 4 * SCENES
+
+
 @pytest.mark.parametrize(("size", "finished"), [("16k", set()), ("152k", {"index.json"})])
 def test_a_full_disk_gets_one_line_and_nothing_half_written(root, tmp_path, size, finished):
     small = tmp_path / "small"

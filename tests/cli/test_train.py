@@ -113,17 +113,30 @@ def stop(process: Forked, number: int, out: Path, beyond: int = 0) -> tuple[int,
 def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
     """tests/training/test_run.py compares the result of a resumed run."""
     out = tmp_path / "run"
-    code, errors, stopped_at = stop(child(train(root, out, *long(root))), signal.SIGINT, out)
+    code, errors, stopped_at = stop(child(train(root, out, *long(root), "--auto-resume")), signal.SIGINT, out)
     resumed = child(train(root, out, *long(root), "--resume"))
     resumed_code, resumed_errors, end = stop(resumed, signal.SIGTERM, out, stopped_at)
     assert (code, resumed_code) == (130, 143), errors + resumed_errors
-    for text in (errors, resumed_errors):
-        assert "Traceback" not in text
-        assert "which is saved\nthe same command with --resume continues\n" in text
+    assert f"{out}: no run to resume, starting one\n" in errors
+    assert "which is saved\nthe same command continues\n" in errors
+    assert "which is saved\nthe same command with --resume continues\n" in resumed_errors
+    assert "Traceback" not in errors + resumed_errors
     assert 0 < stopped_at < end < MANY
     assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, end)]
     # No step was repeated or left out.
     assert [line["step"] for line in read_metrics(out)] == list(range(1, end + 1))
+
+
+def test_auto_resume_continues_a_run_and_says_when_it_starts_one(root, tmp_path, capsys, monkeypatch):
+    asked = []
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", lambda *_, resume, **__: asked.append(resume) or 1 / 0)
+    out = tmp_path / "run"
+    for _ in range(2):
+        cli.main(train(root, out, "--auto-resume"))
+        out.mkdir(exist_ok=True)
+        (out / "run.json").write_text("{}")
+    assert asked == [False, True]
+    assert capsys.readouterr().err.count("no run to resume, starting one") == 1
 
 
 def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, child):

@@ -20,7 +20,6 @@ from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.build import build_index, velocities
 from fcos_lidar_jax.data.nuscenes.index import default_index, open_index, save_index
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
-from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.nuscenes.tables import SampleData, read_table
 
 
@@ -85,19 +84,21 @@ def test_splits_select_the_keyframes_of_their_scenes(made, tmp_path):
     assert data.split("half", file=file) == [token("sample", 0, k) for k in range(KEYFRAMES)]
 
 
-def test_official_splits_are_read_from_the_source_of_the_devkit(tmp_path, monkeypatch):
-    folder = tmp_path / "nuscenes" / "utils"
-    folder.mkdir(parents=True)
-    source = "raise_if_imported = 1 / 0\ntrain_detect = ['b']\ntrain_track = ['a']\n"
-    source += "train = list(sorted(set(train_detect + train_track)))\nval = ['c', 'd']\nother = ['x']\n"
-    (folder / "splits.py").write_text(source)
-    (folder.parent / "__init__.py").write_text("raise ImportError('must not be imported')")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "nuscenes", raising=False)  # another test may have imported the real one
-    assert scenes_of_split("train", tmp_path) == ["a", "b"]
-    assert scenes_of_split("val", tmp_path) == ["c", "d"]
-    with refused("split 'other': not found"):
-        scenes_of_split("other", tmp_path)
+def test_official_splits_need_neither_a_file_nor_the_devkit(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "nuscenes", None)
+    tables, clouds = make_tables(10)
+    names = [*range(10)]
+    names[3], names[7] = 103, 916  # mini_val, as nuScenes documents it
+    for row, number in zip(tables["scene"], names, strict=True):
+        row["name"] = f"scene-{number:04d}"
+    root = write(tmp_path / "root", tables, clouds)
+    (root / VERSION / "splits.json").unlink()
+    data = NuScenes(root, VERSION)
+    assert data.split("mini_val") == [token("sample", s, k) for s in (3, 7) for k in range(KEYFRAMES)]
+    with refused("split 'mini_train': scene-0061: no such scene in", "scene.json", "pass a file {name: [scene"):
+        data.split("mini_train")
+    with refused("split 'other': not found", "expected one of train, val, test, mini_train, mini_val"):
+        data.split("other")
 
 
 def test_tables_read_in_pieces_equal_tables_read_whole(made, tmp_path):

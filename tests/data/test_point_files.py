@@ -11,6 +11,8 @@ import pyarrow.feather
 import pytest
 from refusal import refused
 
+from fcos_lidar_jax.cli import main
+from fcos_lidar_jax.data import point_files
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -97,6 +99,29 @@ def test_other_raw_layouts_are_read_by_columns_and_dtype(tmp_path, points, colum
     read = read_points(save(tmp_path / "a.bin", rows), NUSCENES_HDL32E, columns=columns, dtype=dtype)
     np.testing.assert_array_equal(read[:, :columns], rows.astype(np.float32))
     assert not read[:, columns:].any()
+
+
+def test_every_ending_is_read_and_named_in_the_help(tmp_path, points, capsys, monkeypatch):
+    rows = points[:200, :4]
+    columns = dict(zip(("x", "y", "z", "intensity"), rows.T, strict=True)) | {"laser_number": np.zeros(200, "u1")}
+    stream = io.BytesIO()
+    pyarrow.feather.write_feather(pyarrow.table(columns), stream)
+    contents = {
+        ".pcd.bin": nuscenes_rows(points[:200]),
+        **{".bin": rows, ".npy": rows, ".npz": {"points": rows}},
+        **{".pcd": pcd_header("binary", 200) + rows.tobytes(), ".feather": stream.getvalue()},
+    }
+    assert tuple(contents) == point_files.ENDINGS
+    for ending, content in contents.items():
+        read = read_points(save(tmp_path / f"a{ending}", content), NUSCENES_HDL32E)
+        np.testing.assert_array_equal(read[:, :4], rows)
+    for command in ("detect", "project"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        assert ", ".join(contents) in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    monkeypatch.setattr(point_files, "ENDINGS", (".xyz",))
+    with pytest.raises(NotImplementedError, match=r"^\.xyz is in ENDINGS, but read_points does not"):
+        read_points(save(tmp_path / "a.xyz", b"1 2 3"), NUSCENES_HDL32E)
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5])

@@ -5,17 +5,28 @@ import re
 
 import numpy as np
 import pytest
+import tyro
 
 from experiments.changes import change
 from experiments.paper_tables import scales
+from experiments.paper_tables.__main__ import TablesArgs
 from experiments.paper_tables.paper_rows import PAPER_TABLES
 from experiments.paper_tables.scales import NuScenesLayout, quarter, smoke
-from fcos_lidar_jax.cli import prepare
+from fcos_lidar_jax.cli import _explain, prepare
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.evaluation.results import write_results
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
+from fcos_lidar_jax.training import Schedule
+
+
+def test_the_options_of_the_advice_about_memory_are_known():
+    values = {"optimizer.accumulate": ["4"], "model.precision": ["bfloat16"], "model.remat": []}
+    advised = re.findall(r"--((?:optimizer|model)[\w.]+)", str(_explain(MemoryError())))
+    words = [word for name in advised for word in (f"--{name}", *values[name])]
+    given = tyro.cli(TablesArgs, args=words).nuscenes
+    assert (given.accumulate, given.precision, given.remat) == (4, "bfloat16", True)
 
 
 def test_one_sweep_and_ten_see_the_same_streets(tmp_path):
@@ -94,6 +105,7 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
     ((folder, wanted, frames, options),), ((detector, tests),) = asked, submitted
     assert (folder, wanted, detector) == (tmp_path / "run", config, "the detector")
     assert (options["steps"], options["seed"], options["workers"]) == (5, 3, 2)
+    assert (options["threads"], options["schedule"]) == (None, Schedule()), "as of fcos-lidar train"
     assert {frames.scene(i) for i in range(3)} == {"scene-0001"}
     assert {tests.scene(i) for i in range(3)} == {"scene-0002"}
     assert (frames.reading.num_sweeps, tests.reading.num_sweeps) == (3, 3)
@@ -105,3 +117,16 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
         other.objects(frames)
     with pytest.raises(ValueError, match="wrong"):
         dataclasses.replace(layout, val_split="wrong").checked()
+    # The test split is opened before the first cell is trained.
+    with pytest.raises(ValueError, match=r"^--test-version: .*v9: no such folder"):
+        dataclasses.replace(layout, test_version="v9").checked()
+    testing = dataclasses.replace(layout, test_version="v1.0-mini")
+    with pytest.raises(ValueError, match=r"^--test-version: split 'test': not found in .*splits.json"):
+        testing.checked()
+    splits.write_text(splits.read_text().replace("}", ', "test": ["scene-0002"]}'))
+    assert testing.checked().test_version == "v1.0-mini"
+    for cloud in (tmp_path / "one" / "samples" / "LIDAR_TOP").iterdir():
+        cloud.unlink()
+    NuScenesLayout._data.cache_clear()
+    with pytest.raises(ValueError, match=r"^--test-version: .*\.pcd\.bin: no such file"):
+        testing.checked()

@@ -21,7 +21,7 @@ sys.path += [str(Path(__file__).parents[1] / "support")]
 from experiments.script import run_script, save
 
 from .engine import Limits, fuzz, summed
-from .targets import make_targets
+from .targets import make_targets, plain_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Args:
     seed: int = 0
     """Seed of the mutations."""
     only: tuple[str, ...] = ()
-    """Names of targets; default: all."""
+    """Names of targets, in any case and without spaces; default: all."""
     workers: int = os.cpu_count() or 1
     """Number of concurrent processes."""
     memory_mib: int = 2048
@@ -46,9 +46,12 @@ class Args:
 
 def main(args: Args) -> None:
     """Fuzz the targets, print and write the figures."""
-    targets = [target for target in make_targets() if not args.only or target.name in args.only]
-    if len(targets) < len(args.only):
-        raise ValueError(f"--only: got {args.only}, expected some of {', '.join(t.name for t in make_targets())}")
+    known = {plain_name(target.name): target for target in make_targets()}
+    if unknown := [name for name in args.only if plain_name(name) not in known]:
+        raise ValueError(
+            f"--only: got {unknown[0]!r}, expected some of {', '.join(t.name for t in known.values())}"
+        )
+    targets = [known[name] for name in dict.fromkeys(map(plain_name, args.only))] or list(known.values())
     began = reported = time.monotonic()
 
     def report(done: int) -> None:

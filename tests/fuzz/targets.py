@@ -437,6 +437,11 @@ def _synthesize(folder: Path, name: str = "") -> None:
     write_dataset(SPEC, folder, workers=1, report=lambda done: None)
 
 
+def plain_name(name: str) -> str:
+    """The name of a target in small letters without spaces; for formats, their name."""
+    return name.lower().replace(" ", "")
+
+
 def make_targets() -> list[Target]:
     """All targets, with files that their readers accept."""
     lag, ring = np.zeros(60), np.arange(60) % 32

@@ -1,11 +1,14 @@
 """The short form of the fuzzing, and a test that it notices every kind of failure."""
 
 import json
+import re
 from typing import get_args
 
 from commands import run_python
 
 from fcos_lidar_jax.input_pipeline.open import Format
+
+from .targets import plain_name
 
 
 def test_every_reader_refuses_in_one_line_or_returns_valid_data(tmp_path):
@@ -19,8 +22,19 @@ def test_every_reader_refuses_in_one_line_or_returns_valid_data(tmp_path):
     # Logs skip damaged lines; a run spec that differs in anything is of another run.
     assert record["targets"].keys() - refused == {"metrics.jsonl", "resume log"}
     assert record["targets"].keys() - accepted <= {"run.json"}
-    fuzzed = {name.lower().replace(" ", "") for name in record["targets"]}
+    fuzzed = set(map(plain_name, record["targets"]))
     assert set(get_args(Format)) - fuzzed == {"simulated"}
+
+
+def test_targets_are_named_as_formats_are(tmp_path):
+    out = tmp_path / "fuzz.json"
+    run = ("-m", "tests.fuzz", "--inputs", 20, "--workers", 1, "--out", out, "--only")
+    done = run_python(*run, "argoverse2", "KITTI")
+    assert done.returncode == 0, done.stderr
+    assert set(json.loads(out.read_text())["targets"]) == {"Argoverse 2", "KITTI"}
+    done = run_python(*run, "kitti", "kiti")
+    assert done.returncode == 1
+    assert re.search("--only: got 'kiti', expected some of .*KITTI", done.stderr)
 
 
 MISTREATED = """

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import pickle
 import shutil
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.input_pipeline.open import READERS, default_split, find_data_set, open_frames
+from fcos_lidar_jax.input_pipeline.open import Format as FormatName
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
@@ -57,6 +58,11 @@ def roots(tmp_path_factory):
         "argoverse2": make_argoverse2(folder / "argoverse2", sweeps=2, sensor=COARSE),
         "folder": make_folder(folder / "folder", train=2, val=1),
     }
+
+
+def test_every_format_is_tried_here(roots):
+    assert roots.keys() == FORMATS.keys()
+    assert FORMATS.keys() | {"simulated"} == {reader.name for reader in READERS} == set(get_args(FormatName))
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -220,6 +220,10 @@ def test_a_run_that_stops_fails_and_resumes_is_bit_identical(finished, tmp_path,
     with pytest.raises(NonFiniteLossError, match=message):
         train(2, overflowing, resume=True)
     assert "going back to the checkpoint before" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stopped:  # also in the last step, so that no further run starts
+        exit_code("train", lambda: train(STEPS - 1, signalled(signal.SIGTERM), resume=True))
+    assert stopped.value.code == 143
+    assert f"stopped after step {STEPS}, which is saved" in capsys.readouterr().err
     assert bits(train(-1, None, resume=True)) == bits(state)
     times = {"seconds", "waiting_seconds", "samples_per_second"}
     resumed, uninterrupted = (

@@ -112,10 +112,7 @@ class NuScenes:
             ValueError: no such split, an unknown scene, or no keyframe.
         """
         row = {str(scene): i for i, scene in enumerate(self.index.scene_name)}
-        scenes = scenes_of_split(name, self.tables, file=file)
-        for scene in scenes:
-            if scene not in row:
-                raise ValueError(f"split {name!r}: {scene}: no such scene in {self.tables / 'scene.json'}")
+        scenes = scenes_of_split(name, self.tables, row, file=file)
         selected = np.isin(self.index.sample_scene, [row[scene] for scene in scenes])
         tokens = [token for token, yes in zip(self._sample_row, selected, strict=True) if yes]
         if not tokens:
