@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from commands import assert_one_line_error, command
+from linear_network import linear_network
 from made_folder import CLASSES, make_folder
 from tiny_run import NETWORK_OPTIONS
 
@@ -41,8 +42,9 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     commands = [shlex.split(line) for line in re.findall(r"^fcos-lidar .*", PAGE, re.MULTILINE)]
     assert [command[1] for command in commands] == ["prepare", "train", "evaluate", "detect"]
     smaller = {"train": [*NETWORK_OPTIONS, "--steps 2 --save-every 2 --evaluate-every 2"]}
-    for _, name, *args in commands:
-        command(name, *args, *smaller.get(name, []))
+    with linear_network():
+        for _, name, *args in commands:
+            command(name, *args, *smaller.get(name, []))
     summary = json.loads(Path("evaluation/metrics_summary.json").read_text())
     assert set(summary["mean_dist_aps"]) == {"person", "rider", "vehicle"}
     assert Path("evaluation/report.html").exists()
