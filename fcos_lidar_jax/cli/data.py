@@ -42,7 +42,7 @@ class DataOptions:
     class_map: Annotated[str | None, option("NAME|FILE")] = None
     """Renames classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes, or a JSON file:
     {name in the data: new name, or null to leave out its objects}."""
-    full_turn: bool = False  # KITTI: keep the points outside of the camera's image, where nothing is labelled.
+    full_turn: bool = False  # KITTI: keep the points outside of the camera's image; nothing is labelled there.
     intensity_scale: options.IntensityScale = None
     follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.

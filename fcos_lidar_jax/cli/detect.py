@@ -24,7 +24,7 @@ from fcos_lidar_jax.cli.checks import (
 )
 from fcos_lidar_jax.cli.options import alignment_of, option, radians
 from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import expect_points
+from fcos_lidar_jax.data.cloud_policy import expect_points, truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
@@ -191,7 +191,7 @@ def _detect(
         for index, (state, picture) in enumerate(zip(states, pictures, strict=True))
         if state not in log or (picture is not None and not picture.exists())
     ]
-    progress = Progress("files", len(clouds))
+    progress, num_truncated = Progress("files", len(clouds)), 0
     if done := len(states) - len(todo):
         progress.show(done, "detected before")
     found = predict(detector, clouds, indices=todo, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
@@ -207,9 +207,12 @@ def _detect(
             _draw(picture, points, detections, detector, shown_score)
         record = cloud_record(detections, cloud, detector.classes)
         log.add(states[index], [{"file": str(file), **record}])
+        num_truncated += cloud.num_truncated
         scores = [box["score"] for box in record["boxes"]]
         clear = sum(score >= shown_score for score in scores)
         progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
+    if line := truncation(num_truncated):
+        print(line, file=sys.stderr)
 
 
 def _draw(

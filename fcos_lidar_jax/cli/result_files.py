@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -11,9 +12,9 @@ import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.checks import check_out_folder, check_outputs, check_outside
-from fcos_lidar_jax.data.kitti import CLASSES, read_calibration
+from fcos_lidar_jax.data.kitti import TO_NUSCENES, read_calibration
 from fcos_lidar_jax.data.point_files import ENDINGS
-from fcos_lidar_jax.evaluation.kitti_results import write_result
+from fcos_lidar_jax.evaluation.kitti_results import kitti_types, write_result
 from fcos_lidar_jax.evaluation.openlabel import write_openlabel
 from fcos_lidar_jax.evaluation.records import read_boxes
 from fcos_lidar_jax.evaluation.results import result_entries, write_results
@@ -36,7 +37,7 @@ FORMATS: dict[Format, ResultFormat] = {
     "kitti": ResultFormat(calibrated=True),
     "openlabel": ResultFormat(),
 }
-_TYPES = {name.lower(): name for name in CLASSES}  # KITTI's
+_TYPES = kitti_types(TO_NUSCENES) | kitti_types()
 
 
 def check_result_files(args: Any, keep: Sequence[Path]) -> None:
@@ -77,7 +78,8 @@ def result_files(
 ) -> Iterator[Write]:
     """A function that takes lines of ``stream``. KITTI's files are written at once, one file at the end."""
     if FORMATS[output_format].calibrated:
-        yield _kitti(out, classes, calibration)
+        with _kitti(out, classes, calibration) as write:
+            yield write
         return
     with tempfile.TemporaryFile() as stream:
         records = _Lines(stream)
@@ -111,20 +113,26 @@ def _sample(record: dict[str, Any], classes: Sequence[str]) -> tuple[str, bytes]
     return token, json.dumps(entries).encode()
 
 
-def _kitti(folder: Path, classes: Sequence[str], calibration: Path | None) -> Write:
-    number = 0
+@contextlib.contextmanager
+def _kitti(folder: Path, classes: Sequence[str], calibration: Path | None) -> Iterator[Write]:
+    number = num_boxes = num_left_out = 0
 
     def write(record: dict[str, Any]) -> None:
-        nonlocal number
+        nonlocal number, num_boxes, num_left_out
         cloud, stem = Path(record["file"]), _stem(record["file"], number)
         boxes, labels, scores = read_boxes(record, classes)
         types = np.array([_TYPES.get(classes[int(label)].lower(), "") for label in labels], object)
         kept = types != ""
         rows = boxes[kept], types[kept].tolist(), scores[kept]
-        write_result(folder / f"{stem}.txt", *rows, read_calibration(_calibration(calibration, cloud, stem)))
+        calibrated = read_calibration(_calibration(calibration, cloud, stem))
+        num_left_out += int((~kept).sum()) + write_result(folder / f"{stem}.txt", *rows, calibrated)
+        num_boxes += len(boxes)
         number += 1
 
-    return write
+    yield write
+    if num_left_out:
+        why = "outside of the image, or of a class without a type of KITTI"
+        print(f"{folder}: {num_left_out} of {num_boxes} boxes left out: {why}", file=sys.stderr)
 
 
 def _stem(cloud: str | Path, number: int) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.cli.processes import tell
+from fcos_lidar_jax.data.cloud_policy import truncation
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.comparison import Compared, Comparison
 from fcos_lidar_jax.evaluation.examples import choose_examples
@@ -55,8 +56,8 @@ def write_detections(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: flo
         batch_size=batch_size,
         yaw_rad=yaw_rad,
     )
-    if removed["truncated"]:
-        tell(f"{removed['truncated']} points truncated: more than the detector's max_points")
+    if line := truncation(removed["truncated"]):
+        tell(line)
     if removed["invalid"]:
         tell(f"{removed['invalid']} points dropped: not finite, or beyond physical limits")
 

@@ -18,7 +18,7 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.result_files import FORMATS, check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
@@ -107,7 +107,7 @@ def run(args: Stream) -> None:
     drive = _open(args, kind, detector, aligned.data)
     _tell(drive.notes)
     frames: list[PageFrame] = []
-    tracks, before_us = Tracks(), None
+    tracks, before_us, num_truncated = Tracks(), None, 0
     shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
     with (
         rerun_recording(args.rrd, detector.classes, min_score=shown_score) as record_rerun,
@@ -139,9 +139,9 @@ def run(args: Stream) -> None:
             record_rerun(points, (boxes, labels, scores), **details)
             if args.page is not None:
                 frames.append(page_frame(points, (boxes, labels, scores), **details))
-            before_us = found.sweep.time_us
+            before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
     _tell(drive.notes)
-    print(timing.summary(), file=sys.stderr)
+    print(*filter(None, (truncation(num_truncated), timing.summary())), sep="\n", file=sys.stderr)
     if args.page is not None:
         title = args.scene or str(args.source)
         write_page(args.page, frames, classes=detector.classes, title=title, min_score=shown_score)

@@ -174,6 +174,15 @@ def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sens
     )
 
 
+def truncation(number: int) -> str | None:
+    """A line about truncated points, or None.
+
+    >>> truncation(7)
+    "7 points truncated: more than the detector's max_points"
+    """
+    return f"{number} points truncated: more than the detector's max_points" if number else None
+
+
 def _limits(sensor: Sensor) -> str:
     low, high = sensor.limit_z_m
     return f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m"

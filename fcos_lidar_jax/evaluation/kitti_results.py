@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import LIMITS
-from fcos_lidar_jax.data.class_mapping import MappedFrames
+from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, WrappedFrames
 from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration, read_objects, to_lidar
 from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, evaluate_kitti
@@ -71,16 +71,24 @@ def _kitti_frames(frames: FrameSet | None) -> tuple[KittiFrames, dict[str, str]]
     while isinstance(frames, WrappedFrames):
         maps += [frames.class_map] if isinstance(frames, MappedFrames) and frames.class_map else []
         frames = frames.frames
-    if not isinstance(frames, KittiFrames):
-        return None
+    return (frames, kitti_types(*reversed(maps))) if isinstance(frames, KittiFrames) else None
+
+
+def kitti_types(*class_maps: ClassMap) -> dict[str, str]:
+    """KITTI's types by class in lower case, after class maps from the types to the classes.
+
+    >>> from fcos_lidar_jax.data.kitti import TO_NUSCENES
+    >>> [kitti_types(TO_NUSCENES)[name] for name in ("car", "bicycle", "bus")]
+    ['Car', 'Cyclist', 'Tram']
+    """
     types: dict[str, str] = {}
     for kind in (*MIN_OVERLAP, *CLASSES):  # A class of several types stands for the one that is evaluated.
         name: str | None = kind
-        for class_map in reversed(maps):
+        for class_map in class_maps:
             name = None if name is None else class_map.get(name, name)
         if name is not None:
             types.setdefault(name.lower(), kind)
-    return frames, types
+    return types
 
 
 def write_result(

@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch, truncation
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
@@ -99,6 +99,8 @@ class CloudDetector(abc.ABC):
         if line := sensor_mismatch(rows, self.sensor):
             warnings.warn(line, stacklevel=2)
         cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
+        if line := truncation(cloud.num_truncated):
+            warnings.warn(line, stacklevel=2)
         found = aligned.back(self.detect(cloud))
         boxes, labels, scores = confident(found, 0.0)
         counts = ({"file": str(points)} if is_file else {}) | point_counts(found, cloud)

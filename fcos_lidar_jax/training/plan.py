@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -25,7 +26,7 @@ from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options, packing_for
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.packing import Packing
-from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.sensors import sensor_to_json, turn_between
 from fcos_lidar_jax.training.metrics_log import evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.step import make_state
@@ -238,6 +239,9 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
         own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
         for name, was, now in _differences(own, new, "model"):
             print(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}", file=sys.stderr, flush=True)
+        if turn := turn_between(detector.sensor, checkpoint.sensor):
+            told = f"weights of clouds turned by {math.degrees(turn):g} degrees against those to be trained with"
+            print(f"{folder}: {told}: expect scores to fall at first", file=sys.stderr, flush=True)
     return checkpoint.variables
 
 

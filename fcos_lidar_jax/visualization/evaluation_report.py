@@ -11,6 +11,8 @@ import numpy as np
 
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.examples import sensor_boxes
+from fcos_lidar_jax.evaluation.kitti import DIFFICULTIES
+from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.projection import project_points
@@ -116,11 +118,28 @@ def write_evaluation_report(
         lead=_lead(summary, num_samples, defined),
         links=links,
         summary=_scores(summary, intervals, defined),
-        tables=[("By class", ("class", "AP", *(f"AP {float(d):g} m" for d in distances), *short), rows)],
+        tables=[
+            ("By class", ("class", "AP", *(f"AP {float(d):g} m" for d in distances), *short), rows),
+            *_kitti_table(out / KITTI_SUMMARY),
+        ],
         galleries=[("Precision over recall", precisions), ("Mean errors of the hits, up to each recall", errors)],
         pictures=[*pictures, *views],
         wide_pictures=images,
     )
+
+
+def _kitti_table(file: Path) -> list[tuple[str, tuple[str, ...], list[tuple[Cell, ...]]]]:
+    """The table of KITTI's metric, if it was evaluated."""
+    if not file.is_file():
+        return []
+    metrics = json.loads(file.read_text())
+    rows = [
+        (f"{name}, {kind}", *(float("nan") if value is None else value for value in scores[kind].values()))
+        for name, scores in metrics["classes"].items()
+        for kind in ("bev", "3d")
+    ]
+    head = f"KITTI's metric: AP_R40 in percent, on {metrics['num_frames']} frames"
+    return [(head, ("class", *DIFFICULTIES), rows)]
 
 
 def clear_report(out: Path) -> None:

@@ -193,7 +193,7 @@ def test_keyframes_of_nuscenes_are_called_by_their_tokens(home, tmp_path):
 
 
 @pytest.mark.parametrize("command_line", ["stream", "detect"])
-def test_result_files_of_kitti(home, lines, tmp_path, command_line):
+def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys):
     out = tmp_path / "kitti"
     if command_line == "stream":
         stream(home, out, "--output-format kitti")
@@ -201,6 +201,7 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line):
         where = "--checkpoint", home / "checkpoint", "--min-score 0.001 --output-format kitti --out", out
         command("detect", home / "training" / "velodyne", *where, "--calibration", home / "training" / "calib")
     types, written = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}, 0
+    types |= {"bicycle": "Cyclist", "bus": "Tram"}
     assert sorted(file.name for file in out.iterdir()) == [f"{number:06d}.txt" for number in range(3)]
     for number, line in enumerate(lines):
         left = [box for box in line["boxes"] if box["label"] in types]
@@ -221,6 +222,9 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line):
             u, v, depth = P2 @ [*(AXES @ box["box"][:3] + SHIFT), 1]
             assert depth < 0.1 or not (0 < u / depth < 1241 and 0 < v / depth < 374)
     assert written > 0
+    number = sum(len(line["boxes"]) for line in lines)
+    told = f"{out}: {number - written} of {number} boxes left out: outside of the image, or of a class"
+    assert told in capsys.readouterr().err
 
 
 MISTAKES = [

@@ -19,6 +19,7 @@ from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.types import Detections
+from fcos_lidar_jax.visualization import evaluation_report
 
 
 def random_boxes(number, seed=0):
@@ -182,6 +183,10 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     metrics = json.loads((tmp_path / "out" / "metrics_kitti.json").read_text())
     assert metrics["classes"]["Car"]["3d"] == {"easy": 100.0, "moderate": 100.0, "hard": 100.0}
     assert list(metrics["classes"]) == ["Car", "Pedestrian", "Cyclist"]
+    ((_, header, rows),) = evaluation_report._kitti_table(tmp_path / "out" / "metrics_kitti.json")
+    assert header == ("class", "easy", "moderate", "hard")
+    assert rows[1] == ("Car, 3d", 100.0, 100.0, 100.0)
+    assert evaluation_report._kitti_table(tmp_path / "none.json") == []
     printed = capsys.readouterr().out
     assert "KITTI AP_R40 on 6 frames" in printed
     assert "mAP by centre distance" in printed

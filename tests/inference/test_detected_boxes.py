@@ -106,3 +106,10 @@ def test_a_detector_takes_arrays_of_jax_and_lists_and_prints_in_one_line():
         jax.jit(lambda rows: detector(rows).boxes)(points)
     with pytest.raises(ValueError, match=r"points: got list, expected an array of real numbers$"):
         detector([[1, 2, 3], [4, 5]])
+
+
+def test_truncated_points_are_told():
+    detector = load_detector("quickstart")
+    points = unseen_frames(detector.sensor, 1).frame(0).points
+    with pytest.warns(UserWarning, match="points truncated: more than the detector's max_points"):
+        detector(np.concatenate([points] * 2))

@@ -16,7 +16,7 @@ import pytest
 from commands import run_python
 from event_files import summaries
 from PIL import Image
-from tiny_run import CONFIG, FRAMES, STEPS, TESTS, bits, train_tiny, weights
+from tiny_run import CONFIG, FRAMES, SENSOR, STEPS, TESTS, bits, train_tiny, weights
 
 from fcos_lidar_jax.checkpoints import load_checkpoint, load_state
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
@@ -26,7 +26,8 @@ from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.input_pipeline import loader
 from fcos_lidar_jax.input_pipeline.database import prepare_database
-from fcos_lidar_jax.training import NonFiniteLossError
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.training import NonFiniteLossError, plan
 from fcos_lidar_jax.training import run as runs
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Batch, PackedBatch
@@ -100,6 +101,14 @@ def test_initial_weights_of_another_coding_are_reported(finished, tmp_path, caps
     (line,) = [line for line in lines if "weights of" in line]
     assert line.endswith("weights of model.regression_axes 'lidar', to be trained with 'ray'")
     assert not any(line.startswith("warning: ") for line in lines)
+
+
+def test_initial_weights_for_another_heading_are_reported(finished, capsys):
+    for turn in (0, np.pi / 2):
+        sensor = dataclasses.replace(SENSOR, forward_rad=SENSOR.forward_rad - turn)
+        plan._initial_weights(build_detector(CONFIG, sensor), finished[0])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "weights of clouds turned by 90 degrees against those to be trained with: " in line
 
 
 def test_all_documented_metrics_are_recorded(finished):
