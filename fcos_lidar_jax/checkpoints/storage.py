@@ -6,7 +6,6 @@ is not hashed.
 """
 
 import dataclasses
-import functools
 import json
 import os
 import shutil
@@ -81,7 +80,6 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     processes may call this function.
 
     Raises:
-        CheckpointError: the arrays do not belong to the configuration; nothing is written.
         NonFiniteStateError: a value is not finite; nothing is written.
         OSError: writing failed; the message is one line.
 
@@ -100,8 +98,6 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     for name, leaf in _by_name(parts).items():
         if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
             raise NonFiniteStateError(f"{folder}: not saved: {name}: not finite")
-    shapes = _shapes(checkpoint.config, checkpoint.sensor)
-    check_arrays(folder, shapes, parts[_VARIABLES], whose=f"the configuration {checkpoint.config.name!r}")
     _check_space(folder, parts)
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -162,16 +158,11 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     description = _verify(folder)
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     sensor = sensor_from_json(description["sensor"], f"{folder / _DESCRIPTION}: sensor")
-    variables = _load_arrays(folder / _VARIABLES, _shapes(config, sensor), config)
+    expected = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
+    variables = _load_arrays(folder / _VARIABLES, expected, config)
     return Checkpoint(
         config, sensor, variables, description["step"], description.get("data", ""), description.get("score")
     )
-
-
-@functools.lru_cache(maxsize=8)
-def _shapes(config: Config, sensor: Sensor) -> Any:
-    """Shapes of the variables of a detector."""
-    return jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
 
 
 def read_state(folder: Path, like: TrainState) -> TrainState:

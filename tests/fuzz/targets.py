@@ -32,7 +32,7 @@ from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.drives import read_tum
 from fcos_lidar_jax.data.folder import FolderFrames
-from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
@@ -109,7 +109,8 @@ def expect(condition: object, what: str) -> None:
 def check_points(points: np.ndarray, sensor: Sensor) -> None:
     shape = (len(points), sensor.point_columns)
     expect(points.dtype == np.float32 and points.shape == shape and len(points), f"{points.dtype} {points.shape}")
-    cloud = make_cloud(points, CONFIG, sensor=sensor)
+    kept, num_close = drop_close(points, sensor, CONFIG.reading)
+    cloud = make_cloud(kept, CONFIG, sensor=sensor, num_close=num_close)
     expect(np.isfinite(cloud.points[cloud.valid]).all(), "points that are not finite")
     expect(cloud.valid.sum() + cloud.num_removed == len(points), "points that are not counted")
 
