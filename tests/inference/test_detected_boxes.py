@@ -111,6 +111,6 @@ def test_a_detector_takes_arrays_of_jax_and_lists_and_prints_in_one_line():
 def test_truncated_points_are_told():
     detector = load_detector("quickstart")
     points = unseen_frames(detector.sensor, 1).frame(0).points
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning, match="point") as told:
         detector(np.concatenate([points] * 2))
     assert "points truncated: more than the detector's max_points" in str(told[-1].message)
