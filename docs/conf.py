@@ -63,7 +63,7 @@ nitpick_ignore_regex = [
     (
         r"py:.*",
         r"fcos_lidar_jax\.(inference\.(export|openvino|stream)|evaluation\.metrics|input_pipeline\.database"
-        r"|data\.(sweeps|nuscenes\.index)|devices\.mesh|collectives\.Tree).*",
+        r"|data\.(sweeps|nuscenes\.index)|devices\.mesh|collectives\._Tree).*",
     ),
 ]
 
