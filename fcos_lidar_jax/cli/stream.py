@@ -141,7 +141,9 @@ def run(args: Stream) -> None:
                 frames.append(page_frame(points, (boxes, labels, scores), **details))
             before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
     _tell(drive.notes)
-    print(*filter(None, (truncation(num_truncated), timing.summary())), sep="\n", file=sys.stderr)
+    if line := truncation(num_truncated):
+        print(line, file=sys.stderr)
+    print(timing.summary(), file=sys.stderr)
     if args.page is not None:
         title = args.scene or str(args.source)
         write_page(args.page, frames, classes=detector.classes, title=title, min_score=shown_score)

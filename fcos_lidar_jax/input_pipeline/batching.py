@@ -115,9 +115,8 @@ def _check_frame(where: str, frame: Frame, columns: int) -> None:
     """Refuse a frame whose arrays do not fit each other, or with an implausible box or label."""
     number = len(frame.boxes)
     for name, shape in (("boxes", (number, 9)), ("labels", (number,)), ("num_points", (number,))):
-        check(
-            getattr(frame, name).shape == shape, f"{where}: {name}: shape", getattr(frame, name).shape, f"{shape}"
-        )
+        found = getattr(frame, name).shape
+        check(found == shape, f"{where}: {name}: shape", found, f"{shape}")
     fits = frame.points.ndim == 2 and columns in (5, 6) and frame.points.shape[1] == columns
     expected = "[n, 5], or [n, 6] with laser numbers, as the other frames"
     check(fits, f"{where}: points: shape", frame.points.shape, expected)
