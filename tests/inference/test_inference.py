@@ -123,7 +123,10 @@ def test_a_detector_accepts_files_and_warns_about_clouds_of_another_sensor(tmp_p
     assert (
         arrays(detector(tmp_path / "cloud.npy")) == arrays(detector(str(tmp_path / "cloud.npy"))) == arrays(found)
     )
-    with pytest.warns(UserWarning, match=r"^points hardly of sensor 'tiny' .*; expect poor detections$"):
+    with (
+        pytest.warns(UserWarning, match=r"^points hardly of sensor 'tiny' .*; expect poor detections$"),
+        pytest.warns(UserWarning, match=r"^19674 points truncated: more than the detector's max_points$"),
+    ):
         detector(make_frame(0, NUSCENES_HDL32E).points)
 
 
