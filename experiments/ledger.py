@@ -3,10 +3,10 @@
     python -m experiments.ledger          # print it
     python -m experiments.ledger --write  # also write it into experiments/README.md
 
-Nothing is trained or timed: our figures come from the files in ``experiments/results``. A claim about accuracy is
-a row of a table of the paper, and its verdict follows from the 95 % interval of the gain over the seeds:
+The ledger reads our figures from ``experiments/results``, without training or timing. A claim about accuracy is a
+row of a table of the paper, and its verdict follows from the 95 % interval of the gain over the seeds:
 
-- excludes zero, with the paper's sign: agrees; agrees in direction alone if it also excludes the paper's figure
+- excludes zero, with the paper's sign: agrees; agrees only in direction if it also excludes the paper's figure
 - excludes zero, with the other sign: disagrees
 - contains zero: undecided; disagrees if it excludes the paper's figure
 """
@@ -32,7 +32,7 @@ RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
 _MIN_SEEDS = 3  # Seeds needed for a verdict.
 _MAX_SEEDS = 100  # Largest number of seeds that is worth naming.
-_DIRECTION = "agrees in direction alone"
+_DIRECTION = "agrees only in direction"
 _OUR_NDS = (
     " Simulated objects have no attributes: their error is 1 in every row, so NDS is at most 90 here, and the\n"
     "paper's gains hold a part that these cannot."
@@ -118,7 +118,7 @@ def verdict_of_figure(figure: Figure, ours: float) -> str:
 
     >>> figure = Figure("", "", float, 1.2)
     >>> [verdict_of_figure(figure, ours) for ours in (1.25, 2.0, 0.9)]
-    ['agrees', 'agrees in direction alone', 'disagrees']
+    ['agrees', 'agrees only in direction', 'disagrees']
     """
     if figure.above:
         return "agrees" if ours > figure.paper else "disagrees"
@@ -136,7 +136,7 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     >>> verdict([2.0, 2.1, 2.2], 1.9)
     ('agrees', '')
     >>> verdict([4.0, 4.1, 4.2], 1.9)[0]
-    'agrees in direction alone'
+    'agrees only in direction'
     >>> verdict([-2.0, -2.1, -2.2], 1.9)
     ('disagrees', "a training as long as the paper's")
     >>> verdict([-1.0, 0.5, 2.0], 1.0)

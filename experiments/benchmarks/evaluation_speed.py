@@ -1,11 +1,11 @@
-"""Speed and memory of the evaluation beside the official devkit, on the same files.
+"""Speed and memory of the evaluation compared with the official devkit, on the same files.
 
     pip install --no-deps nuscenes-devkit==1.2.0
     pip install opencv-python-headless scikit-learn cachetools pyquaternion tqdm
     python -m experiments.benchmarks.evaluation_speed
 
 Generates a data set and a results file of the size of nuScenes val (6,019 keyframes in 150 scenes, with 30
-annotations and 200 predictions each), evaluates it with both in separate processes, and expects the same numbers.
+annotations and 200 predictions each), evaluates it with both in separate processes, and expects identical scores.
 Compares the time from tables in memory to the summary (the devkit's ``DetectionEval`` without curves) and the time
 of the whole process. Also measures the command ``fcos-lidar evaluate --results FILE``.
 

@@ -1,4 +1,4 @@
-"""Compilation of the programs for GPUs by XLA's whole pipeline, without a GPU and without running them.
+"""Compile the programs for GPUs with XLA's complete pipeline, without a GPU.
 
     bash .ci/gpu  # fetches XLA's plugin (0.6 GB) into build/gpu/plugin, then runs this script with its arguments
     bash .ci/gpu --programs train-nuscenes detect-compact
@@ -11,8 +11,8 @@ if they depend on data) and kernels per iteration. ``slow`` counts weight gradie
 a kernel as large as the image, for which cuDNN has no good algorithm. The exit code is 1 if a program does not
 compile, or if devices exchange anything but sums.
 
-Nothing is run, so there are no times, and kernels are chosen without measuring them. Cost: one minute per training
-step and 15 seconds per detection on one core.
+Programs are not run, so there are no times, and kernels are chosen without measurements. Cost: one minute per
+training step and 15 seconds per detection on one core.
 """
 
 import collections

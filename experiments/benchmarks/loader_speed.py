@@ -3,7 +3,7 @@
     python -m experiments.benchmarks.loader_speed --data-root ROOT --version V --split S
 
 Reads a data set in nuScenes' layout (such as one written by ``fcos-lidar synthesize``; default: the real
-scene-0523 below the environment's ``FCOS_LIDAR_REAL_DATA``), cuts a ground-truth database from it, and times
+scene-0523 below the environment's ``FCOS_LIDAR_REAL_DATA``), extracts a ground-truth database from it, and times
 batches prepared on demand, by two threads, by two processes, and packed for a device (a CPU here) by two threads.
 A training step of the quickstart preset is timed for comparison. Files come from the page cache. Other programs
 increase the wall time but not the processor time: an undisturbed loader prepares about cores / (processor time per

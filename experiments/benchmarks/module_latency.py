@@ -1,6 +1,6 @@
 """Times of the modality-wise convolutions in the variants of tables 3, 4 and 5.
 
-    python -m experiments.benchmarks.module_latency  # the stem alone, at full size: 64x1088x45
+    python -m experiments.benchmarks.module_latency  # only the stem, at full size: 64x1088x45
     python -m experiments.benchmarks.module_latency --include-grouped  # feature_group_count too, slow on a CPU
 
 Each variant uses the fastest of its formulations (see ``Stem``), found by a short run of all of them; then all

@@ -1,11 +1,11 @@
-"""Points kept by the multi-round projection, and its time: the paper's figures that need no training.
+"""Points kept by the multi-round projection, and its time. Reproduces figures of the paper without training.
 
     python -m experiments.benchmarks.mrv_figures  # the cloud of FCOS_LIDAR_REAL_DATA, else a simulated one
     python -m experiments.benchmarks.mrv_figures --data FOLDER  # FOLDER/ten_sweep_cloud/cloud.f16.bin
 
 Counts the points kept by 1, 3, 5 and 7 rounds with and without priority of the current sweep, and the points of
 the current sweep among them, with and without the points on the vehicle. Times one sweep and ten in turns, as
-ratios to one round, beside table 1. Cost: half a minute on two CPU cores. The paper (section 3.2): about 240K
+ratios to one round, as in table 1. Cost: half a minute on two CPU cores. The paper (section 3.2): about 240K
 points, of which one round keeps about 28K and five rounds more than 50 %; seven rounds are hardly slower than one
 (0.76 and 0.66 ms).
 """

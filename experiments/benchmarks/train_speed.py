@@ -1,4 +1,4 @@
-"""Time of a training step beside PyTorch's forward and backward pass on the same CPU.
+"""Time of a training step compared with PyTorch's forward and backward pass on the same CPU.
 
     python -m experiments.benchmarks.train_speed --torch-python PYTHON  # an interpreter that has torch
     python -m experiments.benchmarks.train_speed --torch-python PYTHON --peer FILE

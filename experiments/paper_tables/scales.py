@@ -175,7 +175,7 @@ class NuScenesLayout:
     train_split: str | None = None  # Default: that of fcos-lidar prepare, train or mini_train.
     val_split: str | None = None  # Default: val or mini_val.
     test_version: str | None = None
-    """Version, such as v1.0-test, for whose split test table 8 writes a results file."""
+    """Version, such as v1.0-test. Table 8 writes a results file for its split test."""
     allow_missing_sweeps: bool = False  # Use fewer sweeps if files of older sweeps are missing.
     steps: int | None = None  # Updates of each cell, instead of the preset's epochs.
     accumulate: Annotated[int, tyro.conf.arg(aliases=("--optimizer.accumulate",))] = 1

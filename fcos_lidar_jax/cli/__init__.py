@@ -1,4 +1,4 @@
-"""The entry point of the command line, which turns each failure into one line and an exit code."""
+"""Entry point of the command line, which turns each failure into one line and an exit code."""
 
 import contextlib
 import io

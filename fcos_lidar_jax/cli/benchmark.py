@@ -36,10 +36,10 @@ _MATRIX_SIZE = 2048
 class Benchmark:
     """Time a detector on one device: each stage, the whole path from file to boxes, and batches.
 
-    The stages take turns after a first run that compiles them. `detect` is a single program of the stages prepare,
-    network and postprocess; an exported detector has only this program. The network's operations are counted as
-    well, and its speed is compared with the product of two float32 matrices. Expect a small share of that speed:
-    narrow channels move more data than they multiply.
+    After a first run that compiles them, the stages are timed in turns. `detect` is a single program of the stages
+    prepare, network and postprocess; an exported detector has only this program. The speed of the network, in
+    operations per second, is compared with a product of two float32 matrices. Expect a small fraction of that
+    speed, because narrow channels move more data than they multiply.
     """
 
     files: tyro.conf.Positional[
@@ -49,7 +49,7 @@ class Benchmark:
     checkpoint: options.Detector = tyro.MISSING
     out: Annotated[Path | None, option("FILE")] = None  # Also write the times as JSON.
     batch: Annotated[tuple[int, ...], option("N...", default="1 2 4, or the exported size")] = ()  # Batch sizes.
-    repeats: int = 20  # Turns of every stage.
+    repeats: int = 20  # Timed runs of each stage.
     backend: options.Backend = "xla"
 
 

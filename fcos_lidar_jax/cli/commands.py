@@ -28,13 +28,13 @@ from fcos_lidar_jax.files import local_path
 _COMMANDS = {
     "demo": (demo.Demo, demo.run, "detect in a simulated drive; needs no data"),
     "synthesize": (synthesize.Synthesize, synthesize.run, "write simulated streets in the nuScenes layout"),
-    "prepare": (prepare.Prepare, prepare.run, "collect the objects that training pastes; index nuScenes"),
+    "prepare": (prepare.Prepare, prepare.run, "extract objects for copy-paste; index nuScenes"),
     "train": (train.Train, train.run, "train a detector, or resume a run"),
     "evaluate": (evaluate.Evaluate, evaluate.run, "write metrics, a report and a page of frames"),
     "detect": (detect.Detect, detect.run, "write the boxes of point files"),
     "stream": (stream.Stream, stream.run, "write the boxes of a drive, sweep by sweep"),
     "project": (project.Project, project.run, "write the range image of a point file"),
-    "export": (export.Export, export.run, "write a detector as a file of its own, or as ONNX"),
+    "export": (export.Export, export.run, "export a detector to a single file, or to ONNX"),
     "benchmark": (benchmark.Benchmark, benchmark.run, "time a detector, stage by stage"),
 }  # name -> (options, function, line of the list of commands)
 

@@ -37,12 +37,12 @@ class DataOptions:
     """nuScenes: folder of the tables, such as v1.0-trainval."""
     index: Annotated[Path | None, option("DIR", default="DATA_ROOT/.fcos_lidar[/VERSION]")] = None
     """Folder that `fcos-lidar prepare` writes: the objects and, for nuScenes, the index."""
-    splits: Annotated[Path | None, option("FILE", default="those of the data")] = None
+    splits: Annotated[Path | None, option("FILE", default="the splits of the data")] = None
     """JSON file with custom splits: {name: [scene, ...]} for nuScenes, {name: [frame, ...]} for a folder."""
     class_map: Annotated[str | None, option("NAME|FILE")] = None
-    """Renames classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes, or a JSON file:
+    """Rename classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes, or a JSON file:
     {name in the data: new name, or null to leave out its objects}."""
-    full_turn: bool = False  # KITTI: keep the points outside of the camera's image; nothing is labelled there.
+    full_turn: bool = False  # KITTI: keep the points outside the camera image, where nothing is labelled.
     intensity_scale: options.IntensityScale = None
     follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.

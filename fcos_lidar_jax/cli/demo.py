@@ -37,16 +37,16 @@ _MAX_LIMIT_M = 50.0  # half the side of the square that pictures show
 class Demo:
     """Run the shipped detector on an unseen simulated drive. Needs no data and no GPU.
 
-    The command simulates a street, writes it as a data set in the nuScenes layout, detects boxes in its keyframes
-    and evaluates them as the benchmark does. It writes the files of `fcos-lidar evaluate`, an animation, and
-    drive.html, which plays the drive. With --train it then trains the quickstart preset from scratch in the
-    folder training. Ctrl-C ends the training early and evaluates the result; the same command resumes.
+    The command simulates a drive, writes it as a data set in the nuScenes layout, detects boxes in its keyframes,
+    and computes the nuScenes metrics. It writes the files of `fcos-lidar evaluate`, an animation, and drive.html,
+    which plays the drive. With --train, it then trains the preset quickstart from scratch in the folder training.
+    Ctrl-C ends the training early and evaluates the result; the same command resumes.
     """
 
     out: Path = Path("demo_output")  # Folder for the results.
     keyframes: int = 12  # Length of the drive in keyframes, half a second apart.
     drive: int = 3  # Seed of the drive.
-    train: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Also train a small detector, for some minutes.
+    train: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Also train a small detector, in minutes.
     steps: int = 2000  # With --train: training steps.
     test_frames: int = 40  # With --train: unseen frames to evaluate on.
     seed: int = 0  # With --train: seed of the weights and frames.

@@ -71,7 +71,7 @@ class Detect:
     labels: options.Labels = None
     remove_close: options.Close = None
     pictures: Annotated[Path | None, option("DIR")] = None
-    """Also draw every cloud from above, with its boxes."""
+    """Also draw every cloud with its boxes, in bird's-eye view."""
     page: options.Page = None
     rrd: options.Rrd = None
     columns: options.Columns = None

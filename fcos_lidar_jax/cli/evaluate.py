@@ -38,15 +38,19 @@ from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Evaluate detections: on nuScenes with the official metric, on other data or with a class map with the same
-    average precision and errors over the detector's classes, without NDS.
+    """Evaluate a detector or a results file: compute metrics and write a report.
 
-    The detections come from a detector that is run over a split (--checkpoint) or from a file (--results). The
-    truth comes from a data set (--data-root) or, for an official results file, from a file (--ground-truth). The
-    command writes metrics_summary.json, curves.json, report.html, frames.html, which shows the worst and the best
-    frames, and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI it adds the
-    benchmark's own metric, metrics_kitti.json, and its result files, results_kitti. After Ctrl-C or a kill, the
-    same command resumes and repeats at most one batch.
+    On nuScenes, the metric is the official one. On other data, and with a class map, it is the same average
+    precision and errors over the detector's classes, without NDS. For KITTI, the command adds the benchmark's own
+    metric.
+
+    Give a detector with --checkpoint, or a file of detections with --results. The ground truth comes from a data
+    set (--data-root) or, for an official results file, from a file (--ground-truth).
+
+    The command writes metrics_summary.json, curves.json, report.html, frames.html (the worst and the best frames),
+    and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI, it also writes
+    metrics_kitti.json and result files in results_kitti. After Ctrl-C or a kill, the same command resumes and
+    repeats at most one batch.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
@@ -59,16 +63,16 @@ class Evaluate:
     results: Annotated[Path | None, option("FILE")] = None
     """Results to evaluate: an official results file, or detections.json with the --checkpoint it came from."""
     ground_truth: Annotated[Path | None, option("FILE")] = None
-    """Truth instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
+    """Ground truth instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
     yaw_deg: options.Yaw = None
     batch_size: options.BatchSize = 1
     backend: options.Backend = "xla"
     bootstrap: Annotated[int, option("N")] = 0
-    """Resampled sets for the 95 % intervals of mAP and NDS, such as 200; 0 for no intervals."""
+    """Bootstrap samples for the 95 % intervals of mAP and NDS, such as 200; 0 for no intervals."""
     report: bool = True  # Write report.html with its pictures, and frames.html.
     rrd: options.Rrd = None
     sensor: Annotated[str, option("SENSOR")] = "nuscenes_hdl32e"
-    """Sensor preset or sensor file of the report's range images, without a --checkpoint."""
+    """Without --checkpoint: sensor preset or sensor file for the range images of the report."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
     """Share the detection among several processes."""
 

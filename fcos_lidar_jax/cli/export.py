@@ -18,11 +18,10 @@ from fcos_lidar_jax.inference.onnx_graph import network_graph
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write a detector as one file, from points to boxes, that runs with only jax and flatbuffers installed.
+    """Export a detector to one file, from points to boxes, that runs with only jax and flatbuffers installed.
 
-    The file runs on CPUs, GPUs and TPUs, and other commands accept it as their --checkpoint. The command prints a
-    JSON record with the seconds that loading took. With --network-only --format onnx it writes the network as an
-    ONNX graph.
+    The file runs on CPUs, GPUs and TPUs. detect, stream, evaluate and benchmark accept it as --checkpoint. With
+    --network-only --format onnx, the command writes the network as an ONNX graph instead.
     """
 
     checkpoint: options.Trained

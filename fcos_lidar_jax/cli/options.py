@@ -52,7 +52,7 @@ Close = Annotated[
     option(
         "{all,sweeps,none}",
         default="as the detector was trained, else sweeps",
-        text="Drop points within a metre of the sensor in x and y: of all sweeps, of older sweeps only, or none.",
+        text="Drop points within a metre of the sensor in x and y: all sweeps, only older sweeps, or none.",
     ),
 ]
 Columns = Annotated[
@@ -78,8 +78,8 @@ Labels = Annotated[
 OutputFormat = Annotated[
     result_files.Format,
     option(
-        text="Format of --out: JSON; a results file of nuScenes, in the global frame; result files of KITTI, for "
-        "which --out is a folder; or an ASAM OpenLABEL 1.0 file."
+        text="Format of --out: JSON; a nuScenes results file, in the global frame; KITTI result files, for which "
+        "--out is a folder; or an ASAM OpenLABEL 1.0 file."
     ),
 ]
 Calibration = Annotated[
@@ -87,7 +87,7 @@ Calibration = Annotated[
     option(
         "PATH",
         default="calib beside the folder of the clouds",
-        text="For --output-format kitti: calibration file of KITTI, or a folder with one per cloud.",
+        text="For --output-format kitti: KITTI calibration file, or a folder with one per cloud.",
     ),
 ]
 Rrd = Annotated[
@@ -106,20 +106,20 @@ DataSensor = Annotated[
     option(
         "SENSOR",
         default="KITTI's or Argoverse 2's for files in their folders, else the detector's",
-        text="Sensor, a preset or a sensor file, whose heading, position and intensity scale the clouds have.",
+        text="Sensor of the data, a preset or a sensor file, for heading, position and intensity scale.",
     ),
 ]
 Yaw = Annotated[
     float | None,
     option(
         "DEGREES",
-        default="the turn between the headings of the two sensors, if known",
-        text="Turn the clouds by this angle about z before detection, instead of the turn that is known, and the "
-        "boxes back. Use 90 if x points forward and the detector expects y forward, as hdl32e does.",
+        default="the angle between the headings of the two sensors, if known",
+        text="Rotate the clouds by this angle about z before detection, and the boxes back. Use 90 if x points "
+        "forward and the detector expects y forward, as hdl32e does.",
     ),
 ]
 IntensityScale = Annotated[
-    float | None, option("FACTOR", default="the sensor's", text="Factor from intensities in files to 0-255.")
+    float | None, option("FACTOR", default="the sensor's", text="Factor that brings intensities to 0-255.")
 ]
 
 

@@ -27,22 +27,22 @@ from fcos_lidar_jax.progress import Progress
 
 @dataclasses.dataclass(frozen=True)
 class Prepare:
-    """Prepare a data set for training: cut objects for copy-paste out of the training split and, for nuScenes,
+    """Prepare a data set for training: extract objects for copy-paste from the training split and, for nuScenes,
     index the tables.
 
-    Both are verified whenever they are opened and can be rebuilt at any time. After Ctrl-C or a kill, the same
-    command resumes and repeats at most one scene of objects.
+    Objects and index are verified whenever they are opened, and can be rebuilt at any time. After Ctrl-C or a
+    kill, the same command resumes and repeats at most one scene of objects.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.
     train_split: Annotated[
         str | None, option("SPLIT", default="train, mini_train, or all frames without splits")
     ] = None
-    """Split to cut objects from. A nuScenes version without annotations only gets an index."""
+    """Split to extract objects from. A nuScenes version without annotations only gets an index."""
     num_sweeps: int = NUSCENES.num_sweeps  # Sweeps per object, if the data have sweeps.
     min_points: int = CopyPasteConfig().min_points
-    """Points an object needs over all its sweeps; --copy-paste.min-points of training may ask for more."""
-    workers: int = 1  # Processes that cut objects.
+    """Minimum number of points of an object in all its sweeps; --copy-paste.min-points of train may be higher."""
+    workers: int = 1  # Processes that extract objects.
 
 
 def run(args: Prepare) -> None:

@@ -47,7 +47,7 @@ _TRACKED_SCORE = 0.5  # Of boxes with lower scores, most are on no object, and t
 class Stream:
     """Detect boxes in a drive, and write one line of JSON per sweep as soon as it is ready, or another format.
 
-    As many earlier sweeps as the detector was trained with are fused into each sweep. The boxes are those of
+    Each sweep is fused with older sweeps, as many as the detector was trained with. The boxes are the same as from
     `fcos-lidar detect --sweeps`.
     """
 
@@ -59,7 +59,7 @@ class Stream:
     """Folder of point files, one per sweep; ROS 1 (.bag) or ROS 2 (folder, .mcap, .db3) recording; KITTI raw
     drive; or Argoverse 2 log."""
     poses: Annotated[
-        Path | None, option("FILE", default="those of the source; without any, sweeps are not fused")
+        Path | None, option("FILE", default="the poses of the source; without poses, sweeps are not fused")
     ] = None
     """Poses from sensor to world for a folder or a ROS recording, lines `t x y z qx qy qz qw` (TUM). For a folder
     also FILE.json: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], oldest first."""
@@ -81,7 +81,7 @@ class Stream:
     data_sensor: options.DataSensor = None
     yaw_deg: options.Yaw = None
     intensity_scale: options.IntensityScale = None
-    track: bool = False  # Give each box the number of its object over time. Needs poses.
+    track: bool = False  # Track objects: each box gets the identity of its object. Needs poses.
     min_score: Annotated[
         float | None,
         option(

@@ -54,9 +54,9 @@ _Preset: Any = reduce(or_, _PRESETS)
 class Train:
     """Train a preset: fcos-lidar train PRESET --data-root DIR --out DIR.
 
-    Every field of the preset is an option, see fcos-lidar train PRESET --help. OUT gets checkpoints,
-    metrics.jsonl, TensorBoard events, curves and pictures. All local devices share each batch. Ctrl-C and SIGTERM
-    save a checkpoint and stop. The same command with --resume continues, bit-identical to an uninterrupted run.
+    Every field of the preset is an option, see fcos-lidar train PRESET --help. The command writes checkpoints,
+    metrics.jsonl, TensorBoard events, curves and pictures to OUT. Each batch is split over all local devices.
+    Ctrl-C and SIGTERM save a checkpoint and stop. The same command with --resume continues.
     """
 
     config: Annotated[_Preset, tyro.conf.arg(name=""), tyro.conf.AvoidSubcommands]  # type: ignore[valid-type]
@@ -75,7 +75,7 @@ class Train:
     """Ranges of the frames of --val-split, LAST excluded."""
     resume: bool = False  # Continue from the newest checkpoint in OUT.
     auto_resume: bool = False
-    """Continue if OUT holds a run, otherwise start one: the same command for a job that a cluster restarts."""
+    """Continue the run in OUT, or start one. For jobs that a cluster restarts with the same command."""
     weights: Annotated[Path | None, option("C", default="random weights")] = None
     """Start from the weights of a checkpoint, of the last checkpoint of a run, or from shipped weights."""
     steps: Annotated[int | None, option("N", default="--optimizer.epochs passes over the frames")] = None
@@ -85,16 +85,16 @@ class Train:
     """Steps between two evaluations."""
     save_every: Annotated[int | None, option("N", default="a fiftieth of the run")] = None
     """Steps between two checkpoints."""
-    keep: int = 2  # Number of newest checkpoints to keep beside the best one.
+    keep: int = 2  # Number of newest checkpoints to keep, in addition to the best one.
     no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Turn off flips, rotations and scaling.
-    no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Do not paste objects of other frames.
+    no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Turn off copy-paste of objects.
     threads: Annotated[
-        int | None, option("N", default="the cores per worker, less one if more than two; at most 16")
+        int | None, option("N", default="the cores per worker, minus one if more than two; at most 16")
     ] = None
     """Threads that prepare batches, per worker process if there are any."""
     workers: int = 0  # Worker processes that prepare batches; 0 for threads of the main process.
     no_packing: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Send batches to GPUs and TPUs unpacked, with more bytes and the same results. CPUs never use packing."""
+    """Do not pack batches for GPUs and TPUs. Results are the same, but transfers take more bytes."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
     """Share each batch among several processes."""
 

@@ -1,4 +1,4 @@
-"""Work on several devices and processes: mesh, transfer of batches, agreement, launchers."""
+"""Several devices and processes: mesh, transfer of batches, launchers, and agreement between processes."""
 
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, pmap_step, replicate, shard_batch

@@ -1,4 +1,4 @@
-"""Evaluation of detections against ground truth."""
+"""Metrics of detections against ground truth, and results files."""
 
 from fcos_lidar_jax.evaluation.summary import evaluate_detections
 

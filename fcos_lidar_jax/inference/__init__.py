@@ -1,4 +1,4 @@
-"""From points to boxes, for single clouds, frames and drives."""
+"""Detection: load a detector, and turn point clouds, frames and drives into boxes."""
 
 from fcos_lidar_jax.inference.detect import Stages, make_detect, make_stages
 from fcos_lidar_jax.inference.detected_boxes import DetectedBox, DetectedBoxes

@@ -1,4 +1,4 @@
-"""From a data set to batches: opening it, the ground-truth database, copy-paste, class balance, the loader."""
+"""Data sets to batches: open a data set, ground-truth database, copy-paste, class balance, and loader."""
 
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.input_pipeline.open import open_frames

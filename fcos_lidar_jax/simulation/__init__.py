@@ -1,1 +1,1 @@
-"""Seeded simulated worlds and a ray-cast LiDAR."""
+"""Simulated streets, seen by a ray-cast LiDAR. The same seed gives the same street."""

@@ -1,4 +1,4 @@
-"""Training: objective, optimizer, step, loop, and runs."""
+"""Training: objective, optimizer, step, loop, and runs with checkpoints."""
 
 from fcos_lidar_jax.training.loop import NonFiniteLossError, fit
 from fcos_lidar_jax.training.optimizer import make_optimizer

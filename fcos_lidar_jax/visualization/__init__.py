@@ -1,1 +1,1 @@
-"""Pictures and reports. Matplotlib is imported on first use."""
+"""Pictures, reports, and pages for a browser. Matplotlib is imported on first use."""

@@ -52,8 +52,8 @@ def test_a_seed_without_its_reference_does_not_count(tmp_path):
     [
         ([0.4, 0.5, 0.6], 0.5, "agrees"),
         ([-0.4, -0.5, -0.6], -0.5, "agrees"),
-        ([3.0, 3.1, 3.2], 0.5, "agrees in direction alone"),
-        ([-3.0, -3.1, -3.2], -0.5, "agrees in direction alone"),
+        ([3.0, 3.1, 3.2], 0.5, "agrees only in direction"),
+        ([-3.0, -3.1, -3.2], -0.5, "agrees only in direction"),
         ([-3.0, -3.1, -3.2], 0.5, "disagrees"),
         ([-0.1, 0.0, 0.1], 2.0, "disagrees"),  # no gain, and the paper's is excluded
         ([-3.0, 0.0, 3.0], 2.0, "undecided"),

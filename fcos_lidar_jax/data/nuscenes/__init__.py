@@ -1,4 +1,4 @@
-"""nuScenes from its official tables, without the devkit."""
+"""Reader of nuScenes from its official tables, without the devkit."""
 
 from fcos_lidar_jax.data.nuscenes.reader import Boxes, NuScenes
 
