@@ -30,5 +30,5 @@ PASTE_TARGETS = {
     **dict(zip(NUSCENES_CLASSES, (2, 3, 4, 6, 7, 2, 6, 6, 2, 2), strict=True)),
     **dict(zip(KITTI_CLASSES, (15, 10, 10), strict=True)),
 }
-"""Reading: class -> number of boxes up to which copy-paste fills a frame."""
+"""Our choice: class -> number of boxes up to which copy-paste fills a frame."""
 DEFAULT_PASTE_TARGET = 2  # Paste target of other classes.

@@ -1,6 +1,6 @@
 """Frozen configurations with the paper's values as defaults.
 
-Fields marked "Reading" settle what the paper leaves open; ``docs/assumptions.md`` lists all of them.
+"Our choice" marks fields that the paper leaves open; ``docs/assumptions.md`` lists all of them.
 Make variants with :func:`dataclasses.replace`. Every configuration is hashable and checked at construction.
 """
 
@@ -55,10 +55,10 @@ class ProjectionConfig:
     num_rounds: int = 5  # Rounds of the multi-round projection.
     prioritize_current: bool = True  # Points of the current sweep win all collisions with older points (table 2).
     remove_close: Literal["all", "sweeps", "none"] = CloudReading.remove_close
-    """Reading: remove the points on the ego vehicle, ``|x|, |y| < close_m``, from all sweeps, from the older
+    """Our choice: remove the points on the ego vehicle, ``|x|, |y| < close_m``, from all sweeps, from the older
     sweeps only (which gives the paper's numbers of points), or from none."""
     close_m: float = CloudReading.close_m
-    """Reading: half the side of the square that ``remove_close`` clears, metres."""
+    """Our choice: half the side of the square that ``remove_close`` clears, metres."""
 
     def __post_init__(self) -> None:
         check(1 <= self.num_rounds <= MAX_ROUNDS, "num_rounds", self.num_rounds, f"1 to {MAX_ROUNDS}")
@@ -82,7 +82,7 @@ class StemConfig:
     channels_per_type: int = 32  # Features per channel type.
     out_channels: int = 64  # Channels after the 1x1 merge.
     merge: Literal["per_branch", "shared"] = "per_branch"
-    """Reading: one 1x1 merge per branch, or one shared by all branches."""
+    """Our choice: one 1x1 merge per branch, or one shared by all branches."""
 
     def __post_init__(self) -> None:
         check_least(self, 1, "num_convs", "channels_per_type", "out_channels")
@@ -110,12 +110,12 @@ class ModelConfig:
     result with less memory and more time. Has no effect on CPUs, where XLA undoes it."""
     row_upscale: int = 2  # Number of times each row is repeated (paper, section 4).
     circular_width: bool = False
-    """Reading: wrap every convolution around the azimuth instead of the paper's zero padding. The number of
+    """Our choice: wrap every convolution around the azimuth instead of the paper's zero padding. The number of
     azimuth bins is then a multiple of 32."""
     backbone_blocks: tuple[int, int, int, int] = (4, 4, 1, 1)  # Bottlenecks per stage.
     backbone_widths: tuple[int, int, int, int] = (64, 128, 128, 128)
     """Bottleneck width per stage; a stage has four times as many output channels."""
-    fpn_channels: int = 256  # Reading: channels of P2 to P7.
+    fpn_channels: int = 256  # Our choice: channels of P2 to P7.
     head_channels: int = 64  # Channels of both towers (128 for the test set).
     head_convs: int = 4  # 3x3 convolutions per tower.
     tied_heads: bool = False  # Share one head between all levels (table 6).
@@ -125,11 +125,11 @@ class ModelConfig:
     local_geometry: bool = False
     """Not in the paper: the offsets from each location's point to the points of the neighbouring pixels are an
     additional input of the heads, see ``fcos_lidar_jax.models.local_geometry``."""
-    background_prior: float = 0.99  # Reading: initial background probability.
+    background_prior: float = 0.99  # Our choice: initial background probability.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
-    """Reading: means subtracted from the nine channels in preprocessing."""
+    """Our choice: means subtracted from the nine channels in preprocessing."""
     channel_scale: tuple[float, ...] = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
-    """Reading: scales by which the nine channels are divided in preprocessing."""
+    """Our choice: scales by which the nine channels are divided in preprocessing."""
 
     def __post_init__(self) -> None:
         check_least(self, 1, "row_upscale", "head_convs", "fpn_channels", "head_channels")
@@ -158,15 +158,15 @@ class LossConfig:
 
     top_q: int = 20  # Q: the dynamic K of a box is the rounded sum of its Q highest IoUs.
     regress_on: Literal["positives", "candidates"] = "positives"
-    """Reading: locations that box and IoU losses are averaged over: the positives, or all locations inside a
+    """Our choice: locations that box and IoU losses are averaged over: the positives, or all locations inside a
     box."""
     iou_loss: Literal["iou", "log_iou", "giou", "diou"] = "iou"
-    """Reading: 1 - IoU, UnitBox's -ln IoU, generalised IoU, or distance IoU."""
-    classification_weight: float = 1.0  # Reading: weight of the cross-entropy.
-    l1_weight: float = 0.25  # Reading: weight of the L1 loss.
-    iou_weight: float = 1.0  # Reading: weight of the IoU loss.
-    iou_prediction_weight: float = 1.0  # Reading: weight of the predicted IoU's binary cross-entropy.
-    velocity_weight: float = 0.2  # Reading: weight of the velocity within the L1 loss.
+    """Our choice: 1 - IoU, UnitBox's -ln IoU, generalised IoU, or distance IoU."""
+    classification_weight: float = 1.0  # Our choice: weight of the cross-entropy.
+    l1_weight: float = 0.25  # Our choice: weight of the L1 loss.
+    iou_weight: float = 1.0  # Our choice: weight of the IoU loss.
+    iou_prediction_weight: float = 1.0  # Our choice: weight of the predicted IoU's binary cross-entropy.
+    velocity_weight: float = 0.2  # Our choice: weight of the velocity within the L1 loss.
     quality: Literal["iou", "centreness"] = "iou"
     """Target of the quality prediction, by which the score is multiplied: the rotated 3D IoU, or the distance
     between predicted and true centre (not in the paper), see :func:`fcos_lidar_jax.losses.centreness`."""
@@ -195,8 +195,8 @@ class InferenceConfig:
     min_probability: float = 0.01  # Minimum class probability of a candidate, before the IoU factor.
     iou_threshold: float = 0.2  # NMS removes boxes that overlap a better box of their class by more than this.
     max_detections: int = 500  # Maximum number of boxes per cloud.
-    candidates_per_level: int = 1000  # Reading: (location, class) pairs of each level that enter NMS.
-    nms_overlap: Literal["bev", "3d"] = "bev"  # Reading: rotated IoU in the ground plane, or in 3D.
+    candidates_per_level: int = 1000  # Our choice: (location, class) pairs of each level that enter NMS.
+    nms_overlap: Literal["bev", "3d"] = "bev"  # Our choice: rotated IoU in the ground plane, or in 3D.
     nms_across_classes: bool = False
     """Not in the paper: NMS also removes boxes that overlap a better box of another class."""
     iou_exponent: float = 1.0
@@ -226,8 +226,8 @@ class AugmentConfig:
     (0.95, 1.05)
     """
 
-    flip_x_probability: float = 0.5  # Reading: probability of x -> -x.
-    flip_y_probability: float = 0.5  # Reading: probability of y -> -y, independent of the flip of x.
+    flip_x_probability: float = 0.5  # Our choice: probability of x -> -x.
+    flip_y_probability: float = 0.5  # Our choice: probability of y -> -y, independent of the flip of x.
     max_rotation_rad: float = math.pi  # The rotation about z is uniform between minus and plus this angle.
     scale_range: tuple[float, float] = (0.95, 1.05)  # The scale is uniform in this range.
 
@@ -249,8 +249,8 @@ class CopyPasteConfig:
     """
 
     targets: tuple[int, ...] = ()
-    """Reading: number of boxes per class up to which a frame is filled, including its own boxes; () looks it up by
-    class name, see ``classes.PASTE_TARGETS``."""
+    """Our choice: number of boxes per class up to which a frame is filled, including its own boxes; () looks it up
+    by class name, see ``classes.PASTE_TARGETS``."""
     min_points: int = 5  # Minimum number of points of an object, over all pasted sweeps.
 
     def __post_init__(self) -> None:
@@ -272,11 +272,11 @@ class OptimizerConfig:
     final_divisor: float = 1e4  # The last learning rate is the first divided by this.
     warmup_fraction: float = 0.4  # Fraction of the steps that belong to the warm-up.
     b1_range: tuple[float, float] = (0.85, 0.95)
-    """Momentum range: high at both ends, low at the peak of the learning rate; cosine (reading)."""
-    b2: float = 0.99  # Reading: decay of the second moment.
-    weight_decay: float = 0.01  # Applied to all parameters (reading).
-    max_gradient_norm: float = 35.0  # Reading: global-norm clipping.
-    batch_size: int = 32  # Reading: samples per step, over all devices.
+    """Momentum range: high at both ends, low at the peak of the learning rate; cosine (our choice)."""
+    b2: float = 0.99  # Our choice: decay of the second moment.
+    weight_decay: float = 0.01  # Applied to all parameters (our choice).
+    max_gradient_norm: float = 35.0  # Our choice: global-norm clipping.
+    batch_size: int = 32  # Our choice: samples per step, over all devices.
     accumulate: int = 1
     """Micro-batches per step. Gradients and counts are summed and divided once; batch norm sees one
     micro-batch."""
@@ -318,11 +318,11 @@ class Config:
     class_ranges_m: tuple[float, ...] = ()
     """Evaluation range per class, metres; () looks it up by class name, see ``classes.RANGES_M``."""
     num_sweeps: int = 10  # Sweeps fused into one cloud, including the current one.
-    max_points: int = 300_000  # Reading: rows to which a fused cloud is padded.
-    max_boxes: int = 256  # Reading: rows to which the ground truth is padded.
+    max_points: int = 300_000  # Our choice: rows to which a fused cloud is padded.
+    max_boxes: int = 256  # Our choice: rows to which the ground truth is padded.
     fade_epochs: int = 0  # Last epochs without copy-paste (paper, section 4.5: 5 for the test set).
     copy_paste: CopyPasteConfig | None = CopyPasteConfig()  # Objects from the ground-truth database; None: none.
-    class_balanced: bool = True  # Reading: frames are resampled so that all classes occur equally often (CBGS).
+    class_balanced: bool = True  # Our choice: frames are resampled so that all classes occur equally often (CBGS).
     projection: ProjectionConfig = ProjectionConfig()  # Points to range image.
     model: ModelConfig = ModelConfig()  # The network.
     loss: LossConfig = LossConfig()  # Assignment and losses.
