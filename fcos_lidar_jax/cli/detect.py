@@ -156,7 +156,8 @@ def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector, sensor
 
 
 def _log_file(args: Detect) -> Path:
-    return args.out.with_name(f".{args.out.name}.resume_log")
+    out = args.out if args.out.name else args.out.absolute()  # such as ".", for KITTI's files
+    return out.parent / f".{out.name}.resume_log"
 
 
 @contextlib.contextmanager

@@ -133,6 +133,8 @@ def _check(args: Evaluate) -> None:
             )
     check_out_folder(args.out)
     if args.checkpoint is not None:
+        if args.sensor != Evaluate.sensor:
+            raise ValueError(f"--sensor: got {args.sensor}, expected none with --checkpoint: its sensor is used")
         check_outside("--out", args.out, args.checkpoint)
     if args.rrd is not None:
         check_rerun()

@@ -1,10 +1,11 @@
 """The sensors that recorded the point files of known data sets."""
 
+import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
 
 RECORDED_BY = {
     "training/velodyne/*.bin": KITTI_HDL64E,
@@ -32,6 +33,17 @@ def recorded_by(paths: Iterable[Path]) -> Sensor | None:
         files = " and ".join(f"{path} of {sensor.name if sensor else 'another'}" for sensor, path in found.items())
         raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")
     return next(iter(found), None)
+
+
+def with_y_ahead(sensor: Sensor) -> Sensor:
+    """A sensor for clouds of nuScenes or simulated clouds, whose y points forward; an unknown heading stays.
+
+    >>> with_y_ahead(KITTI_HDL64E).forward_rad == NUSCENES_HDL32E.forward_rad
+    True
+    """
+    if sensor.forward_rad is None:
+        return sensor
+    return dataclasses.replace(sensor, forward_rad=NUSCENES_HDL32E.forward_rad)
 
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:

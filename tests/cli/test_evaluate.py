@@ -263,6 +263,7 @@ MISTAKES = mistakes(r"""
 --results HOME/results.json DATA --split other => split 'other': not found
 --results x --ground-truth HOME/truth.json --batch-size 0 => --batch-size: got 0, expected at least 1
 --results x --ground-truth HOME/truth.json --bootstrap -1 => --bootstrap: got -1, expected at least 0
+DATA --checkpoint HOME/checkpoint --sensor tiny => --sensor: got tiny, expected none with --checkpoint
 --results x --ground-truth HOME/truth.json --sensor sonar => sonar: no such sensor
 --results HOME/results.json --ground-truth HOME/results_nusc.json --out HOME => --out: .*results_nusc.json: the
 DATA --checkpoint HOME/checkpoint --out HOME/checkpoint/scores => --out: .*inside of the checkpoint
