@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
 
 RECORDED_BY = {
     "training/velodyne/*.bin": KITTI_HDL64E,
@@ -43,7 +43,7 @@ def with_y_ahead(sensor: Sensor) -> Sensor:
     """
     if sensor.forward_rad is None:
         return sensor
-    return dataclasses.replace(sensor, forward_rad=NUSCENES_HDL32E.forward_rad)
+    return in_frame_of(sensor, dataclasses.replace(sensor, forward_rad=NUSCENES_HDL32E.forward_rad))
 
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:
