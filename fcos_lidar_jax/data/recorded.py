@@ -41,9 +41,8 @@ def with_y_ahead(sensor: Sensor) -> Sensor:
     >>> with_y_ahead(KITTI_HDL64E).forward_rad == NUSCENES_HDL32E.forward_rad
     True
     """
-    if sensor.forward_rad is None:
-        return sensor
-    return in_frame_of(sensor, dataclasses.replace(sensor, forward_rad=NUSCENES_HDL32E.forward_rad))
+    ahead = dataclasses.replace(sensor, forward_rad=NUSCENES_HDL32E.forward_rad)
+    return sensor if sensor.forward_rad is None else in_frame_of(sensor, ahead)
 
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:

@@ -75,11 +75,7 @@ class DetectedBoxes:
         return (self[index] for index in range(len(self)))
 
     def select(self, *, min_score: float = 0.0, labels: Collection[str] = ()) -> "DetectedBoxes":
-        """The boxes that reach a score, of some classes; of all classes by default.
-
-        Raises:
-            ValueError: a label that is no class of the detector.
-        """
+        """The boxes that reach a score, of some classes, by default all; a ValueError names an unknown class."""
         kept = self.scores >= min_score
         labels = [labels] if isinstance(labels, str) else labels
         for name in labels:
