@@ -245,4 +245,4 @@ def _write_views(
                 frames.append(page_frame(points, found, name=name))
     if args.page is not None:
         title = f"Boxes of {args.checkpoint.name}"
-        write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)
+        write_page(args.page, frames, clouds.sensor, classes=detector.classes, title=title, min_score=min_score)

@@ -181,7 +181,7 @@ def _open(args: Evaluate) -> Task:
     if detector is None and args.report and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
         tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
         return Task(name, comparison, sensor)
-    return Task(name, comparison, sensor, detector, frames)
+    return Task(name, comparison, frames.sensor, detector, frames)
 
 
 def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: bool) -> None:

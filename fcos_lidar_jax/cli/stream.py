@@ -149,7 +149,7 @@ def run(args: Stream) -> None:
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:
         title = args.scene or str(args.source)
-        write_page(args.page, frames, classes=detector.classes, title=title, min_score=shown_score)
+        write_page(args.page, frames, aligned.data, classes=detector.classes, title=title, min_score=shown_score)
 
 
 @contextlib.contextmanager

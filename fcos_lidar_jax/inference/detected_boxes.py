@@ -77,10 +77,9 @@ class DetectedBoxes:
     def select(self, *, min_score: float = 0.0, labels: Collection[str] = ()) -> "DetectedBoxes":
         """The boxes that reach a score, of some classes, by default all; a ValueError names an unknown class."""
         kept = self.scores >= min_score
-        labels = [labels] if isinstance(labels, str) else labels
-        for name in labels:
-            if name not in self.classes:
-                raise ValueError(f"labels: {unknown_name(name, self.classes)}")
+        labels = {labels} if isinstance(labels, str) else {*labels}
+        for name in labels - {*self.classes}:
+            raise ValueError(f"labels: {unknown_name(name, self.classes)}")
         if labels:
             kept &= np.isin(self.names, list(labels))
         return self._rows(kept)
