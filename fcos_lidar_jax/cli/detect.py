@@ -156,7 +156,8 @@ def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector, sensor
 
 
 def _log_file(args: Detect) -> Path:
-    return args.out.with_name(f".{args.out.name}.resume_log")
+    out = args.out if args.out.name else args.out.absolute()  # such as ".", for KITTI's files
+    return out.parent / f".{out.name}.resume_log"
 
 
 @contextlib.contextmanager
@@ -244,4 +245,4 @@ def _write_views(
                 frames.append(page_frame(points, found, name=name))
     if args.page is not None:
         title = f"Boxes of {args.checkpoint.name}"
-        write_page(args.page, frames, classes=detector.classes, title=title, min_score=min_score)
+        write_page(args.page, frames, clouds.sensor, classes=detector.classes, title=title, min_score=min_score)

@@ -137,6 +137,8 @@ def _check(args: Evaluate) -> None:
             )
     check_out_folder(args.out)
     if args.checkpoint is not None:
+        if args.sensor != Evaluate.sensor:
+            raise ValueError(f"--sensor: got {args.sensor}, expected none with --checkpoint: its sensor is used")
         check_outside("--out", args.out, args.checkpoint)
     if args.rrd is not None:
         check_rerun()
@@ -183,7 +185,7 @@ def _open(args: Evaluate) -> Task:
     if detector is None and args.report and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
         tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
         return Task(name, comparison, sensor)
-    return Task(name, comparison, sensor, detector, frames)
+    return Task(name, comparison, frames.sensor, detector, frames)
 
 
 def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: bool) -> None:

@@ -130,8 +130,10 @@ def radians(degrees: float | None) -> float | None:
     return None if degrees is None else math.radians(degrees)
 
 
-def alignment_of(args: Any, detector: sensors.Sensor, paths: Collection[Path]) -> Alignment:
-    """The alignment of point files, or a recording, by the three options above, else by the paths."""
-    sensor = None if args.data_sensor is None else sensors.load_sensor(args.data_sensor)
+def alignment_of(
+    args: Any, detector: sensors.Sensor, paths: Collection[Path], sensor: sensors.Sensor | None = None
+) -> Alignment:
+    """The alignment of point files, or a recording, by the three options above, else by a sensor or the paths."""
+    sensor = sensor if args.data_sensor is None else sensors.load_sensor(args.data_sensor)
     how = {"yaw_rad": radians(args.yaw_deg), "intensity_scale": args.intensity_scale}
     return align(detector, sensor, paths=paths, **how)

@@ -108,7 +108,7 @@ def write_reports(
         for each in make_examples(*source, examples.extremes, min_score=0, all_sweeps=True)
     ]
     if frames:
-        write_page(out / PAGE, frames, title=title, classes=evaluation.metric.classes)
+        write_page(out / PAGE, frames, task.sensor, title=title, classes=evaluation.metric.classes)
     write_evaluation_report(
         out,
         title=title,

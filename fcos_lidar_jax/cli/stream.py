@@ -22,13 +22,14 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
+from fcos_lidar_jax.data.recorded import with_y_ahead
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
-from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, Recording, find_recording
+from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
@@ -103,7 +104,9 @@ def run(args: Stream) -> None:
     kind = _find(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
     source = args.source or args.data_root or Path()
-    aligned = alignment_of(args, detector.sensor, find_clouds((source,)) if kind is FOLDER else [source])
+    paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
+    ahead = with_y_ahead(sensor) if kind is SCENE else sensor
+    aligned = alignment_of(args, sensor, paths, None if ahead == sensor else ahead)
     drive = _open(args, kind, detector, aligned.data)
     _tell(drive.notes)
     frames: list[PageFrame] = []
@@ -146,7 +149,7 @@ def run(args: Stream) -> None:
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:
         title = args.scene or str(args.source)
-        write_page(args.page, frames, classes=detector.classes, title=title, min_score=shown_score)
+        write_page(args.page, frames, aligned.data, classes=detector.classes, title=title, min_score=shown_score)
 
 
 @contextlib.contextmanager

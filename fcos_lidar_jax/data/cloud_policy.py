@@ -231,8 +231,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
 
 def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     """All findings, except for those that too few points within the sensor's limits cannot show."""
-    if points[:, 3].max() <= 1:
-        yield "no intensity is above 1, expected 0 to 255: multiply them by 255"
+    if (most := points[:, 3].max()) <= 1:
+        yield "no intensity is above 1, expected 0 to 255" + (": multiply them by 255" if most > 0 else "")
     low, high = sensor.limit_z_m
     within = (np.abs(points[:, :2]) < sensor.limit_xy_m).all(axis=1) & (points[:, 2] > low) & (points[:, 2] < high)
     beyond = 1 - within.mean()

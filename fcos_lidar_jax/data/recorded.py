@@ -1,10 +1,11 @@
 """The sensors that recorded the point files of known data sets."""
 
+import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
 
 RECORDED_BY = {
     "training/velodyne/*.bin": KITTI_HDL64E,
@@ -32,6 +33,16 @@ def recorded_by(paths: Iterable[Path]) -> Sensor | None:
         files = " and ".join(f"{path} of {sensor.name if sensor else 'another'}" for sensor, path in found.items())
         raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")
     return next(iter(found), None)
+
+
+def with_y_ahead(sensor: Sensor) -> Sensor:
+    """A sensor for clouds of nuScenes or simulated clouds, whose y points forward; an unknown heading stays.
+
+    >>> with_y_ahead(KITTI_HDL64E).forward_rad == NUSCENES_HDL32E.forward_rad
+    True
+    """
+    ahead = dataclasses.replace(sensor, forward_rad=NUSCENES_HDL32E.forward_rad)
+    return sensor if sensor.forward_rad is None else in_frame_of(sensor, ahead)
 
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:

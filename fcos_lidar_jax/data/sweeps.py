@@ -188,5 +188,6 @@ def turned(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     [[0.0, 1.0, 5.0, 9.0]]
     """
     moved = np.array(points)
-    moved[:, :3] = moved[:, :3] @ pose[:3, :3].T
+    with np.errstate(over="ignore", invalid="ignore"):  # the cloud policy removes rows that are not finite
+        moved[:, :3] = moved[:, :3] @ pose[:3, :3].T
     return moved

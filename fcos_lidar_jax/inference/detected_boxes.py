@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, overload
 
 import numpy as np
 
+from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 
 _TABLE_ROWS = 20
@@ -74,8 +75,11 @@ class DetectedBoxes:
         return (self[index] for index in range(len(self)))
 
     def select(self, *, min_score: float = 0.0, labels: Collection[str] = ()) -> "DetectedBoxes":
-        """The boxes that reach a score, of some classes; of all classes by default."""
+        """The boxes that reach a score, of some classes, by default all; a ValueError names an unknown class."""
         kept = self.scores >= min_score
+        labels = {labels} if isinstance(labels, str) else {*labels}
+        for name in labels - {*self.classes}:
+            raise ValueError(f"labels: {unknown_name(name, self.classes)}")
         if labels:
             kept &= np.isin(self.names, list(labels))
         return self._rows(kept)

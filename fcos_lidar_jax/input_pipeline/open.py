@@ -16,7 +16,7 @@ from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import official_splits
-from fcos_lidar_jax.data.recorded import RECORDED_BY, check_scale
+from fcos_lidar_jax.data.recorded import RECORDED_BY, check_scale, with_y_ahead
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
@@ -233,7 +233,8 @@ def open_frames(
         version: version of nuScenes; may be omitted if there is only one.
         split: name of a split; default: all frames. See also :func:`default_split`.
         sensor: gives the range image; default: the sensor that recorded the points. KITTI and Argoverse 2 keep
-            the heading, the position and the intensity scale of their own sensors.
+            the heading, the position and the intensity scale of their own sensors; in nuScenes and simulated
+            frames, y points forward.
         num_sweeps: maximum number of sweeps to fuse, including the current one; default: ``reading``'s.
         reading: how clouds are read, such as ``config.reading``; default: ``CloudReading()``.
         class_map: name in the data -> name to use instead; None drops objects, other names stay. Or the name of a
@@ -284,6 +285,8 @@ def open_frames(
         if intensity_scale is None and sensor.intensity_scale != given_scale:
             told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
             print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
+    elif sensor is not None and data.reader.sensor is not None:
+        sensor = with_y_ahead(sensor)
     open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
     frames = open_with(sensor=sensor or data.reader.sensor)
     if intensity_scale is not None:  # opened again, because only the frames know the sensor of a folder

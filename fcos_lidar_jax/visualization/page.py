@@ -14,6 +14,7 @@ import numpy as np
 from fcos_lidar_jax.data.cloud_policy import MAX_TIME_LAG_S
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.figure import class_color
 
 STEP_M = 0.02  # resolution of the points
@@ -113,6 +114,7 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
 def write_page(
     path: str | Path,
     frames: Sequence[PageFrame],
+    sensor: Sensor | None = None,
     *,
     classes: Sequence[str],
     title: str,
@@ -121,11 +123,12 @@ def write_page(
     """Write the HTML page.
 
     Args:
+        sensor: where the ego vehicle heads in the frames, if they have no poses; by default along y.
         classes: class names by label.
         min_score: initial threshold of the visible boxes.
     """
     content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}
-    content |= {"colors": [class_color(label) for label in range(len(classes))]}
+    content |= {"colors": [*map(class_color, range(len(classes)))], "forward_rad": sensor and sensor.forward_rad}
     content |= {"frames": [dataclasses.asdict(frame) for frame in frames]}
     # Names may contain anything, even "</script>".
     text = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")

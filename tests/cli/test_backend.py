@@ -54,7 +54,7 @@ def test_benchmark_times_the_same_stages(home, tmp_path):
 
 
 def test_evaluate_accepts_the_backend(home, tmp_path):
-    data = "--format simulated --sensor tiny --samples 0:2 --no-report --checkpoint"
+    data = "--format simulated --samples 0:2 --no-report --checkpoint"
     command("evaluate", data, home / "checkpoint", "--backend openvino --out", tmp_path)
     assert json.loads((tmp_path / "metrics_summary.json").read_text())["mean_ap"] >= 0
 

@@ -281,6 +281,7 @@ project HOME/good.npy --out HOME => found a folder
 detect HOME/good.npy --out HOME/good.npy => --out: .*the same file as .*good.npy
 detect HOME/good.npy --out HOME/link.json => --out: .*the same file as
 detect HOME/none.npy --out HOME/link.json => link.json: found a link to .*good
+detect HOME/none.npy --out . => error: .: found a folder, expected a file to write
 detect HOME/none.npy --out /dev/null => /dev/null: found a device or a pipe
 detect HOME/none.npy --out HOME/checkpoint/boxes.json => --out: .*inside of the checkpoint
 detect HOME/none.npy --pictures HOME/checkpoint/pictures => --pictures: .*inside of the checkpoint

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command
+from commands import assert_one_line_error, command, page_content
 from made_argoverse2 import make_log
 from made_folder import make_folder
 from made_kitti import make_kitti
@@ -75,7 +75,8 @@ def assert_turned_back(boxes, expected, origin=(0, 0, 0)):
 
 def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
     folder, drive = kitti / "training" / "velodyne", kitti / "day" / "drive"
-    boxes = detect(tmp_path / "boxes.json", folder)
+    boxes = detect(tmp_path / "boxes.json", folder, "--page", tmp_path / "page.html")
+    assert page_content(tmp_path / "page.html")["forward_rad"] == KITTI_HDL64E.forward_rad
     told = capsys.readouterr().err
     assert told.count("recorded by kitti_hdl64e") == told.count("intensities times 255") == 1  # of two files
     assert told.count("clouds turned by 90 degrees") == 1
@@ -107,7 +108,8 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 
     for source in (drive, drive / "velodyne_points" / "data"):
         capsys.readouterr()
-        assert stream(tmp_path / "boxes.jsonl", source) == boxes
+        assert stream(tmp_path / "boxes.jsonl", source, "--page", tmp_path / "drive.html") == boxes
+        assert page_content(tmp_path / "drive.html")["forward_rad"] == KITTI_HDL64E.forward_rad
         told = capsys.readouterr().err
         assert told.count("clouds turned by 90 degrees") == 1
 

@@ -22,7 +22,7 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation import comparison, evaluate_detections
 from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.inference.prediction_log import _fingerprint
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
 
 FILES = {"metrics_summary.json", "curves.json", "results_nusc.json", ".lock"}
@@ -61,9 +61,12 @@ def by_files(folder, results, truth, **options):
 
 @pytest.fixture(scope="module")
 def by_tables(home, tmp_path_factory):
-    """The results file evaluated against the tables, with intervals and a report: the output folder."""
-    out = tmp_path_factory.mktemp("by_tables")
-    run(Evaluate(out=out, results=home / "results.json", **place(home), bootstrap=20, sensor="tiny"))
+    """The results file evaluated against the tables, with intervals and a report: the output folder.
+
+    The given sensor has another heading than the clouds."""
+    out, sensor = tmp_path_factory.mktemp("by_tables"), home / "x_ahead.json"
+    sensor.write_text(json.dumps({**sensor_to_json(TINY), "forward_rad": 0.0}))
+    run(Evaluate(out=out, results=home / "results.json", **place(home), bootstrap=20, sensor=str(sensor)))
     return out
 
 
@@ -97,6 +100,7 @@ def test_the_summary_has_the_official_keys_in_order(by_tables):
 def test_a_page_shows_the_worst_and_the_best_frames(by_tables):
     page, summary = page_content(by_tables / "frames.html"), read(by_tables / "metrics_summary.json")
     assert page["classes"] == list(summary["label_aps"])
+    assert page["forward_rad"] == np.pi / 2
     assert page["frames"][0]["name"].startswith("worst 1: ")
     assert {frame["name"].split()[0] for frame in page["frames"]} == {"worst", "best"}
     for frame in page["frames"]:
@@ -263,6 +267,7 @@ MISTAKES = mistakes(r"""
 --results HOME/results.json DATA --split other => split 'other': not found
 --results x --ground-truth HOME/truth.json --batch-size 0 => --batch-size: got 0, expected at least 1
 --results x --ground-truth HOME/truth.json --bootstrap -1 => --bootstrap: got -1, expected at least 0
+DATA --checkpoint HOME/checkpoint --sensor tiny => --sensor: got tiny, expected none with --checkpoint
 --results x --ground-truth HOME/truth.json --sensor sonar => sonar: no such sensor
 --results HOME/results.json --ground-truth HOME/results_nusc.json --out HOME => --out: .*results_nusc.json: the
 DATA --checkpoint HOME/checkpoint --out HOME/checkpoint/scores => --out: .*inside of the checkpoint

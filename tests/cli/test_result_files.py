@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -193,12 +194,15 @@ def test_keyframes_of_nuscenes_are_called_by_their_tokens(home, tmp_path):
 
 
 @pytest.mark.parametrize("command_line", ["stream", "detect"])
-def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys):
-    out = tmp_path / "kitti"
+def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monkeypatch):
+    out = named = tmp_path / "kitti"
     if command_line == "stream":
         stream(home, out, "--output-format kitti")
     else:
-        where = "--checkpoint", home / "checkpoint", "--min-score 0.001 --output-format kitti --out", out
+        out.mkdir()
+        monkeypatch.chdir(out)
+        named = Path(".")
+        where = "--checkpoint", home / "checkpoint", "--min-score 0.001 --output-format kitti --out", named
         command("detect", home / "training" / "velodyne", *where, "--calibration", home / "training" / "calib")
     types, written = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}, 0
     types |= {"bicycle": "Cyclist", "bus": "Tram"}
@@ -223,7 +227,7 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys):
             assert depth < 0.1 or not (0 < u / depth < 1241 and 0 < v / depth < 374)
     assert written > 0
     number = sum(len(line["boxes"]) for line in lines)
-    told = f"{out}: {number - written} of {number} boxes left out: outside of the image, or of a class"
+    told = f"{named}: {number - written} of {number} boxes left out: outside of the image, or of a class"
     assert told in capsys.readouterr().err
 
 

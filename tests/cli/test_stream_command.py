@@ -136,6 +136,14 @@ def test_keyframes_option_skips_the_boxes_of_other_sweeps(home, tmp_path, capsys
     lines = some.read_text().splitlines()
     assert len(lines) == 3
     assert set(lines) < set(every.read_text().splitlines())
+    # A detector that expects x ahead, as of KITTI: in a scene, y is.
+    config, ahead = dataclasses.replace(TINY_CONFIG, num_sweeps=WINDOW), dataclasses.replace(TINY, forward_rad=0.0)
+    save_checkpoint(tmp_path / "ahead", Checkpoint(config, ahead, untrained(config, TINY), 7))
+    data = data.replace(f"{home}/checkpoint", f"{tmp_path}/ahead")
+    for more, told in (("", 1), ("--yaw-deg 0", 0)):
+        capsys.readouterr()
+        command("stream", data, more, "--keyframes --out", tmp_path / "ahead.jsonl")
+        assert capsys.readouterr().err.count("clouds turned by -90 degrees") == told
 
 
 def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys):

@@ -215,7 +215,8 @@ def test_the_warning_describes_the_mismatch(clouds):
             r"the values of [xy] are about \d+, expected metres in the columns x, y, z",
         ),
         (timed, "nuscenes_hdl32e", r"the values of x are about 1.533e\+09, expected metres in the columns x, y"),
-        (shares, "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255"),
+        (shares, "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255: multiply them by 255;"),
+        (hdl32e[:, :3], "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255;"),
     ):
         assert re.search(finding, sensor_mismatch(points, PRESETS[sensor]) or "")
 

@@ -23,6 +23,8 @@ def test_boxes_are_brought_back_by_the_inverse_of_rotation_matrices():
     aligned = Alignment(data, detector)
     expected = (points[:, :3] - data.origin_m) @ matrix.T + detector.origin_m
     np.testing.assert_allclose(aligned.points(points)[:, :3], expected, atol=1e-5)
+    points[0, 0] = np.inf
+    assert np.isfinite(aligned.points(points)[:, :3]).all(axis=1).tolist() == [False] + [True] * 19  # no warning
     boxes = rng.uniform(-3, 3, (6, 9)).astype(np.float32)
     back = aligned.back(Detections(boxes, np.ones(6), np.zeros(6, int), np.ones(6, bool), np.int32(0))).boxes
     np.testing.assert_allclose(back[:, :3], (boxes[:, :3] - detector.origin_m) @ matrix + data.origin_m, atol=1e-5)

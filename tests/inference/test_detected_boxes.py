@@ -64,6 +64,9 @@ def test_selection_by_score_and_class(made):
     some = made.select(min_score=0.5, labels=["car"])
     assert [box.score for box in some] == [float(s) for s in made.scores[::2] if s >= 0.5]
     assert set(some.names) == {"car"}
+    assert len(made.select(min_score=0.5, labels="car")) == len(some)
+    with pytest.raises(ValueError, match="labels: got 'Car', expected car"):
+        made.select(labels=["Car"])
     assert some.to_dict() == {
         "num_points": 7,
         "boxes": [b for b in made.to_dict()["boxes"][::2] if b["score"] >= 0.5],

@@ -25,7 +25,7 @@ from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.input_pipeline.open import READERS, default_split, find_data_set, open_frames
 from fcos_lidar_jax.input_pipeline.open import Format as FormatName
-from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY
+from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, TINY, VLP16, sector
 
 COARSE = dataclasses.replace(ARGOVERSE2, num_columns=128)
 
@@ -116,6 +116,13 @@ def test_data_keep_their_units_and_axes_with_another_sensor(roots, capsys):
     assert "kitti: intensities are scaled by 255, as for all data of format kitti" in capsys.readouterr().err
     np.testing.assert_array_equal(frames.frame(0).points, own.frame(0).points)  # intensities times 255 too
     assert (frames.sensor.forward_rad, frames.sensor.intensity_scale, frames.sensor.num_rows) == (0, 255, 32)
+    # In nuScenes and simulated frames y points forward, whatever a detector expects.
+    for where in ({"root": roots["nuscenes"]}, {"format": "simulated"}):
+        frames = open_frames(**where, sensor=dataclasses.replace(TINY, forward_rad=0.0))
+        assert frames.sensor == TINY
+        assert open_frames(**where, sensor=VLP16).sensor == VLP16  # not known
+        ahead = open_frames(**where, sensor=sector(dataclasses.replace(TINY, forward_rad=0.0), 0.0, 64)).sensor
+        assert ahead.azimuth_limits_rad == pytest.approx((np.pi / 4, 3 * np.pi / 4))
 
 
 def test_intensities_are_brought_to_the_scale_of_the_network_by_a_given_factor(roots, tmp_path):

@@ -47,10 +47,10 @@ def evaluate(tmp_path_factory):
     frame = page_frame(point, (BOXES, np.array([0, 1, 2]), SCORES), name="a", truth=(TRUTH, np.array([0])))
     write_page(folder / "page.html", [frame, frame], classes=CLASSES, title="")
     content, script = re.findall(r"<script.*?>(.*?)</script>", (folder / "page.html").read_text(), re.DOTALL)
-    content = f"made.drive = {{textContent: {json.dumps(content)}}};"
 
-    def run(expression):
-        text = f"{BROWSER}{content}{script}{CLICK}bird(); console.log(JSON.stringify({expression}));"
+    def run(expression, **changes):
+        drive = f"made.drive = {{textContent: {json.dumps(json.dumps(json.loads(content) | changes))}}};"
+        text = f"{BROWSER}{drive}{script}{CLICK}bird(); console.log(JSON.stringify({expression}));"
         (folder / "page.js").write_text(text)
         done = subprocess.run([node, folder / "page.js"], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
@@ -87,6 +87,11 @@ def test_a_picked_box_is_forgotten_when_it_is_no_longer_shown(evaluate):
     cone = f"click({at(7, 5)})"
     assert evaluate(f"[{cone}, $('score').value = '0.5', describe(frames[0])]") == [CONE, "0.5", ""]
     assert evaluate(f"[{cone}, now = 1, describe(frames[1])]") == [CONE, 1, ""]
+
+
+def test_without_poses_the_view_is_from_behind_the_heading_of_the_sensor(evaluate):
+    for forward_rad, behind in ((None, -np.pi / 2), (np.pi / 2, -np.pi / 2), (0, -np.pi)):
+        assert evaluate("[behind, view.yaw]", forward_rad=forward_rad) == pytest.approx([behind, behind])
 
 
 def test_classes_can_be_hidden(evaluate):
