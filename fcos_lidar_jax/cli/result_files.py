@@ -116,10 +116,14 @@ def _sample(record: dict[str, Any], classes: Sequence[str]) -> tuple[str, bytes]
 @contextlib.contextmanager
 def _kitti(folder: Path, classes: Sequence[str], calibration: Path | None) -> Iterator[Write]:
     number = num_boxes = num_left_out = 0
+    written = set[str]()
 
     def write(record: dict[str, Any]) -> None:
         nonlocal number, num_boxes, num_left_out
         cloud, stem = Path(record["file"]), _stem(record["file"], number)
+        if stem in written:
+            raise ValueError(f"{cloud}: got a second cloud named {stem}, expected different names")
+        written.add(stem)
         boxes, labels, scores = read_boxes(record, classes)
         types = np.array([_TYPES.get(classes[int(label)].lower(), "") for label in labels], object)
         kept = types != ""
@@ -133,6 +137,8 @@ def _kitti(folder: Path, classes: Sequence[str], calibration: Path | None) -> It
     if num_left_out:
         why = "outside of the image, or of a class without a type of KITTI"
         print(f"{folder}: {num_left_out} of {num_boxes} boxes left out: {why}", file=sys.stderr)
+    if others := [file.name for file in sorted(folder.glob("*.txt")) if file.stem not in written]:
+        print(f"{folder}: {len(others)} .txt files are of other clouds, such as {others[0]}", file=sys.stderr)
 
 
 def _stem(cloud: str | Path, number: int) -> str:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
+from fcos_lidar_jax.cli.result_files import result_files
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -193,17 +194,29 @@ def test_keyframes_of_nuscenes_are_called_by_their_tokens(home, tmp_path):
     assert list(json.loads((tmp_path / "results.json").read_text())["results"]) == by_time
 
 
+def test_a_second_cloud_of_a_name_is_refused(tmp_path):
+    (tmp_path / "000000.txt").write_text(calibration_text())
+    with result_files("kitti", tmp_path / "out", ["car"], annotator="", calibration=tmp_path) as write:
+        write({"file": "a/000000.bin", "boxes": []})
+        with pytest.raises(ValueError, match=r"^b/000000\.npy: got a second cloud named 000000, "):
+            write({"file": "b/000000.npy", "boxes": []})
+
+
 @pytest.mark.parametrize("command_line", ["stream", "detect"])
 def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monkeypatch):
     out = named = tmp_path / "kitti"
+    out.mkdir()
+    (out / "000009.txt").touch()
     if command_line == "stream":
         stream(home, out, "--output-format kitti")
     else:
-        out.mkdir()
         monkeypatch.chdir(out)
         named = Path(".")
         where = "--checkpoint", home / "checkpoint", "--min-score 0.001 --output-format kitti --out", named
         command("detect", home / "training" / "velodyne", *where, "--calibration", home / "training" / "calib")
+    told = capsys.readouterr().err
+    assert f"{named}: 1 .txt files are of other clouds, such as 000009.txt" in told
+    (out / "000009.txt").unlink()
     types, written = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}, 0
     types |= {"bicycle": "Cyclist", "bus": "Tram"}
     assert sorted(file.name for file in out.iterdir()) == [f"{number:06d}.txt" for number in range(3)]
@@ -227,8 +240,8 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monk
             assert depth < 0.1 or not (0 < u / depth < 1241 and 0 < v / depth < 374)
     assert written > 0
     number = sum(len(line["boxes"]) for line in lines)
-    told = f"{named}: {number - written} of {number} boxes left out: outside of the image, or of a class"
-    assert told in capsys.readouterr().err
+    left_out = f"{named}: {number - written} of {number} boxes left out: outside of the image, or of a class"
+    assert left_out in told
 
 
 MISTAKES = [
