@@ -45,17 +45,9 @@ def check_hashable(record: Any) -> None:
 def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> Any:
     """Convert a parsed JSON value to a dataclass, a tuple, a ``Literal``, an optional or a plain type.
 
-    ``msgspec.convert`` does not suffice: it ignores unknown fields of dataclasses, fills in missing ones, and
-    its messages lack the found value and the choices of a ``Literal``.
-
-    Args:
-        kind: type of the result. Integers are accepted as floats; nothing else is converted.
-        value: parsed JSON value.
-        where: name of the value's source in error messages.
-        defaults: use the default of a field that is missing.
-
-    Raises:
-        ValueError: one line with ``where``, the field, the found and the expected value.
+    ``msgspec.convert`` does not suffice: it ignores unknown fields of dataclasses, fills in missing ones, and its
+    messages lack the found value and the choices of a ``Literal``. Integers are accepted as floats; nothing else
+    is converted. ``where`` names the value's source in messages; with ``defaults``, fields may be missing.
 
     >>> from_json(tuple[float, ...], [1, 2.5], "a.json")
     (1.0, 2.5)

@@ -32,11 +32,7 @@ class Checkpoints:
         self.folder, self.keep = folder, keep
 
     def save(self, checkpoint: Checkpoint, state: TrainState) -> Path:
-        """Write a checkpoint, then remove old ones.
-
-        Raises:
-            OSError: writing failed; the other checkpoints are unchanged.
-        """
+        """Write a checkpoint, then remove old ones; if writing fails, the other checkpoints are unchanged."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{checkpoint.step:08d}"
         save_checkpoint(path, checkpoint, state=state)
@@ -64,10 +60,8 @@ class Checkpoints:
     def newest(self, like: TrainState) -> tuple[Checkpoint, TrainState] | None:
         """The newest intact checkpoint with its state; None if the folder has no checkpoints.
 
-        Corrupt checkpoints are skipped with a warning on standard error. ``like`` is any state of the same run.
-
-        Raises:
-            CheckpointError: all checkpoints are corrupt.
+        Corrupt checkpoints are skipped with a warning on standard error; if all are corrupt, a CheckpointError
+        says so. ``like`` is any state of the same run.
         """
         paths = self.paths()
         for path in reversed(paths):

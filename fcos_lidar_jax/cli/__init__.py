@@ -31,10 +31,10 @@ _CLOSED_PIPE = 128 + signal.SIGPIPE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command of ``argv``, by default the arguments of the process without the program's name.
+    """Run the command of ``argv``, by default the arguments of the process; returns the exit code, see
+    :func:`exit_code`.
 
-    Returns:
-        the exit code, see :func:`exit_code`; usage errors exit with 2.
+    Usage errors exit with 2.
     """
 
     words = sys.argv[1:] if argv is None else [*argv]

@@ -64,14 +64,9 @@ class DataOptions:
     ) -> FrameSet:
         """Open frames whose labels index the classes of a configuration.
 
-        Boxes of other classes are left out and counted on standard error.
-
-        Args:
-            config: how clouds are read, and the classes.
-            split: name of the split; None for all frames.
-            samples: ranges of the split's frames, see :func:`parse_ranges`; None for all.
-            sensor: for formats that do not define one; by default the configuration's.
-            option: name of the option that ``samples`` came from.
+        Boxes of other classes are left out and counted on standard error. ``samples``, from ``option``, are ranges
+        of the split's frames, see :func:`parse_ranges`. ``sensor`` is for formats that do not define one, by
+        default the configuration's.
         """
         frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:
@@ -133,9 +128,6 @@ def read_class_map(given: str | None, reader: Reader) -> ClassMap | str | None:
 
 def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]:
     """Indices of ``FIRST:LAST[,FIRST:LAST...]``: ranges of ``number`` frames in any order, ``LAST`` excluded.
-
-    Raises:
-        ValueError: naming the option and a range that is malformed, out of bounds or overlapping.
 
     >>> parse_ranges("0:2,5:7", 7)
     [0, 1, 5, 6]

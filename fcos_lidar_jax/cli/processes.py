@@ -46,12 +46,7 @@ def check_processes(options: ProcessOptions) -> None:
 
 
 def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.environ) -> None:
-    """Connect to the other processes, if any. Call this before JAX lists its devices.
-
-    Raises:
-        ValueError: no cluster is described, or a variable of the environment cannot be read.
-        OSError: the other processes were not reached.
-    """
+    """Connect to the other processes, if any. Call this before JAX lists its devices."""
     if not options.several:
         return
     cluster = options.coordinator or "the cluster of the environment"

@@ -50,20 +50,11 @@ class Argoverse2Frames(FrameSet):
     """All sweeps of some logs, by log and time: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
     Reads ``ROOT/[SPLIT/]LOG/sensors/lidar/TIMESTAMP_NS.feather``, ``LOG/city_SE3_egovehicle.feather`` and
-    ``LOG/annotations.feather``. A log without annotations, as in the test split, has no boxes. Points and boxes
-    stay in the ego vehicle's frame (x forward, y left, z up). Boxes outside the 26 classes of the detection
-    benchmark are dropped. Velocities are not annotated: they follow from the tracks in the city frame, by the rule
-    of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, and are given along the ego vehicle's axes.
-
-    Args:
-        root: folder of splits, of logs, or of one log.
-        split: read only its logs.
-        sensor: sensor that recorded the points.
-        reading: maximum number of sweeps to fuse, and which points are dropped.
-
-    Raises:
-        ValueError: at construction or on reading a frame, with the file, the row, the field, the found and the
-            expected value.
+    ``LOG/annotations.feather``; ``root`` may also be one log. A log without annotations, as in the test split, has
+    no boxes. Points and boxes stay in the ego vehicle's frame (x forward, y left, z up). Boxes outside the 26
+    classes of the detection benchmark are dropped. Velocities are not annotated: they follow from the tracks in
+    the city frame, by the rule of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, and are given along the
+    ego vehicle's axes.
     """
 
     classes = ARGOVERSE2_CLASSES
@@ -144,12 +135,7 @@ def is_argoverse2_log(folder: Path) -> bool:
 
 
 def argoverse2_drive(log: Path, sensor: Sensor, *, max_points: int = MAX_POINTS) -> Drive:
-    """The sweeps of a log in temporal order, in the ego vehicle's frame, with poses in the city frame.
-
-    Raises:
-        ValueError: at the call or on reading a sweep, with the file, the row, the field, the found and the
-            expected value.
-    """
+    """The sweeps of a log in temporal order, in the ego vehicle's frame, with poses in the city frame."""
     poses, stamps = _read_poses(log / _POSES), _stamps(log)
 
     def read() -> Iterator[Sweep]:

@@ -23,22 +23,9 @@ class CachedFrames(WrappedFrames):
     """A frame set that makes every frame once and keeps it on disk.
 
     The folder contains ``frames.json``, which describes the frame set, and one ``.npz`` archive per requested
-    frame. Threads and processes may share the folder, since files appear whole. A damaged file is made again, with
-    a warning on standard error. Changed code of the same version goes unnoticed: delete the folder then.
-
-    Raises:
-        ValueError: at construction, if the folder contains another set's frames.
-        OSError: a file cannot be written.
-
-    >>> import tempfile
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> frames = CachedFrames(SimulatedFrames(TINY, number=2), folder)
-    >>> len(frames), bool((frames.frame(1).points == frames.frame(1).points).all())
-    (2, True)
-    >>> sorted(file.name for file in folder.iterdir())
-    ['000001.npz', 'frames.json']
+    frame; one with another set's frames is refused at construction. Threads and processes may share the folder,
+    since files appear whole. A damaged file is made again, with a warning on standard error. Changed code of the
+    same version goes unnoticed: delete the folder then.
     """
 
     frames: FrameSet  # a dataclass with fields that JSON can represent

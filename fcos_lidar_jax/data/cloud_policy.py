@@ -159,11 +159,7 @@ def _newest(lags: np.ndarray, number: int) -> np.ndarray:
 
 
 def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> None:
-    """Refuse a cloud without a single point in the range image: the projection dropped all valid rows.
-
-    Raises:
-        ValueError: with the cloud's name and the counts of removed points.
-    """
+    """Refuse a cloud without a single point in the range image: the projection dropped all valid rows."""
     if np.count_nonzero(cloud.valid) > num_dropped:
         return
     raise ValueError(

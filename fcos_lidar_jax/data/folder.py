@@ -57,32 +57,11 @@ class FolderFrames(FrameSet):
     (``{"lorry": "truck", "sign": null}``; the classes are then the translated labels, sorted). ``splits.json``,
     optional, is ``{"train": [NAME, ...], "val": [...]}``.
 
-    File names, and boxes if they determine the classes, are checked at construction; other contents on reading a
-    frame.
-
     Args:
-        root: the folder.
         sensor: replaces ``sensor.json``.
         split: take the frames and their order from a split; default: all frames, sorted.
         splits: JSON file with the splits; default: ``splits.json``.
-        reading: maximum number of clouds to fuse, and which points are dropped.
         follow_links: also read files outside the folder.
-
-    Raises:
-        ValueError: at construction or on reading a frame, with the file, the field, the found and the expected
-            value.
-
-    >>> import json, tempfile
-    >>> root = Path(tempfile.mkdtemp())
-    >>> for name in ("clouds", "boxes"):
-    ...     (root / name).mkdir()
-    >>> _ = (root / "sensor.json").write_text('"tiny"')
-    >>> np.save(root / "clouds" / "a.npy", np.array([[8, 1, -1, 30], [9, 4, -1, 30.0]]))
-    >>> box = {"label": "car", "box": [8, 1, -1, 4, 2, 1.5, 0, None, None]}
-    >>> _ = (root / "boxes" / "a.json").write_text(json.dumps({"boxes": [box]}))
-    >>> frames = FolderFrames(root)
-    >>> frames.classes, frames.labels(0).tolist(), frames.frame(0).num_points.tolist()
-    (('car',), [0], [1])
     """
 
     def __init__(

@@ -209,11 +209,10 @@ class SelectedFrames(WrappedFrames):
 
 
 def files_fingerprint(files: Iterable[Path], root: Path, reading: object) -> str:
-    """Checksum of the name, size and modification time of files, and of the reader's options.
+    """Checksum of the name, size and modification time of files, and of the reader's options, distinguished by
+    ``repr``.
 
-    Args:
-        root: names are relative to it, so that a data set may be moved as a whole.
-        reading: options of the reader, distinguished by ``repr``.
+    Names are relative to ``root``, so that a data set may be moved as a whole.
     """
     states = [(os.path.relpath(file, root), *size_and_time(file)) for file in sorted(files)]
     return checksum(repr((states, reading)).encode())
@@ -242,33 +241,16 @@ def drop_close(points: np.ndarray, sensor: Sensor, reading: CloudReading) -> tup
 
 
 def no_points(sensor: Sensor) -> np.ndarray:
-    """An empty cloud f32[0, c] with the columns of a sensor.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> no_points(TINY).shape
-    (0, 5)
-    """
+    """An empty cloud f32[0, c] with the columns of a sensor."""
     return np.zeros((0, sensor.point_columns), np.float32)
 
 
 def without_points(frame: Frame) -> Frame:
-    """Drop a frame's points, and free their memory.
-
-    >>> frame = Frame(np.zeros((9, 5)), np.zeros((1, 9)), np.zeros(1, int), np.ones(1, int), num_close=4)
-    >>> boxes = without_points(frame)
-    >>> boxes.points.shape, boxes.num_points.tolist(), boxes.num_close
-    ((0, 5), [1], 0)
-    """
+    """Drop a frame's points, and free their memory."""
     return dataclasses.replace(frame, points=frame.points[:0].copy(), num_close=0)  # a view would keep the cloud
 
 
 def without_close(frame: Frame, sensor: Sensor, reading: CloudReading) -> Frame:
-    """Remove the points on the ego vehicle from a frame.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> frame = Frame(np.eye(5, dtype=np.float32) * 9, np.zeros((0, 9)), np.zeros(0), np.zeros(0))
-    >>> len(without_close(frame, TINY, CloudReading(1, "all")).points)
-    2
-    """
+    """Remove the points on the ego vehicle from a frame."""
     points, number = drop_close(frame.points, sensor, reading)
     return dataclasses.replace(frame, points=points, num_close=frame.num_close + number)

@@ -30,9 +30,6 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
     Reads ``velodyne_points/data/N.bin``, line N of ``velodyne_points/timestamps.txt``, ``oxts/data/N.txt``, and
     ``calib_imu_to_velo.txt`` in the folder or its parent. Positions are in a Mercator projection scaled at the
     first latitude, as in the data set's development kit.
-
-    Raises:
-        ValueError: with the file, the found and the expected value.
     """
     points = folder / "velodyne_points"
     files = sorted(points.joinpath("data").glob("*.bin"))

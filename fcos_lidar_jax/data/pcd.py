@@ -18,19 +18,15 @@ _MAX_EXPANSION = 88  # three bytes of LZF unpack to 264 at most
 
 
 def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, np.ndarray]:
-    """Parse a PCD file into named columns.
+    """Parse the content of a PCD file into named columns; errors name the header's field.
 
     Args:
-        content: the whole file.
         max_points: limit of the number of points.
         max_bytes: limit of all points' unpacked size.
 
     Returns:
         x, y, z, and intensity, time_lag and laser if the file has them; one value per point, in the file's own
         units and types.
-
-    Raises:
-        ValueError: one line with the header's field, the found and the expected value.
 
     >>> header = "FIELDS x y z ring\\nSIZE 4 4 4 1\\nTYPE F F F U\\nPOINTS 1\\nDATA ascii\\n"
     >>> table = parse_pcd(header.encode() + b"5 0 -1.5 31\\n", max_points=10, max_bytes=1000)

@@ -144,17 +144,11 @@ def check_time_lags(points: np.ndarray, where: str = "points") -> None:
 
 
 def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_POINTS) -> dict[str, np.ndarray]:
-    """Read columns of an Apache Feather file (version 2); needs the extra ``argoverse2``.
+    """Read columns of an Apache Feather file (version 2), at most ``max_rows`` long; needs the extra
+    ``argoverse2``.
 
-    Args:
-        path: the file.
-        kinds: column -> NumPy's letters of the allowed types: ``"fiu"`` numbers, ``"iu"`` whole numbers, ``"O"``
-            texts.
-        max_rows: longer tables are refused.
-
-    Raises:
-        ValueError: not a Feather file, a column is missing, has another type or a row without a value, or pyarrow
-            is not installed.
+    ``kinds`` maps columns to NumPy's letters of the allowed types: ``"fiu"`` numbers, ``"iu"`` whole numbers,
+    ``"O"`` texts. Rows without a value are refused.
     """
     try:
         import pyarrow

@@ -54,18 +54,11 @@ def ros_bag_drive(
     them. Clouds before the first or after the last pose are skipped, with a note in the drive.
 
     Args:
-        path: the recording.
-        sensor: as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
         topic: topic of the clouds (``PointCloud2``); may be omitted if there is only one.
         odometry: topic of ``Odometry``, ``PoseStamped`` or ``PoseWithCovarianceStamped``; or ``"tf"``: the
             transforms from the cloud's frame up to ``odom``, or to the root. If odometry is of another frame than
             the cloud's, as its child frame tells, the transforms between the two complete it.
         poses: instead of odometry, a file for :func:`~fcos_lidar_jax.data.drives.read_tum` of the cloud's frame.
-        max_points: larger clouds are refused.
-
-    Raises:
-        ValueError: at the call or on reading a cloud, with the recording, the topic, the found and the expected
-            value.
     """
     with _Bag(path) as bag:
         clouds = bag.choose(topic, _CLOUD, "topic")

@@ -18,13 +18,7 @@ def own_splits(folder: Path, file: str | Path | None = None) -> dict[str, list[s
 def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], where: str) -> tuple[str, ...]:
     """Check a list of frame names: at least one, each known and listed once.
 
-    Args:
-        listed: the place of each name, for messages, and the name.
-        known: names of all frames.
-        where: the place of the list, for messages.
-
-    Raises:
-        ValueError: with the place, the found and the expected value.
+    ``listed`` pairs the place of each name, for messages, with the name; ``where`` is the place of the list.
     """
     names: dict[str, None] = {}
     for place, name in listed:

@@ -1,4 +1,8 @@
-"""Evaluation of detections against ground truth."""
+"""Evaluation of detections against ground truth.
+
+Files that are refused raise a ValueError of one line: the file, the sample or frame, the box (from 0) and the
+field.
+"""
 
 from fcos_lidar_jax.evaluation.summary import evaluate_detections
 

@@ -27,17 +27,13 @@ def write_kitti(out: Path, detections: Iterable[Detections], frames: FrameSet | 
     """Write detections as ``results_kitti/NAME.txt``, and KITTI's metric of them as ``metrics_kitti.json``.
 
     Classes match KITTI's types by name, in lower or upper case, after the class map that the frames were opened
-    with. Boxes of other classes are not written, and only classes of the metric are evaluated.
-
-    Args:
-        out: folder; other .txt files in its ``results_kitti`` are removed.
-        detections: of each frame, labels by ``frames.classes``.
-        frames: :class:`~fcos_lidar_jax.data.kitti.KittiFrames`, or some of them with mapped classes.
+    with. Boxes of other classes are not written, and only classes of the metric are evaluated. Other .txt files in
+    ``results_kitti`` are removed.
 
     Returns:
         what :func:`~fcos_lidar_jax.evaluation.kitti.evaluate_kitti` returns, and ``left_out``: classes of the
-        frames and of the metric without a counterpart. None for other frames: nothing is written, and an older
-        ``metrics_kitti.json`` is removed.
+        frames and of the metric without a counterpart. None for frames of other data: nothing is written, and an
+        older ``metrics_kitti.json`` is removed.
     """
     summary, folder = out / KITTI_SUMMARY, out / "results_kitti"
     opened = _kitti_frames(frames)
@@ -139,11 +135,7 @@ def write_result(
 
 
 def read_result(path: Path, calibration: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str], np.ndarray]:
-    """Boxes f64[m, 9] in the Velodyne's frame, velocities NaN, types and scores f64[m] of a result file.
-
-    Raises:
-        ValueError: naming the file, the line, the field, what was found and what was expected.
-    """
+    """Boxes f64[m, 9] in the Velodyne's frame, velocities NaN, types and scores f64[m] of a result file."""
     types, fields = read_objects(path)
     return to_lidar(fields[:, 7:14], calibration["velo_to_rect"]), types, fields[:, 14]
 

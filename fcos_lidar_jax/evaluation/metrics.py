@@ -73,12 +73,8 @@ NUSCENES_METRIC = Metric(NUSCENES_CLASSES, tuple(int(RANGES_M[name]) for name in
 def metric_of(classes: Sequence[str], class_ranges_m: Sequence[float] = ()) -> Metric:
     """Create a metric for any classes: the benchmark's average precision and errors without attributes and NDS.
 
-    Args:
-        classes: names, in the order of the labels.
-        class_ranges_m: range per class; by default from the class name, see ``classes.RANGES_M``.
-
-    Raises:
-        ValueError: no classes, a repeated name, or not exactly one positive range per class.
+    The classes are in the order of the labels. By default, their ranges follow from their names, see
+    ``classes.RANGES_M``.
 
     >>> metric_of(["pedestrian", "forklift"]).class_ranges_m
     (40.0, 50.0)
@@ -110,12 +106,9 @@ class Evaluation:
 
 
 def evaluate(predictions: BoxColumns, truth: GroundTruth, metric: Metric = NUSCENES_METRIC) -> Evaluation:
-    """Filter, match and score predictions.
+    """Filter, match and score predictions, in the order of the results file; ``sample`` indexes ``truth.tokens``.
 
-    Args:
-        predictions: predictions in the order of the results file; ``sample`` is the index into ``truth.tokens``.
-        truth: ground truth of the same samples.
-        metric: the metric; labels of predictions and truth index its classes.
+    Labels of predictions and truth index the classes of the metric.
     """
     began = time.perf_counter()
     predictions, true = (filter_boxes(boxes, truth, metric) for boxes in (predictions, truth.boxes))
@@ -150,10 +143,7 @@ def within_range(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> np.nd
 
 
 def class_curves(ranking: Ranking) -> Curves:
-    """Curves of one class.
-
-    For a distance without hits, precision and score are 0 and errors are 1.
-    """
+    """Curves of one class. For a distance without hits, precision and score are 0 and errors are 1."""
     shape = (len(DISTANCES_M), len(_RECALL))
     precision, confidence, errors = np.zeros(shape), np.zeros(shape), np.ones((len(TP_ERRORS), len(_RECALL)))
     rank_from_one = np.arange(1, len(ranking.score) + 1)

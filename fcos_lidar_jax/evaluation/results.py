@@ -56,15 +56,10 @@ class Results:
 def read_results(
     source: str | Path | dict[str, Any], tokens: tuple[str, ...], *, of: str = "the ground truth"
 ) -> Results:
-    """Read and check detections.
+    """Read and check detections: a file, or the result of ``json.load``, that covers exactly the samples
+    ``tokens``.
 
-    Args:
-        source: the file, or the result of ``json.load``.
-        tokens: expected samples; the file must cover exactly these samples.
-        of: description of the expected samples, for messages.
-
-    Raises:
-        ValueError: naming the file, the sample, the box (from 0) and the field.
+    ``of`` describes the expected samples in messages.
     """
     file, name = json_io.read_json(source, ResultsFile, given="results")
     warnings = _check_meta(file.meta, name)
@@ -135,7 +130,6 @@ def result_entries(
 
     Args:
         found: detections in the sample's LiDAR frame.
-        token: token of the sample.
         sensor_to_global: f64[4, 4], pose of the sensor.
         classes: class names by label, all from the benchmark.
 
@@ -173,8 +167,7 @@ def result_entries(
 def write_results(path: str | Path, samples: Iterable[tuple[str, bytes]]) -> None:
     """Write an official results file of a LiDAR-only detector.
 
-    Args:
-        samples: tokens of the whole split with entries as JSON, ``[]`` for samples without detections.
+    ``samples`` are the tokens of the whole split with entries as JSON, ``[]`` for samples without detections.
     """
     lines = (b"%s: %s" % (json.dumps(token).encode(), entries) for token, entries in samples)
     json_io.write_lines(path, b'{"meta": %s, "results": {' % json.dumps(LIDAR_META).encode(), lines, b"}}\n")

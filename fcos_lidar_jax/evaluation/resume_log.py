@@ -14,10 +14,6 @@ class ResumeLog:
     A truncated or corrupt line and all lines after it are dropped. The first line is a fingerprint of detector and
     data. A file with a different fingerprint is overwritten when the first entry is added.
 
-    Args:
-        path: log file.
-        fingerprint: fingerprint of detector and data.
-
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "resume_log"
     >>> with ResumeLog(file, "this detector") as resume_log:

@@ -94,7 +94,6 @@ def export_detector(detector: TrainedDetector, *, num_points: Size | None = None
     limits and, with ``remove_close``, points on the ego vehicle as configured.
 
     Args:
-        detector: network with its weights.
         num_points: n, number of rows of a padded cloud, by default ``config.max_points``; ``"any"`` compiles for
             each number.
         batch: b, number of clouds, or ``"any"``. With several clouds, boxes and scores differ by rounding.

@@ -70,11 +70,7 @@ def _check_flips(config: Config) -> None:
 
 
 def processor_precision() -> Precision:
-    """bfloat16 if the processor supports it, else float32.
-
-    Raises:
-        ValueError: OpenVINO is not installed.
-    """
+    """bfloat16 if the processor supports it, else float32."""
     capabilities = cpu_package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     return "bfloat16" if "BF16" in capabilities else "float32"
 
@@ -82,9 +78,7 @@ def processor_precision() -> Precision:
 def with_openvino(detector: TrainedDetector, *, precision: Precision | None = None) -> OpenVinoDetector:
     """Compile the network of a detector with OpenVINO, for one cloud at a time.
 
-    Args:
-        detector: network with its weights.
-        precision: precision of the network except its input and outputs; by default :func:`processor_precision`.
+    ``precision`` is that of the network except its input and outputs; by default :func:`processor_precision`.
 
     Raises:
         ValueError: OpenVINO or onnx is not installed, or JAX runs on another device or in several processes.

@@ -59,8 +59,6 @@ def predict(
     processes. Threads read frames while the devices work.
 
     Args:
-        detector: the detector.
-        frames: the frames.
         indices: indices of the frames to process; by default all.
         batch_size: number of clouds per device; more than one changes scores and boxes by rounding, at most 1e-4.
         devices: devices to use; by default all, including those of other processes. Then every process makes the
@@ -96,13 +94,6 @@ def predict_groups(
 
     Raises:
         OSError: another process cannot read its frames of the next group.
-
-    >>> from fcos_lidar_jax.inference import load_detector
-    >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
-    >>> detector = load_detector("quickstart")
-    >>> groups = predict_groups(detector, unseen_frames(detector.sensor, 3), devices=jax.devices()[:1])
-    >>> [[prediction.index for prediction in group] for group in groups]
-    [[0], [1], [2]]
     """
     if batch_size < 1:
         raise ValueError(f"batch_size: got {batch_size}, expected at least 1")

@@ -42,9 +42,6 @@ def write_predictions(
     all after the same frames.
 
     Args:
-        detector: the detector.
-        frames: the frames; their names are unique.
-        path: results file.
         entries: converts the index of a frame and its detections to the entries of the file.
         write: writes the file from names of frames with entries as JSON.
         batch_size, yaw_rad: see :func:`fcos_lidar_jax.inference.prediction.predict`.

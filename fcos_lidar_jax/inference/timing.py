@@ -22,9 +22,6 @@ def interleaved(calls: Mapping[K, Call], repeats: int, *, percentile: int = 99) 
 
     Interleaving keeps comparisons fair when the speed of the machine drifts.
 
-    Raises:
-        ValueError: ``repeats`` is below 1.
-
     >>> sorted(interleaved({"nothing": lambda: None}, 2, percentile=95)["nothing"])
     ['median_ms', 'p95_ms']
     """

@@ -103,12 +103,9 @@ class GroundTruthDatabase:
         return self.table["newest"][:, num_sweeps - 1]
 
     def points(self, index: int) -> np.ndarray:
-        """Read one object's points f32[n, c] at their original pose, sorted by age.
+        """Read one object's points f32[n, c] at their original pose, sorted by age, and verify them.
 
         Opens the file for each object instead of mapping it: a thousand maps would exhaust a process's open files.
-
-        Raises:
-            ValueError: the points were altered.
         """
         row, columns = self.table[index], self.manifest.columns
         file, _ = _files(self.folder, self.manifest.shards[self.shard[index]].name)
@@ -120,11 +117,7 @@ class GroundTruthDatabase:
 
 
 def open_database(folder: str | Path, *, fingerprint: str | None = None) -> GroundTruthDatabase:
-    """Open and check a finished ground-truth database.
-
-    Args:
-        folder: a folder that :func:`prepare_database` wrote.
-        fingerprint: expected fingerprint of the source frames; None accepts any.
+    """Open and check a finished ground-truth database of the frames with a ``fingerprint``; None accepts any.
 
     Raises:
         ValueError: missing, unfinished, altered, truncated, or of another format version or other data.
@@ -185,7 +178,7 @@ def prepare_database(
     workers: int = 1,
     report: Callable[[int, int], None] | None = None,
 ) -> GroundTruthDatabase:
-    """Cut the points of every box with at least ``min_points`` points, one shard per scene.
+    """Cut the points of every box with at least ``min_points`` points over all sweeps, one shard per scene.
 
     Each shard is written atomically, its table last. A killed build loses only the shards in progress, and
     the next call completes it. The files are bit-identical for any number of workers and interruptions. Shards of
@@ -193,14 +186,10 @@ def prepare_database(
 
     Args:
         frames: frames of any classes; must be picklable for several workers.
-        folder: contains only the database; created if missing.
-        min_points: minimum number of points of an object, over all sweeps.
+        folder: contains only the database.
         workers: number of processes; 1 works in this process.
         report: called with (frames done, total) at the start, including frames of an earlier run, and after every
             shard.
-
-    Returns:
-        the finished database, checked and opened.
 
     Raises:
         ValueError: a frame has other columns than its sensor, or an implausible box.
@@ -241,13 +230,7 @@ def prepare_database(
 
 
 def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
-    """Shard -> indices of its frames; named after the scene, or the first frame if the data have no scenes.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> shards_by_scene(SimulatedFrames(TINY, 3))
-    {'frames_000000': [0, 1, 2]}
-    """
+    """Shard -> indices of its frames; named after the scene, or the first frame if the data have no scenes."""
     shards: dict[str, list[int]] = {}
     for index in range(len(frames)):
         scene = re.sub(r"[^\w.-]|^[.-]", "_", frames.scene(index))

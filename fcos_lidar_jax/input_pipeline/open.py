@@ -184,14 +184,9 @@ def default_split(
 ) -> str | None:
     """The default split for a purpose: ``train`` or ``val``; ``mini_train`` or ``mini_val`` for nuScenes mini.
 
-    Args:
-        data: the data set.
-        purpose: the purpose of the split.
-        required: if that split is missing, take the only other split, unless its name tells the other purpose.
-        splits: JSON file of own splits.
-
-    Returns:
-        a name, or None if the data have no splits or, unless it is required, if that split is missing.
+    If that split is missing but one is ``required``, take the only other split, unless its name tells the other
+    purpose. None if the data have no splits or, unless it is required, if that split is missing. ``splits`` is a
+    file of own splits.
 
     Raises:
         ValueError: a split is required, and there are several others or only one for the other purpose.

@@ -79,15 +79,7 @@ _FULL_REACH_M = 45.0
 
 
 def simulated_split(split: str, sensor: Sensor, reading: CloudReading) -> SimulatedFrames:
-    """Streets that fit the sensor: plain streets for a short range, varied streets otherwise.
-
-    Raises:
-        ValueError: unknown split.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> len(simulated_split("val", TINY, CloudReading()))
-    400
-    """
+    """Streets that fit the sensor: plain streets for a short range, varied streets otherwise."""
     if split not in SIMULATED_SPLITS:
         raise ValueError(f"split: {unknown_name(split, SIMULATED_SPLITS)}")
     make = SimulatedFrames if sensor.limit_xy_m < _FULL_REACH_M else city_frames

@@ -77,9 +77,7 @@ def scan_sweeps(
     """Fuse the sweeps up to a moment in the sensor's frame at that moment, current sweep first, then by age.
 
     Args:
-        mount: f64[4, 4], from :func:`~.lidar.sample_mount`.
         time_s: time of the current sweep; sweeps are ``SWEEP_S`` apart.
-        rng: source of noise and dropout.
         reading: the number of sweeps. Close points are removed from all sweeps or from no sweep: the simulated ego
             vehicle has no body that the sensor could see, so close points lie on the road.
 

@@ -36,7 +36,6 @@ def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callab
     Args:
         root: folder of the data set: new, empty, or with an unfinished data set of the same specification.
         workers: number of processes; the bytes do not depend on it.
-        report: called repeatedly with the number of finished sweeps.
 
     Returns:
         False if the data set was already complete.

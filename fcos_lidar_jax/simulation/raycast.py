@@ -57,7 +57,6 @@ def cast(
         rotation: f64[3, 3], from sensor axes to world axes.
         origin: f64[3], position of the sensor in the world, above the ground.
         solids: [s], in the world frame.
-        rng: source of the penetration depths into porous solids.
 
     >>> fan = Fan(np.radians([0.0]), 4, np.pi, np.pi / 2, np.zeros(1))
     >>> from fcos_lidar_jax.simulation.solids import BALL, make_solids

@@ -45,14 +45,10 @@ def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[]
 
     Args:
         root: folder of the data set, with existing folders ``samples/LIDAR_TOP`` and ``sweeps/LIDAR_TOP``.
-        advance: called after each sweep.
 
     Returns:
         rows of the scene by table. Each object is annotated from the first to the last keyframe in which it has
         points.
-
-    Raises:
-        OSError: a file cannot be written; the message names it.
     """
     rng = np.random.default_rng([spec.seed, index])
     world = sample_scene(rng, spec)

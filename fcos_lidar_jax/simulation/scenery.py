@@ -28,8 +28,7 @@ def sample_scenery(
     Args:
         rng: random source for houses, fences, trees and poles.
         surroundings: random source for everything else.
-        low: f64[2], least x and y of the sensor's path.
-        high: f64[2], greatest x and y of the sensor's path.
+        low, high: f64[2], least and greatest x and y of the sensor's path.
         beyond_m: extent of the scenery around the path.
 
     Returns:

@@ -72,7 +72,6 @@ def sample_world(
     Args:
         reach_m: each object is within this distance of the ego vehicle at some time.
         beyond_m: extent of the scenery around the path of the ego vehicle.
-        duration_s: duration of the world.
         labels: i32[m], classes of the objects; objects without room are omitted.
         level: ground without slopes.
         fused: the world is scanned at its end only, as a few fused sweeps. Each object is within reach then.

@@ -58,7 +58,6 @@ def fit(
     Raises:
         NonFiniteLossError: a loss or gradient is not finite.
 
-    >>> import dataclasses
     >>> def count(state, batch):
     ...     return dataclasses.replace(state, step=state.step + 1), {"loss/total": 1.0, "positive_iou": 0.5}
     >>> state = TrainState(np.int32(0), {}, {}, (), None, jax.random.key(0))

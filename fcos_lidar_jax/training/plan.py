@@ -109,11 +109,7 @@ def plan_run(
     workers: int,
     packing: bool | None,
 ) -> Run:
-    """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``.
-
-    Raises:
-        ValueError: the arguments do not fit each other.
-    """
+    """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``."""
     check_numbers(steps, seed)
     order = SampleOrder(frames, config, seed=seed)
     epoch_steps = -(-order.epoch_size // config.optimizer.batch_size)
@@ -190,10 +186,7 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
 def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
     """Check that a run can be started or resumed in a folder.
 
-    Args:
-        folder: folder of the run.
-        spec: expected content of ``run.json``; None to check only whether there is a run.
-        resume: whether the run is to be resumed.
+    ``spec`` is the expected content of ``run.json``; None checks only whether there is a run.
 
     Returns:
         fields that the specification of an older run lacks and that were not compared.

@@ -65,10 +65,8 @@ def train(
     """Train a detector; Ctrl-C and SIGTERM save a checkpoint and stop.
 
     Args:
-        config: configuration of the detector.
         frames: training frames; classes are matched to ``config.classes`` by name, and the detector is built for
             their sensor.
-        out: folder of the run.
         steps: number of updates of the whole run.
         seed: seed of weights, order, pasted objects and augmentation.
         tests: frames to evaluate on along the way.

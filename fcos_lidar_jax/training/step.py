@@ -31,7 +31,6 @@ def make_state(
     """Make the state before the first step, with a running mean of the weights if ``ema_decay`` is not 0.
 
     Args:
-        detector, optimizer: network and optimizer.
         key: random key of the run.
         variables: initial ``params`` and ``batch_stats``; random by default.
 

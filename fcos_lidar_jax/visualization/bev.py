@@ -33,7 +33,6 @@ def draw_bev(
     Args:
         points: f32[n, >= 3], metres; non-finite rows are omitted.
         limit_m: half the side of the plotted square.
-        classes: class names by label.
         detections: boxes f32[d, 9], labels i32[d], scores f32[d].
         truth: boxes f32[m, 9], labels i32[m].
     """

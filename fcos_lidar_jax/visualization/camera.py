@@ -26,14 +26,9 @@ def draw_camera(
     """Draw boxes in a camera image: detections with class and score in the colour of their class, truth dashed.
 
     Args:
-        image: PNG or JPEG file.
         to_image: f64[3, 4], from the frame of the boxes, metres, to homogeneous pixels.
-        classes: class names by label.
         detections: boxes f32[d, >= 7], labels i32[d], scores f32[d].
         truth: boxes f32[m, >= 7], labels i32[m].
-
-    Raises:
-        ValueError: the file is no image.
     """
     from PIL import Image
 

@@ -86,12 +86,10 @@ def write_evaluation_report(
     """Write the self-contained ``report.html``, and its pictures to ``pictures/``.
 
     Reads scores, errors and curves from ``metrics_summary.json``, ``curves.json`` and, if it exists,
-    ``bootstrap.json``, of the nuScenes benchmark or any other metric.
+    ``bootstrap.json`` in the folder, of the nuScenes benchmark or any other metric.
 
     Args:
-        out: folder with these files.
-        examples: samples to plot.
-        sensor: sensor of the range images.
+        examples: samples to plot; ``sensor`` is that of their range images.
         pictures: additional pictures, placed first.
         links: text and file name of links to files beside the report.
     """

@@ -73,7 +73,6 @@ def write_labels(
 
     Args:
         boxes: centre and half the size in units of the axis, f64[2], label, and score, None for the truth.
-        classes: class names by label.
         point: width and height of a typographic point in units of the axis.
     """
     from matplotlib.patheffects import withStroke

@@ -118,12 +118,7 @@ def write_page(
     title: str,
     min_score: float = SHOWN_SCORE,
 ) -> None:
-    """Write the HTML page.
-
-    Args:
-        classes: class names by label.
-        min_score: initial threshold of the visible boxes.
-    """
+    """Write the HTML page; ``min_score`` is the initial threshold of the visible boxes."""
     content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}
     content |= {"colors": [class_color(label) for label in range(len(classes))]}
     content |= {"frames": [dataclasses.asdict(frame) for frame in frames]}

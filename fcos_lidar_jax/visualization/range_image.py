@@ -35,12 +35,10 @@ def draw_range_image(
     are current.
 
     Args:
-        classes: class names by label.
         truth: boxes f32[m, >= 7], metres, in the frame of the points, and labels i32[m]. Each box is outlined in
             round 1, in the colour of its class, around the cells whose points lie in it; boxes without such a cell
             are not visible.
         detections: boxes f32[d, >= 7], labels i32[d] and scores f32[d], in a separate panel.
-        azimuth_limits_rad: sector of the sensor.
     """
     view = _View.of(azimuth_limits_rad)
     features = np.asarray(image.features)

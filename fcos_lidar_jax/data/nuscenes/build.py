@@ -79,15 +79,7 @@ def _floats(rows: list[Any], **widths: int) -> Columns:
 
 
 def build_index(folder: str | Path, report: Report = lambda name, rows: None) -> Index:
-    """Read, check and join the tables of one version.
-
-    Args:
-        folder: ``ROOT/VERSION``.
-        report: called after every piece of a table.
-
-    Raises:
-        ValueError: with the file, the record, the field, the found and the expected value.
-    """
+    """Read, check and join the tables in ``ROOT/VERSION``; ``report`` is called after every piece of a table."""
     tables = _Tables(Path(folder), report)
     if not tables.folder.is_dir():
         raise ValueError(f"{folder}: no such folder, expected the tables of a version")

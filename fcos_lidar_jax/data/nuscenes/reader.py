@@ -149,11 +149,7 @@ class NuScenes:
         return fuse_sweeps(map(self._read, [current, *self._present(older)]), sensor, reading)
 
     def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
-        """The sweeps (or only keyframes) of a scene in temporal order, read on demand.
-
-        Raises:
-            ValueError: no such scene; the message lists the scenes.
-        """
+        """The sweeps (or only keyframes) of a scene in temporal order, read on demand; errors list the scenes."""
         rows = self._keyframe_rows(scene)
         if not keyframes:
             following = {int(before): row for row, before in enumerate(self.index.sweep_previous) if before >= 0}
