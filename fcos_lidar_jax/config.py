@@ -413,9 +413,6 @@ def config_from_json(record: Any, where: str = "config") -> Config:
     The fields determine the class, among the subclasses of :class:`Config` that are already imported. A section
     of another detector may be null.
 
-    Args:
-        record, where: the parsed JSON value, and the name of its source in error messages.
-
     Raises:
         ValueError: naming ``where``, the field, the found and the expected value.
 

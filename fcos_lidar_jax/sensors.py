@@ -134,12 +134,8 @@ def even_inclinations(lowest_deg: float, highest_deg: float, num_rows: int) -> t
 
 
 def sector(sensor: Sensor, middle_rad: float, num_columns: int) -> Sensor:
-    """Sensor that covers a sector of the turn, with columns of the same width.
-
-    Args:
-        sensor: sensor that covers a full turn.
-        middle_rad: azimuth of the middle of the sector.
-        num_columns: number of columns of the sector.
+    """Sensor that covers a sector of a full turn, around the azimuth ``middle_rad``, with columns of the same
+    width.
 
     >>> ahead = sector(NUSCENES_HDL32E, math.pi / 2, 272)
     >>> ahead.num_columns, [round(math.degrees(v), 2) for v in ahead.azimuth_limits_rad]
@@ -298,9 +294,6 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the
     heading is that of the preset of the same name, else unknown.
 
-    Args:
-        record, where: the parsed JSON value, and the name of its source in error messages.
-
     Raises:
         ValueError: naming ``where``, the field, the found and the expected value.
 
@@ -326,10 +319,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
 
 
 def load_sensor(path: str | Path) -> Sensor:
-    """Load a sensor by preset name or from a JSON file.
-
-    Args:
-        path: a key of :data:`PRESETS`, or a JSON file in the format of :func:`sensor_from_json`.
+    """Load a sensor by preset name, or from a JSON file in the format of :func:`sensor_from_json`.
 
     Raises:
         ValueError: naming the file, the field, the found and the expected value.

@@ -28,13 +28,7 @@ BOX = "x, y, z, l, w, h, yaw, ..."
 def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:
     """Refuse arrays without the expected columns: JAX clamps indices, so results would be wrong without an error.
 
-    Args:
-        name: of the array, for the message.
-        array: of any shape [..., columns].
-        columns: names of the columns; ``"..."`` at the end allows more.
-
-    Raises:
-        ValueError: too few or too many columns.
+    ``columns`` are the names of the last axis; ``"..."`` at the end allows more. ``name`` is that of the array.
 
     >>> check_columns("box", np.zeros(5), "x, y, z, l, w, h, yaw, ...")
     Traceback (most recent call last):

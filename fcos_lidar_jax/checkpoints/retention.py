@@ -107,8 +107,7 @@ def find_checkpoint(folder: Path) -> Path:
 def load_checkpoint(checkpoint: str | Path) -> Checkpoint:
     """Read a checkpoint after checking the hashes of its files and the shapes of its arrays.
 
-    Args:
-        checkpoint: path or name, see :func:`find_checkpoint`.
+    ``checkpoint`` is a path or a name, see :func:`find_checkpoint`.
 
     Raises:
         CheckpointError: names the folder, what was found and what was expected.

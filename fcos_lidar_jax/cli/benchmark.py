@@ -20,6 +20,7 @@ from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import CloudDetector, TrainedDetector, load_detector
 from fcos_lidar_jax.inference.detect import make_stages
@@ -56,8 +57,7 @@ class Benchmark:
 def run(args: Benchmark) -> None:
     """Measure, print, and write the times."""
     check_at_least(args, 1, "repeats")
-    if any(size < 1 for size in args.batch):
-        raise ValueError(f"--batch: got {min(args.batch)}, expected at least 1")
+    check(min(args.batch, default=1) >= 1, "--batch", min(args.batch, default=1), "at least 1")
     files = find_clouds(args.files)
     check_outputs(args.checkpoint, files, out=args.out)
     detector = load_detector(args.checkpoint, backend=args.backend)

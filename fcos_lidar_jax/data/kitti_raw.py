@@ -37,7 +37,8 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
         raise ValueError(f"{points / 'data'}: no .bin file in it, expected sweeps")
     times = dict(read_lines(points / "timestamps.txt", "the times of the sweeps"))
     own, of_day = folder / _CALIBRATION, folder.parent / _CALIBRATION
-    velodyne_to_imu = np.linalg.inv(_imu_to_velodyne(own if own.is_file() else of_day))
+    matrices = read_matrices(own if own.is_file() else of_day, {"R": (3, 3), "T": (3, 1)}, ("R",))
+    velodyne_to_imu = np.linalg.inv(np.vstack([np.hstack([matrices["R"], matrices["T"]]), (0, 0, 0, 1)]))
 
     def read() -> Iterator[Sweep]:
         scale = None
@@ -49,12 +50,6 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
             yield Sweep(read_points(file, sensor, max_points=max_points), pose, time_us, str(file))
 
     return Drive(read())
-
-
-def _imu_to_velodyne(file: Path) -> np.ndarray:
-    matrices, pose = read_matrices(file, {"R": (3, 3), "T": (3, 1)}, ("R",)), np.eye(4)
-    pose[:3] = np.hstack([matrices["R"], matrices["T"]])
-    return pose
 
 
 def _read_oxts(file: Path) -> dict[str, float]:

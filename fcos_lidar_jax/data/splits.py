@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import read_json
 
 SPLITS = "splits.json"
@@ -22,8 +23,7 @@ def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], wh
     """
     names: dict[str, None] = {}
     for place, name in listed:
-        if name not in known:
-            raise ValueError(f"{place}: got {name!r}, expected the name of a cloud")
+        check(name in known, place, name, "the name of a cloud")
         if name in names:
             raise ValueError(f"{place}: got {name!r} a second time, expected every frame once")
         names[name] = None

@@ -14,6 +14,7 @@ import numpy as np
 from fcos_lidar_jax.classes import DEFAULT_RANGE_M, NUSCENES_CLASSES, RANGES_M
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
 from fcos_lidar_jax.evaluation.matching import DISTANCES_M, ERROR_ROW, TP_ERRORS, Ranking, candidate_pairs, rank
+from fcos_lidar_jax.fields import check
 
 MIN_RECALL = MIN_PRECISION = 0.1  # lower values do not contribute to the AP
 MAX_BOXES = 500  # maximum number of boxes per sample in an official results file
@@ -37,11 +38,10 @@ class Metric:
     benchmark: bool = False  # nuScenes benchmark, with NDS and attributes; without truth, AP is 0 and errors are 1
 
     def __post_init__(self) -> None:
-        if len(set(self.classes)) != len(self.classes) or not self.classes:
-            raise ValueError(f"classes: got {self.classes}, expected at least one name, each once")
-        if len(self.class_ranges_m) != len(self.classes) or not all(r > 0 for r in self.class_ranges_m):
-            expected = f"{len(self.classes)} positive lengths, one per class"
-            raise ValueError(f"class_ranges_m: got {self.class_ranges_m}, expected {expected}")
+        number, ranges = len(self.classes), self.class_ranges_m
+        check(len(set(self.classes)) == number > 0, "classes", self.classes, "at least one name, each once")
+        positive = len(ranges) == number and all(r > 0 for r in ranges)
+        check(positive, "class_ranges_m", ranges, f"{number} positive lengths, one per class")
 
     @property
     def heading_period_rad(self) -> np.ndarray:

@@ -23,7 +23,6 @@ def write_openlabel(path: str | Path, records: Iterable[dict[str, Any]], *, anno
     they are known, the time in seconds and the transform from the LiDAR to the world.
 
     Args:
-        path: JSON file.
         records: lines of ``fcos-lidar stream``, or entries of ``fcos-lidar detect``; iterated twice.
         annotator: name of the program and the detector that made the boxes.
 

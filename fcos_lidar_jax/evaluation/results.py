@@ -22,6 +22,7 @@ from fcos_lidar_jax.evaluation.boxes import (
     make_columns,
 )
 from fcos_lidar_jax.evaluation.metrics import MAX_BOXES
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.types import Detections
 
 USE_FLAGS = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
@@ -90,8 +91,7 @@ def read_results(
 
 def _check_meta(meta: dict[str, Any], name: str) -> list[str]:
     for flag in USE_FLAGS:
-        if flag in meta and not isinstance(meta[flag], bool):
-            raise ValueError(f"{name}: meta: {flag}: got {meta[flag]!r}, expected true or false")
+        check(isinstance(meta.get(flag, False), bool), f"{name}: meta: {flag}", meta.get(flag), "true or false")
     absent = [flag for flag in USE_FLAGS if flag not in meta]
     return [f"{name}: meta: {', '.join(absent)}: missing; the benchmark's server needs all five"] if absent else []
 

@@ -23,6 +23,7 @@ from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints.storage import CheckpointError, with_later_fields
 from fcos_lidar_jax.config import config_from_json, config_to_json
 from fcos_lidar_jax.data.cloud_policy import usable_rows
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, jit_split
@@ -104,8 +105,7 @@ def export_detector(detector: TrainedDetector, *, num_points: Size | None = None
     config, sensor = detector.config, detector.sensor
     rows = config.max_points if num_points is None else num_points
     for name, size in (("points", rows), ("batch", batch)):
-        if isinstance(size, int) and size < 1:
-            raise ValueError(f"{name}: got {size}, expected at least 1, or any")
+        check(not isinstance(size, int) or size >= 1, name, size, "at least 1, or any")
     if rows != "any":
         config = dataclasses.replace(config, max_points=rows)
     scope = export.SymbolicScope()
@@ -175,20 +175,11 @@ def _settings(values: dict[str, Any]) -> Iterator[None]:
             jax.config.update(name, value)
 
 
-def read_record(file: Path) -> dict[str, Any]:
-    """Read the description of an exported detector without deserialising its program.
-
-    Raises:
-        CheckpointError: not an exported detector, another format, or corrupt.
-    """
-    return _read(file)[0]
-
-
 def load_exported(file: Path) -> ExportedDetector:
     """Load a file of :func:`export_detector`; the program is compiled for the first cloud.
 
     Raises:
-        CheckpointError: see :func:`read_record`; also if the file needs another version of JAX.
+        CheckpointError: not an exported detector, corrupt, or of another format or version of JAX.
     """
     record, program = _read(file)
     config = config_from_json(with_later_fields(record["config"]), f"{file}: config")

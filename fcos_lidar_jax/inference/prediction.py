@@ -18,6 +18,7 @@ from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
@@ -95,8 +96,7 @@ def predict_groups(
     Raises:
         OSError: another process cannot read its frames of the next group.
     """
-    if batch_size < 1:
-        raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
+    check(batch_size >= 1, "batch_size", batch_size, "at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
     aligned = Alignment(frames.sensor, sensor, yaw_rad)
     if (line := aligned.describe()) and jax.process_index() == 0:

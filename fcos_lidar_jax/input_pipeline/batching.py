@@ -97,8 +97,7 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
     for row, frame in enumerate(frames):
         for name, rows, limit in (("points", frame.points, max_points), ("boxes", frame.boxes, max_boxes)):
-            if len(rows) > limit:
-                raise ValueError(f"frame {row}: {name}: got {len(rows)}, expected at most {limit}")
+            check(len(rows) <= limit, f"frame {row}: {name}", len(rows), f"at most {limit}")
         fill_row(batch, row, [frame])
     return batch
 

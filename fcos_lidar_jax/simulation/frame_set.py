@@ -12,6 +12,8 @@ from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
 
+_OPTIONS = ("num_objects", "reach_m", "min_points", "reading", "fast_traffic", "streets")  # of make_frame
+
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedFrames(FrameSet):
@@ -43,16 +45,7 @@ class SimulatedFrames(FrameSet):
         return self.number
 
     def frame(self, index: int) -> Frame:
-        return make_frame(
-            self.first_seed + index,
-            self.sensor,
-            num_objects=self.num_objects,
-            reach_m=self.reach_m,
-            min_points=self.min_points,
-            reading=self.reading,
-            fast_traffic=self.fast_traffic,
-            streets=self.streets,
-        )
+        return make_frame(self.first_seed + index, self.sensor, **{name: getattr(self, name) for name in _OPTIONS})
 
     def name(self, index: int) -> str:
         return f"seed {self.first_seed + index}"

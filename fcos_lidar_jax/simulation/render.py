@@ -8,6 +8,7 @@ import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import count_inside
+from fcos_lidar_jax.data.sweeps import about_z
 from fcos_lidar_jax.files import naming
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.sensors import Sensor
@@ -92,9 +93,7 @@ def sample_scene(rng: np.random.Generator, spec: DatasetSpec) -> World:
 
 def _sample_placement(rng: np.random.Generator) -> np.ndarray:
     """Random pose of the street frame in the global frame, with rotation about z only, f64[4, 4]."""
-    yaw = rng.uniform(-np.pi, np.pi)
-    placement = np.eye(4)
-    placement[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    placement = about_z(rng.uniform(-np.pi, np.pi))
     placement[:2, 3] = rng.uniform(300, 2000, 2)
     return placement
 

@@ -80,19 +80,16 @@ def bev_on(
 
 
 def _draw_points(axis: Any, points: np.ndarray, limit_m: float) -> None:
+    from matplotlib.colors import LinearSegmentedColormap
+
     cloud = points[np.isfinite(points[:, :3]).all(axis=1) & (np.abs(points[:, :2]) < limit_m).all(axis=1)]
     if len(cloud):
         # Heights are relative to the ground: the ground is light and objects on it are dark.
         ground = np.quantile(cloud[:, 2], 0.1)
         dot = float(np.clip(3e4 / len(cloud), 1.6, 7))  # larger dots for sparse clouds
-        colors = {"c": cloud[:, 2] - ground, "cmap": _height_colors(), "vmin": 0, "vmax": _HIGH_M}
+        shades = LinearSegmentedColormap.from_list("height", ["#c4c4c4", "#8aa0b8", "#3f5f86", "#1c1c3c"])
+        colors = {"c": cloud[:, 2] - ground, "cmap": shades, "vmin": 0, "vmax": _HIGH_M}
         axis.scatter(*cloud[:, :2].T, s=dot, linewidths=0, zorder=2, **colors)
-
-
-def _height_colors() -> Any:
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("height", ["#c4c4c4", "#8aa0b8", "#3f5f86", "#1c1c3c"])
 
 
 def _in_view(box: np.ndarray, limit_m: float) -> bool:
