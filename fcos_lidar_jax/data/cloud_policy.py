@@ -121,15 +121,12 @@ def usable_rows(points: np.ndarray | Array) -> np.ndarray | Array:
 
 
 def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarray, valid: np.ndarray) -> int:
-    """Write a cloud's rows into zeroed arrays of a fixed size; see :func:`make_cloud`.
+    """Write a cloud's rows into zeroed arrays of a fixed size and count truncated rows; see :func:`make_cloud`.
 
     Args:
         parts: f32[n, c] each, written one after another.
         kept: bool[n of all parts]; if everything fits, the other rows are written too, as invalid.
         points, valid: outputs f32[m, c] and bool[m].
-
-    Returns:
-        number of truncated rows.
 
     >>> points, valid = np.zeros((2, 5), np.float32), np.zeros(2, bool)
     >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 0, 0]], np.float32)

@@ -97,7 +97,7 @@ def write_result(
     image_size: tuple[int, int] = IMAGE_SIZE,
 ) -> int:
     """Write the detections of a frame, which :func:`read_result` reads; boxes that are outside of the image, or
-    larger than any object, are left out.
+    larger than any object, are left out. Returns their number.
 
     Args:
         path: the benchmark's files are called ``000123.txt``.
@@ -106,9 +106,6 @@ def write_result(
         scores: [m].
         calibration: as ``fcos_lidar_jax.data.kitti.read_calibration`` returns it.
         image_size: width and height, pixels.
-
-    Returns:
-        number of boxes that were left out.
 
     >>> import tempfile
     >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])

@@ -31,14 +31,11 @@ _POLL_S = 0.5
 
 
 def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callable[[int], object]) -> bool:
-    """Write a data set in the official layout, or resume an unfinished one.
+    """Write a data set in the official layout, or resume an unfinished one; False if it was already complete.
 
     Args:
         root: folder of the data set: new, empty, or with an unfinished data set of the same specification.
         workers: number of processes; the bytes do not depend on it.
-
-    Returns:
-        False if the data set was already complete.
 
     Raises:
         ValueError: the folder contains other files or another data set.

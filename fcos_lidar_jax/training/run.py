@@ -62,7 +62,7 @@ def train(
     workers: int = 0,
     packing: bool | None = None,
 ) -> TrainState:
-    """Train a detector; Ctrl-C and SIGTERM save a checkpoint and stop.
+    """Train a detector and return the last state; Ctrl-C and SIGTERM save a checkpoint and stop.
 
     Args:
         frames: training frames; classes are matched to ``config.classes`` by name, and the detector is built for
@@ -81,9 +81,6 @@ def train(
             threads as ``input_pipeline.loader.default_threads`` returns, and no processes.
         packing: transfer batches to the devices in fewer bytes, with the same results, see
             :mod:`fcos_lidar_jax.packing`; by default unless the devices are CPUs.
-
-    Returns:
-        the last state.
 
     Raises:
         ValueError: the folder holds another run, no class is shared, the devices cannot share the batch, steps or
@@ -246,8 +243,7 @@ def _start(run: Run, *, resume: bool) -> TrainState:
     key = jax.random.key(run.seed)
     if resume:
         like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
-        newest = run.checkpoints.newest(like)
-        if newest is not None:
+        if (newest := run.checkpoints.newest(like)) is not None:
             return newest[1]
     return make_state(run.detector, run.optimizer, key, variables=run.weights)
 

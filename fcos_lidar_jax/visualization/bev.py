@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, set_title, write_labels
 
 _SIZE_IN = 9.0
@@ -20,21 +21,15 @@ def draw_bev(
     *,
     limit_m: float,
     classes: Sequence[str],
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    detections: ScoredBoxes | None = None,
+    truth: TrueBoxes | None = None,
     title: str | None = None,
 ) -> None:
     """Plot a cloud from above: x to the right, y up, higher points darker, a cross at the origin.
 
     Detections have solid outlines in the colour of their class, with class and score, or only the score, where
     there is room, highest scores first. Truth has thin dashed black outlines filled with the colour of its class.
-    A line from the centre through the front marks the heading.
-
-    Args:
-        points: f32[n, >= 3], metres; non-finite rows are omitted.
-        limit_m: half the side of the plotted square.
-        detections: boxes f32[d, 9], labels i32[d], scores f32[d].
-        truth: boxes f32[m, 9], labels i32[m].
+    A line from the centre through the front marks the heading. Half the side of the plotted square is ``limit_m``.
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
     options = {"limit_m": limit_m, "classes": classes, "detections": detections, "truth": truth}
@@ -51,8 +46,8 @@ def bev_on(
     *,
     limit_m: float,
     classes: Sequence[str],
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    detections: ScoredBoxes | None = None,
+    truth: TrueBoxes | None = None,
 ) -> set[int]:
     """Plot the view of :func:`draw_bev` on an axis; returns the visible labels."""
     _draw_points(axis, points, limit_m)

@@ -14,7 +14,7 @@ from fcos_lidar_jax.evaluation.examples import sensor_boxes
 from fcos_lidar_jax.evaluation.kitti import DIFFICULTIES
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.bev import draw_bev
@@ -42,8 +42,8 @@ class Example:
     kind: str  # best, typical or worst
     name: str  # name of the sample
     points: np.ndarray  # f32[n, >= 5]: the cloud; if it is empty, there is no range image
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f64[d, 9], labels and scores
-    truth: tuple[np.ndarray, np.ndarray]  # boxes f64[m, 9] and labels
+    detections: ScoredBoxes
+    truth: TrueBoxes
     camera: tuple[Path, np.ndarray] | None = None  # image, and f64[3, 4] from the sensor's frame to it
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.cloud_policy import MAX_TIME_LAG_S
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.visualization.figure import class_color
 
@@ -40,22 +40,20 @@ class PageFrame:
 
 def page_frame(
     points: np.ndarray,
-    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+    found: ScoredBoxes,
     *,
     name: str,
     time_us: int | None = None,
     pose: np.ndarray | None = None,
     ids: np.ndarray | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    truth: TrueBoxes | None = None,
 ) -> PageFrame:
     """Encode a cloud and its boxes compactly, so that many frames fit into memory.
 
     Args:
-        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
-        found: boxes f32[m, 9] in the frame of the points, labels i32[m], scores f32[m].
+        points: see :func:`encode_points`; all boxes are in their frame.
         time_us, pose: time, and pose f64[4, 4] in the world; only for frames of the same drive.
         ids: i32[m], identities over time.
-        truth: boxes f32[k, 9], labels i32[k].
     """
     boxes, labels, scores = found
     return PageFrame(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.files import atomic_path
 from fcos_lidar_jax.visualization.figure import class_color
 
@@ -55,13 +56,13 @@ def _record(
     classes: Sequence[str],
     min_score: float,
     points: np.ndarray,
-    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+    found: ScoredBoxes,
     *,
     name: str,
     time_us: int | None = None,
     pose: np.ndarray | None = None,
     ids: np.ndarray | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    truth: TrueBoxes | None = None,
 ) -> None:
     """Record points coloured by height, boxes with class, score and identity, and truth, in the sensor's frame."""
     import matplotlib as mpl
