@@ -393,7 +393,6 @@ def config_to_json(config: Config) -> dict[str, Any]:
 
 
 def _kind_of(record: Mapping[str, Any]) -> type[Config]:
-    """Class of a configuration: the last subclass of which the record has an additional field."""
     kinds: list[type[Config]] = [Config]
     for kind in kinds:
         kinds += kind.__subclasses__()

@@ -296,7 +296,6 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def _converted(config: dict[str, Any], version: int) -> dict[str, Any]:
-    """Convert a configuration of an older format to the current format."""
     if version == _OLD_FORMAT:
         del config["model"]["stem"]["form"], config["model"]["num_classes"], config["inference"]["nms_form"]
         config |= {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}

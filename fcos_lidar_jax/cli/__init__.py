@@ -224,7 +224,6 @@ def _ended_by_a_second(numbers: Sequence[signal.Signals], program: str) -> Itera
 
 
 def _end(program: str, number: int) -> NoReturn:
-    """End the process without cleaning up."""
     if number == signal.SIGINT:
         os.write(2, f"{program}: interrupted\n".encode())
     os._exit(128 + number)

@@ -139,7 +139,6 @@ def _network_gflop(detector: TrainedDetector) -> float:
 
 
 def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
-    """Call a function with one value after the other."""
     turns = itertools.cycle(values)
     return lambda: function(next(turns))
 

@@ -59,7 +59,6 @@ def parse(argv: Sequence[str]) -> Callable[[], object]:
 
 
 def _check_paths(value: Any) -> None:
-    """Reject URLs in all options of a command."""
     if isinstance(value, str | Path):
         local_path(value)
     elif isinstance(value, tuple):

@@ -199,7 +199,6 @@ def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
 
 
 def _open_tests(args: Train, config: Config, root: Path) -> FrameSet | None:
-    """Open the frames to evaluate on during training, if any."""
     split = args.val_split or args.data.split("val", required=False)
     if split != "none" and (split or args.val_samples):
         return args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")

@@ -81,7 +81,6 @@ class Argoverse2Frames(FrameSet):
         return len(self._sweeps)
 
     def frame(self, index: int) -> Frame:
-        """Read one sweep, fused with the sweeps before it."""
         older = min(self._sweeps[index][2], self.reading.num_sweeps - 1)
         chain = range(index, index - older - 1, -1)
         sweeps = (Sweep(read_points(self._file(i), self.sensor), self.pose(i), self.time_us(i)) for i in chain)
@@ -121,7 +120,6 @@ class Argoverse2Frames(FrameSet):
         return log / _SWEEPS / f"{stamp}.feather"
 
     def _boxes(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Boxes, labels and numbers of points."""
         log, stamp, _ = self._sweeps[index]
         _, (time_ns, *columns) = _read_log(log)
         first, last = np.searchsorted(time_ns, (stamp, stamp + 1))
@@ -173,8 +171,6 @@ def _stamps(log: Path) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class _Poses:
-    """The ego vehicle's poses in a log."""
-
     file: Path
     time_ns: np.ndarray  # i64[p], increasing
     matrices: np.ndarray  # f64[p, 4, 4], ego vehicle to city
@@ -189,8 +185,6 @@ class _Poses:
 
 
 class _Boxes(NamedTuple):
-    """All boxes of a log, by time."""
-
     time_ns: np.ndarray  # i64[m], increasing
     boxes: np.ndarray  # f32[m, 9]
     labels: np.ndarray  # i32[m]

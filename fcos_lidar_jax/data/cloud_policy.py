@@ -95,7 +95,6 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
 
 
 def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Drop or zero-pad columns to the sensor's."""
     points = np.asarray(points, np.float32)
     laser = sensor.row_source == "laser"
     if points.ndim != 2 or not (6 if laser else 3) <= points.shape[1] <= 6:

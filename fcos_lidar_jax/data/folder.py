@@ -114,12 +114,10 @@ class FolderFrames(FrameSet):
         return self.names[index]
 
     def pose(self, index: int) -> np.ndarray | None:
-        """The pose in the frame's list of sweeps, if it has one."""
         current = self._current_sweep(index)
         return None if current is None else np.array(current.sensor_to_world)
 
     def time_us(self, index: int) -> int | None:
-        """The time in the frame's list of sweeps, if it has one."""
         current = self._current_sweep(index)
         return None if current is None else current.timestamp_us
 

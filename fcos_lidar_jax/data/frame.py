@@ -149,7 +149,6 @@ class WrappedFrames(FrameSet):
         object.__setattr__(self, "sensor", self.frames.sensor)
 
     def _source(self, index: int) -> int:
-        """Index into the wrapped frames."""
         return index
 
     def __len__(self) -> int:

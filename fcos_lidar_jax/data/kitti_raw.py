@@ -66,7 +66,6 @@ def _read_oxts(file: Path) -> dict[str, float]:
 def _imu_to_world(
     latitude: float, longitude: float, altitude: float, roll: float, pitch: float, yaw: float, *, scale: float
 ) -> np.ndarray:
-    """The pose f64[4, 4] of the unit."""
     north = np.log(np.tan(np.deg2rad(90 + latitude) / 2))
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()

@@ -152,7 +152,6 @@ def _from_ascii(body: memoryview, fields: list[_Field], number: int, places: lis
 
 
 def _from_binary(body: memoryview, fields: list[_Field], number: int, places: list[int]) -> list[np.ndarray]:
-    """Points stored one after another."""
     record = _size(fields)
     if len(body) < number * record:
         expected = f"{number * record} ({number} points of {record})"

@@ -134,7 +134,6 @@ class _Bag(contextlib.AbstractContextManager):
         raise ValueError(f"{self.path}: {option}: got {found}, expected a topic of {names} among: {topics}")
 
     def messages(self, topic: str, types: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-        """The messages of a topic, each with its name for error messages."""
         connections = [one for one in self._reader.connections if one.topic == topic and one.msgtype in types]
         raw, number = self._reader.messages(connections=connections), 0
         while True:

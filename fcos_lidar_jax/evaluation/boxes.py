@@ -35,7 +35,6 @@ class Columns:
         return len(getattr(self, dataclasses.fields(self)[0].name))
 
     def take(self: Rows, rows: np.ndarray | slice) -> Rows:
-        """Select rows by index, mask or slice."""
         return dataclasses.replace(self, **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
 
 

@@ -62,7 +62,6 @@ def frame_columns(
 
 
 def _columns(sample: int, boxes: np.ndarray, **columns: np.ndarray) -> BoxColumns:
-    """Columns of the boxes ``x, y, z, l, w, h, yaw, vx, vy`` of one sample."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 9)
     centre, size, yaw, velocity = boxes[:, :3], boxes[:, [4, 3, 5]], boxes[:, 6], boxes[:, 7:9]
     return make_columns(sample=sample, translation=centre, size=size, yaw=yaw, velocity=velocity, **columns)

@@ -67,7 +67,6 @@ def _identified(records: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 
 def _extend(intervals: list[dict[str, int]], frame: int) -> None:
-    """Add a frame to the intervals in which an object exists."""
     if intervals and intervals[-1]["frame_end"] == frame - 1:
         intervals[-1]["frame_end"] = frame
     else:
@@ -75,7 +74,6 @@ def _extend(intervals: list[dict[str, int]], frame: int) -> None:
 
 
 def _frames(records: Iterable[dict[str, Any]]) -> Iterator[bytes]:
-    """A line of the file per frame."""
     for number, record in enumerate(_identified(records)):
         properties: dict[str, Any] = {"streams": {_LIDAR: {"uri": record["file"]}}}
         if record.get("timestamp_us") is not None:

@@ -107,7 +107,6 @@ def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None)
 
 
 def _class_table(summary: Mapping[str, Any]) -> list[str]:
-    """Lines of a table: average precision and errors of each class."""
     errors, names = list(summary["tp_errors"]), list(summary["mean_dist_aps"])
     header = "".join(f"  {name:>8}" for name in ("AP", *errors))
     lines, width = [], max(map(len, ["class", *names]))
@@ -144,7 +143,6 @@ def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None =
 
 
 def _beyond_range(truth: GroundTruth, metric: Metric) -> list[str]:
-    """Warning about boxes with points beyond the range of their class, if there are any."""
     far = ~within_range(truth.boxes, truth, metric) & (truth.boxes.num_points != 0)
     labels = np.unique(truth.boxes.label[far])
     if not len(labels):

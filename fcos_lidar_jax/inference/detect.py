@@ -24,8 +24,7 @@ def suppress(
 ) -> tuple[Array, Array, Array, Array]:
     """Apply rotated NMS, per class unless ``config.nms_across_classes``, to the candidates of one cloud.
 
-    Returns:
-        boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
+    Returns boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
     """
     options: dict[str, Any] = {"overlap": config.nms_overlap}
     with jax.named_scope("nms"):
@@ -68,10 +67,8 @@ class Stages(NamedTuple):
 def make_stages(detector: Detector) -> Stages:
     """Make the stages of :func:`make_detect`, to be jitted, timed or replaced separately.
 
-    >>> from fcos_lidar_jax.models import build_detector
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> stages = make_stages(build_detector(QUICKSTART, SHORT_RANGE))
+    >>> from fcos_lidar_jax.inference import load_trained
+    >>> stages = make_stages(load_trained("quickstart").model)
     >>> points, valid = jax.ShapeDtypeStruct((4096, 5), jnp.float32), jax.ShapeDtypeStruct((4096,), bool)
     >>> jax.eval_shape(stages.prepare, points, valid).point_index.shape
     (32, 128, 1)
@@ -95,10 +92,8 @@ def make_detect(detector: Detector) -> Detect:
         caller; compiled once per number of points. Does not remove close points, see
         :func:`fcos_lidar_jax.projection.remove_close`.
 
-    >>> from fcos_lidar_jax.models import build_detector
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> detector = build_detector(QUICKSTART, SHORT_RANGE)
+    >>> from fcos_lidar_jax.inference import load_trained
+    >>> detector = load_trained("quickstart").model
     >>> variables = jax.eval_shape(detector.init, jax.random.key(0))
     >>> points, valid = jax.ShapeDtypeStruct((4096, 5), jnp.float32), jax.ShapeDtypeStruct((4096,), bool)
     >>> jax.eval_shape(make_detect(detector), variables, points, valid).boxes.shape

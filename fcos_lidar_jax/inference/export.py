@@ -164,7 +164,6 @@ def _whole_path(detector: TrainedDetector, batch: Size) -> Callable[..., dict[st
 
 @contextlib.contextmanager
 def _settings(values: dict[str, Any]) -> Iterator[None]:
-    """Change settings of JAX temporarily."""
     before = {name: getattr(jax.config, name) for name in values}
     try:
         for name, value in values.items():

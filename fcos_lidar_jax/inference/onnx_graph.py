@@ -193,7 +193,6 @@ class _Network:
         return self("Slice", x, [row, column], ends, [2, 3])
 
     def upsample(self, x: str, rows: int, columns: int) -> str:
-        """Repeat rows and columns."""
         how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         return self("Resize", x, "", [1.0, 1.0, rows, columns], **how)
 
@@ -315,7 +314,6 @@ def _heads(
     model: ModelConfig,
     shapes: Mapping[str, Sequence[int]],
 ) -> None:
-    """Add the outputs at the locations of all levels."""
     outputs: dict[str, list[str]] = {name: [] for name in _PREDICTIONS}
     for level, image in enumerate(levels):
         path = "heads/shared" if model.tied_heads else f"heads/level{level + 2}"

@@ -59,7 +59,6 @@ class OpenVinoDetector(TrainedDetector):
 
 @functools.lru_cache(maxsize=8)
 def _jitted_stages(detector: Detector) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The stages before and after the network."""
     stages = make_stages(detector)
     return jax.jit(stages.prepare), jax.jit(stages.postprocess)
 

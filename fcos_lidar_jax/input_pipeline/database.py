@@ -239,8 +239,6 @@ def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
 
 
 class _Job(NamedTuple):
-    """A shard to be written."""
-
     folder: Path
     name: str
     indices: list[int]
@@ -250,7 +248,6 @@ class _Job(NamedTuple):
 
 
 def _files(folder: Path, shard: str) -> tuple[Path, Path]:
-    """A shard's points and its table."""
     return folder / f"{shard}.points.f32", folder / f"{shard}.objects.npz"
 
 
@@ -269,7 +266,6 @@ def _finished(job: _Job) -> bool:
 
 
 def _cut_shard(frames: FrameSet, job: _Job) -> int:
-    """Write one shard and return its number of frames."""
     rows: list[tuple] = []
     parts: list[np.ndarray] = []
     start = 0

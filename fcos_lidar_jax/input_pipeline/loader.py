@@ -81,8 +81,6 @@ def steps_per_epoch(frames: FrameSet, config: Config) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _BatchOf:
-    """Maps a step to its batch."""
-
     frames: FrameSet
     config: Config
     seed: int
@@ -311,5 +309,4 @@ class _OwnedBatches:
         return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch)) if self._copied else host
 
     def close(self) -> None:
-        """Drop the reference to the source."""
         self._batches = iter(())

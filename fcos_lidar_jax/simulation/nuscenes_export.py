@@ -119,7 +119,6 @@ def _finished(spec: DatasetSpec, root: Path) -> bool:
 
 
 def _shard(root: Path, index: int) -> Path:
-    """Folder with the rows of a finished scene."""
     return root / _WORK / scene_name(index)
 
 

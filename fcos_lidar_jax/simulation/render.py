@@ -37,7 +37,6 @@ class DatasetSpec:
 
     @property
     def sweeps(self) -> int:
-        """Number of sweeps per scene."""
         return (self.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1
 
 

@@ -89,7 +89,6 @@ def _row_of(
 
 
 def _trees(rng: Generator, side: Side) -> np.ndarray:
-    """Sample trees at the kerb and further back, and bushes."""
     kerb, back = _spaced(rng, side.span, 45), _spaced(rng, side.span, 25)
     far = side.ground.pavement + rng.uniform(1, 12, len(back))
     s, d = np.concatenate([kerb, back]), side.edge_m + np.concatenate([np.full(len(kerb), 1.0), far])

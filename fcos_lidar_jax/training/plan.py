@@ -164,7 +164,6 @@ def plan_run(
 
 
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
-    """Warnings about the clouds of up to five frames."""
     clouds = (frames.frame(index).points for index in spread_indices(len(frames), 5))
     first = next(clouds)
     if mismatch := sensor_mismatch(first, frames.sensor):
@@ -232,7 +231,6 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
 
 
 def _differences(was: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Names and values of the fields in which two JSON values differ."""
     if isinstance(was, dict) and isinstance(now, dict):
         for key in sorted(was.keys() | now.keys()):
             yield from _differences(was.get(key), now.get(key), f"{name}.{key}" if name else key)

@@ -127,7 +127,6 @@ def write_evaluation_report(
 
 
 def _kitti_table(file: Path) -> list[tuple[str, tuple[str, ...], list[tuple[Cell, ...]]]]:
-    """The table of KITTI's metric, if it was evaluated."""
     if not file.is_file():
         return []
     metrics = json.loads(file.read_text())
@@ -150,7 +149,6 @@ def clear_report(out: Path) -> None:
 
 
 def _lead(summary: Mapping[str, Any], num_samples: int, defined: Sequence[str]) -> str:
-    """Introduction: the evaluated samples and the metric."""
     rules = f"over {num_samples} samples: average precision (AP) by matching distance"
     if defined:
         names = ", ".join(ERROR_NAMES[error][1].split(" [")[0] for error in defined)
@@ -224,7 +222,6 @@ def _draw_errors(
 
 
 def _save(figure: Any, path: str | Path, y_label: str, **legend: Any) -> None:
-    """Label the axes, put the legend below the plot and save the figure."""
     axis = figure.axes[0]
     axis.set(xlim=(0, 1), xlabel="recall", ylabel=y_label)
     if handles := axis.get_lines():

@@ -95,7 +95,6 @@ def write_labels(
 
 
 def _text_width(text: str, fontsize: float) -> float:
-    """Width in points."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 

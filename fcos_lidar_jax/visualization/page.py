@@ -82,13 +82,11 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
 
     The data consist of consecutive planes: x as int16 differences, y and z as int16, each with all low bytes
     before all high bytes, then intensity and time lag as uint8, with 255 for the largest lag. The planes are
-    compressed with gzip and encoded in base64.
+    compressed with gzip and encoded in base64. Returns the number of remaining points, their largest time lag in
+    seconds, and the text.
 
     Args:
         points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
-
-    Returns:
-        number of remaining points, their largest time lag in seconds, and the text.
 
     >>> encode_points(np.array([[1, 2, 3, 9], [1, 2, 3.001, 9], [np.nan, 0, 0, 0]], np.float32))[:2]
     (1, 0.0)

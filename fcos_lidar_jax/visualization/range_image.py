@@ -84,13 +84,11 @@ class _View:
 
     @property
     def ticks(self) -> range:
-        """Whole degrees, from left to right."""
         step = 45 if self.left - self.right > 180 else 15
         return range(math.floor(self.left / step) * step, math.ceil(self.right / step) * step - 1, -step)
 
 
 def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r: int, view: _View) -> str:
-    """Plot one channel of one round with its colour bar; returns a description."""
     import matplotlib as mpl
     from matplotlib.colors import LogNorm, Normalize
 

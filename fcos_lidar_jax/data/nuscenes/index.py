@@ -53,7 +53,6 @@ class Index:
 
 
 def _tables(folder: str | Path) -> dict[str, Path]:
-    """The existing tables of a version."""
     files = (Path(folder) / kind.file for kind in TABLES)
     return {file.name: file for file in files if file.is_file()}
 

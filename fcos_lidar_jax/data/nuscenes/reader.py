@@ -118,7 +118,6 @@ class NuScenes:
         return tokens
 
     def scene_of(self, sample_token: str) -> str:
-        """Name of a keyframe's scene."""
         return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
 
     def sweeps(self, sample_token: str, num: int = 10) -> np.ndarray:
@@ -245,7 +244,6 @@ class NuScenes:
         return self.root / self.index.sweep_file[row].decode()
 
     def _present(self, rows: list[int]) -> list[int]:
-        """The sweeps to read: only existing files if others may be missing."""
         return [row for row in rows if os.path.isfile(self._path(row))] if self.allow_missing_sweeps else rows
 
     def _read(self, row: int) -> Sweep:
