@@ -14,19 +14,12 @@ _HARMLESS = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class CentreTargets(NamedTuple):
-    """Targets of one sample.
+    """Targets of one sample."""
 
-    Attributes:
-        heat: f32[h, w, k], Gaussians with a maximum of 1 at the centres.
-        cell: i32[m], cell of each box's centre, 0 for invalid boxes.
-        boxes: f32[m, 9], with harmless values for invalid boxes.
-        valid: bool[m], boxes with a centre on the map.
-    """
-
-    heat: Array
-    cell: Array
-    boxes: Array
-    valid: Array
+    heat: Array  # f32[h, w, k]: Gaussians with a maximum of 1 at the centres.
+    cell: Array  # i32[m]: cell of each box's centre, 0 for invalid boxes.
+    boxes: Array  # f32[m, 9], with harmless values for invalid boxes.
+    valid: Array  # bool[m]: boxes with a centre on the map.
 
 
 def gaussian_radius(

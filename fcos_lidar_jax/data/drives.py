@@ -52,11 +52,10 @@ class PoseTrack(NamedTuple):
     translations: np.ndarray  # f64[n, 3], metres
 
     def at(self, time_us: int, where: str) -> np.ndarray:
-        """The pose f64[4, 4] at a time, interpolated between its neighbours.
+        """The pose f64[4, 4] at a time, interpolated between neighbours at most :data:`MAX_POSE_GAP_US` apart.
 
         Raises:
             OutsidePosesError: with ``where``: the time is before the first or after the last pose.
-            ValueError: the neighbours are more than :data:`MAX_POSE_GAP_US` apart.
 
         >>> track = PoseTrack(np.array([0, 400_000]), np.eye(4)[[0, 0]], np.array([[0.0, 0, 0], [2.0, 0, 0]]))
         >>> track.at(100_000, "poses")[0].tolist()

@@ -18,24 +18,20 @@ from fcos_lidar_jax.sensors import Sensor
 class Frame:
     """Points and boxes of one keyframe in its LiDAR frame, unpadded.
 
-    Attributes:
-        points: f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number
-            as a sixth column for sensors whose rows come from it.
-        boxes: f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
-        labels: i32[m]: index into the ``classes`` of the frame set.
-        num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box.
-        num_close: points on the ego vehicle that the reader removed, over all sweeps, see :func:`drop_close`.
-
     >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
     >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
     [4.0, 2.0, 2.0]
     """
 
     points: np.ndarray
-    boxes: np.ndarray
-    labels: np.ndarray
-    num_points: np.ndarray
-    num_close: int = 0
+    """f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a
+    sixth column for sensors whose rows come from it."""
+    boxes: np.ndarray  # f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
+    labels: np.ndarray  # i32[m]: index into the ``classes`` of the frame set.
+    num_points: np.ndarray  # i32[m]: annotated number of LiDAR points of the current sweep in each box.
+    num_close: int = (
+        0  # Points on the ego vehicle that the reader removed, over all sweeps, see :func:`drop_close`.
+    )
 
 
 @runtime_checkable
@@ -44,10 +40,6 @@ class FrameSet(Protocol):
 
     Readers inherit from it and get defaults for anything that their data lack (poses, times, scenes).
 
-    Attributes:
-        classes: class names, which labels index.
-        sensor: sensor that recorded the points.
-
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
     >>> frames: FrameSet = SimulatedFrames(TINY, 3)
@@ -55,8 +47,8 @@ class FrameSet(Protocol):
     (3, 5, 'car')
     """
 
-    classes: tuple[str, ...]
-    sensor: Sensor
+    classes: tuple[str, ...]  # Class names, which labels index.
+    sensor: Sensor  # Sensor that recorded the points.
 
     def __len__(self) -> int: ...
 

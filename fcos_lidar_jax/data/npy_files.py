@@ -15,8 +15,7 @@ MAX_BYTES = 2**31  # default limit of an unpacked array
 def parse_npy(content: bytes, *, max_rows: int | None = None) -> np.ndarray:
     """The array of an ``.npy`` file, as a read-only view of the bytes; ``max_rows`` limits the first axis.
 
-    Raises:
-        ValueError: damaged, pickled objects, a size that differs from the header's, or too many rows.
+    Refuses pickled objects, and damaged files, also by their size.
 
     >>> stream = io.BytesIO()
     >>> np.save(stream, np.arange(3))
@@ -59,11 +58,7 @@ def npz_names(content: bytes) -> list[str]:
 def parse_npz(
     content: bytes, names: Sequence[str], *, max_rows: int | None = None, max_bytes: int = MAX_BYTES
 ) -> dict[str, np.ndarray]:
-    """Some arrays of an ``.npz`` file, each as in :func:`parse_npy` and with at most ``max_bytes`` unpacked.
-
-    Raises:
-        ValueError: damaged, or an array is missing or too large.
-    """
+    """Some arrays of an ``.npz`` file, each as in :func:`parse_npy` and with at most ``max_bytes`` unpacked."""
     with _opened(content) as archive:
         members, arrays = {_name(member): member for member in archive.infolist()}, {}
         for name in names:

@@ -311,8 +311,7 @@ def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.nd
 def assemble_points(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
     """Combine the columns x, y, z, intensity, time_lag and laser to the array that :func:`read_points` returns.
 
-    Raises:
-        ValueError: with ``where``: no points, a negative lag, or missing or invalid laser numbers.
+    Refuses a cloud without points, negative lags, and missing or invalid laser numbers.
     """
     number = len(table["x"])
     if number == 0:

@@ -96,9 +96,6 @@ def align(
         yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the one between headings.
         intensity_scale: factor from the intensity in files to the scale 0-255, instead of the sensor's.
 
-    Raises:
-        ValueError: files of different sensors, or an intensity scale for files that have their own.
-
     >>> from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E
     >>> aligned = align(NUSCENES_HDL32E, KITTI_HDL64E)
     >>> aligned.data.num_rows, aligned.data.intensity_scale, round(aligned.turn_rad, 4)

@@ -48,20 +48,14 @@ def suppress(
 class Stages(NamedTuple):
     """Stages of detection in one cloud, as pure functions.
 
-    Attributes:
-        prepare: ``(points f32[n, c], valid bool[n]) -> input``.
-        network: ``(variables, input) -> outputs``.
-        candidates: ``(outputs, input) -> boxes, scores, labels, valid``.
-        postprocess: candidates after NMS, see :func:`suppress`.
-
     >>> Stages._fields
     ('prepare', 'network', 'candidates', 'postprocess')
     """
 
-    prepare: Callable[..., Any]
-    network: Callable[..., Any]
-    candidates: Callable[..., tuple[Array, Array, Array, Array]]
-    postprocess: Callable[..., tuple[Array, Array, Array, Array]]
+    prepare: Callable[..., Any]  # ``(points f32[n, c], valid bool[n]) -> input``
+    network: Callable[..., Any]  # ``(variables, input) -> outputs``
+    candidates: Callable[..., tuple[Array, ...]]  # ``(outputs, input) -> boxes, scores, labels, valid``
+    postprocess: Callable[..., tuple[Array, ...]]  # Candidates after NMS, see ``suppress``.
 
 
 def make_stages(detector: Detector) -> Stages:

@@ -98,9 +98,6 @@ def export_detector(detector: TrainedDetector, *, num_points: Size | None = None
         num_points: n, number of rows of a padded cloud, by default ``config.max_points``; ``"any"`` compiles for
             each number.
         batch: b, number of clouds, or ``"any"``. With several clouds, boxes and scores differ by rounding.
-
-    Raises:
-        ValueError: a size below 1.
     """
     config, sensor = detector.config, detector.sensor
     rows = config.max_points if num_points is None else num_points
@@ -175,11 +172,7 @@ def _settings(values: dict[str, Any]) -> Iterator[None]:
 
 
 def load_exported(file: Path) -> ExportedDetector:
-    """Load a file of :func:`export_detector`; the program is compiled for the first cloud.
-
-    Raises:
-        CheckpointError: not an exported detector, corrupt, or of another format or version of JAX.
-    """
+    """Load a file of :func:`export_detector`; the program is compiled for the first cloud."""
     record, program = _read(file)
     config = config_from_json(with_later_fields(record["config"]), f"{file}: config")
     sensor = sensor_from_json(record["sensor"], f"{file}: sensor")

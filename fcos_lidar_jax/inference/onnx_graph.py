@@ -34,9 +34,6 @@ def cpu_package(name: str) -> Any:
 
     Telemetry would report every import, from a fork of this process that may make threads hang. OpenVINO works
     without telemetry if importing it fails.
-
-    Raises:
-        ValueError: the package is not installed.
     """
     reporter = sys.modules.get(_TELEMETRY)
     sys.modules[_TELEMETRY] = None  # type: ignore[assignment]
@@ -52,15 +49,11 @@ def cpu_package(name: str) -> Any:
 
 
 def network_graph(detector: TrainedDetector) -> bytes:
-    """Convert the network to an ONNX file, deterministic for fixed versions.
+    """Convert the network of an FCOS-LiDAR detector to an ONNX file, deterministic for fixed versions.
 
     The input is ``features`` f32[b, h, w, 9, r], a range image from ``project_points`` in raw units. The outputs
     are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. Everything is
     float32 regardless of ``config.model.precision``. The metadata hold classes, configuration and sensor as JSON.
-
-    Raises:
-        ValueError: the detector is not FCOS-LiDAR, onnx is not installed, or the network has parameters that are
-            not part of the graph.
     """
     config, model = detector.config, detector.config.model
     if type(config) is not Config:

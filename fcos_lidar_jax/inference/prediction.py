@@ -90,11 +90,9 @@ def predict_groups(
     devices: Sequence[Any] | None = None,
     yaw_rad: float | None = None,
 ) -> Iterator[list[Prediction]]:
-    """Like :func:`predict`, in groups of frames that the devices process together, so that processes can
-    synchronise between two groups.
+    """Like :func:`predict`, in groups of frames that the devices process together.
 
-    Raises:
-        OSError: another process cannot read its frames of the next group.
+    Processes can synchronise between two groups; if another one cannot read its frames, an OSError says so.
     """
     check(batch_size >= 1, "batch_size", batch_size, "at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor

@@ -119,8 +119,7 @@ class GroundTruthDatabase:
 def open_database(folder: str | Path, *, fingerprint: str | None = None) -> GroundTruthDatabase:
     """Open and check a finished ground-truth database of the frames with a ``fingerprint``; None accepts any.
 
-    Raises:
-        ValueError: missing, unfinished, altered, truncated, or of another format version or other data.
+    Missing, unfinished, altered and truncated databases, and those of another version, are refused.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)

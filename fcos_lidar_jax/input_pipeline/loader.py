@@ -178,8 +178,6 @@ def make_batches(
 
     Args:
         frames: training set with labels that index ``config.classes``; must be picklable for workers.
-        config: batch size, padded sizes, class balance, copy-paste and its end.
-        seed: seed of class balance, order and pasted objects.
         objects: database for copy-paste; required unless ``config.copy_paste`` is None.
         num_processes: of n processes, process i gets the rows i * B / n to (i + 1) * B / n of each batch.
         threads: threads per process that prepare batches, 0 to prepare on demand; default: see

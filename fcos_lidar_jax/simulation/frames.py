@@ -76,14 +76,11 @@ def scan_sweeps(
 ) -> tuple[np.ndarray, int]:
     """Fuse the sweeps up to a moment in the sensor's frame at that moment, current sweep first, then by age.
 
-    Args:
-        time_s: time of the current sweep; sweeps are ``SWEEP_S`` apart.
-        reading: the number of sweeps. Close points are removed from all sweeps or from no sweep: the simulated ego
-            vehicle has no body that the sensor could see, so close points lie on the road.
+    Sweeps are ``SWEEP_S`` apart. Close points are removed from all sweeps or from no sweep: the simulated ego
+    vehicle has no body that the sensor could see, so close points lie on the road.
 
-    Returns:
-        points f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, with lag exactly 0 for the current sweep,
-        and the number of removed points.
+    Returns points f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, with lag exactly 0 for the current
+    sweep, and the number of removed points.
     """
 
     def take_sweep(age: int) -> Sweep:

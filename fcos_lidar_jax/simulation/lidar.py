@@ -73,12 +73,10 @@ def scan(
     *,
     rolling_shutter: bool = False,
 ) -> Scan:
-    """Simulate one turn of the sensor.
+    """Simulate one turn of the sensor, which ends at a time; the points are in the point frame at this time.
 
-    Args:
-        time_s: time at the end of the turn; the points are in the point frame at this time.
-        rolling_shutter: the ego vehicle and the objects move during the turn, and the points are compensated for
-            the ego motion, as in nuScenes. Otherwise the turn takes no time.
+    With ``rolling_shutter``, the ego vehicle and the objects move during the turn, and the points are compensated
+    for the ego motion, as in nuScenes. Otherwise the turn takes no time.
     """
     now = sensor_pose(world, mount, time_s)
     begin = rng.uniform(-1, 1)

@@ -33,13 +33,8 @@ _POLL_S = 0.5
 def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callable[[int], object]) -> bool:
     """Write a data set in the official layout, or resume an unfinished one; False if it was already complete.
 
-    Args:
-        root: folder of the data set: new, empty, or with an unfinished data set of the same specification.
-        workers: number of processes; the bytes do not depend on it.
-
-    Raises:
-        ValueError: the folder contains other files or another data set.
-        OSError: a file cannot be written, or another process writes to the folder.
+    The folder is new, empty, or has an unfinished data set of the same specification; others are refused. The
+    bytes do not depend on the number of worker processes. ``report`` gets the number of finished sweeps.
     """
     _check_order(spec, root)  # reject before writing anything
     if _finished(spec, root) and not _shards(spec, root):

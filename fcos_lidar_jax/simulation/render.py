@@ -43,12 +43,9 @@ class DatasetSpec:
 def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[], object]) -> dict[str, list[Row]]:
     """Write the point files of a scene. Their bytes do not depend on the other scenes.
 
-    Args:
-        root: folder of the data set, with existing folders ``samples/LIDAR_TOP`` and ``sweeps/LIDAR_TOP``.
-
-    Returns:
-        rows of the scene by table. Each object is annotated from the first to the last keyframe in which it has
-        points.
+    The folder of the data set has folders ``samples/LIDAR_TOP`` and ``sweeps/LIDAR_TOP``; ``advance`` is called
+    after each sweep. Returns the rows of the scene by table. Each object is annotated from the first to the last
+    keyframe in which it has points.
     """
     rng = np.random.default_rng([spec.seed, index])
     world = sample_scene(rng, spec)

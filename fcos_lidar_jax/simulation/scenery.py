@@ -23,16 +23,12 @@ def sample_scenery(
     beyond_m: float,
     streets: Streets = PLAIN,
 ) -> np.ndarray:
-    """Sample scenery on both sides of both streets.
+    """Sample scenery on both sides of both streets, solids [s] of :data:`SOLID` in the street frame.
 
     Args:
-        rng: random source for houses, fences, trees and poles.
-        surroundings: random source for everything else.
+        rng, surroundings: random sources for houses, fences, trees and poles, and for everything else.
         low, high: f64[2], least and greatest x and y of the sensor's path.
         beyond_m: extent of the scenery around the path.
-
-    Returns:
-        solids [s] of :data:`SOLID` in the street frame.
     """
     parts = [np.zeros(0, SOLID)]
     setting = sample_setting(surroundings) if streets.setting else "city"

@@ -176,16 +176,10 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
 
 
 def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
-    """Check that a run can be started or resumed in a folder.
+    """Check that a run can be started or resumed in a folder; names the first field in which another run differs.
 
-    ``spec`` is the expected content of ``run.json``; None checks only whether there is a run.
-
-    Returns:
-        fields that the specification of an older run lacks and that were not compared.
-
-    Raises:
-        ValueError: the folder unexpectedly holds a run, holds no run to resume, or holds a different run; names
-            the first field that differs.
+    ``spec`` is the expected content of ``run.json``; None checks only whether there is a run. Returns the fields
+    that the specification of an older run lacks and that were not compared.
     """
     folder = local_path(folder)
     file = folder / RUN_SPEC

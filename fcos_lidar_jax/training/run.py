@@ -223,9 +223,7 @@ def train(
 def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool) -> Iterator[None]:
     """Hold the folder of a run against other processes; with ``spec``, it becomes the folder of that run.
 
-    Raises:
-        ValueError: see :func:`~fcos_lidar_jax.training.plan.check_run`; nothing is written.
-        OSError: another process holds the folder.
+    What :func:`~fcos_lidar_jax.training.plan.check_run` refuses is refused before anything is written.
     """
     check_run(folder, spec, resume=resume)  # before the lock, which makes the folder
     with folder_lock(folder, "training"):

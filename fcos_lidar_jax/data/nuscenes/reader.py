@@ -102,12 +102,9 @@ class NuScenes:
         return list(self._sample_row)
 
     def split(self, name: str, *, file: str | Path | None = None) -> list[str]:
-        """The keyframes of a split by scene and time.
+        """The keyframes of a split by scene and time; unknown splits and scenes are refused.
 
         ``file`` is ``{"name": ["scene", ...]}``; default: the version's ``splits.json``, or the official splits.
-
-        Raises:
-            ValueError: no such split, an unknown scene, or no keyframe.
         """
         row = {str(scene): i for i, scene in enumerate(self.index.scene_name)}
         scenes = scenes_of_split(name, self.tables, row, file=file)
@@ -128,9 +125,6 @@ class NuScenes:
 
         Returns:
             f32[n, 5]: x, y, z, intensity (0-255), time lag in seconds, exactly 0 for the current sweep.
-
-        Raises:
-            ValueError: a file is missing, truncated, empty, or outside the data root.
         """
         return self.fuse_sweeps(sample_token, CloudReading(num, "all"))[0]
 
