@@ -113,7 +113,6 @@ def augment(
         key: the sample's key, see :func:`sample_key`.
         points: x, y, z, ... in metres; the other columns are unchanged.
         boxes: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocities stay NaN.
-        config: probabilities and ranges.
         origin_m: position of the sensor, which stays fixed.
 
     >>> still = AugmentConfig(0.0, 0.0, 0.0, (1.0, 1.0))

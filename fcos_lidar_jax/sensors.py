@@ -163,11 +163,8 @@ def turn_between(data: Sensor, other: Sensor) -> float:
 
 
 def in_frame_of(sensor: Sensor, data: Sensor) -> Sensor:
-    """A sensor's range image in the frame and the units of points that another sensor recorded.
-
-    Args:
-        sensor: gives rows, columns and limits.
-        data: gives the heading, the position of the sensor and the scale of the intensity.
+    """A sensor's rows, columns and limits in the frame and the intensity scale of points that another sensor
+    recorded.
 
     >>> image = in_frame_of(NUSCENES_HDL32E, KITTI_HDL64E)
     >>> image.num_rows, image.intensity_scale, image.forward_rad

@@ -99,9 +99,7 @@ def focal_loss(
     """Compute the penalty-reduced focal loss of the heat map with alpha 2 and beta 4, as sums.
 
     Args:
-        logits: logits of a centre, per class.
         heat, cell, valid: from :func:`centre_targets`.
-        labels: classes of the boxes.
 
     Returns:
         the loss of each class over all cells without a centre of it, and the loss of each box at its centre.

@@ -108,7 +108,6 @@ def make_pillars(
 
     Args:
         points: x, y, z (metres), intensity (0-255), time lag (seconds), and ignored columns.
-        valid: rows that are points.
         grid, sensor: pillars and limits (static).
 
     >>> cloud = np.array([[0.25, 0.5, 0, 9, 0], [0.75, 0.5, 1, 9, 0]], np.float32)

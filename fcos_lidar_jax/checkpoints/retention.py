@@ -121,9 +121,7 @@ def load_checkpoint(checkpoint: str | Path) -> Checkpoint:
 def load_state(checkpoint: str | Path, like: TrainState) -> TrainState:
     """Read the state of a training, bit-identical to the saved one.
 
-    Args:
-        checkpoint: path or name, see :func:`find_checkpoint`.
-        like: any state of the same run, such as the initial one.
+    ``checkpoint`` is a path or a name, see :func:`find_checkpoint`; ``like`` is any state of the same run.
 
     Raises:
         CheckpointError: see :func:`load_checkpoint`; also if the checkpoint has no state.

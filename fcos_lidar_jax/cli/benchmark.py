@@ -102,7 +102,8 @@ def measure(
         calls["detect"] = _in_turn(lambda cloud: detect(1, [cloud]), clouds)
         start: Callable[[Any], Cloud] = (lambda file: clean(read(file))) if files else clean
         calls["whole"] = _in_turn(lambda given: detect(1, [start(given)]), files or arrays)
-    calls["product"] = _product()
+    matrix = jnp.ones((_MATRIX_SIZE, _MATRIX_SIZE))
+    calls["product"] = functools.partial(jax.jit(jnp.matmul), matrix, matrix)  # the speed within reach here
     stages = interleaved(calls, repeats, percentile=95)
     product_gflops = 2 * _MATRIX_SIZE**3 / 1e6 / stages.pop("product")["median_ms"]
     together = {
@@ -121,12 +122,6 @@ def measure(
         rounded = {name: float(f"{value:.4g}") for name, value in speed.items()}
         record["network"] = {**rounded, "share": round(gflops / product_gflops, 3)}
     return record
-
-
-def _product() -> Call:
-    """Product of two float32 matrices, the arithmetic speed within reach of this device."""
-    matrix, multiply = jnp.ones((_MATRIX_SIZE, _MATRIX_SIZE)), jax.jit(jnp.matmul)
-    return lambda: multiply(matrix, matrix)
 
 
 def _network_gflop(detector: TrainedDetector) -> float:

@@ -45,23 +45,14 @@ class _Annotation(msgspec.Struct, forbid_unknown_fields=True):
 class FolderFrames(FrameSet):
     """The frames of a folder, sorted by name: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
-    ``sensor.json`` is a sensor for :func:`~fcos_lidar_jax.sensors.sensor_from_json`, or a preset's name.
-    ``clouds/NAME.EXT`` is a point file for :func:`~fcos_lidar_jax.data.point_files.read_points`.
-    ``boxes/NAME.json`` is ``{"boxes": [{"label": CLASS, "box": [x, y, z, l, w, h, yaw, vx, vy]}]}`` in the points'
-    frame, with ``null, null`` for an unknown velocity and an empty list for a frame without objects.
-    ``sweeps/NAME.json``, optional, is a list for :func:`~fcos_lidar_jax.data.sweeps.read_sweeps`; its first entry
-    is the frame's own cloud. No file may lie outside the folder, not even through a link.
-
-    The classes are the labels of all boxes, sorted, unless ``classes.json`` says otherwise: a list of classes
-    (``["car", "sign"]``; other labels are refused), or a translation of labels, null to drop boxes
-    (``{"lorry": "truck", "sign": null}``; the classes are then the translated labels, sorted). ``splits.json``,
-    optional, is ``{"train": [NAME, ...], "val": [...]}``.
+    ``docs/own_data.md`` describes the files. The first entry of ``sweeps/NAME.json``, a list for
+    :func:`~fcos_lidar_jax.data.sweeps.read_sweeps`, is the frame's own cloud. Labels that a list of classes lacks
+    are refused, and so are files outside the folder, even through a link, unless ``follow_links``.
 
     Args:
         sensor: replaces ``sensor.json``.
         split: take the frames and their order from a split; default: all frames, sorted.
         splits: JSON file with the splits; default: ``splits.json``.
-        follow_links: also read files outside the folder.
     """
 
     def __init__(

@@ -53,7 +53,6 @@ class KittiFrames(FrameSet):
     would learn that everything behind the car is background.
 
     Args:
-        root: folder that contains ``training``.
         split: take the frames and their order from ``ImageSets/SPLIT.txt``, one name per line; default: all
             frames, sorted.
         image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.

@@ -50,7 +50,6 @@ def read_points(
     not look like metres, or if another layout fits them clearly better.
 
     Args:
-        path: the file.
         sensor: scales the intensity, except in ``.pcd.bin``, and tells whether laser numbers are needed.
         columns: values per point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
@@ -103,12 +102,11 @@ def read_points(
 
 
 def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -> np.ndarray:
-    """Convert an array to the columns that :func:`read_points` returns.
+    """Convert an array, which ``where`` names in messages, to the columns that :func:`read_points` returns.
 
     Args:
         array: [n, 3 to 6], of NumPy or JAX, or a list: x, y, z, intensity, time lag, laser number.
         sensor: as in :func:`read_points`.
-        where: name of the array for error messages.
 
     Raises:
         ValueError: wrong shape or type, or a fifth column of whole numbers above 1, which is a ring.

@@ -142,13 +142,11 @@ class _Bag(contextlib.AbstractContextManager):
                 if (record := next(raw, None)) is None:
                     return
                 connection, _, content = record
-                message = self._deserialize(content, connection.msgtype)
+                store = _typestore(self._is_ros1)
+                read = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
+                message = read(content, connection.msgtype)
             yield where, message
             number += 1
-
-    def _deserialize(self, content: bytes, kind: str) -> Any:
-        types = _typestore(self._is_ros1)
-        return types.deserialize_ros1(content, kind) if self._is_ros1 else types.deserialize_cdr(content, kind)
 
 
 @functools.cache

@@ -153,13 +153,13 @@ class Ranking:
     def resampled(self, copies: np.ndarray) -> "Ranking":
         """Ranking of a set with i64[samples] ``copies`` of each sample."""
         times = copies[self.sample]
-        return Ranking(
+        return dataclasses.replace(
+            self,
             score=np.repeat(self.score, times),
             sample=np.repeat(self.sample, times),
             hit=np.repeat(self.hit, times, axis=1),
             errors=np.repeat(self.errors, times[self.hit[ERROR_ROW]], axis=1),
             truth_sample=np.repeat(self.truth_sample, copies[self.truth_sample]),
-            knows_velocity=self.knows_velocity,
         )
 
 

@@ -68,7 +68,8 @@ def network_graph(detector: TrainedDetector) -> bytes:
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
     local = _local_geometry(network, image, rounds, model) if model.local_geometry else None
     _heads(network, levels, local, model, shapes)
-    network.check_all_used()
+    if unknown := sorted(network.parameters.keys() - network.used):
+        raise ValueError(f"ONNX: found the parameters {unknown[0]}, which are not part of the graph")
     described = onnx.helper.make_tensor_value_info
     float32 = onnx.TensorProto.FLOAT
     graph = onnx.helper.make_graph(
@@ -110,10 +111,6 @@ class _Network:
         """A parameter in float64, so that folding rounds only once."""
         self.used.add(f"{kind}/{path}")
         return self.parameters[f"{kind}/{path}"].astype(np.float64)
-
-    def check_all_used(self) -> None:
-        if unknown := sorted(self.parameters.keys() - self.used):
-            raise ValueError(f"ONNX: found the parameters {unknown[0]}, which are not part of the graph")
 
     def constant(self, value: Any) -> str:
         """A constant of float32, or int64 for integers; equal constants are shared."""

@@ -69,8 +69,6 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     Args:
         frames: frames with labels by the classes of the detector, see
             :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames`.
-        max_points: rows of points of each sample, such as ``config.max_points``.
-        max_boxes: rows of boxes of each sample, such as ``config.max_boxes``.
 
     Returns:
         NumPy arrays. Rows of points that are not finite or beyond physical limits are left out. Points on the ego

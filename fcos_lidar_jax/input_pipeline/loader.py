@@ -188,12 +188,8 @@ def make_batches(
             the workers need the memory, and it must be released before the process ends.
 
     Yields:
-        an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows.
-
-    Raises:
-        ValueError: sizes that do not divide, or no frames; :func:`check_loader_options` checks the rest. From the
-            iterator: a frame is unreadable, or, with several processes, which must all run the same program, does
-            not fit the packing.
+        an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows. It refuses unreadable
+        frames and, with several processes, which must all run one program, batches that do not fit the packing.
     """
     import grain
     from absl import flags

@@ -37,8 +37,6 @@ def make_frame(
         reach_m: maximum distance of the objects along the street; by default 80 % of the sensor's range limit.
         min_points: objects with fewer points in the current sweep are not annotated.
         reading: the sweeps to fuse, see :func:`scan_sweeps`; the world moves between sweeps.
-        fast_traffic: see :func:`~.world.sample_world`.
-        streets: how varied they are.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> a, b = make_frame(3, TINY), make_frame(3, TINY)
