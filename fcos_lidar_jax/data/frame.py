@@ -29,9 +29,7 @@ class Frame:
     boxes: np.ndarray  # f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
     labels: np.ndarray  # i32[m]: index into the ``classes`` of the frame set.
     num_points: np.ndarray  # i32[m]: annotated number of LiDAR points of the current sweep in each box.
-    num_close: int = (
-        0  # Points on the ego vehicle that the reader removed, over all sweeps, see :func:`drop_close`.
-    )
+    num_close: int = 0  # Points on the ego vehicle that the reader removed, see :func:`drop_close`.
 
 
 @runtime_checkable
