@@ -61,8 +61,7 @@ def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> A
     if origin is Literal:
         return value  # Checked by the dataclass, see check_choices.
     if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise ValueError(f"{where}: got {value!r}, expected a list")
+        check(isinstance(value, list | tuple), where, value, "a list")
         kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
         if len(kinds) != len(value):
             raise ValueError(f"{where}: got {len(value)} values, expected {len(kinds)}")
@@ -71,8 +70,8 @@ def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> A
         return None if value is None else from_json(args[0], value, where)
     accepted = int | float if kind is float else kind
     fits = kind is not float or (isinstance(value, int | float) and not 1e300 < abs(value) < math.inf)
-    if not (isinstance(value, accepted) and fits) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{where}: got {value!r}, expected {kind.__name__}")
+    fits = fits and isinstance(value, accepted) and (kind is bool or not isinstance(value, bool))
+    check(fits, where, value, kind.__name__)
     return kind(value)
 
 

@@ -20,6 +20,7 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
@@ -237,11 +238,8 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
             "or train with --no-copy-paste"
         )
     source = database.read_manifest(folder).source
-    if config.num_sweeps > database.MAX_SWEEPS:
-        raise ValueError(
-            f"num_sweeps: got {config.num_sweeps}, expected at most {database.MAX_SWEEPS} with copy-paste, or "
-            "--no-copy-paste"
-        )
+    expected = f"at most {database.MAX_SWEEPS} with copy-paste, or --no-copy-paste"
+    check(config.num_sweeps <= database.MAX_SWEEPS, "num_sweeps", config.num_sweeps, expected)
     # Objects cut from more sweeps fit too: their surplus sweeps are left out.
     sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
     if not any(source == args.data.open_whole(split, database.cut_reading(n)).fingerprint() for n in sweeps):

@@ -70,10 +70,9 @@ class ExportedDetector(CloudDetector):
         return self.record["weights"]["blake2b"] + " exported"
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
-        if self.record["batch"] not in (batch_size, "any"):
-            raise ValueError(
-                f"batch size: got {batch_size}, expected {self.record['batch']}: the detector was exported for it"
-            )
+        takes = self.record["batch"]
+        expected = f"{takes}: the detector was exported for it"
+        check(takes in (batch_size, "any"), "batch size", batch_size, expected)
         return _split_program(self, mesh)
 
 

@@ -136,9 +136,8 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
             )
         tables.append(table.rows)
     rows = np.concatenate([np.zeros(0, _ROW), *tables])
-    if len(manifest.classes) <= rows["label"].max(initial=-1):
-        expected = f"at least {rows['label'].max() + 1}; build it anew"
-        raise ValueError(f"{file}: classes: got {manifest.classes}, expected {expected}")
+    used = int(rows["label"].max(initial=-1)) + 1
+    check(len(manifest.classes) >= used, f"{file}: classes", manifest.classes, f"at least {used}; build it anew")
     shard = np.repeat(np.arange(len(tables), dtype=np.int32), [len(table) for table in tables])
     return GroundTruthDatabase(folder, manifest, rows, shard)
 
