@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float32, Int, PRNGKeyArray, UInt32
 
 from fcos_lidar_jax.config import AugmentConfig
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
@@ -40,12 +41,9 @@ def check_augmentation(config: AugmentConfig, sensor: Sensor) -> None:
         )
     # A flip of x maps azimuth a to pi - a, a flip of y maps it to -a.
     for name, turn in (("flip_x_probability", np.pi), ("flip_y_probability", 0.0)):
-        offset = np.remainder(right + left - turn + np.pi, 2 * np.pi) - np.pi
-        if getattr(config, name) > 0 and abs(offset) > 2 * sensor.column_rad:
-            raise ValueError(
-                f"augment.{name}: got {getattr(config, name)}, expected 0: {where}, and the flip does not map "
-                "this sector onto itself"
-            )
+        offset = (right + left - turn + np.pi) % (2 * np.pi) - np.pi
+        probability, expected = getattr(config, name), f"0: {where}, and the flip does not map it onto itself"
+        check(probability == 0 or abs(offset) <= 2 * sensor.column_rad, f"augment.{name}", probability, expected)
 
 
 def flip_x(points: Cloud, boxes: Truth) -> tuple[Cloud, Truth]:
@@ -113,7 +111,6 @@ def augment(
         key: the sample's key, see :func:`sample_key`.
         points: x, y, z, ... in metres; the other columns are unchanged.
         boxes: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocities stay NaN.
-        config: probabilities and ranges.
         origin_m: position of the sensor, which stays fixed.
 
     >>> still = AugmentConfig(0.0, 0.0, 0.0, (1.0, 1.0))

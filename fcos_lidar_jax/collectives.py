@@ -39,7 +39,6 @@ def device_index() -> Array | int:
 def sum_over_devices(tree: _Tree) -> _Tree:
     """Add the leaves of a tree over the mapped axes.
 
-    >>> import jax
     >>> jax.pmap(lambda x: sum_over_devices(x), devices=jax.devices()[:1])(jnp.ones((1, 2)))
     Array([[1., 1.]], dtype=float32)
     """

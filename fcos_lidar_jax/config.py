@@ -393,7 +393,6 @@ def config_to_json(config: Config) -> dict[str, Any]:
 
 
 def _kind_of(record: Mapping[str, Any]) -> type[Config]:
-    """Class of a configuration: the last subclass of which the record has an additional field."""
     kinds: list[type[Config]] = [Config]
     for kind in kinds:
         kinds += kind.__subclasses__()
@@ -412,9 +411,6 @@ def config_from_json(record: Any, where: str = "config") -> Config:
 
     The fields determine the class, among the subclasses of :class:`Config` that are already imported. A section
     of another detector may be null.
-
-    Args:
-        record, where: the parsed JSON value, and the name of its source in error messages.
 
     Raises:
         ValueError: naming ``where``, the field, the found and the expected value.

@@ -45,14 +45,9 @@ def check_hashable(record: Any) -> None:
 def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> Any:
     """Convert a parsed JSON value to a dataclass, a tuple, a ``Literal``, an optional or a plain type.
 
-    ``msgspec.convert`` does not suffice: it ignores unknown fields of dataclasses, fills in missing ones, and
-    its messages lack the found value and the choices of a ``Literal``.
-
-    Args:
-        kind: type of the result. Integers are accepted as floats; nothing else is converted.
-        value: parsed JSON value.
-        where: name of the value's source in error messages.
-        defaults: use the default of a field that is missing.
+    ``msgspec.convert`` does not suffice: it ignores unknown fields of dataclasses, fills in missing ones, and its
+    messages lack the found value and the choices of a ``Literal``. Integers are accepted as floats; nothing else
+    is converted. ``where`` names the value's source in messages; with ``defaults``, fields may be missing.
 
     Raises:
         ValueError: one line with ``where``, the field, the found and the expected value.
@@ -69,8 +64,7 @@ def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> A
     if origin is Literal:
         return value  # Checked by the dataclass, see check_choices.
     if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise ValueError(f"{where}: got {value!r}, expected a list")
+        check(isinstance(value, list | tuple), where, value, "a list")
         kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
         if len(kinds) != len(value):
             raise ValueError(f"{where}: got {len(value)} values, expected {len(kinds)}")
@@ -79,8 +73,8 @@ def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> A
         return None if value is None else from_json(args[0], value, where)
     accepted = int | float if kind is float else kind
     fits = kind is not float or (isinstance(value, int | float) and not 1e300 < abs(value) < math.inf)
-    if not (isinstance(value, accepted) and fits) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{where}: got {value!r}, expected {kind.__name__}")
+    fits = fits and isinstance(value, accepted) and (kind is bool or not isinstance(value, bool))
+    check(fits, where, value, kind.__name__)
     return kind(value)
 
 

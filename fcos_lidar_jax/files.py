@@ -19,11 +19,8 @@ import msgspec
 def atomic_write(path: str | Path, write: Callable[[Path], object]) -> None:
     """Write to a temporary file beside ``path`` and rename it, so that no reader sees a partial file.
 
-    A failure or an interruption leaves the old file unchanged and removes the temporary file.
-
-    Args:
-        path: destination; missing parent folders are created.
-        write: creates and writes the file at the given temporary path, which has the extension of ``path``.
+    A failure or an interruption leaves the old file unchanged and removes the temporary file. Missing parent
+    folders are created. ``write`` gets the temporary path, which has the extension of ``path``.
 
     Raises:
         OSError: ``path`` is a folder, a link or a device, or the file system or ``write`` raised it.
@@ -68,17 +65,7 @@ class FileState(msgspec.Struct, frozen=True):
         return cls(stat.st_size, stat.st_mtime_ns, stat.st_ino, file_checksum(file))
 
     def holds(self, file: Path) -> bool:
-        """Whether the file is unchanged, by size, time and inode, or else by its content (for copies).
-
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp()) / "a"
-        >>> _ = file.write_text("one")
-        >>> state = FileState.of(file)
-        >>> file.touch(), state.holds(file)
-        (None, True)
-        >>> file.write_text("two"), state.holds(file)
-        (3, False)
-        """
+        """Whether the file is unchanged, by size, time and inode, or else by its content (for copies)."""
         stat = file.stat()
         if (stat.st_size, stat.st_mtime_ns, stat.st_ino) == (self.bytes, self.mtime_ns, self.inode):
             return True
@@ -115,9 +102,6 @@ def local_path(path: str | Path) -> Path:
 def check_writable(path: Path) -> None:
     """Reject a path at which :func:`atomic_write` would fail, as far as this is known without writing.
 
-    Raises:
-        OSError: naming the obstacle.
-
     >>> check_writable(Path("/dev/null/boxes.json"))
     Traceback (most recent call last):
     NotADirectoryError: /dev/null: found a file, expected a folder to write to
@@ -143,19 +127,11 @@ def _check_kind(path: Path) -> None:
 
 @contextlib.contextmanager
 def file_lock(path: str | Path, *, wait: bool = False) -> Iterator[bool]:
-    """Lock a file against other processes of this machine and other locks of this process.
+    """Lock a file against other processes of this machine and other locks of this process; yields whether it is
+    held.
 
-    The lock is released when the context or the process ends. The file remains.
-
-    Args:
-        path: lock file; it and missing parent folders are created.
-        wait: wait until the lock is free.
-
-    Yields:
-        whether this lock is held; always True with ``wait``.
-
-    Raises:
-        OSError: the file cannot be created.
+    The lock is released when the context or the process ends. The file remains. With ``wait``, the lock is always
+    held.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "run.lock"
@@ -182,13 +158,6 @@ def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
 
     Raises:
         OSError: naming the file: another process writes to it, or a line cannot be written.
-
-    >>> import tempfile
-    >>> file = Path(tempfile.mkdtemp()) / "a.jsonl"
-    >>> with line_writer(file) as write_line:
-    ...     write_line(b"{}")
-    >>> file.read_bytes()
-    b'{}\\n'
     """
     with path.open("ab", buffering=0) as file:
         try:
@@ -214,12 +183,10 @@ def line_writer(path: Path) -> Iterator[Callable[[bytes], None]]:
 
 
 def read_json(path: Path, kind: Any = Any, *, what: str = "a JSON file") -> Any:
-    """Read a JSON file and check its content against a type.
+    """Read a JSON file in UTF-8 and check its content against a type that msgspec can check.
 
-    Args:
-        path: file in UTF-8. NaN and infinities are accepted; callers reject them by name.
-        kind: any type that msgspec can check.
-        what: noun phrase for the expected file, used in the message for a missing file.
+    NaN and infinities are accepted; callers reject them by name. ``what`` describes the file in the message that
+    it is missing.
 
     Raises:
         ValueError: one line with the file and, on a type mismatch, the place, the found and the expected value.
@@ -280,13 +247,9 @@ _holders: dict[Path, int] = {}  # folders locked by this process -> thread that 
 
 @contextlib.contextmanager
 def folder_lock(folder: Path, doing: str) -> Iterator[None]:
-    """Lock a folder against other processes with a file ``.lock`` that names this process.
+    """Lock a folder against other processes with a file ``.lock`` that says what this process is ``doing``.
 
     The holding thread may take the lock again. The lock is released when the process ends.
-
-    Args:
-        folder: created if missing.
-        doing: activity of this process, for the error messages of other processes.
 
     Raises:
         OSError: another process holds the lock; the message contains its id, machine and activity.

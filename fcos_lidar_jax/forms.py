@@ -12,18 +12,14 @@ T = TypeVar("T")
 
 
 def in_form(form: str | None, forms: Mapping[str, Callable[..., T]], *args: Array, **platforms: str) -> T:
-    """Call one form of a function.
+    """Call one form of a function, with the arguments ``args``.
 
-    Args:
-        form: name of the form; None selects the form of the platform when the program runs.
-        forms: functions with the same arguments and, up to rounding, the same result.
-        args: positional arguments of the function.
-        platforms: form per platform, such as ``cpu="loop", default="reduction"``.
+    ``forms`` have the same arguments and, up to rounding, the same result. Without a name, the form of the
+    platform is selected when the program runs: ``platforms`` are such as ``cpu="loop", default="reduction"``.
 
     Raises:
         ValueError: unknown form.
 
-    >>> import jax.numpy as jnp
     >>> forms = {"product": lambda x: x * 2, "sum": lambda x: x + x}
     >>> in_form(None, forms, jnp.ones(2), cpu="sum", default="product").tolist()
     [2.0, 2.0]
@@ -38,7 +34,6 @@ def in_form(form: str | None, forms: Mapping[str, Callable[..., T]], *args: Arra
 def search(ascending: Array, values: Array, *, side: Literal["left", "right"] = "left") -> Array:
     """``jnp.searchsorted`` by binary search on CPUs, and by comparison of all pairs, without a loop, elsewhere.
 
-    >>> import jax.numpy as jnp
     >>> search(jnp.array([1.0, 2.0, 2.0]), jnp.array([2.0]), side="right").tolist()
     [3]
     """

@@ -25,30 +25,26 @@ STRIDES = (1, 2, 4, 8, 16, 32)  # Strides of P2 to P7 in the padded image.
 class ImageLayout:
     """Sizes of the network's input image.
 
-    Attributes:
-        rows, columns: size of the sensor's image.
-        row_upscale: row i of the network's image is row ``i // row_upscale`` of the sensor's image.
-        height: rows of the network's image, padded with empty rows to a multiple of 32.
-        width: columns of the network's image, padded on the right to a multiple of 32.
-        full_turn: True where the first column follows the last. Copies of the first columns then pad the image;
-            otherwise empty columns do.
-
     >>> layout = ImageLayout(rows=32, columns=1086, row_upscale=2)
     >>> layout.height, layout.width, layout.level_sizes[0]
     (64, 1088, 69632)
     """
 
-    rows: int
-    columns: int
-    row_upscale: int
+    rows: int  # Rows of the sensor's image.
+    columns: int  # Columns of the sensor's image.
+    row_upscale: int  # Row i of the network's image is row ``i // row_upscale`` of the sensor's image.
     full_turn: bool = True
+    """True where the first column follows the last. Copies of the first columns then pad the image; otherwise
+    empty columns do."""
 
     @property
     def height(self) -> int:
+        """Rows of the network's image, padded with empty rows to a multiple of 32."""
         return _up_to_stride(self.rows * self.row_upscale)
 
     @property
     def width(self) -> int:
+        """Columns of the network's image, padded on the right to a multiple of 32."""
         return _up_to_stride(self.columns)
 
     @property

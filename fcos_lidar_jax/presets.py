@@ -119,14 +119,11 @@ COMPACT = dataclasses.replace(
 )
 """One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with an eighth of its parameters.
 
-The sizes follow from measured times (``experiments/LOG.md``, 2026-11-22; numbers are times from file to boxes,
-relative to this preset). Layers at stride 1 cost most, so they are narrow: heads with 48 channels take 1.23, heads
-with four convolutions 1.17, a stem with 8 channels per type 1.30, a first stage of width 32 1.17. The later stages
-of the backbone cost least, so they are deep: the quickstart's blocks take 0.92, its whole network 0.83. Doubled
-rows take 1.95 and contain the same points. Tied heads only save parameters: 1.02. The image wraps around, so there
-is no seam behind the vehicle. NMS at 0.1, weighted NMS and the IoU exponent are not in the paper;
-``python -m experiments.studies.post_processing`` measures what each adds. The regression axes are not in the paper
-either; ``experiments/LOG.md`` compares them with the paper's.
+The sizes follow from measured times (``experiments/LOG.md``, 2026-11-22). Layers at stride 1 cost most, so they
+are narrow; the later stages of the backbone cost least, so they are deep. Doubled rows contain the same points.
+The image wraps around, so there is no seam behind the vehicle. NMS at 0.1, weighted NMS and the IoU exponent are
+not in the paper; ``python -m experiments.studies.post_processing`` measures what each adds. The regression axes
+are not in the paper either; ``experiments/LOG.md`` compares them with the paper's.
 """
 
 CENTERPOINT_PILLARS = CenterPointConfig.of(

@@ -7,12 +7,8 @@ import time
 class Progress:
     """Prints progress lines to stderr, identical on a terminal and in a pipe.
 
-    The rate excludes the work before the first call, which often includes compilation.
-
-    Args:
-        unit: name of the counted items, in the plural.
-        total: number of items.
-        every_s: minimum seconds between two lines; the last item always prints a line.
+    The rate excludes the work before the first call, which often includes compilation. ``unit`` names the counted
+    items, in the plural. Lines are at least ``every_s`` seconds apart; the last item always prints one.
     """
 
     def __init__(self, unit: str, total: int, *, every_s: float = 10.0) -> None:

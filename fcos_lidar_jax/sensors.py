@@ -26,23 +26,6 @@ def _finite(*values: float) -> bool:
 class Sensor:
     """A rotating LiDAR, described as far as the range view needs it (paper, section 3.1).
 
-    Attributes:
-        name: used in messages and pictures.
-        inclinations_rad: inclination of each beam in radians, one per image row and strictly decreasing: row 0 is
-            the highest beam. The table is nominal for sensors with ``row_source="laser"``.
-        num_columns: azimuth bins of one turn, or of the covered sector. Columns run clockwise; column 0 starts at
-            azimuth pi, or at the left end of the sector.
-        origin_m: position of the sensor in the frame of the points; subtracted before equation 1.
-        limit_xy_m: points with ``|x|`` or ``|y|`` at or beyond this limit are dropped (point frame, metres).
-        limit_z_m: points with z outside this open interval are dropped (point frame, metres).
-        intensity_scale: factor from the intensity in files to the scale 0-255.
-        row_source: ``"inclination"`` bins the inclination of each point; ``"laser"`` reads the row from a sixth
-            point column, for stacked sensors whose inclinations overlap.
-        azimuth_limits_rad: right and left end of the covered sector, counter-clockwise and at most a turn apart,
-            with the right end in [-pi, pi]; None for a full turn. Points outside the sector are dropped.
-        forward_rad: azimuth of the ego vehicle's heading in the frame of the points, in [-pi, pi]: 0 where x
-            points forward, pi/2 where y does. None if unknown; then clouds are never turned.
-
     Raises:
         ValueError: at construction, naming the field, the found and the expected value.
 
@@ -52,15 +35,25 @@ class Sensor:
 
     name: str
     inclinations_rad: tuple[float, ...]
+    """Inclination of each beam in radians, one per image row and strictly decreasing: row 0 is the highest beam.
+    The table is nominal for sensors with ``row_source="laser"``."""
     num_columns: int
-    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    limit_xy_m: float = 54.0
-    limit_z_m: tuple[float, float] = (-5.0, 3.0)
-    intensity_scale: float = 1.0
+    """Azimuth bins of one turn, or of the covered sector. Columns run clockwise; column 0 starts at azimuth pi, or
+    at the left end of the sector."""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # In the points' frame; subtracted before equation 1.
+    limit_xy_m: float = 54.0  # Points with ``|x|`` or ``|y|`` at or beyond it are dropped.
+    limit_z_m: tuple[float, float] = (-5.0, 3.0)  # Points with z outside this open interval are dropped.
+    intensity_scale: float = 1.0  # Factor from the intensity in files to the scale 0-255.
     row_source: Literal["inclination", "laser"] = "inclination"
+    """``"inclination"`` bins the inclination of each point; ``"laser"`` reads the row from a sixth point column,
+    for stacked sensors whose inclinations overlap."""
     azimuth_limits_rad: tuple[float, float] | None = None
+    """Right and left end of the covered sector, counter-clockwise and at most a turn apart, with the right end in
+    [-pi, pi]; None for a full turn. Points outside the sector are dropped."""
     # Not in `repr`, which fingerprints of frames contain: it changes no point that is read.
     forward_rad: float | None = dataclasses.field(default=None, repr=False)
+    """Azimuth of the ego vehicle's heading in the frame of the points, in [-pi, pi]: 0 where x points forward,
+    pi/2 where y does. None if unknown; then clouds are never turned."""
 
     def __post_init__(self) -> None:
         check_hashable(self)
@@ -134,12 +127,8 @@ def even_inclinations(lowest_deg: float, highest_deg: float, num_rows: int) -> t
 
 
 def sector(sensor: Sensor, middle_rad: float, num_columns: int) -> Sensor:
-    """Sensor that covers a sector of the turn, with columns of the same width.
-
-    Args:
-        sensor: sensor that covers a full turn.
-        middle_rad: azimuth of the middle of the sector.
-        num_columns: number of columns of the sector.
+    """Sensor that covers a sector of a full turn, around the azimuth ``middle_rad``, with columns of the same
+    width.
 
     >>> ahead = sector(NUSCENES_HDL32E, math.pi / 2, 272)
     >>> ahead.num_columns, [round(math.degrees(v), 2) for v in ahead.azimuth_limits_rad]
@@ -167,11 +156,8 @@ def turn_between(data: Sensor, other: Sensor) -> float:
 
 
 def in_frame_of(sensor: Sensor, data: Sensor) -> Sensor:
-    """A sensor's range image in the frame and the units of points that another sensor recorded.
-
-    Args:
-        sensor: gives rows, columns and limits.
-        data: gives the heading, the position of the sensor and the scale of the intensity.
+    """A sensor's rows, columns and limits in the frame and the intensity scale of points that another sensor
+    recorded.
 
     >>> image = in_frame_of(NUSCENES_HDL32E, KITTI_HDL64E)
     >>> image.num_rows, image.intensity_scale, image.forward_rad
@@ -298,9 +284,6 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the
     heading is that of the preset of the same name, else unknown.
 
-    Args:
-        record, where: the parsed JSON value, and the name of its source in error messages.
-
     Raises:
         ValueError: naming ``where``, the field, the found and the expected value.
 
@@ -326,10 +309,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
 
 
 def load_sensor(path: str | Path) -> Sensor:
-    """Load a sensor by preset name or from a JSON file.
-
-    Args:
-        path: a key of :data:`PRESETS`, or a JSON file in the format of :func:`sensor_from_json`.
+    """Load a sensor by preset name, or from a JSON file in the format of :func:`sensor_from_json`.
 
     Raises:
         ValueError: naming the file, the field, the found and the expected value.

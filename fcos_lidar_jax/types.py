@@ -28,10 +28,7 @@ BOX = "x, y, z, l, w, h, yaw, ..."
 def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:
     """Refuse arrays without the expected columns: JAX clamps indices, so results would be wrong without an error.
 
-    Args:
-        name: of the array, for the message.
-        array: of any shape [..., columns].
-        columns: names of the columns; ``"..."`` at the end allows more.
+    ``columns`` are the names of the last axis; ``"..."`` at the end allows more. ``name`` is that of the array.
 
     Raises:
         ValueError: too few or too many columns.
@@ -52,7 +49,6 @@ def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:
 class RangeImage:
     """A multi-round range image (paper, sections 3.1 and 3.2).
 
-    >>> import numpy as np
     >>> empty = RangeImage(np.zeros((32, 1086, 9, 5)), np.full((32, 1086, 5), -1), np.int32(0))
     >>> empty.features[:, :, CHANNELS.index("range"), 0].shape  # ranges of the first round
     (32, 1086)
@@ -70,7 +66,6 @@ class RangeImage:
 class Batch:
     """One training batch: raw points and padded ground truth.
 
-    >>> import numpy as np
     >>> clouds = np.zeros((2, 4096, 5)), np.zeros((2, 4096), bool)
     >>> batch = Batch(*clouds, np.zeros((2, 32, 9)), np.zeros((2, 32), int), np.zeros((2, 32), bool))
     >>> jax.tree.map(lambda leaf: leaf[0], batch).boxes.shape  # of the first sample
@@ -93,7 +88,6 @@ class PackedBatch:
 
     Valid rows come first, in order; padding rows are zero.
 
-    >>> import numpy as np
     >>> clouds = np.zeros((2, 4096, 3), np.float32), *[np.zeros((2, 4096), np.uint8)] * 2
     >>> truth = np.zeros((2, 32, 9)), np.zeros((2, 32), int), np.zeros((2, 32), bool)
     >>> PackedBatch(*clouds, np.zeros((2, 10), np.float32), None, np.array([17, 4000]), *truth).xyz.nbytes
@@ -132,7 +126,6 @@ class HostBatch:
 class Locations:
     """Point and pixel of each location of the feature levels (paper, section 3.4).
 
-    >>> import numpy as np
     >>> from fcos_lidar_jax.locations import ImageLayout, locate
     >>> image = RangeImage(np.ones((32, 128, 9, 1)), np.zeros((32, 128, 1), int), np.int32(0))
     >>> locate(image, ImageLayout(rows=32, columns=128, row_upscale=1)).points.shape
@@ -150,7 +143,6 @@ class Locations:
 class Outputs:
     """Raw predictions of the network at all locations.
 
-    >>> import numpy as np
     >>> outputs = Outputs(np.zeros((5460, 11)), np.zeros((5460, 10, 10)), np.zeros((5460, 10)))
     >>> outputs.regression[:, :3, 0].shape  # centre offsets of the first class
     (5460, 3)
@@ -199,7 +191,6 @@ class Sums(NamedTuple):
 class Detections:
     """Final boxes, best first, padded to a fixed count.
 
-    >>> import numpy as np
     >>> none = Detections(np.zeros((5, 9)), np.zeros(5), np.zeros(5, int), np.zeros(5, bool), np.int32(0))
     >>> none.boxes[none.valid].shape
     (0, 9)
@@ -217,7 +208,6 @@ class Detections:
 class TrainState:
     """State carried from step to step: arrays only, no functions.
 
-    >>> import numpy as np
     >>> state = TrainState(np.int32(0), {"kernel": np.ones(3)}, {}, (), None, jax.random.key(0))
     >>> len(jax.tree.leaves(state))  # step, kernel, key
     3

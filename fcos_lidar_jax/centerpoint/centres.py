@@ -14,19 +14,12 @@ _HARMLESS = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class CentreTargets(NamedTuple):
-    """Targets of one sample.
+    """Targets of one sample."""
 
-    Attributes:
-        heat: f32[h, w, k], Gaussians with a maximum of 1 at the centres.
-        cell: i32[m], cell of each box's centre, 0 for invalid boxes.
-        boxes: f32[m, 9], with harmless values for invalid boxes.
-        valid: bool[m], boxes with a centre on the map.
-    """
-
-    heat: Array
-    cell: Array
-    boxes: Array
-    valid: Array
+    heat: Array  # f32[h, w, k]: Gaussians with a maximum of 1 at the centres.
+    cell: Array  # i32[m]: cell of each box's centre, 0 for invalid boxes.
+    boxes: Array  # f32[m, 9], with harmless values for invalid boxes.
+    valid: Array  # bool[m]: boxes with a centre on the map.
 
 
 def gaussian_radius(
@@ -106,9 +99,7 @@ def focal_loss(
     """Compute the penalty-reduced focal loss of the heat map with alpha 2 and beta 4, as sums.
 
     Args:
-        logits: logits of a centre, per class.
         heat, cell, valid: from :func:`centre_targets`.
-        labels: classes of the boxes.
 
     Returns:
         the loss of each class over all cells without a centre of it, and the loss of each box at its centre.

@@ -24,10 +24,8 @@ def sample_losses(
     """Compute targets and losses of one sample.
 
     Args:
-        outputs: predictions.
         boxes: f32[m, 9]; NaN velocities are unknown.
         labels, box_valid: i32[m] and bool[m].
-        config, grid: options, and the cells of the heat map (static).
 
     Returns:
         the sums of both losses f32[g] per group of classes, and counts to sum over the batch, with the number of

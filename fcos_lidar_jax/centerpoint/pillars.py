@@ -22,17 +22,11 @@ _STEPS_PER_M = 2.0**16  # Resolution of the integers in means, far finer than a 
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """A square of square cells in the ground plane, row-major, with rows along y and columns along x.
+    """A square of square cells in the ground plane, row-major, with rows along y and columns along x."""
 
-    Attributes:
-        side: cells along each axis.
-        cell_m: side of a cell, metres.
-        low_m: minimum x and y of the square, metres.
-    """
-
-    side: int
-    cell_m: float
-    low_m: tuple[float, float]
+    side: int  # Cells along each axis.
+    cell_m: float  # Side of a cell, metres.
+    low_m: tuple[float, float]  # Minimum x and y of the square, metres.
 
     @property
     def num_cells(self) -> int:
@@ -114,7 +108,6 @@ def make_pillars(
 
     Args:
         points: x, y, z (metres), intensity (0-255), time lag (seconds), and ignored columns.
-        valid: rows that are points.
         grid, sensor: pillars and limits (static).
 
     >>> cloud = np.array([[0.25, 0.5, 0, 9, 0], [0.75, 0.5, 1, 9, 0]], np.float32)

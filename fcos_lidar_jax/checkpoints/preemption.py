@@ -29,10 +29,6 @@ def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
     in_main_thread = threading.current_thread() is threading.main_thread()
     handlers = {number: signal.getsignal(number) for number in _SIGNALS if active and in_main_thread}
 
-    def restore() -> None:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-
     def ask(number: int, _: FrameType | None) -> None:
         request.signal = request.signal or number
         signal.signal(signal.SIGINT, handlers[signal.SIGINT])
@@ -42,7 +38,8 @@ def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
     try:
         yield request
     finally:
-        restore()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def take_sigterm_back() -> None:

@@ -32,11 +32,7 @@ class Checkpoints:
         self.folder, self.keep = folder, keep
 
     def save(self, checkpoint: Checkpoint, state: TrainState) -> Path:
-        """Write a checkpoint, then remove old ones.
-
-        Raises:
-            OSError: writing failed; the other checkpoints are unchanged.
-        """
+        """Write a checkpoint, then remove old ones; if writing fails, the other checkpoints are unchanged."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{checkpoint.step:08d}"
         save_checkpoint(path, checkpoint, state=state)
@@ -64,10 +60,8 @@ class Checkpoints:
     def newest(self, like: TrainState) -> tuple[Checkpoint, TrainState] | None:
         """The newest intact checkpoint with its state; None if the folder has no checkpoints.
 
-        Corrupt checkpoints are skipped with a warning on standard error. ``like`` is any state of the same run.
-
-        Raises:
-            CheckpointError: all checkpoints are corrupt.
+        Corrupt checkpoints are skipped with a warning on standard error; if all are corrupt, a CheckpointError
+        says so. ``like`` is any state of the same run.
         """
         paths = self.paths()
         for path in reversed(paths):
@@ -113,8 +107,7 @@ def find_checkpoint(folder: Path) -> Path:
 def load_checkpoint(checkpoint: str | Path) -> Checkpoint:
     """Read a checkpoint after checking the hashes of its files and the shapes of its arrays.
 
-    Args:
-        checkpoint: path or name, see :func:`find_checkpoint`.
+    ``checkpoint`` is a path or a name, see :func:`find_checkpoint`.
 
     Raises:
         CheckpointError: names the folder, what was found and what was expected.
@@ -128,25 +121,19 @@ def load_checkpoint(checkpoint: str | Path) -> Checkpoint:
 def load_state(checkpoint: str | Path, like: TrainState) -> TrainState:
     """Read the state of a training, bit-identical to the saved one.
 
-    Args:
-        checkpoint: path or name, see :func:`find_checkpoint`.
-        like: any state of the same run, such as the initial one.
+    ``checkpoint`` is a path or a name, see :func:`find_checkpoint`; ``like`` is any state of the same run.
 
     Raises:
         CheckpointError: see :func:`load_checkpoint`; also if the checkpoint has no state.
 
     >>> import tempfile
     >>> import jax
+    >>> import numpy as np
     >>> from fcos_lidar_jax.checkpoints import save_checkpoint
-    >>> from fcos_lidar_jax.models import build_detector
-    >>> from fcos_lidar_jax.training import make_optimizer, make_state
-    >>> shipped, key = load_checkpoint("quickstart"), jax.random.key(0)
-    >>> detector = build_detector(shipped.config, shipped.sensor)
-    >>> optimizer = make_optimizer(shipped.config.optimizer, num_steps=100)
-    >>> state = make_state(detector, optimizer, key, variables=shipped.variables)
+    >>> state = TrainState(np.int32(7), {"kernel": np.ones(3)}, {}, (), None, jax.random.key(0))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     save_checkpoint(f"{folder}/mine", shipped, state=state)
+    ...     save_checkpoint(f"{folder}/mine", load_checkpoint("quickstart"), state=state)
     ...     int(load_state(f"{folder}/mine", state).step)
-    0
+    7
     """
     return read_state(find_checkpoint(Path(checkpoint)), like)

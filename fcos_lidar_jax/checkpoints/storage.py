@@ -136,12 +136,7 @@ def _replace_folder(beside: Path, folder: Path) -> None:
 
 
 def save_score(folder: str | Path, score: float) -> None:
-    """Record the score of a checkpoint without touching its arrays.
-
-    Raises:
-        CheckpointError: there is no checkpoint, or its description is corrupt.
-        OSError: writing failed; the checkpoint is unchanged.
-    """
+    """Record the score of a checkpoint without touching its arrays."""
     file = Path(folder).absolute() / _DESCRIPTION
     read_description(file.parent)
     text = _with_hash(read_json(file, dict[str, Any]) | {"score": score})
@@ -275,11 +270,7 @@ def _verify(folder: Path) -> dict[str, Any]:
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """Read and check the description of a checkpoint, but not its arrays.
-
-    Raises:
-        CheckpointError: the folder is not a checkpoint, or its description is corrupt.
-    """
+    """Read and check the description of a checkpoint, but not its arrays."""
     file = folder / _DESCRIPTION
     if not file.is_file():
         places = "a checkpoint folder, or the folder of a run that has saved one"
@@ -305,7 +296,6 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def _converted(config: dict[str, Any], version: int) -> dict[str, Any]:
-    """Convert a configuration of an older format to the current format."""
     if version == _OLD_FORMAT:
         del config["model"]["stem"]["form"], config["model"]["num_classes"], config["inference"]["nms_form"]
         config |= {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}
@@ -328,10 +318,11 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:
-    """Compare names and shapes of the arrays found at ``where`` with the expected arrays.
+    """Compare names and shapes of the arrays found at ``where`` with the expected arrays, which belong to
+    ``whose``.
 
     Raises:
-        CheckpointError: names the first difference; ``whose`` says what the expected arrays belong to.
+        CheckpointError: names the first difference.
     """
     shapes, got = ({name: tuple(leaf.shape) for name, leaf in _by_name(t).items()} for t in (expected, found))
     for name in sorted(shapes.keys() | got.keys()):

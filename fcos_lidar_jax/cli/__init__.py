@@ -31,10 +31,10 @@ _CLOSED_PIPE = 128 + signal.SIGPIPE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command of ``argv``, by default the arguments of the process without the program's name.
+    """Run the command of ``argv``, by default the arguments of the process; returns the exit code, see
+    :func:`exit_code`.
 
-    Returns:
-        the exit code, see :func:`exit_code`; usage errors exit with 2.
+    Usage errors exit with 2.
     """
 
     words = sys.argv[1:] if argv is None else [*argv]
@@ -224,7 +224,6 @@ def _ended_by_a_second(numbers: Sequence[signal.Signals], program: str) -> Itera
 
 
 def _end(program: str, number: int) -> NoReturn:
-    """End the process without cleaning up."""
     if number == signal.SIGINT:
         os.write(2, f"{program}: interrupted\n".encode())
     os._exit(128 + number)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import check_writable
 
 
@@ -21,8 +22,7 @@ def check_at_least(args: object, least: int, *fields: str) -> None:
     """Reject numbers below a bound; None passes."""
     for field in fields:
         value = getattr(args, field)
-        if value is not None and value < least:
-            raise ValueError(f"{option_name(field)}: got {value}, expected at least {least}")
+        check(value is None or value >= least, option_name(field), value, f"at least {least}")
 
 
 def check_score(args: Any) -> None:

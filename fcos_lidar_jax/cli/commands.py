@@ -40,10 +40,8 @@ _COMMANDS = {
 
 
 def parse(argv: Sequence[str]) -> Callable[[], object]:
-    """Parse the arguments; returns the command, ready to run. Usage errors exit with 2.
-
-    Raises:
-        ValueError: a configuration rejects a value, or an option is a URL.
+    """Parse the arguments; returns the command, ready to run. Usage errors exit with 2; bad values raise
+    ValueError.
     """
     output, rejection, command = io.StringIO(), None, None
     try:
@@ -61,7 +59,6 @@ def parse(argv: Sequence[str]) -> Callable[[], object]:
 
 
 def _check_paths(value: Any) -> None:
-    """Reject URLs in all options of a command."""
     if isinstance(value, str | Path):
         local_path(value)
     elif isinstance(value, tuple):

@@ -11,6 +11,7 @@ from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.input_pipeline.open import (
     CLASS_MAPS,
@@ -23,6 +24,7 @@ from fcos_lidar_jax.input_pipeline.open import (
 )
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 
+_PASSED_ON = ("splits", "allow_missing_sweeps", "follow_links", "full_turn", "intensity_scale")
 _FORMATS = f"{{{','.join(get_args(Format))}}}"
 
 
@@ -64,14 +66,9 @@ class DataOptions:
     ) -> FrameSet:
         """Open frames whose labels index the classes of a configuration.
 
-        Boxes of other classes are left out and counted on standard error.
-
-        Args:
-            config: how clouds are read, and the classes.
-            split: name of the split; None for all frames.
-            samples: ranges of the split's frames, see :func:`parse_ranges`; None for all.
-            sensor: for formats that do not define one; by default the configuration's.
-            option: name of the option that ``samples`` came from.
+        Boxes of other classes are left out and counted on standard error. ``samples``, from ``option``, are ranges
+        of the split's frames, see :func:`parse_ranges`. ``sensor`` is for formats that do not define one, by
+        default the configuration's.
         """
         frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:
@@ -107,11 +104,7 @@ class DataOptions:
             reading=reading,
             class_map=read_class_map(self.class_map, data.reader),
             index=self.index if data.tables else None,
-            splits=self.splits,
-            allow_missing_sweeps=self.allow_missing_sweeps,
-            follow_links=self.follow_links,
-            full_turn=self.full_turn,
-            intensity_scale=self.intensity_scale,
+            **{name: getattr(self, name) for name in _PASSED_ON},
         )
         if report_missing and isinstance(frames, NuScenesFrames):
             number = frames.nuscenes.missing_sweeps(list(frames.tokens), reading.num_sweeps)
@@ -134,20 +127,16 @@ def read_class_map(given: str | None, reader: Reader) -> ClassMap | str | None:
 def parse_ranges(text: str, number: int, option: str = "--samples") -> list[int]:
     """Indices of ``FIRST:LAST[,FIRST:LAST...]``: ranges of ``number`` frames in any order, ``LAST`` excluded.
 
-    Raises:
-        ValueError: naming the option and a range that is malformed, out of bounds or overlapping.
-
     >>> parse_ranges("0:2,5:7", 7)
     [0, 1, 5, 6]
     """
     indices: list[int] = []
     for part in text.split(","):
         first, colon, last = part.partition(":")
-        if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
-            raise ValueError(f"{option}: got {part!r}, expected FIRST:LAST")
+        numbers = bool(colon) and first.strip().isdecimal() and last.strip().isdecimal()
+        check(numbers, option, part, "FIRST:LAST")
         new = range(int(first), int(last))
-        if not new or int(last) > number:
-            raise ValueError(f"{option}: got {part!r}, expected FIRST < LAST within the {number} frames")
+        check(len(new) > 0 and int(last) <= number, option, part, f"FIRST < LAST within the {number} frames")
         if set(new) & set(indices):
             raise ValueError(f"{option}: {part!r} overlaps with another range of {text!r}")
         indices += new

@@ -93,7 +93,6 @@ def _simulate(args: Demo, detector: CloudDetector) -> NuScenesFrames:
 
 
 def _draw(out: Path, title: str, evaluation: Evaluation, frames: FrameSet) -> None:
-    """Draw the animation, and write the page that plays the drive."""
     rows = {name: row for row, name in enumerate(evaluation.tokens)}
     origins = np.zeros((len(rows), 3))
     scenes = list(make_examples(evaluation, frames, origins, rows, min_score=0, all_sweeps=True))

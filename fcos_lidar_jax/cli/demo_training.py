@@ -35,12 +35,6 @@ def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
 
     Writes metrics.json, pictures, report.html, unseen clouds, and the run with its checkpoints. Ctrl-C ends the
     training early and evaluates the result.
-
-    Args:
-        out: folder for the results.
-        steps: training steps; 0 for no training.
-        test_frames: number of unseen frames to evaluate on.
-        seed: of the weights and the training frames.
     """
     began = time.monotonic()
     shipped = load_trained("quickstart")

@@ -106,7 +106,6 @@ def run(args: Evaluate) -> None:
 
 
 def _copy(args: Evaluate, task: Task) -> None:
-    """Copy a given results file to the other results."""
     file, given = args.out / task.comparison.file, args.results
     if given is not None and not (file.exists() and file.samefile(given)):
         atomic_write(file, lambda path: shutil.copyfile(given, path))
@@ -189,7 +188,6 @@ def _open(args: Evaluate) -> Task:
 
 
 def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: bool) -> None:
-    """Reject options that do not fit the metric."""
     if benchmark and args.data.class_map is not None:
         raise ValueError("--class-map: expected none with a results file, since the classes of nuScenes are fixed")
     if benchmark and detector is not None and args.results is not None:

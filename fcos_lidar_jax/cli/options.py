@@ -13,12 +13,10 @@ from fcos_lidar_jax.inference.alignment import Alignment, align
 
 
 def option(metavar: str | None = None, *, default: str | None = None, text: str | None = None) -> Any:
-    """Describe an option in the help.
+    """Describe an option in the help: what stands for the value, and what for a default that is None.
 
-    Args:
-        metavar: what stands for the value.
-        default: text for a default that is None; without it the help calls the option optional.
-        text: help text; by default the comment or docstring of the field.
+    Without ``default`` the help calls an option of None optional. By default the text is the comment or docstring
+    of the field.
     """
 
     def hint(label: str) -> str:

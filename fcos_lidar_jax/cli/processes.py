@@ -11,6 +11,7 @@ import jax
 from fcos_lidar_jax.cli.checks import check_at_least
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.devices.launcher import local_device_ids
+from fcos_lidar_jax.fields import check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +36,8 @@ def check_processes(options: ProcessOptions) -> None:
     given = [value is not None for value in (options.coordinator, options.num_processes, options.process_index)]
     if any(given) and not all(given):
         raise ValueError("--coordinator, --num-processes and --process-index: got some, expected all or none")
-    if options.process_index is not None and not 0 <= options.process_index < (options.num_processes or 0):
-        raise ValueError(
-            f"--process-index: got {options.process_index}, expected 0 to {options.num_processes} excluded"
-        )
+    index, number = options.process_index, options.num_processes or 0
+    check(index is None or 0 <= index < number, "--process-index", index, f"0 to {number} excluded")
     if options.coordinator is not None:
         host, _, port = options.coordinator.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
@@ -46,12 +45,7 @@ def check_processes(options: ProcessOptions) -> None:
 
 
 def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.environ) -> None:
-    """Connect to the other processes, if any. Call this before JAX lists its devices.
-
-    Raises:
-        ValueError: no cluster is described, or a variable of the environment cannot be read.
-        OSError: the other processes were not reached.
-    """
+    """Connect to the other processes, if any. Call this before JAX lists its devices."""
     if not options.several:
         return
     cluster = options.coordinator or "the cluster of the environment"

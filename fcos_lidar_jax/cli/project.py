@@ -16,6 +16,7 @@ from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
 from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import load_sensor
@@ -44,8 +45,7 @@ class Project:
 def run(args: Project) -> None:
     """Project the file, write the image, and print the counts."""
     check_at_least(args, 1, "rounds", "max_file_points")
-    if args.rounds > MAX_ROUNDS:
-        raise ValueError(f"--rounds: got {args.rounds}, expected at most {MAX_ROUNDS}")
+    check(args.rounds <= MAX_ROUNDS, "--rounds", args.rounds, f"at most {MAX_ROUNDS}")
     check_out_file("--out", args.out, keep=[args.file])
     if args.png is not None:
         check_out_file("--png", args.png, keep=[args.file, args.out])

@@ -91,7 +91,7 @@ def result_files(
 
 
 class _Lines:
-    """Records in a file of lines, which can be read as often as they are asked for."""
+    """Records in a file of lines, which can be read repeatedly."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream

@@ -179,7 +179,6 @@ def _announcing(sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
 
 
 def _tell(notes: list[str]) -> None:
-    """Print each note once."""
     while notes:
         print(f"note: {notes.pop(0)}", file=sys.stderr)
 

@@ -20,6 +20,7 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
@@ -199,7 +200,6 @@ def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
 
 
 def _open_tests(args: Train, config: Config, root: Path) -> FrameSet | None:
-    """Open the frames to evaluate on during training, if any."""
     split = args.val_split or args.data.split("val", required=False)
     if split != "none" and (split or args.val_samples):
         return args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
@@ -238,11 +238,8 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
             "or train with --no-copy-paste"
         )
     source = database.read_manifest(folder).source
-    if config.num_sweeps > database.MAX_SWEEPS:
-        raise ValueError(
-            f"num_sweeps: got {config.num_sweeps}, expected at most {database.MAX_SWEEPS} with copy-paste, or "
-            "--no-copy-paste"
-        )
+    expected = f"at most {database.MAX_SWEEPS} with copy-paste, or --no-copy-paste"
+    check(config.num_sweeps <= database.MAX_SWEEPS, "num_sweeps", config.num_sweeps, expected)
     # Objects cut from more sweeps fit too: their surplus sweeps are left out.
     sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
     if not any(source == args.data.open_whole(split, database.cut_reading(n)).fingerprint() for n in sweeps):

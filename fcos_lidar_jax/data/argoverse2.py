@@ -50,16 +50,11 @@ class Argoverse2Frames(FrameSet):
     """All sweeps of some logs, by log and time: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
     Reads ``ROOT/[SPLIT/]LOG/sensors/lidar/TIMESTAMP_NS.feather``, ``LOG/city_SE3_egovehicle.feather`` and
-    ``LOG/annotations.feather``. A log without annotations, as in the test split, has no boxes. Points and boxes
-    stay in the ego vehicle's frame (x forward, y left, z up). Boxes outside the 26 classes of the detection
-    benchmark are dropped. Velocities are not annotated: they follow from the tracks in the city frame, by the rule
-    of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, and are given along the ego vehicle's axes.
-
-    Args:
-        root: folder of splits, of logs, or of one log.
-        split: read only its logs.
-        sensor: sensor that recorded the points.
-        reading: maximum number of sweeps to fuse, and which points are dropped.
+    ``LOG/annotations.feather``; ``root`` may also be one log. A log without annotations, as in the test split, has
+    no boxes. Points and boxes stay in the ego vehicle's frame (x forward, y left, z up). Boxes outside the 26
+    classes of the detection benchmark are dropped. Velocities are not annotated: they follow from the tracks in
+    the city frame, by the rule of :func:`~fcos_lidar_jax.data.nuscenes.build.velocities`, and are given along the
+    ego vehicle's axes.
 
     Raises:
         ValueError: at construction or on reading a frame, with the file, the row, the field, the found and the
@@ -90,7 +85,6 @@ class Argoverse2Frames(FrameSet):
         return len(self._sweeps)
 
     def frame(self, index: int) -> Frame:
-        """Read one sweep, fused with the sweeps before it."""
         older = min(self._sweeps[index][2], self.reading.num_sweeps - 1)
         chain = range(index, index - older - 1, -1)
         sweeps = (Sweep(read_points(self._file(i), self.sensor), self.pose(i), self.time_us(i)) for i in chain)
@@ -130,7 +124,6 @@ class Argoverse2Frames(FrameSet):
         return log / _SWEEPS / f"{stamp}.feather"
 
     def _boxes(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Boxes, labels and numbers of points."""
         log, stamp, _ = self._sweeps[index]
         _, (time_ns, *columns) = _read_log(log)
         first, last = np.searchsorted(time_ns, (stamp, stamp + 1))
@@ -144,12 +137,7 @@ def is_argoverse2_log(folder: Path) -> bool:
 
 
 def argoverse2_drive(log: Path, sensor: Sensor, *, max_points: int = MAX_POINTS) -> Drive:
-    """The sweeps of a log in temporal order, in the ego vehicle's frame, with poses in the city frame.
-
-    Raises:
-        ValueError: at the call or on reading a sweep, with the file, the row, the field, the found and the
-            expected value.
-    """
+    """The sweeps of a log in temporal order, in the ego vehicle's frame, with poses in the city frame."""
     poses, stamps = _read_poses(log / _POSES), _stamps(log)
 
     def read() -> Iterator[Sweep]:
@@ -187,8 +175,6 @@ def _stamps(log: Path) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class _Poses:
-    """The ego vehicle's poses in a log."""
-
     file: Path
     time_ns: np.ndarray  # i64[p], increasing
     matrices: np.ndarray  # f64[p, 4, 4], ego vehicle to city
@@ -203,8 +189,6 @@ class _Poses:
 
 
 class _Boxes(NamedTuple):
-    """All boxes of a log, by time."""
-
     time_ns: np.ndarray  # i64[m], increasing
     boxes: np.ndarray  # f32[m, 9]
     labels: np.ndarray  # i32[m]

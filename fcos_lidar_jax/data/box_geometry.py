@@ -20,9 +20,6 @@ def check_boxes(boxes: np.ndarray, place: Callable[[int], str]) -> None:
         boxes: [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``; an unknown velocity is NaN twice.
         place: row -> name of a box, for messages.
 
-    Raises:
-        ValueError: with the first such box, the field, the found and the expected value.
-
     >>> check_boxes(np.array([[8, 0, 0, 4, 2, 0, 0, np.nan, np.nan]]), "box {}".format)
     Traceback (most recent call last):
     ValueError: box 0: h: got 0, expected a size above 0 m

@@ -16,6 +16,7 @@ from fcos_lidar_jax.files import atomic_write, read_json
 
 _DESCRIPTION = "frames.json"
 _TRUTH = ("boxes", "labels", "num_points")
+_FRAME = (*_TRUTH, "points", "num_close")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,22 +24,13 @@ class CachedFrames(WrappedFrames):
     """A frame set that makes every frame once and keeps it on disk.
 
     The folder contains ``frames.json``, which describes the frame set, and one ``.npz`` archive per requested
-    frame. Threads and processes may share the folder, since files appear whole. A damaged file is made again, with
-    a warning on standard error. Changed code of the same version goes unnoticed: delete the folder then.
+    frame; one with another set's frames is refused at construction. Threads and processes may share the folder,
+    since files appear whole. A damaged file is made again, with a warning on standard error. Changed code of the
+    same version goes unnoticed: delete the folder then.
 
     Raises:
         ValueError: at construction, if the folder contains another set's frames.
         OSError: a file cannot be written.
-
-    >>> import tempfile
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> frames = CachedFrames(SimulatedFrames(TINY, number=2), folder)
-    >>> len(frames), bool((frames.frame(1).points == frames.frame(1).points).all())
-    (2, True)
-    >>> sorted(file.name for file in folder.iterdir())
-    ['000001.npz', 'frames.json']
     """
 
     frames: FrameSet  # a dataclass with fields that JSON can represent
@@ -64,13 +56,13 @@ class CachedFrames(WrappedFrames):
                 raise ValueError(f"{file}: {name}: found {there}, expected {got}: this folder keeps other frames")
 
     def frame(self, index: int) -> Frame:
-        arrays = self._read(index, (*_TRUTH, "points", "num_close"))
-        if arrays is not None:
+        if (arrays := self._read(index, _FRAME)) is not None:
             num_close = int(arrays.pop("num_close"))
             return Frame(**arrays, num_close=num_close)
         frame = self.frames.frame(index)
-        arrays = {name: getattr(frame, name) for name in (*_TRUTH, "points", "num_close")}
-        atomic_write(self._file(index), lambda path: np.savez(path, **arrays))
+        atomic_write(
+            self._file(index), lambda path: np.savez(path, **{name: getattr(frame, name) for name in _FRAME})
+        )
         return frame
 
     def truth(self, index: int) -> Frame:
@@ -78,15 +70,14 @@ class CachedFrames(WrappedFrames):
         arrays = self._read(index, _TRUTH)
         if arrays is None:
             return without_points(self.frame(index))
-        boxes, labels, num_points = (arrays[name] for name in _TRUTH)
-        return Frame(no_points(self.sensor), boxes, labels, num_points)
+        return Frame(no_points(self.sensor), **arrays)
 
     labels = FrameSet.labels
 
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
 
-    def _read(self, index: int, names: Sequence[str]) -> dict[str, np.ndarray] | None:
+    def _read(self, index: int, names: Sequence[str]) -> dict[str, Any] | None:
         """Arrays of a frame's file; None if the file is missing or damaged."""
         file = self._file(index)
         try:

@@ -16,8 +16,7 @@ ClassMap = Mapping[str, str | None]
 def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None = None) -> np.ndarray:
     """i32[len(of)]: index into ``to`` of each class in ``of`` after the class map; -1 for dropped classes.
 
-    Raises:
-        ValueError: the class map contains a name that is not in ``of``.
+    A class map with a name that is not in ``of`` is refused.
 
     >>> map_labels(("Car", "Van", "Tram"), ("person", "car"), {"Car": "car", "Van": "car"}).tolist()
     [1, 1, -1]

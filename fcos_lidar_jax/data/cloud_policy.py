@@ -95,7 +95,6 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
 
 
 def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Drop or zero-pad columns to the sensor's."""
     points = np.asarray(points, np.float32)
     laser = sensor.row_source == "laser"
     if points.ndim != 2 or not (6 if laser else 3) <= points.shape[1] <= 6:
@@ -121,15 +120,12 @@ def usable_rows(points: np.ndarray | Array) -> np.ndarray | Array:
 
 
 def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarray, valid: np.ndarray) -> int:
-    """Write a cloud's rows into zeroed arrays of a fixed size; see :func:`make_cloud`.
+    """Write a cloud's rows into zeroed arrays of a fixed size and count truncated rows; see :func:`make_cloud`.
 
     Args:
         parts: f32[n, c] each, written one after another.
         kept: bool[n of all parts]; if everything fits, the other rows are written too, as invalid.
         points, valid: outputs f32[m, c] and bool[m].
-
-    Returns:
-        number of truncated rows.
 
     >>> points, valid = np.zeros((2, 5), np.float32), np.zeros(2, bool)
     >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 0, 0]], np.float32)
@@ -159,11 +155,7 @@ def _newest(lags: np.ndarray, number: int) -> np.ndarray:
 
 
 def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> None:
-    """Refuse a cloud without a single point in the range image: the projection dropped all valid rows.
-
-    Raises:
-        ValueError: with the cloud's name and the counts of removed points.
-    """
+    """Refuse a cloud without a single point in the range image: the projection dropped all valid rows."""
     if np.count_nonzero(cloud.valid) > num_dropped:
         return
     raise ValueError(

@@ -54,11 +54,7 @@ class CloudFiles(FrameSet):
 
 
 def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Replace folders by their point files, sorted by name, without hidden files.
-
-    Raises:
-        ValueError: a folder contains no point file.
-    """
+    """Replace folders by their point files, at least one, sorted by name, without hidden files."""
     clouds: list[Path] = []
     for path in inputs:
         if not path.is_dir():

@@ -52,11 +52,10 @@ class PoseTrack(NamedTuple):
     translations: np.ndarray  # f64[n, 3], metres
 
     def at(self, time_us: int, where: str) -> np.ndarray:
-        """The pose f64[4, 4] at a time, interpolated between its neighbours.
+        """The pose f64[4, 4] at a time, interpolated between neighbours at most :data:`MAX_POSE_GAP_US` apart.
 
         Raises:
             OutsidePosesError: with ``where``: the time is before the first or after the last pose.
-            ValueError: the neighbours are more than :data:`MAX_POSE_GAP_US` apart.
 
         >>> track = PoseTrack(np.array([0, 400_000]), np.eye(4)[[0, 0]], np.array([[0.0, 0, 0], [2.0, 0, 0]]))
         >>> track.at(100_000, "poses")[0].tolist()
@@ -80,11 +79,7 @@ class PoseTrack(NamedTuple):
 
 
 def make_track(times_us: Sequence[int], rows: Sequence[PoseRow], place: Callable[[int], str]) -> PoseTrack:
-    """A track of poses at increasing times; ``place`` names a pose in messages.
-
-    Raises:
-        ValueError: with the first invalid time or pose.
-    """
+    """A track of poses at increasing times; ``place`` names a pose in messages."""
     for row, (before, after) in enumerate(itertools.pairwise(times_us), 1):
         if after <= before:
             found = f"got {after / 1e6} s after {before / 1e6} s"
@@ -99,16 +94,12 @@ def folder_drive(folder: Path, sensor: Sensor, poses: Path | None = None, **layo
 
     Args:
         folder: point files, see :func:`read_points`; without poses sorted by name.
-        sensor: sensor that recorded the points.
         poses: from the sensor to the world. ``.json``: a list of ``{"file", "timestamp_us", "sensor_to_world"}``
             in temporal order, files relative to the list. Other names: lines ``t x y z qx qy qz qw`` (TUM), t in
             seconds. If the clouds' names are times (seconds with a decimal point, or nanoseconds), poses are
             interpolated between neighbours at most :data:`MAX_POSE_GAP_US` apart; otherwise the file must have one
             line per cloud.
         layout: options of :func:`read_points`.
-
-    Raises:
-        ValueError: with the file, the found and the expected value.
     """
     files = list(find_clouds((folder,)))
     if poses is None:
@@ -187,11 +178,7 @@ def _time_of(file: Path) -> int | None:
 
 
 def read_tum(path: Path) -> PoseTrack:
-    """Read poses from lines ``t x y z qx qy qz qw``; lines that begin with # are skipped.
-
-    Raises:
-        ValueError: with the file, the line, the found and the expected value.
-    """
+    """Read poses from lines ``t x y z qx qy qz qw``; lines that begin with # are skipped."""
     places, times, rows = [], [], []
     for where, words in read_lines(path, "poses"):
         if words[0].startswith("#"):

@@ -45,44 +45,18 @@ class _Annotation(msgspec.Struct, forbid_unknown_fields=True):
 class FolderFrames(FrameSet):
     """The frames of a folder, sorted by name: a :class:`~fcos_lidar_jax.data.frame.FrameSet`.
 
-    ``sensor.json`` is a sensor for :func:`~fcos_lidar_jax.sensors.sensor_from_json`, or a preset's name.
-    ``clouds/NAME.EXT`` is a point file for :func:`~fcos_lidar_jax.data.point_files.read_points`.
-    ``boxes/NAME.json`` is ``{"boxes": [{"label": CLASS, "box": [x, y, z, l, w, h, yaw, vx, vy]}]}`` in the points'
-    frame, with ``null, null`` for an unknown velocity and an empty list for a frame without objects.
-    ``sweeps/NAME.json``, optional, is a list for :func:`~fcos_lidar_jax.data.sweeps.read_sweeps`; its first entry
-    is the frame's own cloud. No file may lie outside the folder, not even through a link.
-
-    The classes are the labels of all boxes, sorted, unless ``classes.json`` says otherwise: a list of classes
-    (``["car", "sign"]``; other labels are refused), or a translation of labels, null to drop boxes
-    (``{"lorry": "truck", "sign": null}``; the classes are then the translated labels, sorted). ``splits.json``,
-    optional, is ``{"train": [NAME, ...], "val": [...]}``.
-
-    File names, and boxes if they determine the classes, are checked at construction; other contents on reading a
-    frame.
+    ``docs/own_data.md`` describes the files. The first entry of ``sweeps/NAME.json``, a list for
+    :func:`~fcos_lidar_jax.data.sweeps.read_sweeps`, is the frame's own cloud. Labels that a list of classes lacks
+    are refused, and so are files outside the folder, even through a link, unless ``follow_links``.
 
     Args:
-        root: the folder.
         sensor: replaces ``sensor.json``.
         split: take the frames and their order from a split; default: all frames, sorted.
         splits: JSON file with the splits; default: ``splits.json``.
-        reading: maximum number of clouds to fuse, and which points are dropped.
-        follow_links: also read files outside the folder.
 
     Raises:
         ValueError: at construction or on reading a frame, with the file, the field, the found and the expected
             value.
-
-    >>> import json, tempfile
-    >>> root = Path(tempfile.mkdtemp())
-    >>> for name in ("clouds", "boxes"):
-    ...     (root / name).mkdir()
-    >>> _ = (root / "sensor.json").write_text('"tiny"')
-    >>> np.save(root / "clouds" / "a.npy", np.array([[8, 1, -1, 30], [9, 4, -1, 30.0]]))
-    >>> box = {"label": "car", "box": [8, 1, -1, 4, 2, 1.5, 0, None, None]}
-    >>> _ = (root / "boxes" / "a.json").write_text(json.dumps({"boxes": [box]}))
-    >>> frames = FolderFrames(root)
-    >>> frames.classes, frames.labels(0).tolist(), frames.frame(0).num_points.tolist()
-    (('car',), [0], [1])
     """
 
     def __init__(
@@ -135,12 +109,10 @@ class FolderFrames(FrameSet):
         return self.names[index]
 
     def pose(self, index: int) -> np.ndarray | None:
-        """The pose in the frame's list of sweeps, if it has one."""
         current = self._current_sweep(index)
         return None if current is None else np.array(current.sensor_to_world)
 
     def time_us(self, index: int) -> int | None:
-        """The time in the frame's list of sweeps, if it has one."""
         current = self._current_sweep(index)
         return None if current is None else current.timestamp_us
 

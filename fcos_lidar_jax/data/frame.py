@@ -18,24 +18,18 @@ from fcos_lidar_jax.sensors import Sensor
 class Frame:
     """Points and boxes of one keyframe in its LiDAR frame, unpadded.
 
-    Attributes:
-        points: f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number
-            as a sixth column for sensors whose rows come from it.
-        boxes: f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
-        labels: i32[m]: index into the ``classes`` of the frame set.
-        num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box.
-        num_close: points on the ego vehicle that the reader removed, over all sweeps, see :func:`drop_close`.
-
     >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
     >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
     [4.0, 2.0, 2.0]
     """
 
     points: np.ndarray
-    boxes: np.ndarray
-    labels: np.ndarray
-    num_points: np.ndarray
-    num_close: int = 0
+    """f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a
+    sixth column for sensors whose rows come from it."""
+    boxes: np.ndarray  # f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
+    labels: np.ndarray  # i32[m]: index into the ``classes`` of the frame set.
+    num_points: np.ndarray  # i32[m]: annotated number of LiDAR points of the current sweep in each box.
+    num_close: int = 0  # Points on the ego vehicle that the reader removed, see :func:`drop_close`.
 
 
 @runtime_checkable
@@ -44,10 +38,6 @@ class FrameSet(Protocol):
 
     Readers inherit from it and get defaults for anything that their data lack (poses, times, scenes).
 
-    Attributes:
-        classes: class names, which labels index.
-        sensor: sensor that recorded the points.
-
     >>> from fcos_lidar_jax.sensors import TINY
     >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
     >>> frames: FrameSet = SimulatedFrames(TINY, 3)
@@ -55,8 +45,8 @@ class FrameSet(Protocol):
     (3, 5, 'car')
     """
 
-    classes: tuple[str, ...]
-    sensor: Sensor
+    classes: tuple[str, ...]  # Class names, which labels index.
+    sensor: Sensor  # Sensor that recorded the points.
 
     def __len__(self) -> int: ...
 
@@ -149,7 +139,6 @@ class WrappedFrames(FrameSet):
         object.__setattr__(self, "sensor", self.frames.sensor)
 
     def _source(self, index: int) -> int:
-        """Index into the wrapped frames."""
         return index
 
     def __len__(self) -> int:
@@ -209,11 +198,10 @@ class SelectedFrames(WrappedFrames):
 
 
 def files_fingerprint(files: Iterable[Path], root: Path, reading: object) -> str:
-    """Checksum of the name, size and modification time of files, and of the reader's options.
+    """Checksum of the name, size and modification time of files, and of the reader's options, distinguished by
+    ``repr``.
 
-    Args:
-        root: names are relative to it, so that a data set may be moved as a whole.
-        reading: options of the reader, distinguished by ``repr``.
+    Names are relative to ``root``, so that a data set may be moved as a whole.
     """
     states = [(os.path.relpath(file, root), *size_and_time(file)) for file in sorted(files)]
     return checksum(repr((states, reading)).encode())
@@ -242,33 +230,16 @@ def drop_close(points: np.ndarray, sensor: Sensor, reading: CloudReading) -> tup
 
 
 def no_points(sensor: Sensor) -> np.ndarray:
-    """An empty cloud f32[0, c] with the columns of a sensor.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> no_points(TINY).shape
-    (0, 5)
-    """
+    """An empty cloud f32[0, c] with the columns of a sensor."""
     return np.zeros((0, sensor.point_columns), np.float32)
 
 
 def without_points(frame: Frame) -> Frame:
-    """Drop a frame's points, and free their memory.
-
-    >>> frame = Frame(np.zeros((9, 5)), np.zeros((1, 9)), np.zeros(1, int), np.ones(1, int), num_close=4)
-    >>> boxes = without_points(frame)
-    >>> boxes.points.shape, boxes.num_points.tolist(), boxes.num_close
-    ((0, 5), [1], 0)
-    """
+    """Drop a frame's points, and free their memory."""
     return dataclasses.replace(frame, points=frame.points[:0].copy(), num_close=0)  # a view would keep the cloud
 
 
 def without_close(frame: Frame, sensor: Sensor, reading: CloudReading) -> Frame:
-    """Remove the points on the ego vehicle from a frame.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> frame = Frame(np.eye(5, dtype=np.float32) * 9, np.zeros((0, 9)), np.zeros(0), np.zeros(0))
-    >>> len(without_close(frame, TINY, CloudReading(1, "all")).points)
-    2
-    """
+    """Remove the points on the ego vehicle from a frame."""
     points, number = drop_close(frame.points, sensor, reading)
     return dataclasses.replace(frame, points=points, num_close=frame.num_close + number)

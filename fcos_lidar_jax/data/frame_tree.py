@@ -40,10 +40,8 @@ class FrameTree:
             self._moving[child, parent].setdefault(time_us, pose)  # some transforms are sent twice
 
     def between(self, to: str, frame: str, time_us: int, where: str) -> np.ndarray:
-        """The pose f64[4, 4] of ``frame`` in ``to``.
-
-        Raises:
-            ValueError: with ``where``: the frames are not connected, or the transforms have a gap.
+        """The pose f64[4, 4] of ``frame`` in ``to``; refused, with ``where``, if they are not connected or have a
+        gap.
         """
         up = self._ancestors(frame, to)
         down = [to] if to in up else self._ancestors(to, frame)
@@ -60,8 +58,7 @@ class FrameTree:
     def to_world(self, frame: str, time_us: int, where: str) -> np.ndarray:
         """The pose f64[4, 4] of a frame in ``odom``, or in its last ancestor if no ancestor has that name.
 
-        Raises:
-            ValueError: with ``where``: no transform on the way moves, or the transforms have a gap.
+        Refused, with ``where``, if no transform on the way moves, or if the transforms have a gap.
         """
         up = self._ancestors(frame, _ODOM)
         if not any(edge in self._moving for edge in pairwise(up)):

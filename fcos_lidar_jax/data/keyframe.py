@@ -13,16 +13,11 @@ from fcos_lidar_jax.sensors import Sensor
 
 
 def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
-    """Read a folder's keyframe with the boxes of the ten nuScenes classes.
+    """Read a folder's keyframe, or that of a number in a list, with the boxes of the ten nuScenes classes.
 
     ``boxes.json`` is ``{"lidar_file": NAME, "boxes": [{"class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy",
     "num_lidar_pts"}]}`` in the LiDAR frame, or a list of such records. The count may also be called
     "num_lidar_pts_at_key_frame". Unknown velocities are null and become NaN. Other classes are dropped.
-
-    Args:
-        folder: contains ``boxes.json`` and the point file.
-        sensor: sensor that recorded the points.
-        number: index into a list of records.
 
     Raises:
         ValueError: with the file and the field.

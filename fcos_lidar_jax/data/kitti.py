@@ -53,10 +53,8 @@ class KittiFrames(FrameSet):
     would learn that everything behind the car is background.
 
     Args:
-        root: folder that contains ``training``.
         split: take the frames and their order from ``ImageSets/SPLIT.txt``, one name per line; default: all
             frames, sorted.
-        sensor: sensor that recorded the points.
         image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.
         reading: which points on the ego vehicle are dropped; a frame is one sweep.
 
@@ -169,11 +167,7 @@ def in_image(points: np.ndarray, velo_to_image: np.ndarray, image_size: tuple[in
 
 
 def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read boxes f64[m, 7] for :func:`to_lidar` and labels i32[m], which index :data:`CLASSES`.
-
-    Raises:
-        ValueError: with the file, the line, the field, the found and the expected value.
-    """
+    """Read boxes f64[m, 7] for :func:`to_lidar` and labels i32[m], which index :data:`CLASSES`."""
     types, fields = read_objects(file)
     kept = [i for i, name in enumerate(types) if name != "DontCare"]
     return fields[kept, 7:14], np.array([CLASSES.index(types[i]) for i in kept], np.int32)
@@ -184,9 +178,6 @@ def read_objects(file: Path) -> tuple[list[str], np.ndarray]:
 
     The columns are truncation, occlusion, alpha, left, top, right, bottom, height, width, length, x, y, z,
     rotation_y and score; the score is NaN where the line has none.
-
-    Raises:
-        ValueError: as :func:`read_labels`.
     """
     types, rows, places = [], [], []
     for where, words in read_lines(file):
@@ -207,11 +198,7 @@ def read_objects(file: Path) -> tuple[list[str], np.ndarray]:
 
 
 def read_calibration(file: Path) -> dict[str, np.ndarray]:
-    """Read ``velo_to_rect`` f64[4, 4], metres to metres, and ``P2`` f64[3, 4], from there to pixels.
-
-    Raises:
-        ValueError: with the file, the matrix, the found and the expected value.
-    """
+    """Read ``velo_to_rect`` f64[4, 4], metres to metres, and ``P2`` f64[3, 4], from there to pixels."""
     matrices = read_matrices(file, _SHAPES, ("R0_rect", "Tr_velo_to_cam"))
     to_rect, to_camera = np.eye(4), np.eye(4)
     to_rect[:3, :3], to_camera[:3] = matrices["R0_rect"], matrices["Tr_velo_to_cam"]

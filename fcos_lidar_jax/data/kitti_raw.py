@@ -30,9 +30,6 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
     Reads ``velodyne_points/data/N.bin``, line N of ``velodyne_points/timestamps.txt``, ``oxts/data/N.txt``, and
     ``calib_imu_to_velo.txt`` in the folder or its parent. Positions are in a Mercator projection scaled at the
     first latitude, as in the data set's development kit.
-
-    Raises:
-        ValueError: with the file, the found and the expected value.
     """
     points = folder / "velodyne_points"
     files = sorted(points.joinpath("data").glob("*.bin"))
@@ -40,7 +37,8 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
         raise ValueError(f"{points / 'data'}: no .bin file in it, expected sweeps")
     times = dict(read_lines(points / "timestamps.txt", "the times of the sweeps"))
     own, of_day = folder / _CALIBRATION, folder.parent / _CALIBRATION
-    velodyne_to_imu = np.linalg.inv(_imu_to_velodyne(own if own.is_file() else of_day))
+    matrices = read_matrices(own if own.is_file() else of_day, {"R": (3, 3), "T": (3, 1)}, ("R",))
+    velodyne_to_imu = np.linalg.inv(np.vstack([np.hstack([matrices["R"], matrices["T"]]), (0, 0, 0, 1)]))
 
     def read() -> Iterator[Sweep]:
         scale = None
@@ -52,12 +50,6 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
             yield Sweep(read_points(file, sensor, max_points=max_points), pose, time_us, str(file))
 
     return Drive(read())
-
-
-def _imu_to_velodyne(file: Path) -> np.ndarray:
-    matrices, pose = read_matrices(file, {"R": (3, 3), "T": (3, 1)}, ("R",)), np.eye(4)
-    pose[:3] = np.hstack([matrices["R"], matrices["T"]])
-    return pose
 
 
 def _read_oxts(file: Path) -> dict[str, float]:
@@ -74,7 +66,6 @@ def _read_oxts(file: Path) -> dict[str, float]:
 def _imu_to_world(
     latitude: float, longitude: float, altitude: float, roll: float, pitch: float, yaw: float, *, scale: float
 ) -> np.ndarray:
-    """The pose f64[4, 4] of the unit."""
     north = np.log(np.tan(np.deg2rad(90 + latitude) / 2))
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()

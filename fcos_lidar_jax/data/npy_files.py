@@ -13,14 +13,9 @@ MAX_BYTES = 2**31  # default limit of an unpacked array
 
 
 def parse_npy(content: bytes, *, max_rows: int | None = None) -> np.ndarray:
-    """The array of an ``.npy`` file, as a read-only view of the bytes.
+    """The array of an ``.npy`` file, as a read-only view of the bytes; ``max_rows`` limits the first axis.
 
-    Args:
-        content: the whole file.
-        max_rows: limit of the first axis; None for no limit.
-
-    Raises:
-        ValueError: damaged, pickled objects, a size that differs from the header's, or too many rows.
+    Refuses pickled objects, and damaged files, also by their size.
 
     >>> stream = io.BytesIO()
     >>> np.save(stream, np.arange(3))
@@ -63,17 +58,7 @@ def npz_names(content: bytes) -> list[str]:
 def parse_npz(
     content: bytes, names: Sequence[str], *, max_rows: int | None = None, max_bytes: int = MAX_BYTES
 ) -> dict[str, np.ndarray]:
-    """Arrays of an ``.npz`` file.
-
-    Args:
-        content: the whole file.
-        names: names of the arrays to read.
-        max_rows: as in :func:`parse_npy`.
-        max_bytes: limit of an unpacked array.
-
-    Raises:
-        ValueError: damaged, an array is missing or too large, or an error of :func:`parse_npy`.
-    """
+    """Some arrays of an ``.npz`` file, each as in :func:`parse_npy` and with at most ``max_bytes`` unpacked."""
     with _opened(content) as archive:
         members, arrays = {_name(member): member for member in archive.infolist()}, {}
         for name in names:

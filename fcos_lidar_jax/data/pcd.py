@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fcos_lidar_jax.fields import check
+
 _COLUMNS: dict[str, tuple[str, ...]] = {name: (name,) for name in ("x", "y", "z", "time_lag")}
 _COLUMNS["intensity"] = ("intensity", "reflectivity")
 _COLUMNS["laser"] = ("laser_number", "laser", "ring", "line", "channel")
@@ -18,19 +20,15 @@ _MAX_EXPANSION = 88  # three bytes of LZF unpack to 264 at most
 
 
 def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, np.ndarray]:
-    """Parse a PCD file into named columns.
+    """Parse the content of a PCD file into named columns; errors name the header's field.
 
     Args:
-        content: the whole file.
         max_points: limit of the number of points.
         max_bytes: limit of all points' unpacked size.
 
     Returns:
         x, y, z, and intensity, time_lag and laser if the file has them; one value per point, in the file's own
         units and types.
-
-    Raises:
-        ValueError: one line with the header's field, the found and the expected value.
 
     >>> header = "FIELDS x y z ring\\nSIZE 4 4 4 1\\nTYPE F F F U\\nPOINTS 1\\nDATA ascii\\n"
     >>> table = parse_pcd(header.encode() + b"5 0 -1.5 31\\n", max_points=10, max_bytes=1000)
@@ -46,8 +44,7 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
         size = f"{number} points of {_size(fields)} bytes"
         raise ValueError(f"POINTS: got {size}, expected at most {max_points} and {max_bytes} bytes in all")
     form = " ".join(header["DATA"]).lower()
-    if form not in _FORMS:
-        raise ValueError(f"DATA: got {form!r}, expected {', '.join(_FORMS)}")
+    check(form in _FORMS, "DATA", form, ", ".join(_FORMS))
     places = find_columns([field.name for field in fields])
     for field in (fields[place] for place in places.values()):
         if field.count != 1:
@@ -124,15 +121,13 @@ def _num_points(header: dict[str, list[str]]) -> int:
     numbers = {}
     for name in ("POINTS", "WIDTH", "HEIGHT"):
         if (words := header.get(name)) is not None:
-            if len(words) != 1 or not words[0].isdecimal():
-                raise ValueError(f"{name}: got {' '.join(words)!r}, expected an integer of at least 0")
+            check(len(words) == 1 and words[0].isdecimal(), name, " ".join(words), "an integer of at least 0")
             numbers[name] = int(words[0])
     product = numbers["WIDTH"] * numbers["HEIGHT"] if {"WIDTH", "HEIGHT"} <= set(numbers) else None
     points = numbers.get("POINTS", product)
     if points is None:
         raise ValueError("POINTS: missing in the header, as are WIDTH and HEIGHT")
-    if product not in (None, points):
-        raise ValueError(f"POINTS: got {points}, expected WIDTH x HEIGHT, which is {product}")
+    check(product in (None, points), "POINTS", points, f"WIDTH x HEIGHT, which is {product}")
     return points
 
 
@@ -157,7 +152,6 @@ def _from_ascii(body: memoryview, fields: list[_Field], number: int, places: lis
 
 
 def _from_binary(body: memoryview, fields: list[_Field], number: int, places: list[int]) -> list[np.ndarray]:
-    """Points stored one after another."""
     record = _size(fields)
     if len(body) < number * record:
         expected = f"{number * record} ({number} points of {record})"

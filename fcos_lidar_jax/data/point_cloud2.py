@@ -15,14 +15,8 @@ _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f
 def parse_point_cloud2(cloud: Any, where: str, sensor: Sensor, *, max_points: int) -> np.ndarray:
     """The points of a message, in the columns of :func:`~fcos_lidar_jax.data.point_files.read_points`.
 
-    Args:
-        cloud: an object with the message's fields; ``data`` is u8[n].
-        where: name of the message for error messages.
-        sensor: scales the intensity and tells whether laser numbers are needed.
-        max_points: larger clouds are refused before they take memory.
-
-    Raises:
-        ValueError: with ``where``, the field, the found and the expected value.
+    ``cloud`` has the message's fields, with ``data`` u8[n]. Clouds of more than ``max_points`` are refused before
+    they take memory. ``where`` names the message in errors.
     """
     width, height, step, pitch = cloud.width, cloud.height, cloud.point_step, cloud.row_step
     if width * height > max_points:

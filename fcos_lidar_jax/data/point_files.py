@@ -50,7 +50,6 @@ def read_points(
     not look like metres, or if another layout fits them clearly better.
 
     Args:
-        path: the file.
         sensor: scales the intensity, except in ``.pcd.bin``, and tells whether laser numbers are needed.
         columns: values per point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
@@ -103,12 +102,11 @@ def read_points(
 
 
 def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -> np.ndarray:
-    """Convert an array to the columns that :func:`read_points` returns.
+    """Convert an array, which ``where`` names in messages, to the columns that :func:`read_points` returns.
 
     Args:
         array: [n, 3 to 6], of NumPy or JAX, or a list: x, y, z, intensity, time lag, laser number.
         sensor: as in :func:`read_points`.
-        where: name of the array for error messages.
 
     Raises:
         ValueError: wrong shape or type, or a fifth column of whole numbers above 1, which is a ring.
@@ -144,17 +142,11 @@ def check_time_lags(points: np.ndarray, where: str = "points") -> None:
 
 
 def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_POINTS) -> dict[str, np.ndarray]:
-    """Read columns of an Apache Feather file (version 2); needs the extra ``argoverse2``.
+    """Read columns of an Apache Feather file (version 2), at most ``max_rows`` long; needs the extra
+    ``argoverse2``.
 
-    Args:
-        path: the file.
-        kinds: column -> NumPy's letters of the allowed types: ``"fiu"`` numbers, ``"iu"`` whole numbers, ``"O"``
-            texts.
-        max_rows: longer tables are refused.
-
-    Raises:
-        ValueError: not a Feather file, a column is missing, has another type or a row without a value, or pyarrow
-            is not installed.
+    ``kinds`` maps columns to NumPy's letters of the allowed types: ``"fiu"`` numbers, ``"iu"`` whole numbers,
+    ``"O"`` texts. Rows without a value are refused.
     """
     try:
         import pyarrow
@@ -317,8 +309,7 @@ def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.nd
 def assemble_points(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
     """Combine the columns x, y, z, intensity, time_lag and laser to the array that :func:`read_points` returns.
 
-    Raises:
-        ValueError: with ``where``: no points, a negative lag, or missing or invalid laser numbers.
+    Refuses a cloud without points, negative lags, and missing or invalid laser numbers.
     """
     number = len(table["x"])
     if number == 0:

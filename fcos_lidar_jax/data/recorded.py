@@ -17,10 +17,7 @@ RECORDED_BY = {
 
 
 def recorded_by(paths: Iterable[Path]) -> Sensor | None:
-    """The sensor that recorded point files, or recordings in folders, as far as their paths tell.
-
-    Raises:
-        ValueError: different sensors recorded them.
+    """The one sensor that recorded point files, or recordings in folders, as far as their paths tell.
 
     >>> recorded_by([Path("KITTI/training/velodyne/000000.bin")]).name, recorded_by([Path("000000.bin")])
     ('kitti_hdl64e', None)

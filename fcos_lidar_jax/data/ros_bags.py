@@ -54,18 +54,11 @@ def ros_bag_drive(
     them. Clouds before the first or after the last pose are skipped, with a note in the drive.
 
     Args:
-        path: the recording.
-        sensor: as in :func:`~fcos_lidar_jax.data.point_files.read_points`.
         topic: topic of the clouds (``PointCloud2``); may be omitted if there is only one.
         odometry: topic of ``Odometry``, ``PoseStamped`` or ``PoseWithCovarianceStamped``; or ``"tf"``: the
             transforms from the cloud's frame up to ``odom``, or to the root. If odometry is of another frame than
             the cloud's, as its child frame tells, the transforms between the two complete it.
         poses: instead of odometry, a file for :func:`~fcos_lidar_jax.data.drives.read_tum` of the cloud's frame.
-        max_points: larger clouds are refused.
-
-    Raises:
-        ValueError: at the call or on reading a cloud, with the recording, the topic, the found and the expected
-            value.
     """
     with _Bag(path) as bag:
         clouds = bag.choose(topic, _CLOUD, "topic")
@@ -141,7 +134,6 @@ class _Bag(contextlib.AbstractContextManager):
         raise ValueError(f"{self.path}: {option}: got {found}, expected a topic of {names} among: {topics}")
 
     def messages(self, topic: str, types: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-        """The messages of a topic, each with its name for error messages."""
         connections = [one for one in self._reader.connections if one.topic == topic and one.msgtype in types]
         raw, number = self._reader.messages(connections=connections), 0
         while True:
@@ -150,13 +142,11 @@ class _Bag(contextlib.AbstractContextManager):
                 if (record := next(raw, None)) is None:
                     return
                 connection, _, content = record
-                message = self._deserialize(content, connection.msgtype)
+                store = _typestore(self._is_ros1)
+                read = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
+                message = read(content, connection.msgtype)
             yield where, message
             number += 1
-
-    def _deserialize(self, content: bytes, kind: str) -> Any:
-        types = _typestore(self._is_ros1)
-        return types.deserialize_ros1(content, kind) if self._is_ros1 else types.deserialize_cdr(content, kind)
 
 
 @functools.cache

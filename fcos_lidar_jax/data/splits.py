@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import read_json
 
 SPLITS = "splits.json"
@@ -18,18 +19,11 @@ def own_splits(folder: Path, file: str | Path | None = None) -> dict[str, list[s
 def distinct_names(listed: Iterable[tuple[str, str]], known: Collection[str], where: str) -> tuple[str, ...]:
     """Check a list of frame names: at least one, each known and listed once.
 
-    Args:
-        listed: the place of each name, for messages, and the name.
-        known: names of all frames.
-        where: the place of the list, for messages.
-
-    Raises:
-        ValueError: with the place, the found and the expected value.
+    ``listed`` pairs the place of each name, for messages, with the name; ``where`` is the place of the list.
     """
     names: dict[str, None] = {}
     for place, name in listed:
-        if name not in known:
-            raise ValueError(f"{place}: got {name!r}, expected the name of a cloud")
+        check(name in known, place, name, "the name of a cloud")
         if name in names:
             raise ValueError(f"{place}: got {name!r} a second time, expected every frame once")
         names[name] = None

@@ -47,7 +47,6 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
 
     Args:
         sweeps: the current sweep, then the others by age; all of them are fused.
-        sensor: sensor that recorded the points.
         reading: which points on the ego vehicle are dropped.
 
     Returns:
@@ -82,16 +81,9 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
 
 
 def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any) -> tuple[np.ndarray, int]:
-    """Fuse the sweeps of a JSON list; the result is that of :func:`fuse_sweeps`.
+    """Fuse the sweeps of a JSON list, at most ``reading.num_sweeps``; the result is that of :func:`fuse_sweeps`.
 
-    Args:
-        path: the JSON file, see :func:`read_list`.
-        sensor: sensor that recorded the points.
-        reading: maximum number of sweeps, from the current one on, and which points are dropped.
-        layout: options of :func:`~fcos_lidar_jax.data.point_files.read_points`.
-
-    Raises:
-        ValueError: with the file, the entry, the field, the found and the expected value.
+    ``layout`` are options of :func:`~fcos_lidar_jax.data.point_files.read_points`, for each file of the list.
     """
 
     def read(index: int, each: ListedSweep) -> Sweep:
@@ -109,9 +101,6 @@ def read_list(path: Path) -> list[ListedSweep]:
     """Read a JSON list ``[{"file", "timestamp_us", "sensor_to_world": 4x4}, ...]`` of sweeps.
 
     The first entry is the current sweep; the others follow by age, newest first.
-
-    Raises:
-        ValueError: with the file, the entry, the field, the found and the expected value.
     """
     sweeps = read_entries(path)
     for index, (newer, sweep) in enumerate(itertools.pairwise(sweeps), 1):
@@ -150,9 +139,6 @@ def check_poses(rotation: np.ndarray, translation: np.ndarray, place: Callable[[
         rotation: f64[n, 4], quaternions w, x, y, z.
         translation: f64[n, 3], metres.
         place: row -> name of a pose, for messages.
-
-    Raises:
-        ValueError: with the first such pose, the field, the found and the expected value.
 
     >>> check_poses(np.array([[2.0, 0, 0, 0]]), np.zeros((1, 3)), "pose {}".format)
     Traceback (most recent call last):

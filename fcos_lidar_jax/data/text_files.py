@@ -13,8 +13,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
     """The place of each line, for messages, and its words; blank lines are skipped.
 
-    Raises:
-        ValueError: with the file: it cannot be read or is not text; ``what`` describes what is expected.
+    ``what`` describes the expected file, if there is none or it is not text.
     """
     if not file.is_file():
         raise ValueError(f"{file}: no such file, expected {what}")
@@ -48,13 +47,8 @@ def read_matrices(
 ) -> dict[str, np.ndarray]:
     """Read matrices from lines ``NAME: NUMBER NUMBER ...``; lines of other names are skipped.
 
-    Args:
-        file: the file.
-        shapes: names of the matrices, all of them required, and their rows and columns.
-        rotations: names of the matrices that begin with a 3x3 rotation.
-
-    Raises:
-        ValueError: with the file, the line, the matrix, the found and the expected value.
+    ``shapes`` are the names of all required matrices with their rows and columns. ``rotations`` are those that
+    begin with a 3x3 rotation.
     """
     matrices = {}
     for where, (name, *words) in read_lines(file):

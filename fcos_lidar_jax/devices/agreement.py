@@ -41,11 +41,7 @@ def agreed(failed: str) -> Iterator[None]:
 
 
 def check_same(checksum: str, what: str) -> None:
-    """Refuse processes with different inputs.
-
-    Args:
-        checksum: hexadecimal checksum of the inputs.
-        what: description of the inputs, for the message.
+    """Refuse processes with different inputs, described by ``what``, from a hexadecimal checksum of the inputs.
 
     Raises:
         ValueError: on all processes; names the first process that differs from process 0.

@@ -25,7 +25,6 @@ def feed(batches: Iterable[HostBatch], mesh: Mesh, *, ahead: int = 2) -> Iterato
 
     Args:
         batches: NumPy arrays with the rows of this process; only the thread may iterate over them.
-        mesh: mesh of the devices.
         ahead: maximum number of batches waiting on the devices, besides the last one that was taken.
 
     Yields:

@@ -11,13 +11,10 @@ _VISIBLE = ("CUDA_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES
 
 
 def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
-    """Choose the GPUs of a process, for ``jax.distributed.initialize``.
+    """Choose the GPUs for ``jax.distributed.initialize`` from the environment of a process.
 
     The only process of a machine uses all visible GPUs. One of several processes uses the GPU with its local rank,
     or all visible GPUs if the launcher only shows each process its own.
-
-    Args:
-        environment: environment variables of the process.
 
     Returns:
         indices into the visible GPUs; ``()`` for all of them; None to let JAX decide, if the process was started
@@ -40,10 +37,8 @@ def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
     rank, size = local
     # By default, JAX gives each process of these launchers the GPU of its rank. On a machine with one process, the
     # other GPUs would stay idle, and if each process only sees its own GPU, rank 1 would have none. An empty
-    # sequence leaves all GPUs visible, because jax 0.10 tests `local_device_ids is None`, then
-    # `if local_device_ids`. Listing all ids would be the documented way, but their number is unknown until JAX's
-    # backend starts: CUDA_VISIBLE_DEVICES may be unset or contain UUIDs. If a later JAX takes an empty sequence as
-    # no GPUs, it fails instead of leaving GPUs idle.
+    # sequence leaves all GPUs visible in jax 0.10. Listing all ids would be the documented way, but their number
+    # is unknown until JAX's backend starts.
     return () if size == 1 or _sees_only_its_own(environment) else (rank,)
 
 

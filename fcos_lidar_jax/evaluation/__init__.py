@@ -1,4 +1,7 @@
-"""Metrics of detections against ground truth, and results files."""
+"""Metrics of detections against ground truth, and results files.
+
+A refused file raises a ValueError of one line: the file, the sample or frame, the box (from 0) and the field.
+"""
 
 from fcos_lidar_jax.evaluation.summary import evaluate_detections
 

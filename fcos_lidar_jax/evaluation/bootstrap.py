@@ -32,15 +32,11 @@ def bootstrap(
     groups: Sequence[int] | None = None,
     report: Callable[[int], None] = lambda done: None,
 ) -> dict[str, Any]:
-    """Intervals of the scores over resampled sets with the same number of samples.
+    """Intervals of the scores over ``repeats`` resampled sets with the same number of samples.
 
     Matching never crosses samples and is done once. Each set is scored by the metric of the evaluation. Keyframes
-    of a scene resemble each other, so the true intervals are wider unless whole scenes are drawn with ``groups``.
-
-    Args:
-        repeats: number of sets.
-        groups: group of each sample, such as its scene, starting at 0; groups are drawn instead of samples.
-        report: called with the number of finished sets.
+    of a scene resemble each other, so the true intervals are wider unless whole scenes are drawn: ``groups`` are
+    the group of each sample, starting at 0. ``report`` is called with the number of finished sets.
 
     Returns:
         ``{"repeats", "seed", "level", "mean_ap": {"low", "high"}}``, and ``"nd_score"`` for the benchmark.

@@ -35,7 +35,6 @@ class Columns:
         return len(getattr(self, dataclasses.fields(self)[0].name))
 
     def take(self: Rows, rows: np.ndarray | slice) -> Rows:
-        """Select rows by index, mask or slice."""
         return dataclasses.replace(self, **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
 
 
@@ -59,10 +58,7 @@ _WHOLE = {"sample": np.int32, "label": np.int16, "attribute": np.int8, "num_poin
 
 
 def make_columns(**columns: Any) -> BoxColumns:
-    """Create columns with the right types. A scalar fills all rows.
-
-    Args:
-        columns: fields of :class:`BoxColumns`; attribute, score and number of points default to unknown.
+    """Create columns with the right types. A scalar fills all rows; unknown fields may be left out.
 
     >>> no_box = np.zeros((0, 3))
     >>> len(make_columns(sample=0, label=0, translation=no_box, size=no_box, yaw=0.0, velocity=no_box[:, :2]))
@@ -95,10 +91,8 @@ class GroundTruth:
 
 
 def heading_yaw(rotation: np.ndarray) -> np.ndarray:
-    """Direction of the rotated x axis in the ground plane, f64[n].
-
-    Args:
-        rotation: f64[n, 4], quaternions w, x, y, z of any positive norm.
+    """Direction of the x axis in the ground plane, f64[n], after rotations f64[n, 4]: w, x, y, z of any positive
+    norm.
 
     >>> heading_yaw(np.array([[2.0, 0, 0, 2]])).round(4).tolist()
     [1.5708]

@@ -48,10 +48,8 @@ def compare_by_benchmark(
 ) -> Comparison:
     """By nuScenes' own metric.
 
-    Args:
-        truth: keyframes, or the truth of a file, for which no detections can be written.
-        of: what the samples are of, for messages.
-        classes: that the labels of detections index.
+    ``truth`` are keyframes, or the truth of a file, for which no detections can be written. ``of`` describes the
+    samples in messages; the labels of detections index ``classes``.
     """
     frames = truth
     known = split_truth(frames.nuscenes, frames.tokens) if isinstance(frames, NuScenesFrames) else frames

@@ -6,6 +6,7 @@ import numpy as np
 
 from fcos_lidar_jax.evaluation.boxes import BoxColumns
 from fcos_lidar_jax.evaluation.metrics import ERROR_ROW, Evaluation
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
 
 _EXTREMES = 3  # number of worst and of best samples
 
@@ -50,7 +51,7 @@ def choose_examples(evaluation: Evaluation) -> Examples:
 
 def sensor_boxes(
     evaluation: Evaluation, sample: int, sensor_to_global: np.ndarray, *, min_score: float
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+) -> tuple[ScoredBoxes, TrueBoxes]:
     """Evaluated predictions (boxes, labels, scores) and truth (boxes, labels) of a sample in a sensor's frame.
 
     ``sensor_to_global`` is the pose of the sensor, f64[4, 4]; ``min_score`` is the threshold of the predictions.

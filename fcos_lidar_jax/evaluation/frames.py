@@ -62,7 +62,6 @@ def frame_columns(
 
 
 def _columns(sample: int, boxes: np.ndarray, **columns: np.ndarray) -> BoxColumns:
-    """Columns of the boxes ``x, y, z, l, w, h, yaw, vx, vy`` of one sample."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 9)
     centre, size, yaw, velocity = boxes[:, :3], boxes[:, [4, 3, 5]], boxes[:, 6], boxes[:, 7:9]
     return make_columns(sample=sample, translation=centre, size=size, yaw=yaw, velocity=velocity, **columns)
@@ -71,8 +70,7 @@ def _columns(sample: int, boxes: np.ndarray, **columns: np.ndarray) -> BoxColumn
 def write_detections(path: Path, frames: Iterable[tuple[str, bytes]], classes: Sequence[str]) -> None:
     """Write detections: ``{"classes", "frames": [{"name", "boxes": [{"label", "score", "box"}]}]}``.
 
-    Args:
-        frames: names with their boxes as JSON, see :func:`fcos_lidar_jax.evaluation.records.as_records`.
+    ``frames`` are names with their boxes as JSON, see :func:`fcos_lidar_jax.evaluation.records.as_records`.
     """
     lines = (b'{"name": %s, "boxes": %s}' % (json.dumps(name).encode(), boxes) for name, boxes in frames)
     write_lines(path, b'{"classes": %s, "frames": [' % json.dumps(list(classes)).encode(), lines, b"]}\n")
@@ -94,14 +92,9 @@ class _DetectionsFile(msgspec.Struct, gc=False):
 
 
 def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) -> list[Detections]:
-    """Read a file of :func:`write_detections`, in the order of ``names``.
+    """Read a file of :func:`write_detections` in the order of ``names``, which it must cover exactly.
 
-    Args:
-        names: names of the frames; the file must cover exactly these frames.
-        classes: class names by label.
-
-    Raises:
-        ValueError: naming the file, the frame, the box (from 0) and the fault.
+    ``classes`` are the class names by label.
     """
     by_name: dict[str, list[_Box]] = {}
     for frame in read_json(path, _DetectionsFile)[0].frames:

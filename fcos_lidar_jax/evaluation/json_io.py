@@ -37,13 +37,8 @@ class JsonBox(msgspec.Struct, gc=False):
 def read_json(source: str | Path | dict[str, Any], kind: Any, *, given: str = "") -> tuple[Any, str]:
     """Read a JSON file as an object of a type; also returns its name for messages.
 
-    Args:
-        source: the file, or the result of ``json.load``, optionally with NumPy numbers and arrays.
-        kind: type of the object.
-        given: name of a source that is not a file.
-
-    Raises:
-        ValueError: the file does not exist, is empty, is not JSON or does not match the type.
+    ``source`` may also be the result of ``json.load``, optionally with NumPy numbers and arrays; ``given`` names
+    it then.
     """
     if isinstance(source, dict):
         text = json.dumps(source, default=lambda array: array.tolist()).encode()
@@ -62,9 +57,6 @@ def decode_json(text: Text, kind: Any, source: str) -> Any:
 
     Accepts NaN and infinities, which Python writes although JSON excludes them: NaN is read as ``null``, and
     infinities are rejected where the type expects a number.
-
-    Raises:
-        ValueError: naming the source: it is not JSON or does not match the type.
 
     >>> decode_json(b'{"a": NaN}', dict[str, float | None], "here")
     {'a': None}
@@ -92,16 +84,9 @@ def _plain_json(text: Text) -> bytes:
 
 
 def decode_samples(samples: msgspec.Raw, kind: Any, source: str, *, field: str = "") -> Iterator[tuple[str, Any]]:
-    """Iterate over sample tokens and their entries, decoded as objects of a type.
+    """Iterate over sample tokens and their entries, decoded as objects of a type; a token must not occur twice.
 
-    Args:
-        samples: the JSON object of all samples.
-        kind: type of one entry.
-        field: field of the file that contains the samples; ``""`` for the whole file.
-
-    Raises:
-        ValueError: ``samples`` is not an object, a token occurs twice, or an entry does not match the type; names
-            sample, box and field.
+    ``samples`` is the JSON object of all samples, which the file has in ``field``; ``""`` for the whole file.
     """
     whole = f"{source}: {field}" if field else source
     entries = decode_json(samples, dict[str, msgspec.Raw], whole)
@@ -134,11 +119,7 @@ def _explain(error: msgspec.ValidationError) -> str:
 
 
 def expect_samples(found: Collection[str], wanted: Sequence[str], source: str, *, of: str) -> None:
-    """Check that ``found`` contains exactly the samples in ``wanted``, described by ``of`` as ``"split 'val'"``.
-
-    Raises:
-        ValueError: naming the source, missing and unexpected samples.
-    """
+    """Check that ``found`` contains exactly the ``wanted`` samples, described by ``of`` as ``"split 'val'"``."""
     present, known = set(found), set(wanted)
     missing = [token for token in wanted if token not in present]
     extra = [token for token in found if token not in known]
@@ -154,8 +135,7 @@ def expect_samples(found: Collection[str], wanted: Sequence[str], source: str, *
 def geometry(boxes: Sequence[JsonBox], where: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Translation, size, yaw and velocity of boxes as columns, and rotations f64[n, 4].
 
-    Raises:
-        ValueError: naming ``where`` (file and sample), the box and the field.
+    ``where`` names file and sample in messages.
     """
     unknown = (None, None)
     rows = [box.translation + box.size + box.rotation + (box.velocity or unknown) for box in boxes]
@@ -173,11 +153,7 @@ def geometry(boxes: Sequence[JsonBox], where: str) -> tuple[dict[str, np.ndarray
 
 
 def index_of(boxes: Sequence[msgspec.Struct], field: str, known: Mapping[str, int], where: str) -> np.ndarray:
-    """Map the names in a field of the boxes to numbers of at least -1, i64[n]; ``""`` stands for no name.
-
-    Raises:
-        ValueError: unknown name, with ``where`` (file and sample).
-    """
+    """Map the names in a field of the boxes to numbers of at least -1, i64[n]; ``""`` stands for no name."""
     index = np.array([known.get(getattr(box, field), -2) for box in boxes], np.int64)
     names = ", ".join(filter(None, known))
     expect(index > -2, boxes, field, where, f"one of {names}{' or nothing' if '' in known else ''}")

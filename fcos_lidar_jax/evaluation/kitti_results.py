@@ -10,7 +10,7 @@ import numpy as np
 from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, WrappedFrames
-from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration, read_objects, to_lidar
+from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration
 from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, evaluate_kitti
 from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.files import atomic_write
@@ -27,17 +27,13 @@ def write_kitti(out: Path, detections: Iterable[Detections], frames: FrameSet | 
     """Write detections as ``results_kitti/NAME.txt``, and KITTI's metric of them as ``metrics_kitti.json``.
 
     Classes match KITTI's types by name, in lower or upper case, after the class map that the frames were opened
-    with. Boxes of other classes are not written, and only classes of the metric are evaluated.
-
-    Args:
-        out: folder; other .txt files in its ``results_kitti`` are removed.
-        detections: of each frame, labels by ``frames.classes``.
-        frames: :class:`~fcos_lidar_jax.data.kitti.KittiFrames`, or some of them with mapped classes.
+    with. Boxes of other classes are not written, and only classes of the metric are evaluated. Other .txt files in
+    ``results_kitti`` are removed.
 
     Returns:
         what :func:`~fcos_lidar_jax.evaluation.kitti.evaluate_kitti` returns, and ``left_out``: classes of the
-        frames and of the metric without a counterpart. None for other frames: nothing is written, and an older
-        ``metrics_kitti.json`` is removed.
+        frames and of the metric without a counterpart. None for frames of other data: nothing is written, and an
+        older ``metrics_kitti.json`` is removed.
     """
     summary, folder = out / KITTI_SUMMARY, out / "results_kitti"
     opened = _kitti_frames(frames)
@@ -100,19 +96,14 @@ def write_result(
     *,
     image_size: tuple[int, int] = IMAGE_SIZE,
 ) -> int:
-    """Write the detections of a frame, which :func:`read_result` reads; boxes that are outside of the image, or
-    larger than any object, are left out.
+    """Write the detections of a frame; boxes that are outside of the image, or
+    larger than any object, are left out. Returns their number.
 
     Args:
         path: the benchmark's files are called ``000123.txt``.
         boxes: [m, >= 7], ``x, y, z, l, w, h, yaw`` in the Velodyne's frame.
-        types: KITTI's, one for each box.
-        scores: [m].
         calibration: as ``fcos_lidar_jax.data.kitti.read_calibration`` returns it.
         image_size: width and height, pixels.
-
-    Returns:
-        number of boxes that were left out.
 
     >>> import tempfile
     >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
@@ -136,16 +127,6 @@ def write_result(
         lines.append(f"{types[i]} -1 -1 {alpha[i]:.4f} {pixels} {place} {scores[i]:.9g}\n")
     atomic_write(path, lambda file: file.write_text("".join(lines), encoding="utf-8"))
     return len(boxes) - len(lines)
-
-
-def read_result(path: Path, calibration: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str], np.ndarray]:
-    """Boxes f64[m, 9] in the Velodyne's frame, velocities NaN, types and scores f64[m] of a result file.
-
-    Raises:
-        ValueError: naming the file, the line, the field, what was found and what was expected.
-    """
-    types, fields = read_objects(path)
-    return to_lidar(fields[:, 7:14], calibration["velo_to_rect"]), types, fields[:, 14]
 
 
 def to_camera(boxes: np.ndarray, velo_to_rect: np.ndarray) -> np.ndarray:

@@ -31,11 +31,7 @@ def candidate_pairs(
     *,
     max_distance_m: float,
 ) -> Pairs:
-    """Find all pairs within a group whose distance is strictly below a maximum.
-
-    Args:
-        group, true_group: group of each detection and truth, such as a number per class and sample.
-        centres, true_centres: centres of the detections and truths, metres.
+    """Find all pairs within a group, such as a class in a sample, whose centres are nearer than a distance.
 
     >>> one = np.zeros(1, int)
     >>> pairs = candidate_pairs(one, np.zeros((1, 2)), one, np.ones((1, 2)), max_distance_m=2)
@@ -64,10 +60,7 @@ def candidate_pairs(
 
 
 def greedy(pairs: Pairs, num_detections: int, num_truths: int) -> Int[np.ndarray, "d"]:
-    """Match each detection in order to its nearest free truth; -1 for detections without a match.
-
-    Args:
-        pairs: pairs that may match, with detections in order of priority.
+    """Match each detection, in order of priority, to its nearest free truth; -1 for detections without a match.
 
     >>> greedy(Pairs(np.array([0, 1, 1]), np.array([1, 1, 0]), np.array([0.2, 0.1, 0.3])), 2, 2).tolist()
     [1, 0]
@@ -118,9 +111,8 @@ def match_frame(
     """Match detections, by decreasing score, to the nearest free truth of their class, one to one.
 
     Args:
-        boxes, true_boxes: detections and truths, ``x, y, z, l, w, h, yaw, vx, vy``.
-        labels, true_labels: classes of the detections and truths.
-        scores: scores of the detections; equal scores keep their order.
+        boxes, true_boxes: ``x, y, z, l, w, h, yaw, vx, vy``.
+        scores: equal scores keep their order.
         max_distance_m: exclusive upper limit of the distance of a hit in the ground plane.
         max_heading_error_rad: inclusive upper limit of the yaw error of a hit.
         heading_period_rad: period per class, see :func:`heading_error`; by default 2 pi for all classes.
@@ -161,13 +153,13 @@ class Ranking:
     def resampled(self, copies: np.ndarray) -> "Ranking":
         """Ranking of a set with i64[samples] ``copies`` of each sample."""
         times = copies[self.sample]
-        return Ranking(
+        return dataclasses.replace(
+            self,
             score=np.repeat(self.score, times),
             sample=np.repeat(self.sample, times),
             hit=np.repeat(self.hit, times, axis=1),
             errors=np.repeat(self.errors, times[self.hit[ERROR_ROW]], axis=1),
             truth_sample=np.repeat(self.truth_sample, copies[self.truth_sample]),
-            knows_velocity=self.knows_velocity,
         )
 
 
@@ -185,8 +177,6 @@ def rank(
     matching distance, from centre to centre in the ground plane.
 
     Args:
-        predictions: filtered predictions in the order of the results.
-        truth: filtered truth.
         heading_period_rad: period per class, see :func:`heading_error`; determines the number of classes.
         distances_m: matching distances; errors are measured within the distance of row :data:`ERROR_ROW`.
     """

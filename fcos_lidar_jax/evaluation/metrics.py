@@ -14,6 +14,7 @@ import numpy as np
 from fcos_lidar_jax.classes import DEFAULT_RANGE_M, NUSCENES_CLASSES, RANGES_M
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
 from fcos_lidar_jax.evaluation.matching import DISTANCES_M, ERROR_ROW, TP_ERRORS, Ranking, candidate_pairs, rank
+from fcos_lidar_jax.fields import check
 
 MIN_RECALL = MIN_PRECISION = 0.1  # lower values do not contribute to the AP
 MAX_BOXES = 500  # maximum number of boxes per sample in an official results file
@@ -37,11 +38,10 @@ class Metric:
     benchmark: bool = False  # nuScenes benchmark, with NDS and attributes; without truth, AP is 0 and errors are 1
 
     def __post_init__(self) -> None:
-        if len(set(self.classes)) != len(self.classes) or not self.classes:
-            raise ValueError(f"classes: got {self.classes}, expected at least one name, each once")
-        if len(self.class_ranges_m) != len(self.classes) or not all(r > 0 for r in self.class_ranges_m):
-            expected = f"{len(self.classes)} positive lengths, one per class"
-            raise ValueError(f"class_ranges_m: got {self.class_ranges_m}, expected {expected}")
+        number, ranges = len(self.classes), self.class_ranges_m
+        check(len(set(self.classes)) == number > 0, "classes", self.classes, "at least one name, each once")
+        positive = len(ranges) == number and all(r > 0 for r in ranges)
+        check(positive, "class_ranges_m", ranges, f"{number} positive lengths, one per class")
 
     @property
     def heading_period_rad(self) -> np.ndarray:
@@ -73,12 +73,8 @@ NUSCENES_METRIC = Metric(NUSCENES_CLASSES, tuple(int(RANGES_M[name]) for name in
 def metric_of(classes: Sequence[str], class_ranges_m: Sequence[float] = ()) -> Metric:
     """Create a metric for any classes: the benchmark's average precision and errors without attributes and NDS.
 
-    Args:
-        classes: names, in the order of the labels.
-        class_ranges_m: range per class; by default from the class name, see ``classes.RANGES_M``.
-
-    Raises:
-        ValueError: no classes, a repeated name, or not exactly one positive range per class.
+    The classes are in the order of the labels. By default, their ranges follow from their names, see
+    ``classes.RANGES_M``.
 
     >>> metric_of(["pedestrian", "forklift"]).class_ranges_m
     (40.0, 50.0)
@@ -110,12 +106,9 @@ class Evaluation:
 
 
 def evaluate(predictions: BoxColumns, truth: GroundTruth, metric: Metric = NUSCENES_METRIC) -> Evaluation:
-    """Filter, match and score predictions.
+    """Filter, match and score predictions, in the order of the results file; ``sample`` indexes ``truth.tokens``.
 
-    Args:
-        predictions: predictions in the order of the results file; ``sample`` is the index into ``truth.tokens``.
-        truth: ground truth of the same samples.
-        metric: the metric; labels of predictions and truth index its classes.
+    Labels of predictions and truth index the classes of the metric.
     """
     began = time.perf_counter()
     predictions, true = (filter_boxes(boxes, truth, metric) for boxes in (predictions, truth.boxes))
@@ -150,10 +143,7 @@ def within_range(boxes: BoxColumns, truth: GroundTruth, metric: Metric) -> np.nd
 
 
 def class_curves(ranking: Ranking) -> Curves:
-    """Curves of one class.
-
-    For a distance without hits, precision and score are 0 and errors are 1.
-    """
+    """Curves of one class. For a distance without hits, precision and score are 0 and errors are 1."""
     shape = (len(DISTANCES_M), len(_RECALL))
     precision, confidence, errors = np.zeros(shape), np.zeros(shape), np.ones((len(TP_ERRORS), len(_RECALL)))
     rank_from_one = np.arange(1, len(ranking.score) + 1)

@@ -23,7 +23,6 @@ def write_openlabel(path: str | Path, records: Iterable[dict[str, Any]], *, anno
     they are known, the time in seconds and the transform from the LiDAR to the world.
 
     Args:
-        path: JSON file.
         records: lines of ``fcos-lidar stream``, or entries of ``fcos-lidar detect``; iterated twice.
         annotator: name of the program and the detector that made the boxes.
 
@@ -68,7 +67,6 @@ def _identified(records: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 
 def _extend(intervals: list[dict[str, int]], frame: int) -> None:
-    """Add a frame to the intervals in which an object exists."""
     if intervals and intervals[-1]["frame_end"] == frame - 1:
         intervals[-1]["frame_end"] = frame
     else:
@@ -76,7 +74,6 @@ def _extend(intervals: list[dict[str, int]], frame: int) -> None:
 
 
 def _frames(records: Iterable[dict[str, Any]]) -> Iterator[bytes]:
-    """A line of the file per frame."""
     for number, record in enumerate(_identified(records)):
         properties: dict[str, Any] = {"streams": {_LIDAR: {"uri": record["file"]}}}
         if record.get("timestamp_us") is not None:

@@ -11,6 +11,11 @@ from fcos_lidar_jax.types import Detections
 
 SHOWN_SCORE = 0.3  # pictures, pages and recordings show boxes from this score
 
+ScoredBoxes = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Boxes [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``, labels i32[m] and scores f32[m] of one cloud."""
+TrueBoxes = tuple[np.ndarray, np.ndarray]
+"""Boxes [m, 9] and labels i32[m] of one cloud."""
+
 
 def as_records(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
     """Detections of one cloud, of NumPy arrays, as JSON objects, best first.
@@ -36,7 +41,7 @@ def point_counts(found: Detections, cloud: Cloud) -> dict[str, Any]:
     return {"num_points": cloud.num_points, "num_dropped": int(found.num_dropped) + cloud.num_removed, **counts}
 
 
-def read_boxes(record: dict[str, Any], classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def read_boxes(record: dict[str, Any], classes: Sequence[str]) -> ScoredBoxes:
     """Boxes, labels and scores of a record of :func:`cloud_record`."""
     boxes = record["boxes"]
     return (
@@ -66,7 +71,7 @@ def select(
     return dataclasses.replace(found, valid=kept)
 
 
-def confident(found: Detections, min_score: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def confident(found: Detections, min_score: float) -> ScoredBoxes:
     """Boxes, labels and scores of the detections of one cloud that reach a score."""
     kept = np.asarray(found.valid) & (np.asarray(found.scores) >= min_score)
     return np.asarray(found.boxes)[kept], np.asarray(found.labels)[kept], np.asarray(found.scores)[kept]

@@ -22,6 +22,7 @@ from fcos_lidar_jax.evaluation.boxes import (
     make_columns,
 )
 from fcos_lidar_jax.evaluation.metrics import MAX_BOXES
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.types import Detections
 
 USE_FLAGS = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
@@ -56,15 +57,10 @@ class Results:
 def read_results(
     source: str | Path | dict[str, Any], tokens: tuple[str, ...], *, of: str = "the ground truth"
 ) -> Results:
-    """Read and check detections.
+    """Read and check detections: a file, or the result of ``json.load``, that covers exactly the samples
+    ``tokens``.
 
-    Args:
-        source: the file, or the result of ``json.load``.
-        tokens: expected samples; the file must cover exactly these samples.
-        of: description of the expected samples, for messages.
-
-    Raises:
-        ValueError: naming the file, the sample, the box (from 0) and the field.
+    ``of`` describes the expected samples in messages.
     """
     file, name = json_io.read_json(source, ResultsFile, given="results")
     warnings = _check_meta(file.meta, name)
@@ -95,8 +91,7 @@ def read_results(
 
 def _check_meta(meta: dict[str, Any], name: str) -> list[str]:
     for flag in USE_FLAGS:
-        if flag in meta and not isinstance(meta[flag], bool):
-            raise ValueError(f"{name}: meta: {flag}: got {meta[flag]!r}, expected true or false")
+        check(isinstance(meta.get(flag, False), bool), f"{name}: meta: {flag}", meta.get(flag), "true or false")
     absent = [flag for flag in USE_FLAGS if flag not in meta]
     return [f"{name}: meta: {', '.join(absent)}: missing; the benchmark's server needs all five"] if absent else []
 
@@ -135,7 +130,6 @@ def result_entries(
 
     Args:
         found: detections in the sample's LiDAR frame.
-        token: token of the sample.
         sensor_to_global: f64[4, 4], pose of the sensor.
         classes: class names by label, all from the benchmark.
 
@@ -173,8 +167,7 @@ def result_entries(
 def write_results(path: str | Path, samples: Iterable[tuple[str, bytes]]) -> None:
     """Write an official results file of a LiDAR-only detector.
 
-    Args:
-        samples: tokens of the whole split with entries as JSON, ``[]`` for samples without detections.
+    ``samples`` are the tokens of the whole split with entries as JSON, ``[]`` for samples without detections.
     """
     lines = (b"%s: %s" % (json.dumps(token).encode(), entries) for token, entries in samples)
     json_io.write_lines(path, b'{"meta": %s, "results": {' % json.dumps(LIDAR_META).encode(), lines, b"}}\n")

@@ -13,18 +13,6 @@ class ResumeLog:
 
     A truncated or corrupt line and all lines after it are dropped. The first line is a fingerprint of detector and
     data. A file with a different fingerprint is overwritten when the first entry is added.
-
-    Args:
-        path: log file.
-        fingerprint: fingerprint of detector and data.
-
-    >>> import tempfile
-    >>> file = Path(tempfile.mkdtemp()) / "resume_log"
-    >>> with ResumeLog(file, "this detector") as resume_log:
-    ...     resume_log.add("a", [])
-    >>> with ResumeLog(file, "this detector") as resume_log:
-    ...     "a" in resume_log, "b" in resume_log
-    (True, False)
     """
 
     def __init__(self, path: Path, fingerprint: str) -> None:
@@ -56,7 +44,6 @@ class ResumeLog:
         return len(self.places)
 
     def add(self, token: str, entries: list[dict[str, Any]]) -> None:
-        """Append the entries of a sample."""
         name, text = json.dumps(token).encode(), json.dumps(entries).encode()
         with naming(self.path):
             if not self._begun:

@@ -73,16 +73,11 @@ def write_evaluation(
     repeats: int = 0,
     report: Callable[[int], None] = lambda done: None,
 ) -> dict[str, Any] | None:
-    """Write ``metrics_summary.json``, ``curves.json`` and, with ``repeats``, ``bootstrap.json``.
+    """Write ``metrics_summary.json``, ``curves.json`` and, with ``repeats``, ``bootstrap.json``, else remove that.
 
-    Args:
-        out: destination folder; without ``repeats``, an existing ``bootstrap.json`` is removed.
-        meta: see :func:`full_summary`.
-        repeats: number of resampled sets for the intervals of the scores; 0 for no intervals.
-        report: called with the number of finished sets.
-
-    Returns:
-        the intervals, see :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`, or None without ``repeats``.
+    ``repeats`` is the number of resampled sets for the intervals of the scores, which are returned, see
+    :func:`fcos_lidar_jax.evaluation.bootstrap.bootstrap`; ``report`` is called with the number of finished sets.
+    For ``meta`` see :func:`full_summary`.
     """
 
     def write(name: str, value: Any) -> None:
@@ -112,7 +107,6 @@ def describe(evaluation: Evaluation, intervals: Mapping[str, Any] | None = None)
 
 
 def _class_table(summary: Mapping[str, Any]) -> list[str]:
-    """Lines of a table: average precision and errors of each class."""
     errors, names = list(summary["tp_errors"]), list(summary["mean_dist_aps"])
     header = "".join(f"  {name:>8}" for name in ("AP", *errors))
     lines, width = [], max(map(len, ["class", *names]))
@@ -127,9 +121,8 @@ def _class_table(summary: Mapping[str, Any]) -> list[str]:
 def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None = None) -> list[str]:
     """Warnings about missing truth and missing detections, which affect the meaning of the scores.
 
-    Args:
-        num_found: number of detections before filtering.
-        truth: truth before filtering, to warn about boxes beyond their class range; not used for the benchmark.
+    ``num_found`` and ``truth`` are the detections and the truth before filtering; with the truth, boxes beyond
+    their class range are counted, unless in the benchmark.
     """
     benchmark, lines = evaluation.metric.benchmark, []
     rankings = zip(evaluation.metric.classes, evaluation.rankings, strict=True)
@@ -150,7 +143,6 @@ def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None =
 
 
 def _beyond_range(truth: GroundTruth, metric: Metric) -> list[str]:
-    """Warning about boxes with points beyond the range of their class, if there are any."""
     far = ~within_range(truth.boxes, truth, metric) & (truth.boxes.num_points != 0)
     labels = np.unique(truth.boxes.label[far])
     if not len(labels):

@@ -40,14 +40,7 @@ class Sample(msgspec.Struct, gc=False):
 
 
 def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
-    """Ground truth as ``{sample_token: {"ego_translation", "boxes"}}``.
-
-    Args:
-        source: the JSON file, or the result of ``json.load``.
-
-    Raises:
-        ValueError: naming the file, the sample, the box (from 0) and the field.
-    """
+    """Ground truth ``{sample_token: {"ego_translation", "boxes"}}``, as a JSON file or its content."""
     raw, name = json_io.read_json(source, msgspec.Raw, given="ground truth")
     ego, parts, rotations = dict[str, json_io.Vector](), [NO_BOXES], [np.zeros((0, 4))]
     for row, (token, sample) in enumerate(json_io.decode_samples(raw, Sample, name)):
@@ -76,11 +69,7 @@ def _ground_truth(tokens: Any, ego: Sequence[Any], boxes: BoxColumns, rotation: 
 
 
 def split_truth(data: NuScenes, tokens: Sequence[str]) -> GroundTruth:
-    """Ground truth of keyframes: boxes of the ten classes and bicycle racks.
-
-    Raises:
-        ValueError: an attribute that is unknown to the benchmark.
-    """
+    """Ground truth of keyframes: boxes of the ten classes, with the benchmark's attributes, and bicycle racks."""
     index = data.index
     own = [data.annotations(token) for token in tokens]
     rows = np.concatenate([np.arange(part.start, part.stop) for part in own])

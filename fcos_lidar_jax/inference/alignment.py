@@ -20,13 +20,7 @@ _SAME = 1e-9  # smaller angles and shifts are rounding
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """A rotation about z and a shift from the points of one sensor to the frame of a detector's sensor.
-
-    >>> from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E
-    >>> aligned = Alignment(KITTI_HDL64E, NUSCENES_HDL32E)
-    >>> aligned.points(np.array([[10, 0, -1, 200, 0]], np.float32)).round(3).tolist()
-    [[0.0, 10.0, -1.0, 200.0, 0.0]]
-    """
+    """A rotation about z and a shift from the points of one sensor to the frame of a detector's sensor."""
 
     data: Sensor  # sensor that recorded the points
     detector: Sensor  # sensor that the detector expects
@@ -90,7 +84,6 @@ def align(
     """The alignment to a detector of points, which are read with its ``data``.
 
     Args:
-        detector: sensor that the detector expects.
         sensor: recorded the points. By default the one that the paths tell, which a line says, or the detector's.
         paths: point files, or recordings in folders.
         yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the one between headings.

@@ -24,8 +24,7 @@ def suppress(
 ) -> tuple[Array, Array, Array, Array]:
     """Apply rotated NMS, per class unless ``config.nms_across_classes``, to the candidates of one cloud.
 
-    Returns:
-        boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
+    Returns boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
     """
     options: dict[str, Any] = {"overlap": config.nms_overlap}
     with jax.named_scope("nms"):
@@ -49,29 +48,21 @@ def suppress(
 class Stages(NamedTuple):
     """Stages of detection in one cloud, as pure functions.
 
-    Attributes:
-        prepare: ``(points f32[n, c], valid bool[n]) -> input``.
-        network: ``(variables, input) -> outputs``.
-        candidates: ``(outputs, input) -> boxes, scores, labels, valid``.
-        postprocess: candidates after NMS, see :func:`suppress`.
-
     >>> Stages._fields
     ('prepare', 'network', 'candidates', 'postprocess')
     """
 
-    prepare: Callable[..., Any]
-    network: Callable[..., Any]
-    candidates: Callable[..., tuple[Array, Array, Array, Array]]
-    postprocess: Callable[..., tuple[Array, Array, Array, Array]]
+    prepare: Callable[..., Any]  # ``(points f32[n, c], valid bool[n]) -> input``
+    network: Callable[..., Any]  # ``(variables, input) -> outputs``
+    candidates: Callable[..., tuple[Array, ...]]  # ``(outputs, input) -> boxes, scores, labels, valid``
+    postprocess: Callable[..., tuple[Array, ...]]  # Candidates after NMS, see ``suppress``.
 
 
 def make_stages(detector: Detector) -> Stages:
     """Make the stages of :func:`make_detect`, to be jitted, timed or replaced separately.
 
-    >>> from fcos_lidar_jax.models import build_detector
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> stages = make_stages(build_detector(QUICKSTART, SHORT_RANGE))
+    >>> from fcos_lidar_jax.inference import load_trained
+    >>> stages = make_stages(load_trained("quickstart").model)
     >>> points, valid = jax.ShapeDtypeStruct((4096, 5), jnp.float32), jax.ShapeDtypeStruct((4096,), bool)
     >>> jax.eval_shape(stages.prepare, points, valid).point_index.shape
     (32, 128, 1)
@@ -95,10 +86,8 @@ def make_detect(detector: Detector) -> Detect:
         caller; compiled once per number of points. Does not remove close points, see
         :func:`fcos_lidar_jax.projection.remove_close`.
 
-    >>> from fcos_lidar_jax.models import build_detector
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> detector = build_detector(QUICKSTART, SHORT_RANGE)
+    >>> from fcos_lidar_jax.inference import load_trained
+    >>> detector = load_trained("quickstart").model
     >>> variables = jax.eval_shape(detector.init, jax.random.key(0))
     >>> points, valid = jax.ShapeDtypeStruct((4096, 5), jnp.float32), jax.ShapeDtypeStruct((4096,), bool)
     >>> jax.eval_shape(make_detect(detector), variables, points, valid).boxes.shape

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 
 from fcos_lidar_jax.data.class_mapping import unknown_name
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, TrueBoxes
 
 _TABLE_ROWS = 20
 
@@ -93,14 +93,9 @@ class DetectedBoxes:
         boxes = [{"label": name, "score": score, "box": box.tolist()} for name, score, box in self]
         return {**self.counts, "boxes": boxes}
 
-    def picture(
-        self, *, min_score: float = SHOWN_SCORE, truth: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> bytes:
-        """Draw the cloud and its boxes from above, as a PNG file.
-
-        Args:
-            min_score: boxes with a lower score are omitted.
-            truth: boxes f32[k, 9] and labels i32[k], drawn with dashed outlines.
+    def picture(self, *, min_score: float = SHOWN_SCORE, truth: TrueBoxes | None = None) -> bytes:
+        """Draw the cloud and its boxes from ``min_score`` from above, as a PNG file, with the truth in dashed
+        outlines.
         """
         from fcos_lidar_jax.visualization.bev import draw_bev
 

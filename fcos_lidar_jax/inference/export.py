@@ -23,6 +23,7 @@ from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints.storage import CheckpointError, with_later_fields
 from fcos_lidar_jax.config import config_from_json, config_to_json
 from fcos_lidar_jax.data.cloud_policy import usable_rows
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector, jit_split
@@ -69,10 +70,9 @@ class ExportedDetector(CloudDetector):
         return self.record["weights"]["blake2b"] + " exported"
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
-        if self.record["batch"] not in (batch_size, "any"):
-            raise ValueError(
-                f"batch size: got {batch_size}, expected {self.record['batch']}: the detector was exported for it"
-            )
+        takes = self.record["batch"]
+        expected = f"{takes}: the detector was exported for it"
+        check(takes in (batch_size, "any"), "batch size", batch_size, expected)
         return _split_program(self, mesh)
 
 
@@ -94,19 +94,14 @@ def export_detector(detector: TrainedDetector, *, num_points: Size | None = None
     limits and, with ``remove_close``, points on the ego vehicle as configured.
 
     Args:
-        detector: network with its weights.
         num_points: n, number of rows of a padded cloud, by default ``config.max_points``; ``"any"`` compiles for
             each number.
         batch: b, number of clouds, or ``"any"``. With several clouds, boxes and scores differ by rounding.
-
-    Raises:
-        ValueError: a size below 1.
     """
     config, sensor = detector.config, detector.sensor
     rows = config.max_points if num_points is None else num_points
     for name, size in (("points", rows), ("batch", batch)):
-        if isinstance(size, int) and size < 1:
-            raise ValueError(f"{name}: got {size}, expected at least 1, or any")
+        check(not isinstance(size, int) or size >= 1, name, size, "at least 1, or any")
     if rows != "any":
         config = dataclasses.replace(config, max_points=rows)
     scope = export.SymbolicScope()
@@ -165,7 +160,6 @@ def _whole_path(detector: TrainedDetector, batch: Size) -> Callable[..., dict[st
 
 @contextlib.contextmanager
 def _settings(values: dict[str, Any]) -> Iterator[None]:
-    """Change settings of JAX temporarily."""
     before = {name: getattr(jax.config, name) for name in values}
     try:
         for name, value in values.items():
@@ -176,21 +170,8 @@ def _settings(values: dict[str, Any]) -> Iterator[None]:
             jax.config.update(name, value)
 
 
-def read_record(file: Path) -> dict[str, Any]:
-    """Read the description of an exported detector without deserialising its program.
-
-    Raises:
-        CheckpointError: not an exported detector, another format, or corrupt.
-    """
-    return _read(file)[0]
-
-
 def load_exported(file: Path) -> ExportedDetector:
-    """Load a file of :func:`export_detector`; the program is compiled for the first cloud.
-
-    Raises:
-        CheckpointError: see :func:`read_record`; also if the file needs another version of JAX.
-    """
+    """Load a file of :func:`export_detector`; the program is compiled for the first cloud."""
     record, program = _read(file)
     config = config_from_json(with_later_fields(record["config"]), f"{file}: config")
     sensor = sensor_from_json(record["sensor"], f"{file}: sensor")

@@ -34,9 +34,6 @@ def cpu_package(name: str) -> Any:
 
     Telemetry would report every import, from a fork of this process that may make threads hang. OpenVINO works
     without telemetry if importing it fails.
-
-    Raises:
-        ValueError: the package is not installed.
     """
     reporter = sys.modules.get(_TELEMETRY)
     sys.modules[_TELEMETRY] = None  # type: ignore[assignment]
@@ -52,15 +49,11 @@ def cpu_package(name: str) -> Any:
 
 
 def network_graph(detector: TrainedDetector) -> bytes:
-    """Convert the network to an ONNX file, deterministic for fixed versions.
+    """Convert the network of an FCOS-LiDAR detector to an ONNX file, deterministic for fixed versions.
 
     The input is ``features`` f32[b, h, w, 9, r], a range image from ``project_points`` in raw units. The outputs
     are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. Everything is
     float32 regardless of ``config.model.precision``. The metadata hold classes, configuration and sensor as JSON.
-
-    Raises:
-        ValueError: the detector is not FCOS-LiDAR, onnx is not installed, or the network has parameters that are
-            not part of the graph.
     """
     config, model = detector.config, detector.config.model
     if type(config) is not Config:
@@ -75,7 +68,8 @@ def network_graph(detector: TrainedDetector) -> bytes:
     shapes = {"logits": (k + 1,), "regression": (10, k), "iou_logits": (k,)}
     local = _local_geometry(network, image, rounds, model) if model.local_geometry else None
     _heads(network, levels, local, model, shapes)
-    network.check_all_used()
+    if unknown := sorted(network.parameters.keys() - network.used):
+        raise ValueError(f"ONNX: found the parameters {unknown[0]}, which are not part of the graph")
     described = onnx.helper.make_tensor_value_info
     float32 = onnx.TensorProto.FLOAT
     graph = onnx.helper.make_graph(
@@ -117,10 +111,6 @@ class _Network:
         """A parameter in float64, so that folding rounds only once."""
         self.used.add(f"{kind}/{path}")
         return self.parameters[f"{kind}/{path}"].astype(np.float64)
-
-    def check_all_used(self) -> None:
-        if unknown := sorted(self.parameters.keys() - self.used):
-            raise ValueError(f"ONNX: found the parameters {unknown[0]}, which are not part of the graph")
 
     def constant(self, value: Any) -> str:
         """A constant of float32, or int64 for integers; equal constants are shared."""
@@ -193,7 +183,6 @@ class _Network:
         return self("Slice", x, [row, column], ends, [2, 3])
 
     def upsample(self, x: str, rows: int, columns: int) -> str:
-        """Repeat rows and columns."""
         how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         return self("Resize", x, "", [1.0, 1.0, rows, columns], **how)
 
@@ -315,7 +304,6 @@ def _heads(
     model: ModelConfig,
     shapes: Mapping[str, Sequence[int]],
 ) -> None:
-    """Add the outputs at the locations of all levels."""
     outputs: dict[str, list[str]] = {name: [] for name in _PREDICTIONS}
     for level, image in enumerate(levels):
         path = "heads/shared" if model.tied_heads else f"heads/level{level + 2}"

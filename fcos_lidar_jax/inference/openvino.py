@@ -59,7 +59,6 @@ class OpenVinoDetector(TrainedDetector):
 
 @functools.lru_cache(maxsize=8)
 def _jitted_stages(detector: Detector) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The stages before and after the network."""
     stages = make_stages(detector)
     return jax.jit(stages.prepare), jax.jit(stages.postprocess)
 
@@ -70,24 +69,15 @@ def _check_flips(config: Config) -> None:
 
 
 def processor_precision() -> Precision:
-    """bfloat16 if the processor supports it, else float32.
-
-    Raises:
-        ValueError: OpenVINO is not installed.
-    """
+    """bfloat16 if the processor supports it, else float32."""
     capabilities = cpu_package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     return "bfloat16" if "BF16" in capabilities else "float32"
 
 
 def with_openvino(detector: TrainedDetector, *, precision: Precision | None = None) -> OpenVinoDetector:
-    """Compile the network of a detector with OpenVINO, for one cloud at a time.
+    """Compile the network of a detector with OpenVINO, for one cloud at a time, on the CPU in one process.
 
-    Args:
-        detector: network with its weights.
-        precision: precision of the network except its input and outputs; by default :func:`processor_precision`.
-
-    Raises:
-        ValueError: OpenVINO or onnx is not installed, or JAX runs on another device or in several processes.
+    ``precision`` is that of the network except its input and outputs; by default :func:`processor_precision`.
     """
     if jax.default_backend() != "cpu" or jax.process_count() > 1:
         found = f"{jax.process_count()} processes on {jax.default_backend()}"

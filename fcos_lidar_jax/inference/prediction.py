@@ -18,6 +18,7 @@ from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.progress import Progress
@@ -59,8 +60,6 @@ def predict(
     processes. Threads read frames while the devices work.
 
     Args:
-        detector: the detector.
-        frames: the frames.
         indices: indices of the frames to process; by default all.
         batch_size: number of clouds per device; more than one changes scores and boxes by rounding, at most 1e-4.
         devices: devices to use; by default all, including those of other processes. Then every process makes the
@@ -91,21 +90,11 @@ def predict_groups(
     devices: Sequence[Any] | None = None,
     yaw_rad: float | None = None,
 ) -> Iterator[list[Prediction]]:
-    """Like :func:`predict`, in groups of frames that the devices process together, so that processes can
-    synchronise between two groups.
+    """Like :func:`predict`, in groups of frames that the devices process together.
 
-    Raises:
-        OSError: another process cannot read its frames of the next group.
-
-    >>> from fcos_lidar_jax.inference import load_detector
-    >>> from fcos_lidar_jax.simulation.frame_set import unseen_frames
-    >>> detector = load_detector("quickstart")
-    >>> groups = predict_groups(detector, unseen_frames(detector.sensor, 3), devices=jax.devices()[:1])
-    >>> [[prediction.index for prediction in group] for group in groups]
-    [[0], [1], [2]]
+    Processes can synchronise between two groups; if another one cannot read its frames, an OSError says so.
     """
-    if batch_size < 1:
-        raise ValueError(f"batch_size: got {batch_size}, expected at least 1")
+    check(batch_size >= 1, "batch_size", batch_size, "at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
     aligned = Alignment(frames.sensor, sensor, yaw_rad)
     if (line := aligned.describe()) and jax.process_index() == 0:

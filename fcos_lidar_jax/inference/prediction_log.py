@@ -35,16 +35,13 @@ def write_predictions(
     batch_size: int = 1,
     yaw_rad: float | None = None,
 ) -> dict[str, int]:
-    """Detect boxes in all frames and write a results file.
+    """Detect boxes in all frames, whose names are unique, and write a results file.
 
     A resume log next to the file keeps the detections of finished frames until the file is written. Several
     processes share the frames, and the first writes; the path is the same for all. A SIGTERM to any process stops
     all after the same frames.
 
     Args:
-        detector: the detector.
-        frames: the frames; their names are unique.
-        path: results file.
         entries: converts the index of a frame and its detections to the entries of the file.
         write: writes the file from names of frames with entries as JSON.
         batch_size, yaw_rad: see :func:`fcos_lidar_jax.inference.prediction.predict`.
@@ -53,8 +50,7 @@ def write_predictions(
         number of points removed by all processes in this run, by reason: ``close``, ``invalid``, ``truncated``.
 
     Raises:
-        ValueError: the processes have different detectors or frames.
-        OSError: another process failed.
+        ValueError, OSError: the processes have different detectors or frames; another process failed.
         SystemExit: after SIGTERM, in a cluster.
     """
     file = path.with_name(f"{path.stem}.resume_log")

@@ -38,7 +38,6 @@ def detect_stream(
 
     Args:
         sweeps: sweeps in temporal order; may be an iterator that waits for the next sweep.
-        detector: the detector, compiled once for the first sweep.
         reading: number of sweeps to fuse and points to drop; by default as in training. Use one sweep if the poses
             are unknown.
         at_us: times of the sweeps to detect in; other sweeps are only fused into later ones. By default all.

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from fcos_lidar_jax import __version__
+from fcos_lidar_jax.fields import check
 
 Call = Callable[[], Any]
 Times = dict[str, float]
@@ -22,14 +23,10 @@ def interleaved(calls: Mapping[K, Call], repeats: int, *, percentile: int = 99) 
 
     Interleaving keeps comparisons fair when the speed of the machine drifts.
 
-    Raises:
-        ValueError: ``repeats`` is below 1.
-
     >>> sorted(interleaved({"nothing": lambda: None}, 2, percentile=95)["nothing"])
     ['median_ms', 'p95_ms']
     """
-    if repeats < 1:
-        raise ValueError(f"repeats: got {repeats}, expected at least 1")
+    check(repeats >= 1, "repeats", repeats, "at least 1")
     for call in calls.values():
         jax.block_until_ready(call())
     times_ms: dict[K, list[float]] = {name: [] for name in calls}

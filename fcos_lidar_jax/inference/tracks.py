@@ -17,9 +17,7 @@ class Tracks:
     labels: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int32))  # i32[t]
     centres: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))  # f64[t, 2]: x, y, metres
     velocities: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))  # f64[t, 2]: m/s
-    unseen_s: np.ndarray = dataclasses.field(
-        default_factory=lambda: np.zeros(0)
-    )  # f64[t]: time since the last box
+    unseen_s: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))  # f64[t]: since the last box
     next_id: int = 0
 
 
@@ -29,14 +27,11 @@ def track(
     labels: np.ndarray,
     scores: np.ndarray,
     dt: float,
-    *,
-    max_distance_m: float = MAX_DISTANCE_M,
-    max_unseen_s: float = MAX_UNSEEN_S,
 ) -> tuple[Tracks, np.ndarray]:
     """Match boxes greedily to tracks of their class, nearest pairs first, regardless of the order of the boxes.
 
-    The position of a track is extrapolated by its velocity, and a track ends ``max_unseen_s`` after its last box.
-    Unmatched boxes start new tracks, by decreasing score.
+    The position of a track is extrapolated by its velocity, and a track ends :data:`MAX_UNSEEN_S` after its last
+    box. Unmatched boxes start new tracks, by decreasing score.
 
     Args:
         tracks: tracks of the previous time.
@@ -54,7 +49,7 @@ def track(
     >>> ids.tolist(), track(tracks, moved, np.zeros(1, int), np.ones(1), 0.5)[1].tolist()
     ([0], [0])
     """
-    alive = tracks.unseen_s + dt <= max_unseen_s + _CLOCK_S
+    alive = tracks.unseen_s + dt <= MAX_UNSEEN_S + _CLOCK_S
     fields = tracks.ids, tracks.labels, tracks.centres, tracks.velocities, tracks.unseen_s
     tracks = Tracks(*(field[alive] for field in fields), next_id=tracks.next_id)
     order = np.lexsort((*boxes.T, labels, -scores))
@@ -63,7 +58,7 @@ def track(
     distance = np.linalg.norm(boxes[:, None, :2] - expected, axis=-1)
     distance[labels[:, None] != tracks.labels] = np.inf
     ids, free = np.full(len(boxes), -1), np.ones(len(expected), bool)
-    near = np.flatnonzero(distance <= max_distance_m)
+    near = np.flatnonzero(distance <= MAX_DISTANCE_M)
     for pair in near[np.argsort(distance.flat[near], kind="stable")]:
         box, old = divmod(int(pair), len(expected))
         if ids[box] < 0 and free[old]:

@@ -33,26 +33,18 @@ def empty_batch(size: int, *, max_points: int, max_boxes: int, columns: int) -> 
 def fill_row(
     batch: Batch, row: int, parts: Sequence[Frame], removed: Sequence[int] | np.ndarray = ()
 ) -> dict[str, int]:
-    """Write one sample into a row of a batch of NumPy arrays.
+    """Write one sample into a row of a batch from :func:`empty_batch`.
 
     Points follow the policy of :mod:`fcos_lidar_jax.data.cloud_policy`. If there are too many boxes, those
     with the fewest points are dropped, the last ones first on ties; the order is preserved.
 
     Args:
-        batch: batch from :func:`empty_batch`.
-        row: index of the sample in the batch.
         parts: the frame, and objects pasted into it.
         removed: i64[k], rows of points to drop, counted through the parts.
 
     Returns:
         the numbers ``truncated_points``, ``truncated_boxes`` and ``invalid_points`` (not finite or beyond physical
         limits).
-
-    >>> batch = empty_batch(1, max_points=2, max_boxes=1, columns=5)
-    >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 1e30, 0]], np.float32)
-    >>> frame = Frame(cloud, np.zeros((0, 9)), np.zeros(0, int), np.zeros(0, int))
-    >>> fill_row(batch, 0, [frame], removed=[0]), batch.points[0, :, 0].tolist()
-    ({'truncated_points': 0, 'truncated_boxes': 0, 'invalid_points': 1}, [2.0, 0.0])
     """
     points, valid, boxes, labels, box_valid = (
         cast(np.ndarray, array)[row]
@@ -77,8 +69,6 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     Args:
         frames: frames with labels by the classes of the detector, see
             :class:`~fcos_lidar_jax.data.class_mapping.MappedFrames`.
-        max_points: rows of points of each sample, such as ``config.max_points``.
-        max_boxes: rows of boxes of each sample, such as ``config.max_boxes``.
 
     Returns:
         NumPy arrays. Rows of points that are not finite or beyond physical limits are left out. Points on the ego
@@ -105,8 +95,7 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     batch = empty_batch(len(frames), max_points=max_points, max_boxes=max_boxes, columns=columns)
     for row, frame in enumerate(frames):
         for name, rows, limit in (("points", frame.points, max_points), ("boxes", frame.boxes, max_boxes)):
-            if len(rows) > limit:
-                raise ValueError(f"frame {row}: {name}: got {len(rows)}, expected at most {limit}")
+            check(len(rows) <= limit, f"frame {row}: {name}", len(rows), f"at most {limit}")
         fill_row(batch, row, [frame])
     return batch
 
@@ -138,9 +127,6 @@ def check_counts(frames: FrameSet) -> None:
     """Refuse frames with boxes but without a single point in them: training would see no object.
 
     Reads a sample of the frames, until one has a box with a point.
-
-    Raises:
-        ValueError: with the first frame that has a box.
     """
     empty = None
     for index in spread_indices(len(frames), _NUM_INSPECTED):

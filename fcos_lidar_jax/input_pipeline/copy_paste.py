@@ -19,12 +19,8 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
 
     For each class in order, samples without replacement as many objects as the frame lacks, counting the frame's
     boxes with at least one point. An object that overlaps a box of the frame or an object pasted before is dropped
-    and not replaced.
-
-    Args:
-        objects: source of the objects, matched by class name; objects need ``min_points`` points to paste, at
-            least one of them from the current sweep.
-        config: target counts per class; a model of k sweeps gets the points of the newest k sweeps.
+    and not replaced. Objects match by class name and need ``min_points`` points to paste, at least one of them
+    from the current sweep; a model of k sweeps gets the points of the newest k sweeps.
 
     Returns:
         ``(frame, rng) -> (pasted, removed)``: the objects, with their numbers of points of the current sweep, and

@@ -103,12 +103,9 @@ class GroundTruthDatabase:
         return self.table["newest"][:, num_sweeps - 1]
 
     def points(self, index: int) -> np.ndarray:
-        """Read one object's points f32[n, c] at their original pose, sorted by age.
+        """Read one object's points f32[n, c] at their original pose, sorted by age, and verify them.
 
         Opens the file for each object instead of mapping it: a thousand maps would exhaust a process's open files.
-
-        Raises:
-            ValueError: the points were altered.
         """
         row, columns = self.table[index], self.manifest.columns
         file, _ = _files(self.folder, self.manifest.shards[self.shard[index]].name)
@@ -120,14 +117,9 @@ class GroundTruthDatabase:
 
 
 def open_database(folder: str | Path, *, fingerprint: str | None = None) -> GroundTruthDatabase:
-    """Open and check a finished ground-truth database.
+    """Open and check a finished ground-truth database of the frames with a ``fingerprint``; None accepts any.
 
-    Args:
-        folder: a folder that :func:`prepare_database` wrote.
-        fingerprint: expected fingerprint of the source frames; None accepts any.
-
-    Raises:
-        ValueError: missing, unfinished, altered, truncated, or of another format version or other data.
+    Missing, unfinished, altered and truncated databases, and those of another version, are refused.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -144,9 +136,8 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
             )
         tables.append(table.rows)
     rows = np.concatenate([np.zeros(0, _ROW), *tables])
-    if len(manifest.classes) <= rows["label"].max(initial=-1):
-        expected = f"at least {rows['label'].max() + 1}; build it anew"
-        raise ValueError(f"{file}: classes: got {manifest.classes}, expected {expected}")
+    used = int(rows["label"].max(initial=-1)) + 1
+    check(len(manifest.classes) >= used, f"{file}: classes", manifest.classes, f"at least {used}; build it anew")
     shard = np.repeat(np.arange(len(tables), dtype=np.int32), [len(table) for table in tables])
     return GroundTruthDatabase(folder, manifest, rows, shard)
 
@@ -185,7 +176,7 @@ def prepare_database(
     workers: int = 1,
     report: Callable[[int, int], None] | None = None,
 ) -> GroundTruthDatabase:
-    """Cut the points of every box with at least ``min_points`` points, one shard per scene.
+    """Cut the points of every box with at least ``min_points`` points over all sweeps, one shard per scene.
 
     Each shard is written atomically, its table last. A killed build loses only the shards in progress, and
     the next call completes it. The files are bit-identical for any number of workers and interruptions. Shards of
@@ -193,14 +184,10 @@ def prepare_database(
 
     Args:
         frames: frames of any classes; must be picklable for several workers.
-        folder: contains only the database; created if missing.
-        min_points: minimum number of points of an object, over all sweeps.
+        folder: contains only the database.
         workers: number of processes; 1 works in this process.
         report: called with (frames done, total) at the start, including frames of an earlier run, and after every
             shard.
-
-    Returns:
-        the finished database, checked and opened.
 
     Raises:
         ValueError: a frame has other columns than its sensor, or an implausible box.
@@ -241,13 +228,7 @@ def prepare_database(
 
 
 def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
-    """Shard -> indices of its frames; named after the scene, or the first frame if the data have no scenes.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> shards_by_scene(SimulatedFrames(TINY, 3))
-    {'frames_000000': [0, 1, 2]}
-    """
+    """Shard -> indices of its frames; named after the scene, or the first frame if the data have no scenes."""
     shards: dict[str, list[int]] = {}
     for index in range(len(frames)):
         scene = re.sub(r"[^\w.-]|^[.-]", "_", frames.scene(index))
@@ -256,8 +237,6 @@ def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
 
 
 class _Job(NamedTuple):
-    """A shard to be written."""
-
     folder: Path
     name: str
     indices: list[int]
@@ -267,7 +246,6 @@ class _Job(NamedTuple):
 
 
 def _files(folder: Path, shard: str) -> tuple[Path, Path]:
-    """A shard's points and its table."""
     return folder / f"{shard}.points.f32", folder / f"{shard}.objects.npz"
 
 
@@ -286,7 +264,6 @@ def _finished(job: _Job) -> bool:
 
 
 def _cut_shard(frames: FrameSet, job: _Job) -> int:
-    """Write one shard and return its number of frames."""
     rows: list[tuple] = []
     parts: list[np.ndarray] = []
     start = 0

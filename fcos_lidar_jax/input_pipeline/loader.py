@@ -44,17 +44,6 @@ class SampleOrder:
     samples equally often for each class: with n_c frames that show class c, N the sum of n_c and C the number of
     classes that occur, it samples floor(N / C) frames per class, uniformly and with replacement from the n_c.
     Frames without boxes are then never sampled. A position's frame depends only on the seed and the position.
-
-    Raises:
-        ValueError: no frames, or no frame shows an object.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> plain = dataclasses.replace(QUICKSTART, class_balanced=False)
-    >>> order = SampleOrder(SimulatedFrames(TINY, 3), plain, seed=0)
-    >>> sorted(order[position] for position in range(order.epoch_size))
-    [0, 1, 2]
     """
 
     def __init__(self, frames: FrameSet, config: Config, *, seed: int) -> None:
@@ -92,8 +81,6 @@ def steps_per_epoch(frames: FrameSet, config: Config) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _BatchOf:
-    """Maps a step to its batch."""
-
     frames: FrameSet
     config: Config
     seed: int
@@ -191,29 +178,18 @@ def make_batches(
 
     Args:
         frames: training set with labels that index ``config.classes``; must be picklable for workers.
-        config: batch size, padded sizes, class balance, copy-paste and its end.
-        seed: seed of class balance, order and pasted objects.
-        num_steps: number of steps of the whole run.
-        first_step: step at which a resumed run starts.
         objects: database for copy-paste; required unless ``config.copy_paste`` is None.
-        process_index: index of this process among those that share each global batch.
-        num_processes: process i gets the rows i * B / n to (i + 1) * B / n.
+        num_processes: of n processes, process i gets the rows i * B / n to (i + 1) * B / n of each batch.
         threads: threads per process that prepare batches, 0 to prepare on demand; default: see
             :func:`default_threads`. At most one batch more than threads is in progress or waiting.
-        workers: processes that prepare batches; 0 for none.
         packing: packing of the batches, see :func:`packing_for`; None for plain batches. A batch that does not fit
             stays plain, with one line on standard error for the first.
         lend: leave batches of workers in shared memory instead of copying them. Do not keep their arrays then:
             the workers need the memory, and it must be released before the process ends.
-        order: order of the samples, if already known.
 
     Yields:
-        an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows.
-
-    Raises:
-        ValueError: sizes that do not divide, or no frames; :func:`check_loader_options` checks the rest. From the
-            iterator: a frame is unreadable, or, with several processes, which must all run the same program, does
-            not fit the packing.
+        an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows. It refuses unreadable
+        frames and, with several processes, which must all run one program, batches that do not fit the packing.
     """
     import grain
     from absl import flags
@@ -270,12 +246,6 @@ def packing_for(frames: FrameSet, config: Config) -> Packing:
     """Choose the packing of a run's batches from five frames, spread evenly over the set.
 
     The result is the same in every process.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> packing_for(SimulatedFrames(TINY, 3), QUICKSTART).num_lags > 0
-    True
     """
     clouds = (frames.frame(index).points for index in spread_indices(len(frames), _NUM_INSPECTED))
     usable = (points[usable_rows(points)] for points in clouds)
@@ -333,5 +303,4 @@ class _OwnedBatches:
         return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch)) if self._copied else host
 
     def close(self) -> None:
-        """Drop the reference to the source."""
         self._batches = iter(())

@@ -27,25 +27,15 @@ Format = Literal["nuscenes", "kitti", "argoverse2", "folder", "simulated"]
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """A format of data sets.
-
-    Attributes:
-        name: one of :data:`Format`.
-        marks: glob patterns; a folder that matches one has this format. ``()``: the frames are not on disk.
-        sensor: default sensor; None if the data name it.
-        splits: ``(data set, file of own splits) -> names of the splits``.
-        open: ``(data set, *, split, sensor, reading, **options) -> frames``.
-        options: further options of :func:`open_frames` that this format takes.
-        class_maps: name -> class map to the classes of another data set.
-    """
+    """A format of data sets."""
 
     name: Format
-    marks: tuple[str, ...]
-    sensor: Sensor | None
-    splits: Callable[["DataSet", str | Path | None], list[str]]
-    open: Callable[..., FrameSet]
-    options: tuple[str, ...] = ()
-    class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)
+    marks: tuple[str, ...]  # glob patterns of folders in this format; () if the frames are not on disk
+    sensor: Sensor | None  # default sensor; None if the data name it
+    splits: Callable[["DataSet", str | Path | None], list[str]]  # (data set, file of own splits) -> their names
+    open: Callable[..., FrameSet]  # (data set, *, split, sensor, reading, **options) -> frames
+    options: tuple[str, ...] = ()  # further options of open_frames that this format takes
+    class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)  # by the data set they lead to
 
     @property
     def named_maps(self) -> str:
@@ -129,15 +119,10 @@ class DataSet:
 
 
 def find_data_set(root: str | Path | None, format: str | None = None, version: str | None = None) -> DataSet:
-    """Recognise the format of the data set in a folder.
+    """The data set in a folder, or, without one, simulated frames.
 
-    Args:
-        root: the folder; None for simulated frames.
-        format: one of :data:`Format`; default: recognised.
-        version: version of nuScenes; may be omitted if there is only one.
-
-    Raises:
-        ValueError: no or several formats or versions match; the message names the folder and the patterns.
+    By default the format and, if there is only one, the version of nuScenes are recognised; messages name the
+    patterns.
     """
     readers: dict[str, Reader] = {reader.name: reader for reader in READERS}
     if format is not None and format not in readers:
@@ -184,17 +169,9 @@ def default_split(
 ) -> str | None:
     """The default split for a purpose: ``train`` or ``val``; ``mini_train`` or ``mini_val`` for nuScenes mini.
 
-    Args:
-        data: the data set.
-        purpose: the purpose of the split.
-        required: if that split is missing, take the only other split, unless its name tells the other purpose.
-        splits: JSON file of own splits.
-
-    Returns:
-        a name, or None if the data have no splits or, unless it is required, if that split is missing.
-
-    Raises:
-        ValueError: a split is required, and there are several others or only one for the other purpose.
+    If that split is missing but one is ``required``, take the only other split, unless its name tells the other
+    purpose; of several, none is taken, but an error asks for one. None if the data have no splits or, unless it is
+    required, if that split is missing. ``splits`` is a file of own splits.
     """
     name = f"mini_{purpose}" if data.version.endswith("mini") else purpose
     names = data.reader.splits(data, splits)

@@ -15,18 +15,11 @@ from fcos_lidar_jax.sensors import Sensor
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """A kind of drive.
+    """A kind of drive."""
 
-    Attributes:
-        title: what it is, in messages.
-        recognises: whether a path is of this kind; None if it does not show.
-        open: ``(path, sensor, **options) -> drive``.
-        options: options that ``open`` takes.
-    """
-
-    title: str
-    recognises: Callable[[Path], bool] | None
-    open: Callable[..., Drive]
+    title: str  # what it is, in messages
+    recognises: Callable[[Path], bool] | None  # whether a path is of this kind; None if it does not show
+    open: Callable[..., Drive]  # (path, sensor, **options) -> drive
     options: tuple[str, ...]
 
 

@@ -24,7 +24,6 @@ def select_candidates(
     A pair needs a point in its cell and a class probability above the threshold, before the IoU factor.
 
     Args:
-        outputs, locations: predictions and locations of one sample.
         config, layout: thresholds, counts and sizes (static).
         axes: axes of the regression, see :mod:`fcos_lidar_jax.coding` (static).
 

@@ -45,7 +45,6 @@ def sample_losses(
     """Assign targets and compute the losses of one sample (paper, section 3.4).
 
     Args:
-        outputs, image: predictions and range image.
         boxes: f32[m, 9]; NaN velocities are unknown.
         labels, box_valid: i32[m] and bool[m].
         config, layout: weights, options and sizes (static).

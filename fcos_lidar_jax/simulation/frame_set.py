@@ -12,6 +12,8 @@ from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.simulation.streets import CITY, PLAIN, Streets
 
+_OPTIONS = ("num_objects", "reach_m", "min_points", "reading", "fast_traffic", "streets")  # of make_frame
+
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedFrames(FrameSet):
@@ -43,16 +45,7 @@ class SimulatedFrames(FrameSet):
         return self.number
 
     def frame(self, index: int) -> Frame:
-        return make_frame(
-            self.first_seed + index,
-            self.sensor,
-            num_objects=self.num_objects,
-            reach_m=self.reach_m,
-            min_points=self.min_points,
-            reading=self.reading,
-            fast_traffic=self.fast_traffic,
-            streets=self.streets,
-        )
+        return make_frame(self.first_seed + index, self.sensor, **{name: getattr(self, name) for name in _OPTIONS})
 
     def name(self, index: int) -> str:
         return f"seed {self.first_seed + index}"
@@ -79,15 +72,7 @@ _FULL_REACH_M = 45.0
 
 
 def simulated_split(split: str, sensor: Sensor, reading: CloudReading) -> SimulatedFrames:
-    """Streets that fit the sensor: plain streets for a short range, varied streets otherwise.
-
-    Raises:
-        ValueError: unknown split.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> len(simulated_split("val", TINY, CloudReading()))
-    400
-    """
+    """Streets that fit the sensor: plain streets for a short range, varied streets otherwise."""
     if split not in SIMULATED_SPLITS:
         raise ValueError(f"split: {unknown_name(split, SIMULATED_SPLITS)}")
     make = SimulatedFrames if sensor.limit_xy_m < _FULL_REACH_M else city_frames

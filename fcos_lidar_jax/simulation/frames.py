@@ -37,8 +37,6 @@ def make_frame(
         reach_m: maximum distance of the objects along the street; by default 80 % of the sensor's range limit.
         min_points: objects with fewer points in the current sweep are not annotated.
         reading: the sweeps to fuse, see :func:`scan_sweeps`; the world moves between sweeps.
-        fast_traffic: see :func:`~.world.sample_world`.
-        streets: how varied they are.
 
     >>> from fcos_lidar_jax.sensors import TINY
     >>> a, b = make_frame(3, TINY), make_frame(3, TINY)
@@ -76,16 +74,11 @@ def scan_sweeps(
 ) -> tuple[np.ndarray, int]:
     """Fuse the sweeps up to a moment in the sensor's frame at that moment, current sweep first, then by age.
 
-    Args:
-        mount: f64[4, 4], from :func:`~.lidar.sample_mount`.
-        time_s: time of the current sweep; sweeps are ``SWEEP_S`` apart.
-        rng: source of noise and dropout.
-        reading: the number of sweeps. Close points are removed from all sweeps or from no sweep: the simulated ego
-            vehicle has no body that the sensor could see, so close points lie on the road.
+    Sweeps are ``SWEEP_S`` apart. Close points are removed from all sweeps or from no sweep: the simulated ego
+    vehicle has no body that the sensor could see, so close points lie on the road.
 
-    Returns:
-        points f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, with lag exactly 0 for the current sweep,
-        and the number of removed points.
+    Returns points f32[n, c] as in :class:`fcos_lidar_jax.data.frame.Frame`, with lag exactly 0 for the current
+    sweep, and the number of removed points.
     """
 
     def take_sweep(age: int) -> Sweep:

@@ -45,7 +45,6 @@ class Ground:
         return height if self.relief is None else height + self.relief.at(x, y)
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Height of the ground with kerbs."""
         return self.slope_height(x, y) + np.where(self.on_road(x, y), 0.0, self.kerb)
 
     def first_hits(self, d: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -73,21 +73,10 @@ def scan(
     *,
     rolling_shutter: bool = False,
 ) -> Scan:
-    """Simulate one turn of the sensor.
+    """Simulate one turn of the sensor, which ends at a time; the points are in the point frame at this time.
 
-    Args:
-        mount: f64[4, 4], from :func:`sample_mount`.
-        time_s: time at the end of the turn; the points are in the point frame at this time.
-        rng: source of noise and dropout.
-        rolling_shutter: the ego vehicle and the objects move during the turn, and the points are compensated for
-            the ego motion, as in nuScenes. Otherwise the turn takes no time.
-
-    >>> from fcos_lidar_jax.simulation.world import sample_world
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> rng = np.random.default_rng(0)
-    >>> world = sample_world(rng, reach_m=20, beyond_m=30, duration_s=0.0, labels=np.arange(10), level=True)
-    >>> scan(world, TINY, sample_mount(rng, TINY, level=True), 0.0, rng).points.shape
-    (4096, 5)
+    With ``rolling_shutter``, the ego vehicle and the objects move during the turn, and the points are compensated
+    for the ego motion, as in nuScenes. Otherwise the turn takes no time.
     """
     now = sensor_pose(world, mount, time_s)
     begin = rng.uniform(-1, 1)

@@ -31,19 +31,10 @@ _POLL_S = 0.5
 
 
 def write_dataset(spec: DatasetSpec, root: Path, *, workers: int, report: Callable[[int], object]) -> bool:
-    """Write a data set in the official layout, or resume an unfinished one.
+    """Write a data set in the official layout, or resume an unfinished one; False if it was already complete.
 
-    Args:
-        root: folder of the data set: new, empty, or with an unfinished data set of the same specification.
-        workers: number of processes; the bytes do not depend on it.
-        report: called repeatedly with the number of finished sweeps.
-
-    Returns:
-        False if the data set was already complete.
-
-    Raises:
-        ValueError: the folder contains other files or another data set.
-        OSError: a file cannot be written, or another process writes to the folder.
+    The folder is new, empty, or has an unfinished data set of the same specification; others are refused. The
+    bytes do not depend on the number of worker processes. ``report`` gets the number of finished sweeps.
     """
     _check_order(spec, root)  # reject before writing anything
     if _finished(spec, root) and not _shards(spec, root):
@@ -123,7 +114,6 @@ def _finished(spec: DatasetSpec, root: Path) -> bool:
 
 
 def _shard(root: Path, index: int) -> Path:
-    """Folder with the rows of a finished scene."""
     return root / _WORK / scene_name(index)
 
 

@@ -61,11 +61,7 @@ def fixed_tables(logs: list[str]) -> dict[str, list[Row]]:
 
 
 def scene_name(index: int) -> str:
-    """Name of a scene from its index, starting at 0.
-
-    >>> scene_name(0)
-    'scene-0001'
-    """
+    """Name of a scene from its index, starting at 0."""
     return f"scene-{index + 1:04d}"
 
 
@@ -82,10 +78,8 @@ def sweep_file(seed: int, index: int, number: int) -> str:
 def scene_rows(seed: int, index: int, mount: Row, ego_poses: Sequence[Row]) -> dict[str, list[Row]]:
     """Rows of a scene without its objects, from the seed of the data set and the index of the scene.
 
-    Args:
-        mount: pose of the sensor in the ego frame, from :func:`pose_fields`.
-        ego_poses: pose of the ego vehicle per sweep, from :func:`pose_fields`; the first and the last sweep are
-            keyframes.
+    ``mount``, the pose of the sensor in the ego frame, and ``ego_poses``, one per sweep, are from
+    :func:`pose_fields`; the first and the last sweep are keyframes.
     """
     key = (seed, scene_name(index))
     log, scene, calibration = (token(table, *key) for table in ("log", "scene", "calibrated_sensor"))
@@ -204,11 +198,7 @@ def attribute_of(name: str, speed_mps: float, *, rider: bool, parked: bool) -> s
 
 
 def visibility_of(share: float) -> str:
-    """Token of the visibility level of an object, from the share of rays that reach it.
-
-    >>> [visibility_of(share) for share in (0.0, 0.5, 0.7, 1.0)]
-    ['1', '2', '3', '4']
-    """
+    """Token of the visibility level of an object, from the share of rays that reach it."""
     return str(1 + int(np.searchsorted((0.4, 0.6, 0.8), share, side="right")))
 
 

@@ -107,7 +107,6 @@ def object_solids(model: ObjectModel, size_m: np.ndarray, paint: float) -> np.nd
 
     Args:
         size_m: f64[3], length, width, height of the annotated box.
-        paint: albedo of the painted or cloth parts.
 
     >>> cone = OBJECT_MODELS["traffic_cone"][0]
     >>> object_solids(cone, np.array([0.48, 0.48, 0.84]), 0.4)["half"][0].round(3).tolist()

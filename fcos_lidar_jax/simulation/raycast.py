@@ -57,14 +57,6 @@ def cast(
         rotation: f64[3, 3], from sensor axes to world axes.
         origin: f64[3], position of the sensor in the world, above the ground.
         solids: [s], in the world frame.
-        rng: source of the penetration depths into porous solids.
-
-    >>> fan = Fan(np.radians([0.0]), 4, np.pi, np.pi / 2, np.zeros(1))
-    >>> from fcos_lidar_jax.simulation.solids import BALL, make_solids
-    >>> ball = make_solids(BALL, [5, 0, 0], 1.0)
-    >>> flat = Ground(np.array([[0, 0, -2.0]]), 7, 0, 7, 0.1, 3, (0.1, 0.2, 0.2))
-    >>> cast(fan, np.eye(3), np.zeros(3), ball, flat, np.random.default_rng(0)).range_m.tolist()
-    [inf, inf, 4.0, inf]
     """
     d = rotation.astype(np.float32) @ fan.directions
     best, cosine = ground.first_hits(d, origin)

@@ -8,6 +8,7 @@ import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.box_geometry import count_inside
+from fcos_lidar_jax.data.sweeps import about_z
 from fcos_lidar_jax.files import naming
 from fcos_lidar_jax.geometry import pose_matrix
 from fcos_lidar_jax.sensors import Sensor
@@ -36,23 +37,15 @@ class DatasetSpec:
 
     @property
     def sweeps(self) -> int:
-        """Number of sweeps per scene."""
         return (self.keyframes - 1) * SWEEPS_PER_KEYFRAME + 1
 
 
 def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[], object]) -> dict[str, list[Row]]:
     """Write the point files of a scene. Their bytes do not depend on the other scenes.
 
-    Args:
-        root: folder of the data set, with existing folders ``samples/LIDAR_TOP`` and ``sweeps/LIDAR_TOP``.
-        advance: called after each sweep.
-
-    Returns:
-        rows of the scene by table. Each object is annotated from the first to the last keyframe in which it has
-        points.
-
-    Raises:
-        OSError: a file cannot be written; the message names it.
+    The folder of the data set has folders ``samples/LIDAR_TOP`` and ``sweeps/LIDAR_TOP``; ``advance`` is called
+    after each sweep. Returns the rows of the scene by table. Each object is annotated from the first to the last
+    keyframe in which it has points.
     """
     rng = np.random.default_rng([spec.seed, index])
     world = sample_scene(rng, spec)
@@ -96,9 +89,7 @@ def sample_scene(rng: np.random.Generator, spec: DatasetSpec) -> World:
 
 def _sample_placement(rng: np.random.Generator) -> np.ndarray:
     """Random pose of the street frame in the global frame, with rotation about z only, f64[4, 4]."""
-    yaw = rng.uniform(-np.pi, np.pi)
-    placement = np.eye(4)
-    placement[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    placement = about_z(rng.uniform(-np.pi, np.pi))
     placement[:2, 3] = rng.uniform(300, 2000, 2)
     return placement
 

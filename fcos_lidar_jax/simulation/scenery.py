@@ -23,17 +23,12 @@ def sample_scenery(
     beyond_m: float,
     streets: Streets = PLAIN,
 ) -> np.ndarray:
-    """Sample scenery on both sides of both streets.
+    """Sample scenery on both sides of both streets, solids [s] of :data:`SOLID` in the street frame.
 
     Args:
-        rng: random source for houses, fences, trees and poles.
-        surroundings: random source for everything else.
-        low: f64[2], least x and y of the sensor's path.
-        high: f64[2], greatest x and y of the sensor's path.
+        rng, surroundings: random sources for houses, fences, trees and poles, and for everything else.
+        low, high: f64[2], least and greatest x and y of the sensor's path.
         beyond_m: extent of the scenery around the path.
-
-    Returns:
-        solids [s] of :data:`SOLID` in the street frame.
     """
     parts = [np.zeros(0, SOLID)]
     setting = sample_setting(surroundings) if streets.setting else "city"
@@ -90,7 +85,6 @@ def _row_of(
 
 
 def _trees(rng: Generator, side: Side) -> np.ndarray:
-    """Sample trees at the kerb and further back, and bushes."""
     kerb, back = _spaced(rng, side.span, 45), _spaced(rng, side.span, 25)
     far = side.ground.pavement + rng.uniform(1, 12, len(back))
     s, d = np.concatenate([kerb, back]), side.edge_m + np.concatenate([np.full(len(kerb), 1.0), far])

@@ -55,7 +55,6 @@ class Side:
 
     @property
     def yaw(self) -> float:
-        """Direction of the street, radians."""
         return np.pi / 2 * self.along
 
     @property
@@ -104,7 +103,6 @@ def sample_setting(rng: Generator) -> str:
 
 
 def _buildings(rng: Generator, side: Side, setback: float, built: float) -> list[np.ndarray]:
-    """Sample a row of buildings with gaps along a common front line."""
     parts, s = [], side.span[0] + rng.uniform(0, 10)
     while s < side.span[1]:
         width = rng.uniform(6, 28)
@@ -199,7 +197,6 @@ def _trees(rng: Generator, side: Side, density: float) -> list[np.ndarray]:
 
 
 def _clutter(rng: Generator, side: Side, density: float, setback: float) -> list[np.ndarray]:
-    """Sample clutter at all three locations, partly in groups of equal things."""
     pavement, things = side.ground.pavement, []
     beyond = {
         "kerb": (0.25, 0.9),

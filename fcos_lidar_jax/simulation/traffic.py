@@ -117,8 +117,6 @@ def sample_traffic(
 
 
 class _Occupancy:
-    """Occupied rectangles on the ground at given times."""
-
     def __init__(self, times: np.ndarray, occupied: np.ndarray) -> None:
         self._poses = np.repeat(occupied[:, None, [0, 1, 4]], len(times), axis=1)
         self._sizes = occupied[:, 2:4]
@@ -171,8 +169,6 @@ class _Row:
 
 @dataclasses.dataclass
 class _Places:
-    """Samples places and motions of objects."""
-
     rng: Generator
     ground: Ground
     ego: np.ndarray

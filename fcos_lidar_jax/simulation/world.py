@@ -38,7 +38,6 @@ class World:
         return np.stack([x, y, self.ground.height(x, y), yaw], axis=1)
 
     def solids(self, time_s: float) -> np.ndarray:
-        """Solids at a time, without the ground and the ego vehicle."""
         objects = place_solids(self.parts, self.object_poses(time_s)[self.parts["owner"]])
         return np.concatenate([self.scenery, objects])
 
@@ -72,17 +71,11 @@ def sample_world(
     Args:
         reach_m: each object is within this distance of the ego vehicle at some time.
         beyond_m: extent of the scenery around the path of the ego vehicle.
-        duration_s: duration of the world.
         labels: i32[m], classes of the objects; objects without room are omitted.
         level: ground without slopes.
         fused: the world is scanned at its end only, as a few fused sweeps. Each object is within reach then.
         fast_traffic: the ego vehicle drives straight at 10 to 20 m/s, all lanes flow, and nearly all objects that
             can move do.
-
-    >>> labels = np.arange(10)
-    >>> world = sample_world(np.random.default_rng(0), reach_m=30, beyond_m=40, duration_s=0.0, labels=labels)
-    >>> len(world.traffic.labels) <= 10, world.object_poses(0.0).shape[1]
-    (True, 4)
     """
     shapes, grounds, surroundings, unit = rng.spawn(4)
     ground = _uneven(grounds, _sample_ground(rng, level), streets)

@@ -35,7 +35,7 @@ def fit(
     stopping: Callable[[int], bool] = lambda _: False,
     log_every_s: float = 10.0,
 ) -> TrainState:
-    """Run the training step over batches.
+    """Run the training step over batches and return the last state.
 
     Metrics are read one step late, so that the host never waits for the device. Before a pause and at the end, all
     metrics have been read, so a state that is saved there has finite losses.
@@ -44,7 +44,6 @@ def fit(
         step: compiled ``(state, batch) -> (state, metrics)``; may donate the buffers of the state.
         state: initial state; the run ends when ``state.step`` reaches ``num_steps``.
         batches: at least one batch per remaining step; the time to get one is recorded as ``waiting_seconds``.
-        num_steps: number of steps of the whole run.
         report: called after every step with the number of steps and the metrics of the last one.
         pause_at: called with the number of steps; returns whether to pause.
         pause: called at a pause with the number of steps and the state; do not keep a reference to the state: its
@@ -52,13 +51,9 @@ def fit(
         stopping: called after every step with the number of steps; returns whether to stop.
         log_every_s: seconds between progress lines on standard error.
 
-    Returns:
-        the last state.
-
     Raises:
         NonFiniteLossError: a loss or gradient is not finite.
 
-    >>> import dataclasses
     >>> def count(state, batch):
     ...     return dataclasses.replace(state, step=state.step + 1), {"loss/total": 1.0, "positive_iou": 0.5}
     >>> state = TrainState(np.int32(0), {}, {}, (), None, jax.random.key(0))

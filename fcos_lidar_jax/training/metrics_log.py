@@ -38,7 +38,6 @@ class MetricsLog:
             self._write_event(first_step + 1, session_log={"status": _START})
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
-        """Record numbers and lists of numbers by name."""
         with naming(Path(self._lines.name)):
             self._lines.write(json.dumps({"step": step, **values}) + "\n")
             self._lines.flush()

@@ -27,8 +27,7 @@ def draw_predictions(
 ) -> list[Path]:
     """Draw frames from above, with their truth and the detections that reach a score; one picture per prediction.
 
-    Args:
-        prefix, title: begin the names and the titles of the pictures, before the numbers of their frames.
+    ``prefix`` and ``title`` begin the names and the titles of the pictures, before the numbers of their frames.
     """
     from fcos_lidar_jax.visualization.bev import draw_bev
 

@@ -19,8 +19,9 @@ from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.mesh import check_batch_size
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import local_path, read_json
-from fcos_lidar_jax.input_pipeline.batching import check_counts
+from fcos_lidar_jax.input_pipeline.batching import check_counts, spread_indices
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options, packing_for
@@ -52,8 +53,8 @@ class Schedule:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is not None and (type(value) is not int or value < 1):
-                raise ValueError(f"schedule.{field.name}: got {value!r}, expected an integer of at least 1")
+            known = value is None or (type(value) is int and value >= 1)
+            check(known, f"schedule.{field.name}", value, "an integer of at least 1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,12 +110,9 @@ def plan_run(
     workers: int,
     packing: bool | None,
 ) -> Run:
-    """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``.
-
-    Raises:
-        ValueError: the arguments do not fit each other.
-    """
-    check_numbers(steps, seed)
+    """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``."""
+    check(type(steps) is int and steps >= 1, "steps", steps, "an integer of at least 1")
+    check(type(seed) is int and 0 <= seed < NUM_SEEDS, "seed", seed, f"an integer from 0 to {NUM_SEEDS - 1}")
     order = SampleOrder(frames, config, seed=seed)
     epoch_steps = -(-order.epoch_size // config.optimizer.batch_size)
     if config.copy_paste is not None and config.fade_epochs * epoch_steps >= steps:
@@ -165,18 +163,8 @@ def plan_run(
     )
 
 
-def check_numbers(steps: int, seed: int) -> None:
-    """Raise a ValueError for an invalid number of steps or seed."""
-    if type(steps) is not int or steps < 1:
-        raise ValueError(f"steps: got {steps!r}, expected an integer of at least 1")
-    if type(seed) is not int or not 0 <= seed < NUM_SEEDS:
-        raise ValueError(f"seed: got {seed!r}, expected an integer from 0 to {NUM_SEEDS - 1}")
-
-
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
-    """Warnings about the clouds of up to five frames."""
-    indices = np.unique(np.linspace(0, len(frames) - 1, 5).round().astype(int))
-    clouds = (frames.frame(int(index)).points for index in indices)
+    clouds = (frames.frame(index).points for index in spread_indices(len(frames), 5))
     first = next(clouds)
     if mismatch := sensor_mismatch(first, frames.sensor):
         yield f"{frames.name(0)}: {mismatch}"
@@ -188,19 +176,10 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
 
 
 def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
-    """Check that a run can be started or resumed in a folder.
+    """Check that a run can be started or resumed in a folder; names the first field in which another run differs.
 
-    Args:
-        folder: folder of the run.
-        spec: expected content of ``run.json``; None to check only whether there is a run.
-        resume: whether the run is to be resumed.
-
-    Returns:
-        fields that the specification of an older run lacks and that were not compared.
-
-    Raises:
-        ValueError: the folder unexpectedly holds a run, holds no run to resume, or holds a different run; names
-            the first field that differs.
+    ``spec`` is the expected content of ``run.json``; None checks only whether there is a run. Returns the fields
+    that the specification of an older run lacks and that were not compared.
     """
     folder = local_path(folder)
     file = folder / RUN_SPEC
@@ -246,7 +225,6 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
 
 
 def _differences(was: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Names and values of the fields in which two JSON values differ."""
     if isinstance(was, dict) and isinstance(now, dict):
         for key in sorted(was.keys() | now.keys()):
             yield from _differences(was.get(key), now.get(key), f"{name}.{key}" if name else key)

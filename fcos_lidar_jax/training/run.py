@@ -62,13 +62,11 @@ def train(
     workers: int = 0,
     packing: bool | None = None,
 ) -> TrainState:
-    """Train a detector; Ctrl-C and SIGTERM save a checkpoint and stop.
+    """Train a detector and return the last state; Ctrl-C and SIGTERM save a checkpoint and stop.
 
     Args:
-        config: configuration of the detector.
         frames: training frames; classes are matched to ``config.classes`` by name, and the detector is built for
             their sensor.
-        out: folder of the run.
         steps: number of updates of the whole run.
         seed: seed of weights, order, pasted objects and augmentation.
         tests: frames to evaluate on along the way.
@@ -83,9 +81,6 @@ def train(
             threads as ``input_pipeline.loader.default_threads`` returns, and no processes.
         packing: transfer batches to the devices in fewer bytes, with the same results, see
             :mod:`fcos_lidar_jax.packing`; by default unless the devices are CPUs.
-
-    Returns:
-        the last state.
 
     Raises:
         ValueError: the folder holds another run, no class is shared, the devices cannot share the batch, steps or
@@ -228,9 +223,7 @@ def train(
 def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool) -> Iterator[None]:
     """Hold the folder of a run against other processes; with ``spec``, it becomes the folder of that run.
 
-    Raises:
-        ValueError: see :func:`~fcos_lidar_jax.training.plan.check_run`; nothing is written.
-        OSError: another process holds the folder.
+    What :func:`~fcos_lidar_jax.training.plan.check_run` refuses is refused before anything is written.
     """
     check_run(folder, spec, resume=resume)  # before the lock, which makes the folder
     with folder_lock(folder, "training"):
@@ -248,8 +241,7 @@ def _start(run: Run, *, resume: bool) -> TrainState:
     key = jax.random.key(run.seed)
     if resume:
         like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
-        newest = run.checkpoints.newest(like)
-        if newest is not None:
+        if (newest := run.checkpoints.newest(like)) is not None:
             return newest[1]
     return make_state(run.detector, run.optimizer, key, variables=run.weights)
 

@@ -31,15 +31,13 @@ def make_state(
     """Make the state before the first step, with a running mean of the weights if ``ema_decay`` is not 0.
 
     Args:
-        detector, optimizer: network and optimizer.
         key: random key of the run.
         variables: initial ``params`` and ``batch_stats``; random by default.
 
-    >>> from fcos_lidar_jax.models import build_detector
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> from fcos_lidar_jax.inference import load_trained
     >>> from fcos_lidar_jax.training import make_optimizer
-    >>> detector, optimizer = build_detector(QUICKSTART, SHORT_RANGE), make_optimizer(QUICKSTART.optimizer, 100)
+    >>> detector = load_trained("quickstart").model
+    >>> optimizer = make_optimizer(detector.config.optimizer, 100)
     >>> state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
     >>> sorted(state.params)
     ['backbone', 'fpn', 'heads', 'stem']
@@ -116,11 +114,10 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. A packed batch is unpacked first.
         Metrics are scalars except ``positives_per_level`` i32[6].
 
-    >>> from fcos_lidar_jax.models import build_detector
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
+    >>> from fcos_lidar_jax.inference import load_trained
     >>> from fcos_lidar_jax.training import make_optimizer
-    >>> detector, optimizer = build_detector(QUICKSTART, SHORT_RANGE), make_optimizer(QUICKSTART.optimizer, 100)
+    >>> detector = load_trained("quickstart").model
+    >>> optimizer = make_optimizer(detector.config.optimizer, 100)
     >>> state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
     >>> clouds = jnp.zeros((2, 4096, 5)), jnp.zeros((2, 4096), bool)
     >>> batch = Batch(*clouds, jnp.zeros((2, 32, 9)), jnp.zeros((2, 32), int), jnp.zeros((2, 32), bool))

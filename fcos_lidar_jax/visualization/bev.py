@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, set_title, write_labels
 
 _SIZE_IN = 9.0
@@ -20,22 +21,15 @@ def draw_bev(
     *,
     limit_m: float,
     classes: Sequence[str],
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    detections: ScoredBoxes | None = None,
+    truth: TrueBoxes | None = None,
     title: str | None = None,
 ) -> None:
     """Plot a cloud from above: x to the right, y up, higher points darker, a cross at the origin.
 
     Detections have solid outlines in the colour of their class, with class and score, or only the score, where
     there is room, highest scores first. Truth has thin dashed black outlines filled with the colour of its class.
-    A line from the centre through the front marks the heading.
-
-    Args:
-        points: f32[n, >= 3], metres; non-finite rows are omitted.
-        limit_m: half the side of the plotted square.
-        classes: class names by label.
-        detections: boxes f32[d, 9], labels i32[d], scores f32[d].
-        truth: boxes f32[m, 9], labels i32[m].
+    A line from the centre through the front marks the heading. Half the side of the plotted square is ``limit_m``.
     """
     figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
     options = {"limit_m": limit_m, "classes": classes, "detections": detections, "truth": truth}
@@ -52,8 +46,8 @@ def bev_on(
     *,
     limit_m: float,
     classes: Sequence[str],
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    detections: ScoredBoxes | None = None,
+    truth: TrueBoxes | None = None,
 ) -> set[int]:
     """Plot the view of :func:`draw_bev` on an axis; returns the visible labels."""
     _draw_points(axis, points, limit_m)
@@ -81,19 +75,16 @@ def bev_on(
 
 
 def _draw_points(axis: Any, points: np.ndarray, limit_m: float) -> None:
+    from matplotlib.colors import LinearSegmentedColormap
+
     cloud = points[np.isfinite(points[:, :3]).all(axis=1) & (np.abs(points[:, :2]) < limit_m).all(axis=1)]
     if len(cloud):
         # Heights are relative to the ground: the ground is light and objects on it are dark.
         ground = np.quantile(cloud[:, 2], 0.1)
         dot = float(np.clip(3e4 / len(cloud), 1.6, 7))  # larger dots for sparse clouds
-        colors = {"c": cloud[:, 2] - ground, "cmap": _height_colors(), "vmin": 0, "vmax": _HIGH_M}
+        shades = LinearSegmentedColormap.from_list("height", ["#c4c4c4", "#8aa0b8", "#3f5f86", "#1c1c3c"])
+        colors = {"c": cloud[:, 2] - ground, "cmap": shades, "vmin": 0, "vmax": _HIGH_M}
         axis.scatter(*cloud[:, :2].T, s=dot, linewidths=0, zorder=2, **colors)
-
-
-def _height_colors() -> Any:
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("height", ["#c4c4c4", "#8aa0b8", "#3f5f86", "#1c1c3c"])
 
 
 def _in_view(box: np.ndarray, limit_m: float) -> bool:

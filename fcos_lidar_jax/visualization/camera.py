@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.visualization.bev import corners_from_above
 from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, write_labels
 
@@ -20,20 +21,12 @@ def draw_camera(
     to_image: np.ndarray,
     *,
     classes: Sequence[str],
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray],
-    truth: tuple[np.ndarray, np.ndarray],
+    detections: ScoredBoxes,
+    truth: TrueBoxes,
 ) -> None:
     """Draw boxes in a camera image: detections with class and score in the colour of their class, truth dashed.
 
-    Args:
-        image: PNG or JPEG file.
-        to_image: f64[3, 4], from the frame of the boxes, metres, to homogeneous pixels.
-        classes: class names by label.
-        detections: boxes f32[d, >= 7], labels i32[d], scores f32[d].
-        truth: boxes f32[m, >= 7], labels i32[m].
-
-    Raises:
-        ValueError: the file is no image.
+    ``to_image`` f64[3, 4] leads from the frame of the boxes, metres, to homogeneous pixels.
     """
     from PIL import Image
 

@@ -17,6 +17,7 @@ from fcos_lidar_jax.visualization.figure import EMPTY, new_figure, save_png, set
 
 _SIZE_IN = (8.0, 9.6)
 _DPI = 90
+_SCENE_S = 0.5  # duration of each scene
 _COLORS = 96  # colours of the GIF; more colours increase its size but hardly its quality
 
 
@@ -28,25 +29,13 @@ def draw_drive(
     classes: Sequence[str],
     title: str,
     limit_m: float,
-    seconds_a_scene: float = 0.5,
     report: Callable[[int], object] = lambda done: None,
 ) -> list[Path]:
-    """Write an animated GIF, and one PNG file per scene beside it.
+    """Write an animated GIF, and one PNG file per scene beside it, ``NAME_00.png`` and so on; returns these files.
 
     The top shows the range image, with the forward direction in the middle. Below is the bird's-eye view with
-    detections and dashed truth.
-
-    Args:
-        path: GIF file; the PNG files are named ``NAME_00.png``, ``NAME_01.png`` and so on.
-        sensor: sensor of the range image.
-        classes: class names by label.
-        title: begins the title of each picture.
-        limit_m: half the side of the bird's-eye view.
-        seconds_a_scene: duration of each scene.
-        report: called with the number of finished scenes.
-
-    Returns:
-        the PNG files.
+    detections and dashed truth, in a square with half the side ``limit_m``. ``title`` begins the title of each
+    picture; ``report`` is called with the number of finished scenes.
     """
     from PIL import Image
 
@@ -63,12 +52,12 @@ def draw_drive(
         _draw_ranges(strip, scene.points, size, sensor)
         bev_on(view, scene.points, limit_m=limit_m, classes=classes, detections=found, truth=scene.truth)
         class_legend(figure, sorted(labels), classes, detections=True, truth=True)
-        set_title(strip, f"{title}, {number * seconds_a_scene:.1f} s", fontsize=11)
+        set_title(strip, f"{title}, {number * _SCENE_S:.1f} s", fontsize=11)
         save_png(figure, file, dpi=_DPI)
         with Image.open(file) as picture:
             pictures.append(picture.convert("RGB").quantize(_COLORS))
         report(number + 1)
-    options: Any = {"save_all": True, "append_images": pictures[1:], "loop": 0, "duration": 1e3 * seconds_a_scene}
+    options: Any = {"save_all": True, "append_images": pictures[1:], "loop": 0, "duration": 1e3 * _SCENE_S}
     atomic_write(path, lambda out: pictures[0].save(out, "GIF", **options))
     return files
 

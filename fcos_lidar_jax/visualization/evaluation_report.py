@@ -14,7 +14,7 @@ from fcos_lidar_jax.evaluation.examples import sensor_boxes
 from fcos_lidar_jax.evaluation.kitti import DIFFICULTIES
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.bev import draw_bev
@@ -42,8 +42,8 @@ class Example:
     kind: str  # best, typical or worst
     name: str  # name of the sample
     points: np.ndarray  # f32[n, >= 5]: the cloud; if it is empty, there is no range image
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray]  # boxes f64[d, 9], labels and scores
-    truth: tuple[np.ndarray, np.ndarray]  # boxes f64[m, 9] and labels
+    detections: ScoredBoxes
+    truth: TrueBoxes
     camera: tuple[Path, np.ndarray] | None = None  # image, and f64[3, 4] from the sensor's frame to it
 
 
@@ -86,12 +86,10 @@ def write_evaluation_report(
     """Write the self-contained ``report.html``, and its pictures to ``pictures/``.
 
     Reads scores, errors and curves from ``metrics_summary.json``, ``curves.json`` and, if it exists,
-    ``bootstrap.json``, of the nuScenes benchmark or any other metric.
+    ``bootstrap.json`` in the folder, of the nuScenes benchmark or any other metric.
 
     Args:
-        out: folder with these files.
-        examples: samples to plot.
-        sensor: sensor of the range images.
+        examples: samples to plot; ``sensor`` is that of their range images.
         pictures: additional pictures, placed first.
         links: text and file name of links to files beside the report.
     """
@@ -129,7 +127,6 @@ def write_evaluation_report(
 
 
 def _kitti_table(file: Path) -> list[tuple[str, tuple[str, ...], list[tuple[Cell, ...]]]]:
-    """The table of KITTI's metric, if it was evaluated."""
     if not file.is_file():
         return []
     metrics = json.loads(file.read_text())
@@ -152,7 +149,6 @@ def clear_report(out: Path) -> None:
 
 
 def _lead(summary: Mapping[str, Any], num_samples: int, defined: Sequence[str]) -> str:
-    """Introduction: the evaluated samples and the metric."""
     rules = f"over {num_samples} samples: average precision (AP) by matching distance"
     if defined:
         names = ", ".join(ERROR_NAMES[error][1].split(" [")[0] for error in defined)
@@ -226,7 +222,6 @@ def _draw_errors(
 
 
 def _save(figure: Any, path: str | Path, y_label: str, **legend: Any) -> None:
-    """Label the axes, put the legend below the plot and save the figure."""
     axis = figure.axes[0]
     axis.set(xlim=(0, 1), xlabel="recall", ylabel=y_label)
     if handles := axis.get_lines():

@@ -73,7 +73,6 @@ def write_labels(
 
     Args:
         boxes: centre and half the size in units of the axis, f64[2], label, and score, None for the truth.
-        classes: class names by label.
         point: width and height of a typographic point in units of the axis.
     """
     from matplotlib.patheffects import withStroke
@@ -96,7 +95,6 @@ def write_labels(
 
 
 def _text_width(text: str, fontsize: float) -> float:
-    """Width in points."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.cloud_policy import MAX_TIME_LAG_S
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.figure import class_color
@@ -41,22 +41,20 @@ class PageFrame:
 
 def page_frame(
     points: np.ndarray,
-    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+    found: ScoredBoxes,
     *,
     name: str,
     time_us: int | None = None,
     pose: np.ndarray | None = None,
     ids: np.ndarray | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    truth: TrueBoxes | None = None,
 ) -> PageFrame:
     """Encode a cloud and its boxes compactly, so that many frames fit into memory.
 
     Args:
-        points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
-        found: boxes f32[m, 9] in the frame of the points, labels i32[m], scores f32[m].
+        points: see :func:`encode_points`; all boxes are in their frame.
         time_us, pose: time, and pose f64[4, 4] in the world; only for frames of the same drive.
         ids: i32[m], identities over time.
-        truth: boxes f32[k, 9], labels i32[k].
     """
     boxes, labels, scores = found
     return PageFrame(
@@ -85,13 +83,11 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
 
     The data consist of consecutive planes: x as int16 differences, y and z as int16, each with all low bytes
     before all high bytes, then intensity and time lag as uint8, with 255 for the largest lag. The planes are
-    compressed with gzip and encoded in base64.
+    compressed with gzip and encoded in base64. Returns the number of remaining points, their largest time lag in
+    seconds, and the text.
 
     Args:
         points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
-
-    Returns:
-        number of remaining points, their largest time lag in seconds, and the text.
 
     >>> encode_points(np.array([[1, 2, 3, 9], [1, 2, 3.001, 9], [np.nan, 0, 0, 0]], np.float32))[:2]
     (1, 0.0)
@@ -122,10 +118,8 @@ def write_page(
 ) -> None:
     """Write the HTML page.
 
-    Args:
-        sensor: where the ego vehicle heads in the frames, if they have no poses; by default along y.
-        classes: class names by label.
-        min_score: initial threshold of the visible boxes.
+    ``sensor`` gives the heading of the ego vehicle in frames without poses, by default along y; ``min_score`` is
+    the initial threshold of the visible boxes.
     """
     content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}
     content |= {"colors": [*map(class_color, range(len(classes)))], "forward_rad": sensor and sensor.forward_rad}

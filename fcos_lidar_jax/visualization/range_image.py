@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.types import CHANNELS, RangeImage
 from fcos_lidar_jax.visualization.figure import EMPTY, class_color, new_figure, save_png, set_title, write_labels
 
@@ -24,8 +25,8 @@ def draw_range_image(
     *,
     title: str | None = None,
     classes: Sequence[str] = (),
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
-    detections: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    truth: TrueBoxes | None = None,
+    detections: ScoredBoxes | None = None,
     azimuth_limits_rad: tuple[float, float] | None = None,
 ) -> None:
     """Plot the range of each round, and intensity and time lag of the first round.
@@ -34,13 +35,8 @@ def draw_range_image(
     are grey. The range scale is logarithmic, because most cells are near. The time lag is omitted if all points
     are current.
 
-    Args:
-        classes: class names by label.
-        truth: boxes f32[m, >= 7], metres, in the frame of the points, and labels i32[m]. Each box is outlined in
-            round 1, in the colour of its class, around the cells whose points lie in it; boxes without such a cell
-            are not visible.
-        detections: boxes f32[d, >= 7], labels i32[d] and scores f32[d], in a separate panel.
-        azimuth_limits_rad: sector of the sensor.
+    Truth and detections, in the frame of the points, have separate panels. Each box is outlined in round 1, in the
+    colour of its class, around the cells whose points lie in it; boxes without such a cell are not visible.
     """
     view = _View.of(azimuth_limits_rad)
     features = np.asarray(image.features)
@@ -88,13 +84,11 @@ class _View:
 
     @property
     def ticks(self) -> range:
-        """Whole degrees, from left to right."""
         step = 45 if self.left - self.right > 180 else 15
         return range(math.floor(self.left / step) * step, math.ceil(self.right / step) * step - 1, -step)
 
 
 def _draw_channel(figure: Any, axis: Any, features: np.ndarray, channel: int, r: int, view: _View) -> str:
-    """Plot one channel of one round with its colour bar; returns a description."""
     import matplotlib as mpl
     from matplotlib.colors import LogNorm, Normalize
 

@@ -50,10 +50,7 @@ def write_report(
     Floats in the summary and in tables have three decimals; NaN is a dash.
 
     Args:
-        summary: values by name.
-        lead: one paragraph below the heading.
         links: text and file name of links to files beside the report.
-        tables: (caption, header, rows) of each table; the first column names the row.
         galleries: (heading, small pictures) of each gallery, arranged side by side.
         pictures: (caption, PNG or GIF file) of each picture; the files are embedded.
         wide_pictures: pictures that scroll horizontally on narrow screens instead of shrinking.

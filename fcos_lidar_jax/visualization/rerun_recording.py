@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
 from fcos_lidar_jax.files import atomic_path
 from fcos_lidar_jax.visualization.figure import class_color
 
@@ -14,11 +15,7 @@ _HIGH_M = 4.0  # height above ground at the end of the colour scale
 
 
 def check_rerun() -> None:
-    """Check that rerun is installed.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """Refuse a recording if rerun is not installed."""
     try:
         import rerun  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -29,14 +26,11 @@ def check_rerun() -> None:
 def rerun_recording(
     path: Path | None, classes: Sequence[str], *, min_score: float = 0.0
 ) -> Iterator[Callable[..., None]]:
-    """Yield a function that records frames, with the arguments of :func:`~.page.page_frame`.
+    """Yield a function that records frames, with the arguments of :func:`~.page.page_frame`; nothing without a
+    path.
 
-    Frames are written immediately. The file appears when the context ends without an error.
-
-    Args:
-        path: recording (.rrd), or None to record nothing.
-        classes: class names by label.
-        min_score: boxes with a lower score are not recorded, because the viewer cannot hide them.
+    Frames are written immediately. The file appears when the context ends without an error. Boxes below
+    ``min_score`` are not recorded, because the viewer cannot hide them.
 
     >>> with rerun_recording(None, ("car",)) as record:
     ...     record(np.zeros((0, 4)), (np.zeros((0, 9)), np.zeros(0), np.zeros(0)), name="a")
@@ -62,13 +56,13 @@ def _record(
     classes: Sequence[str],
     min_score: float,
     points: np.ndarray,
-    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+    found: ScoredBoxes,
     *,
     name: str,
     time_us: int | None = None,
     pose: np.ndarray | None = None,
     ids: np.ndarray | None = None,
-    truth: tuple[np.ndarray, np.ndarray] | None = None,
+    truth: TrueBoxes | None = None,
 ) -> None:
     """Record points coloured by height, boxes with class, score and identity, and truth, in the sensor's frame."""
     import matplotlib as mpl

@@ -11,10 +11,18 @@ from made_kitti import AXES, MOUNTED, P2, RECTIFIED, calibration_text, label_tex
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.frame import SelectedFrames
-from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, TO_NUSCENES, KittiFrames, read_calibration, to_lidar
+from fcos_lidar_jax.data.kitti import (
+    CLASSES,
+    IMAGE_SIZE,
+    TO_NUSCENES,
+    KittiFrames,
+    read_calibration,
+    read_objects,
+    to_lidar,
+)
 from fcos_lidar_jax.evaluation.frames import write_detections
 from fcos_lidar_jax.evaluation.kitti import describe_kitti
-from fcos_lidar_jax.evaluation.kitti_results import image_boxes, read_result, to_camera, write_kitti, write_result
+from fcos_lidar_jax.evaluation.kitti_results import image_boxes, to_camera, write_kitti, write_result
 from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -38,7 +46,8 @@ def test_boxes_return_from_a_file(tmp_path, calibration):
     boxes, scores = random_boxes(300), np.random.default_rng(1).random(300).astype(np.float32)
     types = [CLASSES[i % len(CLASSES)] for i in range(300)]
     left_out = write_result(tmp_path / "000123.txt", boxes, types, scores, calibration)
-    back, back_types, back_scores = read_result(tmp_path / "000123.txt", calibration)
+    back_types, fields = read_objects(tmp_path / "000123.txt")
+    back, back_scores = to_lidar(fields[:, 7:14], calibration["velo_to_rect"]), fields[:, 14]
     seen = image_boxes(to_camera(boxes, calibration["velo_to_rect"]), calibration["P2"], IMAGE_SIZE)[1]
     assert 0 < left_out == (~seen).sum() < 100
     np.testing.assert_allclose(back[:, :6], boxes[seen, :6], atol=1e-4)
@@ -100,7 +109,7 @@ def test_what_no_object_can_be_is_left_out(tmp_path, calibration):
     boxes = np.tile([20, 0, -1, 4, 1.6, 1.5, 0.0], (6, 1))
     boxes[1, 0], boxes[2, 3], boxes[3, 5], boxes[4, 0], boxes[5, 6] = -20, 600, 1e-7, 20_000, np.nan
     assert write_result(tmp_path / "a.txt", boxes, ["Car"] * 6, np.ones(6), calibration) == 5
-    assert len(read_result(tmp_path / "a.txt", calibration)[0]) == 1
+    assert len(read_objects(tmp_path / "a.txt")[0]) == 1
 
 
 CARS = [(x, y, -0.9, 4.0, 1.7, 1.5, 0.1) for x in (10.0, 15.0, 20.0) for y in (-4.0, 0.0, 4.0)]

@@ -15,7 +15,7 @@ from tiny_run import TINY_CONFIG, bits, untrained
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.data.cloud_policy import make_cloud
-from fcos_lidar_jax.inference.export import PLATFORMS, export_detector, load_exported, read_record
+from fcos_lidar_jax.inference.export import PLATFORMS, export_detector, load_exported
 from fcos_lidar_jax.sensors import TINY, sensor_from_json
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -95,7 +95,7 @@ def test_exports_are_deterministic_and_contain_no_path_of_this_machine(home):
 def test_the_record_describes_the_detector(home):
     first, line, program = (home / "detector.fcos").read_bytes().split(b"\n", 2)
     record = json.loads(line)
-    assert record == read_record(home / "detector.fcos")
+    assert record == load_exported(home / "detector.fcos").record
     assert record["classes"] == list(TINY_CONFIG.classes)
     assert sensor_from_json(record["sensor"], "") == TINY
     assert record["platforms"] == list(PLATFORMS) == ["cpu", "cuda", "rocm", "tpu"]

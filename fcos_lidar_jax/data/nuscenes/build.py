@@ -21,8 +21,6 @@ _DANGLING = -2  # row number for a token that no row has
 
 
 class _Tables:
-    """The tables of one folder, with their common checks."""
-
     def __init__(self, folder: Path, report: Report) -> None:
         self.folder, self.report = folder, report
 
@@ -39,7 +37,6 @@ class _Tables:
         return rows, self.number(rows, {})
 
     def number(self, rows: list[R], numbers: dict[str, int]) -> dict[str, int]:
-        """Add rows to ``numbers``: token -> row number."""
         for row in rows:
             if row.token in numbers:
                 raise self.error(type(row), row.token, "token: occurs twice")
@@ -79,15 +76,7 @@ def _floats(rows: list[Any], **widths: int) -> Columns:
 
 
 def build_index(folder: str | Path, report: Report = lambda name, rows: None) -> Index:
-    """Read, check and join the tables of one version.
-
-    Args:
-        folder: ``ROOT/VERSION``.
-        report: called after every piece of a table.
-
-    Raises:
-        ValueError: with the file, the record, the field, the found and the expected value.
-    """
+    """Read, check and join the tables in ``ROOT/VERSION``; ``report`` is called after every piece of a table."""
     tables = _Tables(Path(folder), report)
     if not tables.folder.is_dir():
         raise ValueError(f"{folder}: no such folder, expected the tables of a version")
@@ -232,7 +221,7 @@ def _boxes(tables: _Tables, samples: dict[str, int], sample_time_us: np.ndarray)
 
 
 def velocities(translation: np.ndarray, time_us: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Velocity of every annotation from its neighbours in time.
+    """Velocity of every annotation from its neighbours in time, f64[n, 3] in m/s, NaN if unknown.
 
     The central difference between two neighbours at most 3 s apart, or the one-sided difference to a single
     neighbour at most 1.5 s away; otherwise unknown.
@@ -241,9 +230,6 @@ def velocities(translation: np.ndarray, time_us: np.ndarray, before: np.ndarray,
         translation: f64[n, 3], metres.
         time_us: i64[n].
         before, after: row of the same object's annotation before and after, -1 if there is none.
-
-    Returns:
-        f64[n, 3] in m/s, NaN if unknown.
 
     >>> where, when = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([0, 500_000])
     >>> velocities(where, when, np.array([-1, 0]), np.array([1, -1]))[:, 0].tolist()

@@ -53,19 +53,12 @@ class Index:
 
 
 def _tables(folder: str | Path) -> dict[str, Path]:
-    """The existing tables of a version."""
     files = (Path(folder) / kind.file for kind in TABLES)
     return {file.name: file for file in files if file.is_file()}
 
 
 def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
-    """Write an index; the manifest is written last and marks a complete index.
-
-    Args:
-        index: the index.
-        folder: destination of the columns and the manifest.
-        tables: ``ROOT/VERSION``, from which the index was made.
-    """
+    """Write an index of the tables in ``ROOT/VERSION``; the manifest is written last and marks it as complete."""
     folder = Path(folder)
     states = {name: FileState.of(file) for name, file in _tables(tables).items()}
     (folder / _MANIFEST).unlink(missing_ok=True)
@@ -93,14 +86,8 @@ def has_index(folder: str | Path) -> bool:
 
 
 def open_index(folder: str | Path, *, tables: str | Path) -> Index:
-    """Read an index and verify its format, counts, checksums, and that it was made from these tables.
-
-    Args:
-        folder: a folder that :func:`save_index` wrote.
-        tables: ``ROOT/VERSION``.
-
-    Raises:
-        ValueError: with the file, the field, the found and the expected value.
+    """Read an index and verify its format, counts, checksums, and that it was made from the tables in
+    ``ROOT/VERSION``.
     """
     folder = Path(folder)
     manifest = _read_manifest(folder / _MANIFEST)

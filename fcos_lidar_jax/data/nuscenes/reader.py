@@ -102,11 +102,9 @@ class NuScenes:
         return list(self._sample_row)
 
     def split(self, name: str, *, file: str | Path | None = None) -> list[str]:
-        """The keyframes of a split by scene and time.
+        """The keyframes of a split by scene and time; unknown splits and scenes are refused.
 
-        Args:
-            name: name of the split.
-            file: ``{"name": ["scene", ...]}``; default: the version's ``splits.json``, or the official splits.
+        ``file`` is ``{"name": ["scene", ...]}``; default: the version's ``splits.json``, or the official splits.
 
         Raises:
             ValueError: no such split, an unknown scene, or no keyframe.
@@ -120,18 +118,13 @@ class NuScenes:
         return tokens
 
     def scene_of(self, sample_token: str) -> str:
-        """Name of a keyframe's scene."""
         return str(self.index.scene_name[self.index.sample_scene[self._row(sample_token)]])
 
     def sweeps(self, sample_token: str, num: int = 10) -> np.ndarray:
-        """The latest sweeps up to a keyframe, fused in its LiDAR frame like in the official devkit.
+        """The latest ``num`` sweeps up to a keyframe, fused in its LiDAR frame like in the official devkit.
 
         The current sweep comes first, then the others by age; there are fewer at the start of a scene. Points on
         the ego vehicle, ``|x|, |y| < 1`` m in each sweep's own frame, are dropped.
-
-        Args:
-            sample_token: the keyframe.
-            num: maximum number of sweeps, including the current one.
 
         Returns:
             f32[n, 5]: x, y, z, intensity (0-255), time lag in seconds, exactly 0 for the current sweep.
@@ -145,7 +138,7 @@ class NuScenes:
         self, sample_token: str, reading: CloudReading, sensor: Sensor = NUSCENES_HDL32E
     ) -> tuple[np.ndarray, int]:
         """:meth:`sweeps` with another reading; also returns the number of dropped points on the ego vehicle."""
-        current, *older = self._chain(sample_token, reading.num_sweeps)
+        current, *older = self._chain(self._sweep(sample_token), reading.num_sweeps)
         return fuse_sweeps(map(self._read, [current, *self._present(older)]), sensor, reading)
 
     def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
@@ -159,7 +152,7 @@ class NuScenes:
             following = {int(before): row for row, before in enumerate(self.index.sweep_previous) if before >= 0}
             while rows[-1] in following:
                 rows.append(following[rows[-1]])
-            rows = self._chain_of(rows[-1], len(self.index.sweep_file))[::-1]
+            rows = self._chain(rows[-1], len(self.index.sweep_file))[::-1]
         if not (present := self._present(rows)):
             raise ValueError(f"{self.root}: scene {scene}: found no file of {len(rows)} sweeps, expected some")
         return map(self._read, present)
@@ -217,7 +210,7 @@ class NuScenes:
 
     def sweep_files(self, sample_token: str, num: int = 10) -> list[Path]:
         """Files of the sweeps up to a keyframe, the current one first, even if they are missing."""
-        return [self._path(row) for row in self._chain(sample_token, num)]
+        return [self._path(row) for row in self._chain(self._sweep(sample_token), num)]
 
     def sensor_to_global(self, sample_token: str) -> np.ndarray:
         """f64[4, 4] from a keyframe's LiDAR frame to the global frame."""
@@ -239,10 +232,7 @@ class NuScenes:
     def _sweep(self, sample_token: str) -> int:
         return int(self.index.sample_sweep[self._row(sample_token)])
 
-    def _chain(self, sample_token: str, num: int) -> list[int]:
-        return self._chain_of(self._sweep(sample_token), num)
-
-    def _chain_of(self, row: int, num: int) -> list[int]:
+    def _chain(self, row: int, num: int) -> list[int]:
         """A sweep and the sweeps before it, at most ``num``."""
         chain = [row]
         while len(chain) < num and (before := int(self.index.sweep_previous[chain[-1]])) >= 0:
@@ -258,7 +248,6 @@ class NuScenes:
         return self.root / self.index.sweep_file[row].decode()
 
     def _present(self, rows: list[int]) -> list[int]:
-        """The sweeps to read: only existing files if others may be missing."""
         return [row for row in rows if os.path.isfile(self._path(row))] if self.allow_missing_sweeps else rows
 
     def _read(self, row: int) -> Sweep:

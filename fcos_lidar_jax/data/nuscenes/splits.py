@@ -29,14 +29,7 @@ def scenes_of_split(
 ) -> list[str]:
     """Scene names of a split in the given file, else in the version's ``splits.json``, else of an official split.
 
-    Args:
-        split: name of the split.
-        tables: ``ROOT/VERSION``.
-        known: names of the version's scenes.
-        file: ``{"name": ["scene", ...]}``.
-
-    Raises:
-        ValueError: the split is unknown or has no scene, or one that is not known.
+    An unknown split, one without scenes, and scenes that are not ``known`` are refused.
     """
     path, splits = Path(file or Path(tables) / SPLITS), own_splits(Path(tables), file)
     hint = "you can pass a file {name: [scene, ...]}"

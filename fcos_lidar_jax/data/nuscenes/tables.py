@@ -124,16 +124,7 @@ TABLES: tuple[type[Row], ...] = tuple(Row.__subclasses__())
 
 
 def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) -> Iterator[list[R]]:
-    """Read the rows of a table in order, one piece at a time.
-
-    Args:
-        folder: folder of the tables.
-        kind: one of :data:`TABLES`.
-        piece_bytes: approximate size of a piece's text.
-
-    Raises:
-        ValueError: the table is missing or not JSON, or a row lacks fields of ``kind``.
-    """
+    """Read the rows of a table in order, in pieces of about ``piece_bytes`` of text."""
     path = folder / kind.file
     if not path.is_file():
         raise ValueError(f"{path}: no such file, expected the table")
