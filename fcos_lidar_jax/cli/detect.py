@@ -212,7 +212,7 @@ def _detect(
         scores = [box["score"] for box in record["boxes"]]
         clear = sum(score >= shown_score for score in scores)
         progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
-    if line := truncation(num_truncated):
+    if line := truncation(num_truncated, detector.config):
         print(line, file=sys.stderr)
 
 

@@ -56,7 +56,7 @@ def write_detections(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: flo
         batch_size=batch_size,
         yaw_rad=yaw_rad,
     )
-    if line := truncation(removed["truncated"]):
+    if line := truncation(removed["truncated"], task.detector.config):
         tell(line)
     if removed["invalid"]:
         tell(f"{removed['invalid']} points dropped: not finite, or beyond physical limits")

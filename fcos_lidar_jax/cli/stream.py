@@ -22,7 +22,7 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import with_y_ahead
+from fcos_lidar_jax.data.recorded import with_heading
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
@@ -30,7 +30,7 @@ from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.stream import Found, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
-from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
@@ -105,7 +105,7 @@ def run(args: Stream) -> None:
     detector = load_detector(args.checkpoint, backend=args.backend)
     source = args.source or args.data_root or Path()
     paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
-    ahead = with_y_ahead(sensor) if kind is SCENE else sensor
+    ahead = with_heading(sensor, NUSCENES_HDL32E) if kind is SCENE else sensor
     aligned = alignment_of(args, sensor, paths, None if ahead == sensor else ahead)
     drive = _open(args, kind, detector, aligned.data)
     _tell(drive.notes)
@@ -144,7 +144,7 @@ def run(args: Stream) -> None:
                 frames.append(page_frame(points, (boxes, labels, scores), **details))
             before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
     _tell(drive.notes)
-    if line := truncation(num_truncated):
+    if line := truncation(num_truncated, detector.config):
         print(line, file=sys.stderr)
     print(timing.summary(), file=sys.stderr)
     if args.page is not None:

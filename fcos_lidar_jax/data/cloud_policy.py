@@ -166,13 +166,15 @@ def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sens
     )
 
 
-def truncation(number: int) -> str | None:
+def truncation(number: int, config: Config) -> str | None:
     """A line about truncated points, or None.
 
-    >>> truncation(7)
-    "7 points truncated: more than the detector's max_points"
+    >>> from fcos_lidar_jax.presets import QUICKSTART
+    >>> truncation(7, QUICKSTART)
+    '7 points left out at random: the detector takes at most 4096 per cloud (max_points)'
     """
-    return f"{number} points truncated: more than the detector's max_points" if number else None
+    how = f"left out at random: the detector takes at most {config.max_points} per cloud (max_points)"
+    return f"{number} points {how}" if number else None
 
 
 def _limits(sensor: Sensor) -> str:
@@ -202,13 +204,13 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     >>> cloud = make_frame(0, NUSCENES_HDL32E).points
     >>> sensor_mismatch(cloud, NUSCENES_HDL32E)
     >>> sensor_mismatch(cloud, SHORT_RANGE)[:68]
-    "points hardly of sensor 'short_range' (32 rows, 128 columns): 7.7 of"
+    "points do not fit sensor 'short_range' (32 rows, 128 columns): 7.7 p"
     """
     points = _with_columns(points, sensor)
     points = points[usable_rows(points)]
     about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
     if len(points) >= _MIN_ROWS and (hint := _coordinate_hint(points)):
-        return f"points hardly of {about}{hint}; expect poor detections"
+        return f"points do not fit {about}{hint}; expect poor detections"
     points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
     points = points[~np.asarray(close_to_sensor(points, sensor, _NEAR_M))]
     if sensor.azimuth_limits_rad is not None:
@@ -218,7 +220,7 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     if len(points) < _MIN_ROWS:
         return None
     reason = "; ".join(_mismatch(points, sensor))
-    return None if not reason else f"points hardly of {about}: {reason}; expect poor detections"
+    return None if not reason else f"points do not fit {about}: {reason}; expect poor detections"
 
 
 def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
@@ -245,7 +247,7 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     filled = cells[:-1].reshape(sensor.num_rows, sensor.num_columns) > 0
     density = cells[:-1].sum() / filled.sum()
     if density > _MAX_DENSITY:
-        yield f"{density:.1f} of the points share a cell, expected about one, with the origin in the sensor"
+        yield f"{density:.1f} points per cell, expected about 1, with the origin in the sensor"
     beside = (filled & np.roll(filled, 1, axis=1)).sum() / filled.sum()
     below = (filled[1:] & filled[:-1]).sum() / filled.sum()
     for share, what in ((beside, "column"), (below, "row")):

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, in_frame_of
 
 RECORDED_BY = {
     "training/velodyne/*.bin": KITTI_HDL64E,
@@ -32,14 +32,16 @@ def recorded_by(paths: Iterable[Path]) -> Sensor | None:
     return next(iter(found), None)
 
 
-def with_y_ahead(sensor: Sensor) -> Sensor:
-    """A sensor for clouds of nuScenes or simulated clouds, whose y points forward; an unknown heading stays.
+def with_heading(sensor: Sensor, data: Sensor) -> Sensor:
+    """A sensor for points with the heading of another sensor; an unknown heading stays.
 
-    >>> with_y_ahead(KITTI_HDL64E).forward_rad == NUSCENES_HDL32E.forward_rad
+    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+    >>> with_heading(KITTI_HDL64E, NUSCENES_HDL32E).forward_rad == NUSCENES_HDL32E.forward_rad
     True
     """
-    ahead = dataclasses.replace(sensor, forward_rad=NUSCENES_HDL32E.forward_rad)
-    return sensor if sensor.forward_rad is None else in_frame_of(sensor, ahead)
+    if sensor.forward_rad is None or data.forward_rad is None:
+        return sensor
+    return in_frame_of(sensor, dataclasses.replace(sensor, forward_rad=data.forward_rad))
 
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:

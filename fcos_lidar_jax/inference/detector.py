@@ -23,7 +23,7 @@ from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
 from fcos_lidar_jax.models import Detector, Variables, build_detector
-from fcos_lidar_jax.sensors import Sensor
+from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.types import Detections
 
 Rows = np.ndarray | jax.Array | Sequence[Any]
@@ -73,7 +73,7 @@ class CloudDetector(abc.ABC):
             ``batch_size`` times the number of devices, split over the devices.
         """
 
-    def __call__(self, points: Rows | str | Path, *, sensor: Sensor | None = None) -> DetectedBoxes:
+    def __call__(self, points: Rows | str | Path, *, sensor: Sensor | str | Path | None = None) -> DetectedBoxes:
         """Detect boxes in one cloud of any length; compiled once.
 
         Warns in one line if the cloud does not fit the sensor of the detector.
@@ -82,8 +82,9 @@ class CloudDetector(abc.ABC):
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
                 in metres, intensity, time lag in seconds, laser number, as in an array file. Under ``jax.jit``,
                 call the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
-            sensor: sensor that recorded the points, which gives their heading, position and intensity scale. By
-                default the detector's or, for files in the folders of KITTI and Argoverse 2, theirs.
+            sensor: sensor that recorded the points, or its name or JSON file; gives their heading, position and
+                intensity scale. By default the detector's or, for files in the folders of KITTI and Argoverse 2,
+                theirs.
 
         Returns:
             the boxes, best score first, at most ``config.inference.max_detections``, without padding.
@@ -92,6 +93,7 @@ class CloudDetector(abc.ABC):
             ValueError: invalid shape or type, or a fifth column that contains rings instead of time lags.
         """
         is_file = isinstance(points, str | Path)
+        sensor = load_sensor(sensor) if isinstance(sensor, str | Path) else sensor
         aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())  # type: ignore[arg-type]
         rows = (read_points if is_file else points_from_array)(points, aligned.data)  # type: ignore[arg-type]
         rows, num_close = drop_close(rows, aligned.data, self.config.reading)
@@ -99,7 +101,7 @@ class CloudDetector(abc.ABC):
         if line := sensor_mismatch(rows, self.sensor):
             warnings.warn(line, stacklevel=2)
         cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
-        if line := truncation(cloud.num_truncated):
+        if line := truncation(cloud.num_truncated, self.config):
             warnings.warn(line, stacklevel=2)
         found = aligned.back(self.detect(cloud))
         boxes, labels, scores = confident(found, 0.0)

@@ -16,7 +16,7 @@ from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import official_splits
-from fcos_lidar_jax.data.recorded import RECORDED_BY, check_scale, with_y_ahead
+from fcos_lidar_jax.data.recorded import check_scale, with_heading
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
@@ -36,6 +36,7 @@ class Reader:
     open: Callable[..., FrameSet]  # (data set, *, split, sensor, reading, **options) -> frames
     options: tuple[str, ...] = ()  # further options of open_frames that this format takes
     class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)  # by the data set they lead to
+    any_sensor: bool = False  # any sensor records this format, with the heading of ``sensor``
 
     @property
     def named_maps(self) -> str:
@@ -52,6 +53,7 @@ READERS = (
         lambda data, **how: open_keyframes(data.root, data.version, **how),
         ("version", "index", "splits", "allow_missing_sweeps", "follow_links"),
         class_maps={"kitti": TO_KITTI},
+        any_sensor=True,
     ),
     Reader(
         "kitti",
@@ -88,6 +90,7 @@ READERS = (
         lambda data, _: list(SIMULATED_SPLITS),
         lambda data, split, **how: simulated_split(split or "train", **how),
         class_maps={"kitti": TO_KITTI},
+        any_sensor=True,
     ),
 )
 
@@ -256,14 +259,14 @@ def open_frames(
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
-    recorded = data.reader.sensor if data.reader.sensor in RECORDED_BY.values() else None
-    if sensor is not None and recorded is not None:
+    recorded = data.reader.sensor
+    if sensor is not None and recorded is not None and data.reader.any_sensor:
+        sensor = with_heading(sensor, recorded)
+    elif sensor is not None and recorded is not None:
         given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, recorded)
         if intensity_scale is None and sensor.intensity_scale != given_scale:
             told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
             print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
-    elif sensor is not None and data.reader.sensor is not None:
-        sensor = with_y_ahead(sensor)
     open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
     frames = open_with(sensor=sensor or data.reader.sensor)
     if intensity_scale is not None:  # opened again, because only the frames know the sensor of a folder

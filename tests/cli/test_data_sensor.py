@@ -93,11 +93,11 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 
     detector = fcos.load_detector("hdl32e")
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "points hardly of sensor")  # it has 64 beams
+        warnings.filterwarnings("ignore", "points do not fit sensor")  # it has 64 beams
         capsys.readouterr()
         by_path, again = (detector(folder / "000000.bin") for _ in range(2))
         assert capsys.readouterr().err.count("recorded by kitti_hdl64e") <= 1  # not for every file
-        by_sensor, moved = detector(raw, sensor=KITTI_HDL64E), detector(kitti / "elsewhere" / "cloud.bin")
+        by_sensor, moved = detector(raw, sensor="kitti_hdl64e"), detector(kitti / "elsewhere" / "cloud.bin")
     for found in (by_path, again, by_sensor):
         assert found.to_dict()["boxes"] == boxes
         assert found.points[:, 3].max() > 1

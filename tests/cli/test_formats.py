@@ -157,7 +157,7 @@ def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path):
             warnings.simplefilter("always")
             detections = detector(np.load(root / "clouds" / f"{frame['name']}.npy"))
         found = " and ".join(str(warning.message) for warning in told)
-        assert re.fullmatch(".* share a cell.* points truncated.*" if frame["name"] == "000" else "", found)
+        assert re.fullmatch(".* points per cell.* points left out.*" if frame["name"] == "000" else "", found)
         assert len(detections) > 0
         assert detections.to_dict()["boxes"] == frame["boxes"]
 
@@ -166,10 +166,10 @@ def test_a_cloud_of_another_sensor_causes_one_warning(tmp_path, capsys):
     cloud = make_frame(0, fcos.load_sensor("nuscenes_hdl32e")).points
     np.save(tmp_path / "cloud.npy", cloud)
     command("detect", tmp_path / "cloud.npy", "--checkpoint quickstart --out", tmp_path / "boxes.json")
-    [line] = [line for line in capsys.readouterr().err.splitlines() if "hardly of" in line]
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "do not fit" in line]
     assert line.startswith("warning: ")
     command("project", tmp_path / "cloud.npy", "--sensor short_range --out", tmp_path / "image.npz")
-    assert f"warning: {tmp_path / 'cloud.npy'}: points hardly of" in capsys.readouterr().err
+    assert f"warning: {tmp_path / 'cloud.npy'}: points do not fit" in capsys.readouterr().err
     command("project", tmp_path / "cloud.npy", "--out", tmp_path / "image.npz")
     assert capsys.readouterr().err == ""
 
@@ -237,7 +237,7 @@ def test_training_warns_of_another_sensors_clouds_before_compiling(tmp_path, cap
     with pytest.raises(TypeError):  # there is no step
         train(dataclasses.replace(QUICKSTART, copy_paste=None), wrong, tmp_path / "run", steps=1)
     warning, compiling = capsys.readouterr().err.splitlines()[:2]
-    assert warning.startswith("warning: frame 0: points hardly of sensor 'short_range'")
+    assert warning.startswith("warning: frame 0: points do not fit sensor 'short_range'")
     assert compiling.startswith("compiling")
 
 

@@ -204,8 +204,8 @@ def test_the_warning_describes_the_mismatch(clouds):
     shares = hdl32e * np.array([1, 1, 1, 1 / 255, 1], np.float32)
     timed = np.column_stack([np.full(len(hdl32e), 1.533e9), hdl32e[:, :3], hdl32e[:, 3] / 255])
     for points, sensor, finding in (
-        (hdl32e, "short_range", r"\d\.\d of the points share a cell"),
-        (clouds["kitti_hdl64e"], "nuscenes_hdl32e", r"\d\.\d of the points share a cell"),
+        (hdl32e, "short_range", r"\d\.\d points per cell"),
+        (clouds["kitti_hdl64e"], "nuscenes_hdl32e", r"\d\.\d points per cell"),
         (hdl32e, "kitti_hdl64e", "0% of the points have a neighbour in the next row|next column"),
         (hdl32e, "waymo_top", "outside its vertical field of view"),
         (hdl32e + np.array([0, 0, 100, 0, 0]), "nuscenes_hdl32e", "beyond its limits, .* < 54 m"),
@@ -225,7 +225,7 @@ def test_the_warning_has_all_findings(clouds):
     shares = clouds["nuscenes_hdl32e"] * np.array([1, 1, 1, 1 / 255, 1], np.float32)
     line = sensor_mismatch(shares, PRESETS["short_range"]) or ""
     assert "no intensity is above 1" in line
-    assert "of the points share a cell" in line
+    assert "points per cell" in line
 
 
 def test_too_few_points_give_no_warning():

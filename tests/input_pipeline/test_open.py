@@ -125,6 +125,17 @@ def test_data_keep_their_units_and_axes_with_another_sensor(roots, capsys):
         assert ahead.azimuth_limits_rad == pytest.approx((np.pi / 4, 3 * np.pi / 4))
 
 
+def test_a_new_format_keeps_the_units_and_axes_of_its_sensor(roots, monkeypatch):
+    own = dataclasses.replace(VLP16, forward_rad=0.5, origin_m=(0.0, 0.0, 1.9), intensity_scale=2.0)
+    readers = tuple(
+        dataclasses.replace(reader, sensor=own) if reader.name == "kitti" else reader for reader in READERS
+    )
+    monkeypatch.setattr("fcos_lidar_jax.input_pipeline.open.READERS", readers)
+    sensor = open_frames(roots["kitti"], sensor=NUSCENES_HDL32E).sensor
+    assert (sensor.forward_rad, sensor.origin_m, sensor.intensity_scale) == (0.5, (0.0, 0.0, 1.9), 2.0)
+    assert sensor.num_columns == NUSCENES_HDL32E.num_columns
+
+
 def test_intensities_are_brought_to_the_scale_of_the_network_by_a_given_factor(roots, tmp_path):
     for format in ("kitti", "argoverse2", "folder"):
         plain, times = open_frames(roots[format]), open_frames(roots[format], intensity_scale=8.0)
