@@ -44,7 +44,7 @@ class DataOptions:
     class_map: Annotated[str | None, option("NAME|FILE")] = None
     """Rename classes: nuscenes for KITTI and Argoverse 2, kitti for nuScenes, or a JSON file:
     {name in the data: new name, or null to leave out its objects}."""
-    full_turn: bool = False  # KITTI: keep the points outside the camera image, where nothing is labelled.
+    full_turn: options.FullTurn = False
     intensity_scale: options.IntensityScale = None
     follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.

@@ -67,6 +67,7 @@ class Detect:
     data_sensor: options.DataSensor = None
     yaw_deg: options.Yaw = None
     intensity_scale: options.IntensityScale = None
+    full_turn: options.FullTurn = False
     min_score: options.MinScore = None
     labels: options.Labels = None
     remove_close: options.Close = None
@@ -152,6 +153,7 @@ def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector, sensor
         columns=args.columns,
         dtype=args.dtype,
         max_points=args.max_file_points,
+        full_turn=args.full_turn or args.data_sensor is not None,
     )
 
 
@@ -165,7 +167,7 @@ def _resume_log(args: Detect, detector: CloudDetector, aligned: Alignment) -> It
     """The log of the files that an interrupted call with the same options has finished; deleted in the end."""
     file = _log_file(args)
     same = args.remove_close, args.columns, args.dtype, args.min_score, args.labels, args.batch_size
-    same += sensor_to_json(aligned.data), aligned.yaw_rad
+    same += sensor_to_json(aligned.data), aligned.yaw_rad, args.full_turn
     with file_lock(file) as held:
         if not held:
             raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")

@@ -121,6 +121,12 @@ IntensityScale = Annotated[
 ]
 
 
+FullTurn = Annotated[
+    bool,
+    option(text="KITTI: keep the points outside the camera image, where nothing is labelled."),
+]
+
+
 def radians(degrees: float | None) -> float | None:
     """The angle of ``yaw_deg`` in radians; None stays None."""
     if degrees is not None and not math.isfinite(degrees):

@@ -8,6 +8,7 @@ import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points
+from fcos_lidar_jax.data.kitti import in_camera
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.sensors import Sensor
@@ -23,6 +24,7 @@ class CloudFiles(FrameSet):
     columns: int | None = None  # of raw files in another layout
     dtype: str | None = None  # of raw files in another layout
     max_points: int = MAX_POINTS  # larger clouds are refused
+    full_turn: bool = True  # False: only the points that :func:`~fcos_lidar_jax.data.kitti.in_camera` keeps
     classes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -34,7 +36,9 @@ class CloudFiles(FrameSet):
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
-            points, num_close = drop_close(read_points(file, self.sensor, **layout), self.sensor, self.reading)
+            points = read_points(file, self.sensor, **layout)
+            points = points if self.full_turn else in_camera(file, points)
+            points, num_close = drop_close(points, self.sensor, self.reading)
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 
     def truth(self, index: int) -> Frame:
@@ -49,7 +53,7 @@ class CloudFiles(FrameSet):
         return str(self.files[index])
 
     def fingerprint(self) -> str:
-        reading = self.reading, self.columns, self.dtype
+        reading = self.reading, self.columns, self.dtype, self.full_turn
         return files_fingerprint([file.absolute() for file in self.files], Path("/"), reading)
 
 

@@ -1,5 +1,8 @@
 """KITTI object detection: Velodyne clouds with labels in camera coordinates."""
 
+import functools
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +167,29 @@ def in_image(points: np.ndarray, velo_to_image: np.ndarray, image_size: tuple[in
         u, v, depth = velo_to_image[:, :3] @ points[:, :3].T.astype(np.float64) + velo_to_image[:, 3:]
     # No division by the depth, which may be zero; 0 <= u < width * depth holds only in front of the camera.
     return (u >= 0) & (u < width * depth) & (v >= 0) & (v < height * depth)
+
+
+def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
+    """The points of a file in KITTI's folders inside the left colour image, as in :class:`KittiFrames`.
+
+    Files elsewhere, or without ``calib/NAME.txt`` beside the folder, keep all points. A line says once per folder
+    that points are left out.
+
+    >>> in_camera(Path("street.bin"), np.zeros((9, 5))).shape
+    (9, 5)
+    """
+    calibration = file.parent.parent / "calib" / f"{file.stem}.txt"
+    known = any(Path(os.path.abspath(file)).match(f"{part}/velodyne/*.bin") for part in ("training", "testing"))
+    if not known or not calibration.is_file():
+        return points
+    matrices = read_calibration(calibration)
+    _tell_once(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them")
+    return points[in_image(points, matrices["P2"] @ matrices["velo_to_rect"], IMAGE_SIZE)]
+
+
+@functools.cache
+def _tell_once(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:

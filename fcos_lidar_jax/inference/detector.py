@@ -16,6 +16,7 @@ from jax.sharding import Mesh, PartitionSpec
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch, truncation
 from fcos_lidar_jax.data.frame import drop_close
+from fcos_lidar_jax.data.kitti import in_camera
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
@@ -73,7 +74,13 @@ class CloudDetector(abc.ABC):
             ``batch_size`` times the number of devices, split over the devices.
         """
 
-    def __call__(self, points: Rows | str | Path, *, sensor: Sensor | str | Path | None = None) -> DetectedBoxes:
+    def __call__(
+        self,
+        points: Rows | str | Path,
+        *,
+        sensor: Sensor | str | Path | None = None,
+        full_turn: bool = False,
+    ) -> DetectedBoxes:
         """Detect boxes in one cloud of any length; compiled once.
 
         Warns in one line if the cloud does not fit the sensor of the detector.
@@ -85,6 +92,8 @@ class CloudDetector(abc.ABC):
             sensor: sensor that recorded the points, or its name or JSON file; gives their heading, position and
                 intensity scale. By default the detector's or, for files in the folders of KITTI and Argoverse 2,
                 theirs.
+            full_turn: keep the points of KITTI's files outside the camera image, see
+                :func:`~fcos_lidar_jax.data.kitti.in_camera`; always for a given ``sensor``.
 
         Returns:
             the boxes, best score first, at most ``config.inference.max_detections``, without padding.
@@ -96,6 +105,8 @@ class CloudDetector(abc.ABC):
         sensor = load_sensor(sensor) if isinstance(sensor, str | Path) else sensor
         aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())  # type: ignore[arg-type]
         rows = (read_points if is_file else points_from_array)(points, aligned.data)  # type: ignore[arg-type]
+        if is_file and sensor is None and not full_turn:
+            rows = in_camera(Path(points), rows)  # type: ignore[arg-type]
         rows, num_close = drop_close(rows, aligned.data, self.config.reading)
         rows = aligned.points(rows)
         if line := sensor_mismatch(rows, self.sensor):

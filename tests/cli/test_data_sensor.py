@@ -75,29 +75,37 @@ def assert_turned_back(boxes, expected, origin=(0, 0, 0)):
 
 def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
     folder, drive = kitti / "training" / "velodyne", kitti / "day" / "drive"
-    boxes = detect(tmp_path / "boxes.json", folder, "--page", tmp_path / "page.html")
+    boxes = detect(tmp_path / "boxes.json", folder, "--full-turn --page", tmp_path / "page.html")
     assert page_content(tmp_path / "page.html")["forward_rad"] == KITTI_HDL64E.forward_rad
     told = capsys.readouterr().err
     assert told.count("recorded by kitti_hdl64e") == told.count("intensities times 255") == 1  # of two files
     assert told.count("clouds turned by 90 degrees") == 1
     assert "no intensity is above 1" not in told
+    assert "outside the camera image" not in told
+    cropped = detect(tmp_path / "cropped.json", folder)
+    told = capsys.readouterr().err
+    assert told.count("points outside the camera image are left out; --full-turn keeps them") == 1  # of two files
 
     raw = np.fromfile(folder / "000000.bin", np.float32).reshape(-1, 4)
     np.save(tmp_path / "by_hand.npy", as_nuscenes(raw * np.float32([1, 1, 1, 255])))
     assert_turned_back(boxes, detect(tmp_path / "by_hand.json", tmp_path / "by_hand.npy"))
 
-    data = f"--data-root {kitti} --format kitti --split train --full-turn --class-map {kitti}/map.json"
-    command("evaluate", data, "--no-report", HDL32E, tmp_path / "scores")
-    [evaluated] = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
-    assert evaluated["boxes"] == boxes
+    data = f"--data-root {kitti} --format kitti --split train --class-map {kitti}/map.json --no-report"
+    for more, expected in (("", cropped), ("--full-turn", boxes)):
+        command("evaluate", data, more, HDL32E, tmp_path / f"scores{more}")
+        [evaluated] = json.loads((tmp_path / f"scores{more}" / "detections.json").read_text())["frames"]
+        assert evaluated["boxes"] == expected
+    assert len(cropped) > 20
+    assert cropped != boxes
 
     detector = fcos.load_detector("hdl32e")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "points do not fit sensor")  # it has 64 beams
         capsys.readouterr()
-        by_path, again = (detector(folder / "000000.bin") for _ in range(2))
+        by_path, again = (detector(folder / "000000.bin", full_turn=True) for _ in range(2))
         assert capsys.readouterr().err.count("recorded by kitti_hdl64e") <= 1  # not for every file
         by_sensor, moved = detector(raw, sensor="kitti_hdl64e"), detector(kitti / "elsewhere" / "cloud.bin")
+        assert detector(folder / "000000.bin").to_dict()["boxes"] == cropped
     for found in (by_path, again, by_sensor):
         assert found.to_dict()["boxes"] == boxes
         assert found.points[:, 3].max() > 1
@@ -117,7 +125,7 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):
     inside, copy = kitti / "training" / "velodyne" / "000000.bin", kitti / "elsewhere" / "cloud.bin"
     out = tmp_path / "boxes.json"
-    boxes, plain = detect(out, inside), detect(out, copy)
+    boxes, plain = detect(out, inside, "--full-turn"), detect(out, copy)
     assert boxes != plain
     capsys.readouterr()
     assert detect(out, inside, "--data-sensor nuscenes_hdl32e") == plain
@@ -125,8 +133,8 @@ def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):
     assert detect(out, copy, "--data-sensor kitti_hdl64e") == boxes
     assert detect(out, copy, "--yaw-deg 90 --intensity-scale 255") == boxes
     # An angle takes the place of the turn between the sensors, and a factor that of their scale.
-    assert detect(out, inside, "--yaw-deg 0") == detect(out, copy, "--intensity-scale 255") != boxes
-    assert detect(out, inside, "--yaw-deg 0 --intensity-scale 1") == plain
+    assert detect(out, inside, "--yaw-deg 0 --full-turn") == detect(out, copy, "--intensity-scale 255") != boxes
+    assert detect(out, inside, "--yaw-deg 0 --intensity-scale 1 --full-turn") == plain
     assert stream(out, copy, "--data-sensor kitti_hdl64e") == boxes
     assert stream(out, copy, "--yaw-deg 90 --intensity-scale 255") == boxes
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import inside_box
-from fcos_lidar_jax.data.kitti import CLASSES, KittiFrames, read_calibration, read_labels, to_lidar
+from fcos_lidar_jax.data.kitti import CLASSES, KittiFrames, in_camera, read_calibration, read_labels, to_lidar
 from fcos_lidar_jax.input_pipeline.open import open_frames
 from fcos_lidar_jax.sensors import TINY
 
@@ -31,6 +31,19 @@ def root(tmp_path):
         (training / "velodyne").mkdir(exist_ok=True)
         np.array(CLOUD, np.float32).tofile(training / "velodyne" / f"{name}.bin")
     return tmp_path
+
+
+def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, capsys):
+    points = np.array(CLOUD, np.float32)
+    file = root / "training" / "velodyne" / "000007.bin"
+    cropped = in_camera(file, points)
+    np.testing.assert_array_equal(cropped[:, :3], KittiFrames(root).frame(1).points[:, :3])
+    assert 0 < len(cropped) < len(points)
+    in_camera(file, points)
+    assert capsys.readouterr().err.count("points outside the camera image are left out") == 1
+    (root / "training" / "calib" / "000003.txt").unlink()
+    for other in (file.with_name("000003.bin"), root / "000007.bin"):
+        np.testing.assert_array_equal(in_camera(other, points), points)
 
 
 def test_frames_are_sorted_by_name_and_have_points_boxes_labels_and_counts(root):
