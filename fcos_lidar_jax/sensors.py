@@ -274,14 +274,15 @@ class _EvenBeams:
     def __post_init__(self) -> None:
         for name in ("lowest", "highest"):
             check(_finite(getattr(self, name)), name, getattr(self, name), "a finite number")
+        check(self.lowest < self.highest, "highest", self.highest, f"more than the lowest beam, {self.lowest:g}")
         check(2 <= self.rows <= _MAX_ROWS, "rows", self.rows, f"an integer from 2 to {_MAX_ROWS}")
 
 
 def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
     """Create a sensor from a JSON object with the fields of :class:`Sensor`.
 
-    ``inclinations_rad`` is a list of beams. Evenly spaced beams can be given as
-    ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the
+    ``inclinations_rad`` and ``inclinations_deg`` are lists of beams, highest first. Evenly spaced beams can be
+    given as ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the
     heading is that of the preset of the same name, else unknown.
 
     Raises:
@@ -301,8 +302,12 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
         raise ValueError(f"{where}: inclinations_deg, inclinations_rad: {found}, expected one of them")
     record = {"forward_rad": _usual_heading(record.get("name")), **record}
     if "inclinations_deg" in record:
-        beams = from_json(_EvenBeams, record["inclinations_deg"], f"{where}: inclinations_deg")
-        table = even_inclinations(beams.lowest, beams.highest, beams.rows)
+        kind = tuple[float, ...] if isinstance(record["inclinations_deg"], list) else _EvenBeams
+        beams = from_json(kind, record["inclinations_deg"], f"{where}: inclinations_deg")
+        if isinstance(beams, _EvenBeams):
+            table = even_inclinations(beams.lowest, beams.highest, beams.rows)
+        else:
+            table = tuple(math.radians(beam) for beam in beams)
         others = {name: value for name, value in record.items() if name != "inclinations_deg"}
         record = {**others, "inclinations_rad": table}
     return from_json(Sensor, record, where, defaults=True)

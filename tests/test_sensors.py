@@ -123,6 +123,11 @@ def test_evenly_spaced_beams_can_be_given_in_degrees():
     assert math.degrees(sensor.inclinations_rad[-1]) == pytest.approx(-25)
 
 
+def test_beams_can_be_listed_in_degrees():
+    sensor = sensor_from_json({"name": "a", "num_columns": 1024, "inclinations_deg": [10, 0.5, -25]})
+    np.testing.assert_allclose(sensor.inclinations_rad, np.deg2rad([10, 0.5, -25]))
+
+
 GOOD = {"name": "a", "num_columns": 8, "inclinations_rad": [0.1, 0.0]}
 BEAMLESS = {"name": "a", "num_columns": 8}
 BAD = [
@@ -144,6 +149,11 @@ BAD = [
     ({**BEAMLESS, "inclinations_deg": {"lowest": 1}}, "inclinations_deg.highest: missing"),
     ({**BEAMLESS, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 1}}, "rows: got 1"),
     ({**BEAMLESS, "inclinations_deg": {"lowest": 0, "highest": 1, "rows": 2**32}}, "rows: got 4294967296"),
+    (
+        {**BEAMLESS, "inclinations_deg": {"lowest": 5, "highest": -5, "rows": 2}},
+        "inclinations_deg.*highest: got -5.0, expected more than the lowest beam, 5",
+    ),
+    ({**BEAMLESS, "inclinations_deg": [1, "2"]}, r"inclinations_deg\[1\]: got '2', expected float"),
     ({**GOOD, "azimuth_limits_rad": 1}, "azimuth_limits_rad: got 1, expected a list"),
     ({**GOOD, "azimuth_limits_rad": [1]}, "azimuth_limits_rad: got 1 values, expected 2"),
     ({**GOOD, "azimuth_limits_rad": [1, 1]}, r"azimuth_limits_rad: got \(1\.0, 1\.0\), expected \(right, left\)"),
