@@ -2,6 +2,7 @@
 
 import ast
 import builtins
+import dataclasses
 import doctest
 import importlib
 import importlib.util
@@ -19,7 +20,7 @@ import pytest
 import fcos_lidar_jax
 from fcos_lidar_jax.cli import demo
 from fcos_lidar_jax.cli.commands import parse
-from fcos_lidar_jax.sensors import SHORT_RANGE
+from fcos_lidar_jax.sensors import SHORT_RANGE, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
 ROOT = Path(__file__).parents[1]
@@ -171,6 +172,11 @@ def test_json_of_the_pages_parses():
     for page in PAGES:
         for block in blocks(page, "json"):
             json.loads(block)
+
+
+def test_the_page_names_every_field_of_a_sensor_file():
+    text = (DOCS / "own_data.md").read_text()
+    assert [f.name for f in dataclasses.fields(Sensor) if not re.search(rf"[`\"]{f.name}[`\"]", text)] == []
 
 
 def test_blocks_of_code_are_run_or_marked():
