@@ -1,5 +1,6 @@
-"""Progress lines for long operations, with rate and time left."""
+"""Lines on stderr: progress of long operations, with rate and time left, and notes."""
 
+import functools
 import sys
 import time
 
@@ -30,3 +31,9 @@ class Progress:
             rate = (done - first) / (now - began)
             line += f"  {rate:.2f} {self.unit}/s, {(self.total - done) / rate:.0f} s left"
         print(line, file=sys.stderr, flush=True)
+
+
+@functools.cache
+def tell_once(line: str) -> None:
+    """Print a line to stderr, once per process."""
+    print(line, file=sys.stderr, flush=True)

@@ -153,7 +153,7 @@ def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector, sensor
         columns=args.columns,
         dtype=args.dtype,
         max_points=args.max_file_points,
-        full_turn=args.full_turn or args.data_sensor is not None,
+        full_turn=args.full_turn,
     )
 
 

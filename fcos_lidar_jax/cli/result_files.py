@@ -138,7 +138,7 @@ def _kitti(folder: Path, classes: Sequence[str], calibration: Path | None) -> It
         why = "outside of the image, or of a class without a type of KITTI"
         print(f"{folder}: {num_left_out} of {num_boxes} boxes left out: {why}", file=sys.stderr)
     if others := [file.name for file in sorted(folder.glob("*.txt")) if file.stem not in written]:
-        print(f"{folder}: {len(others)} .txt files are of other clouds, such as {others[0]}", file=sys.stderr)
+        print(f"{folder}: also contains {len(others)} .txt of other clouds, such as {others[0]}", file=sys.stderr)
 
 
 def _stem(cloud: str | Path, number: int) -> str:

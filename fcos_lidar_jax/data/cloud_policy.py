@@ -171,9 +171,9 @@ def truncation(number: int, config: Config) -> str | None:
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> truncation(7, QUICKSTART)
-    '7 points left out at random: the detector takes at most 4096 per cloud (max_points)'
+    '7 points left out: the detector takes at most 4096 per cloud (max_points)'
     """
-    how = f"left out at random: the detector takes at most {config.max_points} per cloud (max_points)"
+    how = f"left out: the detector takes at most {config.max_points} per cloud (max_points)"
     return f"{number} points {how}" if number else None
 
 

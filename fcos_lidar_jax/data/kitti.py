@@ -1,8 +1,5 @@
 """KITTI object detection: Velodyne clouds with labels in camera coordinates."""
 
-import functools
-import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +9,10 @@ from fcos_lidar_jax.data.box_geometry import check_boxes, count_inside
 from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
+from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
+from fcos_lidar_jax.progress import tell_once
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
 CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
@@ -179,17 +178,11 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
     (9, 5)
     """
     calibration = file.parent.parent / "calib" / f"{file.stem}.txt"
-    known = any(Path(os.path.abspath(file)).match(f"{part}/velodyne/*.bin") for part in ("training", "testing"))
-    if not known or not calibration.is_file():
+    if recorded_by([file]) != KITTI_HDL64E or not calibration.is_file():
         return points
     matrices = read_calibration(calibration)
-    _tell_once(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them")
+    tell_once(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them")
     return points[in_image(points, matrices["P2"] @ matrices["velo_to_rect"], IMAGE_SIZE)]
-
-
-@functools.cache
-def _tell_once(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:

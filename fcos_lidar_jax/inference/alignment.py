@@ -1,9 +1,7 @@
 """The way from the frame of a data set to the frame that a detector expects, and back."""
 
 import dataclasses
-import functools
 import math
-import sys
 from collections.abc import Collection
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import numpy as np
 from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
 from fcos_lidar_jax.inference.tracks import to_world
+from fcos_lidar_jax.progress import tell_once
 from fcos_lidar_jax.sensors import Sensor, in_frame_of, turn_between
 from fcos_lidar_jax.types import Detections
 
@@ -108,10 +107,5 @@ def align(
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
     if sensor is None and recorded is not None and data != detector:
         told = f"recorded by {recorded.name}, as the path tells, unless --data-sensor names another"
-        _tell_once(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}")
+        tell_once(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}")
     return Alignment(data, detector, yaw_rad)
-
-
-@functools.cache
-def _tell_once(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

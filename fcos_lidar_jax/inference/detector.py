@@ -93,7 +93,7 @@ class CloudDetector(abc.ABC):
                 intensity scale. By default the detector's or, for files in the folders of KITTI and Argoverse 2,
                 theirs.
             full_turn: keep the points of KITTI's files outside the camera image, see
-                :func:`~fcos_lidar_jax.data.kitti.in_camera`; always for a given ``sensor``.
+                :func:`~fcos_lidar_jax.data.kitti.in_camera`.
 
         Returns:
             the boxes, best score first, at most ``config.inference.max_detections``, without padding.
@@ -105,7 +105,7 @@ class CloudDetector(abc.ABC):
         sensor = load_sensor(sensor) if isinstance(sensor, str | Path) else sensor
         aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())  # type: ignore[arg-type]
         rows = (read_points if is_file else points_from_array)(points, aligned.data)  # type: ignore[arg-type]
-        if is_file and sensor is None and not full_turn:
+        if is_file and not full_turn:
             rows = in_camera(Path(points), rows)  # type: ignore[arg-type]
         rows, num_close = drop_close(rows, aligned.data, self.config.reading)
         rows = aligned.points(rows)

@@ -128,7 +128,7 @@ def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):
     boxes, plain = detect(out, inside, "--full-turn"), detect(out, copy)
     assert boxes != plain
     capsys.readouterr()
-    assert detect(out, inside, "--data-sensor nuscenes_hdl32e") == plain
+    assert detect(out, inside, "--data-sensor nuscenes_hdl32e --full-turn") == plain
     assert "recorded by" not in capsys.readouterr().err
     assert detect(out, copy, "--data-sensor kitti_hdl64e") == boxes
     assert detect(out, copy, "--yaw-deg 90 --intensity-scale 255") == boxes

@@ -215,7 +215,7 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monk
         where = "--checkpoint", home / "checkpoint", "--min-score 0.001 --output-format kitti --out", named
         command("detect", home / "training" / "velodyne", *where, "--calibration", home / "training" / "calib")
     told = capsys.readouterr().err
-    assert f"{named}: 1 .txt files are of other clouds, such as 000009.txt" in told
+    assert f"{named}: also contains 1 .txt of other clouds, such as 000009.txt" in told
     (out / "000009.txt").unlink()
     types, written = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}, 0
     types |= {"bicycle": "Cyclist", "bus": "Tram"}
