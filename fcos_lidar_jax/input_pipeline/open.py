@@ -36,7 +36,8 @@ class Reader:
     open: Callable[..., FrameSet]  # (data set, *, split, sensor, reading, **options) -> frames
     options: tuple[str, ...] = ()  # further options of open_frames that this format takes
     class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)  # by the data set they lead to
-    any_sensor: bool = False  # any sensor records this format, with the heading of ``sensor``
+    adapt: Callable[[Sensor, Sensor], Sensor] = in_frame_of
+    """(given sensor, ``sensor``) -> the given one with frame and scale, or only the heading, of ``sensor``."""
 
     @property
     def named_maps(self) -> str:
@@ -53,7 +54,7 @@ READERS = (
         lambda data, **how: open_keyframes(data.root, data.version, **how),
         ("version", "index", "splits", "allow_missing_sweeps", "follow_links"),
         class_maps={"kitti": TO_KITTI},
-        any_sensor=True,
+        adapt=with_heading,
     ),
     Reader(
         "kitti",
@@ -90,7 +91,7 @@ READERS = (
         lambda data, _: list(SIMULATED_SPLITS),
         lambda data, split, **how: simulated_split(split or "train", **how),
         class_maps={"kitti": TO_KITTI},
-        any_sensor=True,
+        adapt=with_heading,
     ),
 )
 
@@ -260,17 +261,17 @@ def open_frames(
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
     recorded = data.reader.sensor
-    if sensor is not None and recorded is not None and data.reader.any_sensor:
-        sensor = with_heading(sensor, recorded)
-    elif sensor is not None and recorded is not None:
-        given_scale, sensor = sensor.intensity_scale, in_frame_of(sensor, recorded)
+    if sensor is not None and recorded is not None:
+        given_scale, sensor = sensor.intensity_scale, data.reader.adapt(sensor, recorded)
         if intensity_scale is None and sensor.intensity_scale != given_scale:
             told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
             print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
     open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
-    frames = open_with(sensor=sensor or data.reader.sensor)
-    if intensity_scale is not None:  # opened again, because only the frames know the sensor of a folder
-        frames = open_with(sensor=dataclasses.replace(frames.sensor, intensity_scale=intensity_scale))
+    sensor = sensor or recorded
+    if intensity_scale is not None:
+        sensor = sensor or open_with(sensor=None).sensor  # only the frames know the sensor of a folder
+        sensor = dataclasses.replace(sensor, intensity_scale=intensity_scale)
+    frames = open_with(sensor=sensor)
     if class_map is None:
         return frames
     return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
