@@ -24,7 +24,7 @@ class CloudFiles(FrameSet):
     columns: int | None = None  # of raw files in another layout
     dtype: str | None = None  # of raw files in another layout
     max_points: int = MAX_POINTS  # larger clouds are refused
-    full_turn: bool = True  # False: only the points that :func:`~fcos_lidar_jax.data.kitti.in_camera` keeps
+    full_turn: bool = False  # keep the points of KITTI's files outside the camera image
     classes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -36,9 +36,7 @@ class CloudFiles(FrameSet):
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
-            points = read_points(file, self.sensor, **layout)
-            points = points if self.full_turn else in_camera(file, points)
-            points, num_close = drop_close(points, self.sensor, self.reading)
+            points, num_close = read_cloud(file, self.sensor, self.reading, full_turn=self.full_turn, **layout)
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 
     def truth(self, index: int) -> Frame:
@@ -55,6 +53,18 @@ class CloudFiles(FrameSet):
     def fingerprint(self) -> str:
         reading = self.reading, self.columns, self.dtype, self.full_turn
         return files_fingerprint([file.absolute() for file in self.files], Path("/"), reading)
+
+
+def read_cloud(
+    file: str | Path, sensor: Sensor, reading: CloudReading, *, full_turn: bool = False, **layout: Any
+) -> tuple[np.ndarray, int]:
+    """Read a point file without the points on the ego vehicle; also returns their number.
+
+    KITTI's files are cropped by :func:`~fcos_lidar_jax.data.kitti.in_camera`, unless ``full_turn``. ``layout`` are
+    options of :func:`~fcos_lidar_jax.data.point_files.read_points`.
+    """
+    points = read_points(file, sensor, **layout)
+    return drop_close(points if full_turn else in_camera(Path(file), points), sensor, reading)
 
 
 def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:

@@ -57,7 +57,7 @@ class KittiFrames(FrameSet):
     Args:
         split: take the frames and their order from ``ImageSets/SPLIT.txt``, one name per line; default: all
             frames, sorted.
-        image_size: width and height in pixels of the image that points must fall into; None keeps the full turn.
+        full_turn: keep the points outside the image.
         reading: which points on the ego vehicle are dropped; a frame is one sweep.
 
     Raises:
@@ -73,10 +73,11 @@ class KittiFrames(FrameSet):
         split: str | None = None,
         *,
         sensor: Sensor = KITTI_HDL64E,
-        image_size: tuple[int, int] | None = IMAGE_SIZE,
+        full_turn: bool = False,
         reading: CloudReading = CloudReading(),
     ) -> None:
-        self.root, self.sensor, self.image_size, self.reading = Path(root), sensor, image_size, reading
+        self.root, self.sensor, self.reading = Path(root), sensor, reading
+        self.image_size = None if full_turn else IMAGE_SIZE
         clouds = _stems(self.root / "training" / "velodyne", ".bin")
         self.names = tuple(sorted(clouds)) if split is None else _read_split(self.root, split, clouds)
         """Names of the frames: file names without extension."""
@@ -98,10 +99,9 @@ class KittiFrames(FrameSet):
         check_boxes(boxes, lambda i: f"{self._file('calib', name)}: takes box {i} of the labels far away")
         boxes = boxes.astype(np.float32)
         points = read_points(self._file("velodyne", name), self.sensor)
-        kept = np.ones(len(points), bool)
         if self.image_size is not None:
-            kept = in_image(points, calibration["P2"] @ calibration["velo_to_rect"], self.image_size)
-        points, num_close = drop_close(points[kept], self.sensor, self.reading)
+            points = points[in_image(points, calibration["P2"] @ calibration["velo_to_rect"], self.image_size)]
+        points, num_close = drop_close(points, self.sensor, self.reading)
         return Frame(points, boxes, labels, count_inside(points, boxes), num_close)
 
     def labels(self, index: int) -> np.ndarray:

@@ -50,9 +50,8 @@ def write_kitti(out: Path, detections: Iterable[Detections], frames: FrameSet | 
         boxes, labels, scores = confident(found, 0.0)
         known = kinds[labels] != ""
         calibration = read_calibration(source.root / "training" / "calib" / f"{name}.txt")
-        size = source.image_size or IMAGE_SIZE
         rows = boxes[known], kinds[labels[known]].tolist(), scores[known]
-        write_result(folder / f"{name}.txt", *rows, calibration, image_size=size)
+        write_result(folder / f"{name}.txt", *rows, calibration)
     classes = [name for name in MIN_OVERLAP if name in kinds]
     metrics = evaluate_kitti(folder, source.root / "training" / "label_2", classes=classes)
     others = [name for name, kind in zip(frames.classes, kinds, strict=True) if kind not in MIN_OVERLAP]
@@ -93,8 +92,6 @@ def write_result(
     types: Sequence[str],
     scores: np.ndarray,
     calibration: dict[str, np.ndarray],
-    *,
-    image_size: tuple[int, int] = IMAGE_SIZE,
 ) -> int:
     """Write the detections of a frame; boxes that are outside of the image, or
     larger than any object, are left out. Returns their number.
@@ -103,7 +100,6 @@ def write_result(
         path: the benchmark's files are called ``000123.txt``.
         boxes: [m, >= 7], ``x, y, z, l, w, h, yaw`` in the Velodyne's frame.
         calibration: as ``fcos_lidar_jax.data.kitti.read_calibration`` returns it.
-        image_size: width and height, pixels.
 
     >>> import tempfile
     >>> axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
@@ -116,7 +112,7 @@ def write_result(
     """
     boxes = np.asarray(boxes, np.float64)[:, :7]
     camera = to_camera(boxes, calibration["velo_to_rect"])
-    image, visible = image_boxes(camera, calibration["P2"], image_size)
+    image, visible = image_boxes(camera, calibration["P2"], IMAGE_SIZE)
     visible &= (np.abs(boxes) <= list(LIMITS.values())[:7]).all(axis=1)
     visible &= (boxes[:, 3:6] >= _SMALLEST_M).all(axis=1)
     alpha = wrap_angle(camera[:, 6] - np.arctan2(camera[:, 3], camera[:, 5]))

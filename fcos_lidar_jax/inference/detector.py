@@ -15,9 +15,9 @@ from jax.sharding import Mesh, PartitionSpec
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch, truncation
+from fcos_lidar_jax.data.clouds import read_cloud
 from fcos_lidar_jax.data.frame import drop_close
-from fcos_lidar_jax.data.kitti import in_camera
-from fcos_lidar_jax.data.point_files import points_from_array, read_points
+from fcos_lidar_jax.data.point_files import points_from_array
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
 from fcos_lidar_jax.inference.alignment import align
@@ -103,11 +103,12 @@ class CloudDetector(abc.ABC):
         """
         is_file = isinstance(points, str | Path)
         sensor = load_sensor(sensor) if isinstance(sensor, str | Path) else sensor
-        aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())  # type: ignore[arg-type]
-        rows = (read_points if is_file else points_from_array)(points, aligned.data)  # type: ignore[arg-type]
-        if is_file and not full_turn:
-            rows = in_camera(Path(points), rows)  # type: ignore[arg-type]
-        rows, num_close = drop_close(rows, aligned.data, self.config.reading)
+        aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())
+        data, reading = aligned.data, self.config.reading
+        if is_file:
+            rows, num_close = read_cloud(points, data, reading, full_turn=full_turn)
+        else:
+            rows, num_close = drop_close(points_from_array(points, data), data, reading)
         rows = aligned.points(rows)
         if line := sensor_mismatch(rows, self.sensor):
             warnings.warn(line, stacklevel=2)

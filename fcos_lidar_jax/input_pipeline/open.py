@@ -61,9 +61,7 @@ READERS = (
         ("training/velodyne",),
         KITTI_HDL64E,
         lambda data, _: sorted(file.stem for file in (data.root / "ImageSets").glob("*.txt")),
-        lambda data, full_turn=False, **how: kitti.KittiFrames(
-            data.root, image_size=None if full_turn else kitti.IMAGE_SIZE, **how
-        ),
+        lambda data, **how: kitti.KittiFrames(data.root, **how),
         ("full_turn", "intensity_scale"),
         class_maps={"nuscenes": kitti.TO_NUSCENES},
     ),

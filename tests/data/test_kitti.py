@@ -10,9 +10,18 @@ from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import inside_box
-from fcos_lidar_jax.data.kitti import CLASSES, KittiFrames, in_camera, read_calibration, read_labels, to_lidar
+from fcos_lidar_jax.data.clouds import CloudFiles
+from fcos_lidar_jax.data.kitti import (
+    CLASSES,
+    KittiFrames,
+    in_camera,
+    in_image,
+    read_calibration,
+    read_labels,
+    to_lidar,
+)
 from fcos_lidar_jax.input_pipeline.open import open_frames
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.sensors import KITTI_HDL64E, TINY
 
 UPRIGHT = Rotation.from_euler("y", 0.8, degrees=True).as_matrix()  # about the camera's vertical
 CAR = (15.0, 2.0, -0.9, 4.0, 1.7, 1.5, 0.4)
@@ -39,7 +48,9 @@ def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, c
     cropped = in_camera(file, points)
     np.testing.assert_array_equal(cropped[:, :3], KittiFrames(root).frame(1).points[:, :3])
     assert 0 < len(cropped) < len(points)
-    in_camera(file, points)
+    for how, expected in (({}, cropped), ({"full_turn": True}, points)):
+        read = CloudFiles((file,), KITTI_HDL64E, **how).frame(0).points
+        np.testing.assert_array_equal(read[:, :3], expected[:, :3])
     assert capsys.readouterr().err.count("points outside the camera image are left out") == 1
     (root / "training" / "calib" / "000003.txt").unlink()
     for other in (file.with_name("000003.bin"), root / "000007.bin"):
@@ -63,11 +74,13 @@ def test_points_outside_the_image_are_dropped(root):
     """Points behind, beside and on the car are dropped; intensities reach 255."""
     seen = np.array([[15, 2, -1, 51, 0], [14, 1.6, -0.8, 255, 0], [9, -1, -0.5, 0, 0]], np.float32)
     np.testing.assert_allclose(KittiFrames(root).frame(1).points, seen)
+    readings = CloudReading(1, "all"), WHOLE_SWEEP
+    whole = [KittiFrames(root, full_turn=True, reading=reading).frame(1) for reading in readings]
+    assert [(len(frame.points), frame.num_close) for frame in whole] == [(5, 1), (6, 0)]
     # The pedestrian lies to the right of the car, and a narrower image has only the car.
-    whole = {"image_size": None, "reading": CloudReading(1, "all")}
-    options = whole, {"image_size": None, "reading": WHOLE_SWEEP}, {"image_size": (600, 375)}
-    assert [len(KittiFrames(root, **o).frame(1).points) for o in options] == [5, 6, 2]
-    assert KittiFrames(root, **whole).frame(1).num_close == 1
+    calibration = read_calibration(root / "training" / "calib" / "000007.txt")
+    to_image = calibration["P2"] @ calibration["velo_to_rect"]
+    assert in_image(np.array(CLOUD), to_image, (600, 375)).sum() == 2
 
 
 def test_the_border_of_the_image_follows_from_the_projection(root):
