@@ -11,7 +11,7 @@ from experiments.script import real_data
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, SelectedFrames, without_close
+from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, SelectedFrames
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
@@ -36,7 +36,7 @@ def real_frames(data: Path | None, reading: CloudReading) -> dict[str, FrameSet]
     }
     for number, frames in (("0103", 2), ("0061", 1)):
         folder = real_data(data, f"nuscenes_scene{number}")
-        read = (without_close(read_keyframe(folder, SENSOR, i), SENSOR, reading) for i in range(frames))
+        read = (read_keyframe(folder, SENSOR, i, reading=reading) for i in range(frames))
         sets[f"scene-{number}"] = InMemoryFrames(tuple(read), SENSOR, NUSCENES_CLASSES)
     return sets
 

@@ -49,7 +49,7 @@ def remove_close(
     sensor: Sensor,
     reading: CloudReading,
 ) -> Bool[Array | np.ndarray, "n"]:
-    """Remove the points on the ego vehicle from ``valid``, by their position in the current frame.
+    """Mask of the ``valid`` points that are not on the ego vehicle, by their position in the current frame.
 
     Args:
         points: x, y, z, intensity, time lag. NumPy input gives NumPy output, JAX input gives JAX output.

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.database import cut_reading
@@ -82,8 +81,8 @@ def measure(args: Args) -> dict[str, Any]:
         return {"preset": config.name, "training_gib": training_memory(config)}
     sensor = load_sensor(config.sensor)
     folder = find_real_data(args.data, "nuscenes_scene0061") if sensor == NUSCENES_HDL32E else None
-    frame = read_keyframe(folder, sensor) if folder else make_frame(0, sensor)
-    frame = without_close(frame, sensor, cut_reading(1))
+    reading = cut_reading(1)
+    frame = read_keyframe(folder, sensor, reading=reading) if folder else make_frame(0, sensor, reading=reading)
     shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
     times = interleaved({"train step": training_steps(config, sensor, [frame])}, args.repeats)
     return {

@@ -27,7 +27,6 @@ from experiments.benchmarks.training_steps import training_steps
 from experiments.changes import change
 from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.frame import without_close
 from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
@@ -124,7 +123,7 @@ def measure(args: Args) -> dict[str, Any]:
     for name in args.sizes:
         size = _SIZES[name]
         config, sensor = of_size(size)
-        frames = [without_close(make_frame(0, sensor, num_objects=30), sensor, cut_reading(1))]
+        frames = [make_frame(0, sensor, num_objects=30, reading=cut_reading(1))]
         over = 64 // size["STEM"]
         others = {"NH": size["HEIGHT"], "NW": size["WIDTH"], "Q": over, "FPN": over * size["PYRAMID"]}
         sizes = {**size, **others, "TRAIN": 1, "CL": 1}  # Other peers use other names.

@@ -28,7 +28,7 @@ from experiments.script import Options, real_data, run_measurement
 from fcos_lidar_jax.assignment import owners
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.data.frame import Frame, InMemoryFrames, without_close
+from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.matching import candidate_pairs, match_frame
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
@@ -139,8 +139,8 @@ def _run(frame: Frame, seed: int, args: Args) -> dict[str, Any]:
 def measure(args: Args) -> dict[str, Any]:
     """Run all seeds and print a line for each."""
     real = args.source == "real"
-    frame = read_keyframe(real_data(args.data, "nuscenes_scene0061"), SENSOR) if real else make_frame(0, SENSOR)
-    frame = without_close(frame, SENSOR, cut_reading(1))
+    how: dict[str, Any] = {"sensor": SENSOR, "reading": cut_reading(1)}
+    frame = read_keyframe(real_data(args.data, "nuscenes_scene0061"), **how) if real else make_frame(0, **how)
     names = Counter(NUSCENES_CLASSES[i] for i in sorted(frame.labels[owned_cells(frame) >= MIN_CELLS]))
     print("counted boxes:", ", ".join(f"{number} {name}" for name, number in names.items()))
     shapes = jax.eval_shape(build_detector(CONFIGS[args.detector], SENSOR).init, jax.random.key(0))

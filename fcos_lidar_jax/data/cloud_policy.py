@@ -80,18 +80,17 @@ def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close:
     ((4096, 5), [True, False, False], 1, 1)
     """
     points = _with_columns(points, sensor)
+    valid = kept = np.asarray(usable_rows(points))
+    by_reader = num_close or 0
     if num_close is None:
         check_time_lags(points)
-    valid = usable_rows(points)
-    num_invalid = int((~valid).sum())
-    kept = np.asarray(valid if num_close is not None else remove_close(points, valid, sensor, config.reading))
-    num_close = num_close or 0
-    num_removed = int((~kept).sum())
+        kept = np.asarray(remove_close(points, valid, sensor, config.reading))
+        num_close = int((valid & ~kept).sum())
     padded = np.zeros((config.max_points, points.shape[1]), np.float32)
     padded_valid = np.zeros(config.max_points, bool)
     num_truncated = write_points([points], kept, padded, padded_valid)
-    close = num_close + num_removed - num_invalid
-    return Cloud(padded, padded_valid, len(points) + num_close, close, num_invalid, num_truncated)
+    num_points, num_invalid = len(points) + by_reader, int((~valid).sum())
+    return Cloud(padded, padded_valid, num_points, num_close, num_invalid, num_truncated)
 
 
 def _with_columns(points: np.ndarray, sensor: Sensor) -> np.ndarray:

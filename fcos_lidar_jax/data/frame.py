@@ -237,9 +237,3 @@ def no_points(sensor: Sensor) -> np.ndarray:
 def without_points(frame: Frame) -> Frame:
     """Drop a frame's points, and free their memory."""
     return dataclasses.replace(frame, points=frame.points[:0].copy(), num_close=0)  # a view would keep the cloud
-
-
-def without_close(frame: Frame, sensor: Sensor, reading: CloudReading) -> Frame:
-    """Remove the points on the ego vehicle from a frame."""
-    points, number = drop_close(frame.points, sensor, reading)
-    return dataclasses.replace(frame, points=points, num_close=frame.num_close + number)

@@ -5,14 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes
-from fcos_lidar_jax.data.frame import Frame
+from fcos_lidar_jax.data.frame import Frame, drop_close
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.sensors import Sensor
 
 
-def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
+def read_keyframe(folder: Path, sensor: Sensor, number: int = 0, reading: CloudReading = WHOLE_SWEEP) -> Frame:
     """Read a folder's keyframe, or that of a number in a list, with the boxes of the ten nuScenes classes.
 
     ``boxes.json`` is ``{"lidar_file": NAME, "boxes": [{"class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy",
@@ -22,7 +23,7 @@ def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
     Raises:
         ValueError: with the file and the field.
     """
-    file = Path(folder) / "boxes.json"
+    file = folder / "boxes.json"
     record = read_json(file, what="the boxes of a keyframe")
     try:
         record = record[number] if isinstance(record, list) else record
@@ -37,7 +38,7 @@ def read_keyframe(folder: str | Path, sensor: Sensor, number: int = 0) -> Frame:
     check_boxes(boxes, lambda i: f"{file}: box {i} of the ten classes")
     labels = np.array([NUSCENES_CLASSES.index(b["class"]) for b in rows], np.int32)
     try:
-        points = read_points(cloud, sensor)
+        points, num_close = drop_close(read_points(cloud, sensor), sensor, reading)
     except ValueError as error:
         raise ValueError(f"{file}: lidar_file: {error}") from None
-    return Frame(points, boxes.astype(np.float32), labels, counts)
+    return Frame(points, boxes.astype(np.float32), labels, counts, num_close)

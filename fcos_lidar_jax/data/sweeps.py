@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import read_json
-from fcos_lidar_jax.projection import close_to_sensor
 from fcos_lidar_jax.sensors import Sensor
 
 FARTHEST_M = 1e8  # beyond any place on earth in any map's coordinates
@@ -63,19 +63,17 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
     """
     parts, num_close, now_us, world_to_current = [], 0, 0, np.eye(4)
     for index, sweep in enumerate(sweeps):
-        points = sweep.points.copy()
-        if reading.remove_close == "all" or (reading.remove_close == "sweeps" and index > 0):
-            close = np.asarray(close_to_sensor(points, sensor, reading.close_m))
-            num_close += int(close.sum())
-            points = points[~close]
         if index == 0:
             now_us, world_to_current = sweep.time_us, np.linalg.inv(sweep.sensor_to_world)
-        else:
+        points = sweep.points.copy()
+        points[:, 4] = (now_us - sweep.time_us) / 1e6
+        points, close = drop_close(points, sensor, reading)
+        num_close += close
+        if index > 0:
             motion = world_to_current @ sweep.sensor_to_world
             # Coordinates may overflow to infinity; the cloud policy removes such rows.
             with np.errstate(over="ignore", invalid="ignore"):
                 points[:, :3] = points[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
-        points[:, 4] = (now_us - sweep.time_us) / 1e6
         parts.append(points)
     return np.concatenate(parts), num_close
 

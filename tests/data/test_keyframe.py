@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
@@ -19,9 +20,9 @@ def test_a_keyframe_has_points_boxes_and_unknown_velocities(tmp_path):
     box = dict(zip("xyzlwh", range(1, 7), strict=True)) | {"yaw": 0.5, "vx": None, "vy": None, "num_lidar_pts": 9}
     counted = {("num_lidar_pts_at_key_frame" if k == "num_lidar_pts" else k): v for k, v in box.items()}
 
-    def read(content, number=0):
+    def read(content, number=0, **how):
         (tmp_path / "boxes.json").write_text(content if isinstance(content, str) else json.dumps(content))
-        return read_keyframe(tmp_path, NUSCENES_HDL32E, number)
+        return read_keyframe(tmp_path, NUSCENES_HDL32E, number, **how)
 
     def record(*boxes):
         return {"lidar_file": "a.pcd.bin", "boxes": boxes}
@@ -30,6 +31,10 @@ def test_a_keyframe_has_points_boxes_and_unknown_velocities(tmp_path):
     frame = read(truck)
     np.testing.assert_array_equal(frame.boxes, np.array([[1, 2, 3, 4, 5, 6, 0.5, np.nan, np.nan]], np.float32))
     assert (frame.labels.tolist(), frame.num_points.tolist(), len(frame.points)) == ([1], [9], len(points))
+    close = int((np.abs(points[:, :2]) < 8).all(axis=1).sum())
+    far = read(truck, reading=CloudReading(1, "all", 8.0))
+    assert (len(far.points), far.num_close) == (len(points) - close, close)
+    assert 0 < close < len(points)
     several = [truck, record({**counted, "class": "bus"})]
     assert [read(several, i).labels.tolist() for i in (0, 1)] == [[1], [2]]
     with refused("list index out of range"):
