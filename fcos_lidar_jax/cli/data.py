@@ -1,6 +1,7 @@
 """The options that select a data set."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -49,11 +50,12 @@ class DataOptions:
     follow_links: bool = False  # Follow links that lead out of DATA_ROOT.
     allow_missing_sweeps: bool = False  # nuScenes: use fewer sweeps if files of older sweeps are missing.
 
-    def find(self) -> DataSet:
+    @functools.cached_property
+    def data_set(self) -> DataSet:
         return find_data_set(self.data_root, self.format, self.version)
 
     def split(self, purpose: Literal["train", "val"], *, required: bool = True) -> str | None:
-        return default_split(self.find(), purpose, required=required, splits=self.splits)
+        return default_split(self.data_set, purpose, required=required, splits=self.splits)
 
     def open(
         self,
@@ -76,7 +78,7 @@ class DataOptions:
         try:
             mapped = MappedFrames(frames, config.classes)
         except ValueError as error:
-            raise ValueError(f"{error}; {self.find().reader.named_maps}") from None
+            raise ValueError(f"{error}; {self.data_set.reader.named_maps}") from None
         if left_out := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
             counts = ", ".join(f"{count} {name}" for name, count in left_out.items())
             tell(f"left out boxes of classes that the detector does not have: {counts}")
@@ -94,7 +96,7 @@ class DataOptions:
 
         With ``report_missing`` a line on standard error counts the missing sweep files.
         """
-        data = self.find()
+        data = self.data_set
         frames = open_frames(
             self.data_root,
             format=data.reader.name,

@@ -159,7 +159,7 @@ def _open(args: Evaluate) -> Task:
     if args.ground_truth is not None:
         comparison = compare_by_benchmark(read_truth(args.ground_truth), str(args.ground_truth))
         return Task(args.ground_truth.name, comparison, sensor)
-    data = args.data.find()
+    data = args.data.data_set
     official = detector is None or (set(detector.classes) <= set(NUSCENES_CLASSES) and args.data.class_map is None)
     benchmark = data.tables is not None and official
     _check_metric(args, detector, benchmark=benchmark)

@@ -48,7 +48,7 @@ class Prepare:
 def run(args: Prepare) -> None:
     """Build the index and the database, and print a record of them."""
     check_at_least(args, 1, "workers", "num_sweeps", "min_points")
-    data, began = args.data.find(), time.monotonic()
+    data, began = args.data.data_set, time.monotonic()
     if not data.on_disk:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
     folder = args.data.index or data.index

@@ -167,7 +167,7 @@ def _open(args: Train) -> _Task:
     )
     options = {"threads": args.threads, "workers": args.workers, "num_processes": jax.process_count()}
     check_loader_options(config, **options)  # before objects are cut
-    data = args.data.find()
+    data = args.data.data_set
     index = args.data.index or data.index
     if data.tables is not None and data.tables.is_dir() and not has_index(index):
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")

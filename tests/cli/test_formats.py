@@ -22,9 +22,12 @@ from tiny_run import NETWORK_OPTIONS, SENSOR
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES
+from fcos_lidar_jax.cli.data import DataOptions
+from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.argoverse2 import TO_NUSCENES
 from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.inference.prediction import predict
+from fcos_lidar_jax.input_pipeline import open as open_module
 from fcos_lidar_jax.input_pipeline.open import Format
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, sensor_to_json
@@ -228,6 +231,15 @@ def test_prepares_into_another_folder_and_evaluates_given_detections(tmp_path, m
     (tmp_path / "given.json").write_text(json.dumps(record))
     command(evaluate, out, "--results", tmp_path / "given.json")
     assert (out / "detections.json").read_bytes() == (tmp_path / "given.json").read_bytes()
+
+
+def test_a_command_recognises_its_data_set_once(tmp_path, monkeypatch):
+    recognise = Mock(wraps=open_module._recognise)
+    monkeypatch.setattr(open_module, "_recognise", recognise)
+    data = DataOptions(make_folder(tmp_path / "data", train=2, val=1))
+    assert len(data.open_whole(data.split("train"), CloudReading())) == 2
+    assert data.data_set.reader.name == "folder"
+    recognise.assert_called_once_with(tmp_path / "data")
 
 
 def test_training_warns_of_another_sensors_clouds_before_compiling(tmp_path, capsys, monkeypatch):
