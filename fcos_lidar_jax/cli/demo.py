@@ -16,6 +16,7 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
 from fcos_lidar_jax.evaluation.metrics import Evaluation
+from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.input_pipeline import open_frames
 from fcos_lidar_jax.progress import Progress
@@ -64,7 +65,8 @@ def run(args: Demo) -> None:
     print(f"simulating a drive of {args.keyframes} keyframes", file=sys.stderr, flush=True)
     detector, title = load_detector(WEIGHTS), f"{WEIGHTS} on an unseen simulated drive"
     frames = _simulate(args, detector)
-    comparison = compare_by_benchmark(frames, "the drive", detector.classes)
+    truth = split_truth(frames.nuscenes, frames.tokens)
+    comparison = compare_by_benchmark(truth, "the drive", detector.classes, frames)
     task = Task("the drive", comparison, detector.sensor, detector, frames)
     write_detections(task, args.out)
     compared = comparison.read(args.out / comparison.file)

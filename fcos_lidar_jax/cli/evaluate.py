@@ -27,7 +27,7 @@ from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
-from fcos_lidar_jax.evaluation.truth import read_truth
+from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
@@ -179,7 +179,8 @@ def _open(args: Evaluate) -> Task:
     if args.samples is not None:
         tokens = tuple(frames.tokens[i] for i in parse_ranges(args.samples, len(frames)))
         frames = dataclasses.replace(frames, tokens=tokens)
-    comparison = compare_by_benchmark(frames, name, config.classes)
+    truth = split_truth(frames.nuscenes, frames.tokens)
+    comparison = compare_by_benchmark(truth, name, config.classes, frames)
     # Evaluating a results file needs only the tables.
     if detector is None and args.report and (missing := frames.nuscenes.missing_sweeps(list(frames.tokens), 1)):
         tell(f"{missing} files of keyframes are missing: the report shows boxes without points")

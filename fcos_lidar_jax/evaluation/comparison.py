@@ -8,13 +8,11 @@ from typing import Any, NamedTuple
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import FrameSet
-from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.boxes import BoxColumns, GroundTruth
 from fcos_lidar_jax.evaluation.frames import frame_columns, read_detections, write_detections
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Metric, metric_of
 from fcos_lidar_jax.evaluation.records import as_records
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
-from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.types import Detections
 
 
@@ -44,23 +42,22 @@ RESULT_FILES = ("results_nusc.json", "detections.json")
 
 
 def compare_by_benchmark(
-    truth: GroundTruth | NuScenesFrames, of: str, classes: Sequence[str] = NUSCENES_CLASSES
+    truth: GroundTruth, of: str, classes: Sequence[str] = NUSCENES_CLASSES, frames: FrameSet | None = None
 ) -> Comparison:
     """By nuScenes' own metric.
 
-    ``truth`` are keyframes, or the truth of a file, for which no detections can be written. ``of`` describes the
-    samples in messages; the labels of detections index ``classes``.
+    ``of`` describes the samples in messages. The labels of detections index ``classes``. Detections can only be
+    written if the samples are ``frames``, whose poses lead to the global frame.
     """
-    frames = truth
-    known = split_truth(frames.nuscenes, frames.tokens) if isinstance(frames, NuScenesFrames) else frames
 
     def entries(index: int, detections: Detections) -> list[dict[str, Any]]:
-        assert isinstance(frames, NuScenesFrames)
-        return result_entries(detections, frames.tokens[index], frames.pose(index), classes)
+        pose = None if frames is None else frames.pose(index)
+        assert pose is not None
+        return result_entries(detections, truth.tokens[index], pose, classes)
 
     def read(file: Path) -> Compared:
-        results = read_results(file, known.tokens, of=of)
-        return Compared(results.boxes, known, results.meta, results.warnings)
+        results = read_results(file, truth.tokens, of=of)
+        return Compared(results.boxes, truth, results.meta, results.warnings)
 
     return Comparison(RESULT_FILES[0], NUSCENES_METRIC, entries, write_results, read)
 
