@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import itertools
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,7 +27,7 @@ from fcos_lidar_jax.data.cloud_policy import expect_points, truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.sweeps import read_list
+from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.json_io import write_lines
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, read_boxes, select
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
@@ -84,18 +83,18 @@ class Detect:
 
 def run(args: Detect) -> None:
     """Detect in all files, then write; finished files are kept in a log beside the output until then."""
-    inputs = _check(args)
+    files, sweeps = _inputs(args)
+    parts = [Path(sweep.file) for sweep in sweeps]
+    _check(args, [*files, *parts])
     detector = load_detector(args.checkpoint, backend=args.backend)
-    place = dict[str, Any]() if args.sweeps is None else _place(args.sweeps)
-    check_results(args, detector.classes, posed=bool(place), clouds=[Path(place["file"])] if place else [*inputs])
-    num_sweeps = detector.config.num_sweeps
-    for file, parts in inputs.items():
-        if len(parts) > num_sweeps:
-            line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
-            print(f"{file}: {line}", file=sys.stderr)
-    aligned = alignment_of(args, detector.sensor, [*itertools.chain(*inputs.values())] or inputs)
-    clouds = _clouds(args, inputs, detector, aligned.data)
-    states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
+    place: dict[str, Any] = msgspec.to_builtins(sweeps[0]) if sweeps else {}  # of the current sweep
+    check_results(args, detector.classes, posed=bool(sweeps), clouds=parts[:1] or files)
+    if len(parts) > (num_sweeps := detector.config.num_sweeps):
+        line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
+        print(f"{args.sweeps}: {line}", file=sys.stderr)
+    aligned = alignment_of(args, detector.sensor, parts or files)
+    clouds = _clouds(args, files, detector, aligned.data)
+    states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file in files]
     with _resume_log(args, detector, aligned) as log:
         _detect(args, detector, clouds, states, log)
         lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
@@ -110,22 +109,25 @@ def run(args: Detect) -> None:
             _write_views(args, clouds, detector, (json.loads(entry)[0] for _, entry in log.entries(states)))
 
 
-def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
-    """Check the options; returns the inputs, each with the point files that it lists."""
+def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
+    """The files, each once; or the list of sweeps, and its entries with the paths of their files."""
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected either point files or --sweeps")
-    check_at_least(args, 1, "batch_size", "max_file_points")
-    check_score(args)
     for file in args.files:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
-    if args.sweeps is not None and args.sweeps.suffix != ".json":
-        raise ValueError(f"--sweeps: {args.sweeps}: expected a file that ends in .json")
     if args.sweeps is None:
-        inputs: dict[Path, tuple[Path, ...]] = dict.fromkeys(find_clouds(args.files), ())
-    else:
-        inputs = {args.sweeps: tuple(args.sweeps.parent / each.file for each in read_list(args.sweeps))}
-    read = [*inputs, *itertools.chain.from_iterable(inputs.values())]
+        return tuple(dict.fromkeys(find_clouds(args.files))), []
+    if args.sweeps.suffix != ".json":
+        raise ValueError(f"--sweeps: {args.sweeps}: expected a file that ends in .json")
+    folder, sweeps = args.sweeps.parent, read_list(args.sweeps)
+    return (args.sweeps,), [msgspec.structs.replace(each, file=str(folder / each.file)) for each in sweeps]
+
+
+def _check(args: Detect, read: Sequence[Path]) -> None:
+    """Check the options, and that no output replaces a file to read."""
+    check_at_least(args, 1, "batch_size", "max_file_points")
+    check_score(args)
     log = _log_file(args)
     if args.rrd is not None:
         check_rerun()
@@ -135,19 +137,12 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
     if args.pictures is not None:
         check_outside("--pictures", args.pictures, args.checkpoint)
         check_out_folder(args.pictures, "--pictures")
-    return inputs
 
 
-def _place(sweeps: Path) -> dict[str, Any]:
-    """File, time and pose of the current sweep of a list."""
-    current = read_list(sweeps)[0]
-    return {**msgspec.to_builtins(current), "file": str(sweeps.parent / current.file)}
-
-
-def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector, sensor: Sensor) -> CloudFiles:
+def _clouds(args: Detect, files: tuple[Path, ...], detector: CloudDetector, sensor: Sensor) -> CloudFiles:
     reading = detector.config.reading
     return CloudFiles(
-        tuple(files),
+        files,
         sensor,
         dataclasses.replace(reading, remove_close=args.remove_close or reading.remove_close),
         columns=args.columns,

@@ -208,14 +208,17 @@ def test_file_names_may_hold_formulas_and_invalid_utf8(home, tmp_path):
     command("project", cloud, "--sensor tiny --out", tmp_path / "a.npz", "--png", tmp_path / "a.png")
 
 
-def test_detect_fuses_sweeps(home, tmp_path):
+def test_detect_fuses_sweeps(home, tmp_path, monkeypatch):
     sweep = {"file": str(home / "good.npy"), "sensor_to_world": np.eye(4).tolist()}
     out, sweeps = tmp_path / "boxes.json", tmp_path / "sweeps.json"
     sweeps.write_text(json.dumps([{**sweep, "timestamp_us": 10**6 - i} for i in range(3)]))
     several = dataclasses.replace(TINY_CONFIG, num_sweeps=2)
     save_checkpoint(tmp_path / "several", Checkpoint(several, TINY, untrained(several, TINY), 7))
+    read = Mock(wraps=detect_command.read_list)
+    monkeypatch.setattr(detect_command, "read_list", read)
     command("detect --sweeps", sweeps, "--checkpoint", tmp_path / "several", "--out", out)
     [result] = files_of(out)
+    read.assert_called_once_with(sweeps)
     points = np.load(home / "good.npy")
     close = (np.abs(points[:, :2]) < 1).all(axis=1).sum()
     assert result["num_points"] == 2 * len(points)
