@@ -14,6 +14,7 @@ MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
 """The classes that KITTI evaluates -> overlap that a detection must exceed, from above and in space."""
 DIFFICULTIES = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
 """Of the objects that count: height in the image (pixels) that they exceed, greatest occlusion and truncation."""
+TABLE_HEAD = (*DIFFICULTIES, f"objects: {' / '.join(DIFFICULTIES)}")
 
 _NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _POSITIONS = 40
@@ -70,18 +71,24 @@ def evaluate_kitti(
 
 def describe_kitti(metrics: dict[str, Any]) -> str:
     """What :func:`evaluate_kitti` returns, as lines of text."""
-    rows = [(f"KITTI AP_R40 on {metrics['num_frames']} frames", [*DIFFICULTIES])]
+    rows = [(f"KITTI AP_R40 on {metrics['num_frames']} frames", [*TABLE_HEAD])]
     for name, scores in metrics["classes"].items():
         for kind in ("bev", "3d"):
             values = ["-" if v is None else f"{v:.2f}" for v in scores[kind].values()]
-            rows.append((f"{name} {scores['min_overlap']} {kind}", values))
-    lines = [title.ljust(28) + "".join(value.rjust(9) for value in values) for title, values in rows]
+            rows.append((f"{name} {scores['min_overlap']} {kind}", [*values, object_counts(scores)]))
+    widths = [max(9, len(head) + 1) for head in TABLE_HEAD]
+    lines = [title.ljust(28) + "".join(map(str.rjust, values, widths)) for title, values in rows]
     few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
     if few:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
     if metrics.get("left_out"):
         lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
     return "\n".join(lines)
+
+
+def object_counts(scores: dict[str, Any]) -> str:
+    """The numbers of objects of a class that count, as the last cell of a row under :data:`TABLE_HEAD`."""
+    return " / ".join(map(str, scores["num_truth"].values()))
 
 
 class _Objects:

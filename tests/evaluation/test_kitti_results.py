@@ -193,8 +193,8 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     assert metrics["classes"]["Car"]["3d"] == {"easy": 100.0, "moderate": 100.0, "hard": 100.0}
     assert list(metrics["classes"]) == ["Car", "Pedestrian", "Cyclist"]
     ((_, header, rows),) = evaluation_report._kitti_table(tmp_path / "out" / "metrics_kitti.json")
-    assert header == ("class", "easy", "moderate", "hard")
-    assert rows[1] == ("Car, 3d", 100.0, 100.0, 100.0)
+    assert header == ("class", "easy", "moderate", "hard", "objects: easy / moderate / hard")
+    assert rows[1] == ("Car, 3d", 100.0, 100.0, 100.0, "54 / 54 / 54")
     assert evaluation_report._kitti_table(tmp_path / "none.json") == []
     printed = capsys.readouterr().out
     assert "KITTI AP_R40 on 6 frames" in printed
