@@ -17,6 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import NoReturn, TextIO
 
 from fcos_lidar_jax import __version__
+from fcos_lidar_jax.signals import watch_signals
 
 _LESS_MEMORY = (
     "for training, --optimizer.accumulate N splits each batch into N parts, --model.precision bfloat16 halves the "
@@ -192,35 +193,19 @@ def _ending_signals() -> Iterator[list[signal.Signals]]:
 
 @contextlib.contextmanager
 def _ended_by_a_second(numbers: Sequence[signal.Signals], program: str) -> Iterator[None]:
-    """End the process at the second of the signals.
+    """End the process at the second of the signals, even while C code blocks the main thread."""
+    first_s = None
 
-    Python calls handlers only when the main thread returns from C, where XLA may compile for minutes. But it
-    writes the number of each signal to a pipe at once, which another thread reads.
-    """
-    if not numbers:
+    def end(number: int) -> None:
+        nonlocal first_s
+        if number in numbers:
+            now_s = time.monotonic()
+            first_s = now_s if first_s is None else first_s
+            if now_s - first_s > _REPEATED_S[signal.Signals(number)]:
+                _end(program, number)
+
+    with watch_signals(end) if numbers else contextlib.nullcontext():
         yield
-        return
-    read, write = os.pipe()
-
-    def watch() -> None:
-        first_s = None
-        while number := os.read(read, 1):
-            if number[0] in numbers:
-                now_s = time.monotonic()
-                first_s = now_s if first_s is None else first_s
-                if now_s - first_s > _REPEATED_S[signal.Signals(number[0])]:
-                    _end(program, number[0])
-
-    os.set_blocking(write, False)
-    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-    (watching := threading.Thread(target=watch, daemon=True)).start()
-    try:
-        yield
-    finally:
-        signal.set_wakeup_fd(before)
-        os.close(write)
-        watching.join()
-        os.close(read)
 
 
 def _end(program: str, number: int) -> NoReturn:

@@ -177,7 +177,8 @@ def train(
             lend=True,
             order=run.order,
         )
-        with stop_requests(active=not several) as request, batches as prepared, feed(prepared, mesh) as stream:
+        asked = stop_requests("stopping after this step or evaluation, which is saved", active=not several)
+        with asked as request, batches as prepared, feed(prepared, mesh) as stream:
 
             def stopping(done: int) -> bool:
                 if several:  # all stop after the same step, whichever of them received the signal

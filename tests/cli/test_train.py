@@ -118,8 +118,11 @@ def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
     resumed_code, resumed_errors, end = stop(resumed, signal.SIGTERM, out, stopped_at)
     assert (code, resumed_code) == (130, 143), errors + resumed_errors
     assert f"{out}: no run to resume, starting one\n" in errors
-    assert "which is saved\nthe same command continues\n" in errors
-    assert "which is saved\nthe same command with --resume continues\n" in resumed_errors
+    stopping = "\nstopping after this step or evaluation, which is saved"
+    assert f"{stopping}; press Ctrl-C again to stop now, without saving\n" in errors
+    assert f"{stopping}\n" in resumed_errors
+    assert f"stopped after step {stopped_at}, which is saved\nthe same command continues\n" in errors
+    assert f"after step {end}, which is saved\nthe same command with --resume continues\n" in resumed_errors
     assert "Traceback" not in errors + resumed_errors
     assert 0 < stopped_at < end < MANY
     assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, end)]
