@@ -16,6 +16,7 @@ from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
 from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
+from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.projection import project_points
@@ -60,7 +61,7 @@ def run(args: Project) -> None:
     image = jax.device_get(project_points(cloud.points, cloud.valid, sensor, **rounds))
     dropped = int(image.num_dropped)
     expect_points(args.file, cloud, dropped, sensor)
-    if line := sensor_mismatch(points, sensor):
+    if line := sensor_mismatch(points, sensor, recorded_by([args.file])):
         print(f"warning: {args.file}: {line}", file=sys.stderr)
     counts: dict[str, Any] = {"num_points": cloud.num_points, "num_dropped": dropped + cloud.num_removed}
     kept = (image.point_index >= 0).sum(axis=(0, 1)).tolist()

@@ -22,7 +22,7 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import with_heading
+from fcos_lidar_jax.data.recorded import recorded_by, with_heading
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
@@ -105,6 +105,7 @@ def run(args: Stream) -> None:
     detector = load_detector(args.checkpoint, backend=args.backend)
     source = args.source or args.data_root or Path()
     paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
+    usual = NUSCENES_HDL32E if kind is SCENE else recorded_by(paths[:1])
     ahead = with_heading(sensor, NUSCENES_HDL32E) if kind is SCENE else sensor
     aligned = alignment_of(args, sensor, paths, None if ahead == sensor else ahead)
     drive = _open(args, kind, detector, aligned.data)
@@ -123,7 +124,7 @@ def run(args: Stream) -> None:
         detect = functools.partial(detect_stream, detector=detector, **how)
         for found in timing.detect(_announcing(drive.sweeps), detect):
             points = found.cloud.points[found.cloud.valid]
-            if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
+            if before_us is None and (line := sensor_mismatch(points, detector.sensor, usual)):
                 print(f"warning: {line}", file=sys.stderr)
             kept = select(found.detections, detector.classes, min_score=args.min_score, labels=args.labels)
             record = _record(dataclasses.replace(found, detections=kept), detector.classes, drive)

@@ -66,6 +66,7 @@ class KittiFrames(FrameSet):
     """
 
     classes = CLASSES
+    usual_sensor = KITTI_HDL64E
 
     def __init__(
         self,

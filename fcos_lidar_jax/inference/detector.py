@@ -18,6 +18,7 @@ from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch,
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.kitti import in_camera
 from fcos_lidar_jax.data.point_files import points_from_array, read_points
+from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
 from fcos_lidar_jax.inference.alignment import align
@@ -103,13 +104,14 @@ class CloudDetector(abc.ABC):
         """
         is_file = isinstance(points, str | Path)
         sensor = load_sensor(sensor) if isinstance(sensor, str | Path) else sensor
-        aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())  # type: ignore[arg-type]
+        paths = [Path(points)] if is_file else []  # type: ignore[arg-type]
+        aligned = align(self.sensor, sensor, paths=paths)
         rows = (read_points if is_file else points_from_array)(points, aligned.data)  # type: ignore[arg-type]
         if is_file and not full_turn:
             rows = in_camera(Path(points), rows)  # type: ignore[arg-type]
         rows, num_close = drop_close(rows, aligned.data, self.config.reading)
         rows = aligned.points(rows)
-        if line := sensor_mismatch(rows, self.sensor):
+        if line := sensor_mismatch(rows, self.sensor, recorded_by(paths)):
             warnings.warn(line, stacklevel=2)
         cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
         if line := truncation(cloud.num_truncated, self.config):

@@ -113,7 +113,8 @@ def predict_groups(
             if row < len(group):
                 frame = frames.frame(group[row])
                 given = aligned.points(frame.points)
-                if group is groups[0] and slot == 0 and (line := sensor_mismatch(given, sensor)):
+                is_first = group is groups[0] and slot == 0
+                if is_first and (line := sensor_mismatch(given, sensor, frames.usual_sensor)):
                     print(f"warning: {line}", file=sys.stderr, flush=True)
                 cloud = make_cloud(given, config, sensor=sensor, num_close=frame.num_close)
                 points[slot], valid[slot] = cloud.points, cloud.valid

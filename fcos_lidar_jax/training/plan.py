@@ -166,7 +166,7 @@ def plan_run(
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
     clouds = (frames.frame(index).points for index in spread_indices(len(frames), 5))
     first = next(clouds)
-    if mismatch := sensor_mismatch(first, frames.sensor):
+    if mismatch := sensor_mismatch(first, frames.sensor, frames.usual_sensor):
         yield f"{frames.name(0)}: {mismatch}"
     if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in (first, *clouds)):
         yield (

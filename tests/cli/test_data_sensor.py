@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import warnings
 
@@ -13,7 +14,9 @@ from made_folder import make_folder
 from made_kitti import make_kitti
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax import cli
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
+from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E
 
 HDL32E = "--checkpoint hdl32e --out"
@@ -71,6 +74,35 @@ def assert_turned_back(boxes, expected, origin=(0, 0, 0)):
         np.testing.assert_allclose(one["box"][:6], [*place, *size], atol=1e-4)
         np.testing.assert_allclose(np.exp(1j * one["box"][6]), np.exp(1j * (yaw - np.pi / 2)), atol=1e-4)
         np.testing.assert_allclose(one["box"][7:], [vy, -vx], atol=1e-4)
+
+
+def test_commands_name_the_sensor_and_the_presets_that_fit_the_data(kitti, tmp_path, capsys, monkeypatch):
+    def advised(*words, code=0):
+        assert cli.main([str(word) for text in words for word in str(text).split()]) == code
+        return [line for line in capsys.readouterr().err.splitlines() if "do not fit" in line]
+
+    def stop(*_, **__):
+        raise ValueError("enough")
+
+    monkeypatch.setattr("fcos_lidar_jax.training.run.make_batches", stop)
+    cloud, data = kitti / "training" / "velodyne" / "000000.bin", f"--data-root {kitti} --class-map nuscenes"
+    train = f"train compact {data} --no-copy-paste --no-class-balanced --out"
+    presets = ", ".join(name for name, preset in PRESETS.items() if preset.sensor == "kitti_hdl64e")
+    advice = f": expected --sensor kitti_hdl64e (train, project) or a preset ({presets})"
+    for lines in (
+        advised(train, tmp_path / "run", code=1),
+        advised("evaluate", data, "--no-report", HDL32E, tmp_path / "scores"),
+        advised("detect", cloud, HDL32E, tmp_path / "boxes.json"),
+        advised("stream", cloud.parent, HDL32E, tmp_path / "boxes.jsonl"),
+        advised("project", cloud, "--out", tmp_path / "image.npz"),
+    ):
+        [line] = lines
+        assert line.startswith("warning: ")
+        assert line.endswith(advice)
+    with pytest.warns(UserWarning, match=re.escape(advice)):
+        fcos.load_detector("hdl32e")(cloud)
+    assert not advised(train, tmp_path / "fitting", "--sensor kitti_hdl64e", code=1)
+    assert not advised("project", cloud, "--sensor kitti_hdl64e --out", tmp_path / "image.npz")
 
 
 def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
