@@ -12,7 +12,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.data.class_mapping import MappedFrames
-from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch, tell_truncation
 from fcos_lidar_jax.data.frame import Frame, FrameSet, without_points
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
@@ -117,6 +117,7 @@ def predict_groups(
                 if is_first and (line := sensor_mismatch(given, sensor, frames.usual_sensor)):
                     print(f"warning: {line}", file=sys.stderr, flush=True)
                 cloud = make_cloud(given, config, sensor=sensor, num_close=frame.num_close)
+                tell_truncation(cloud, config)
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud
         return loaded, (points, valid)

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud
+from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud, tell_truncation
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detector import CloudDetector
@@ -76,6 +76,7 @@ def detect_stream(
         points, num_close = fuse_sweeps(window, aligned.data, reading)
         points = aligned.points(points)
         cloud = make_cloud(points, detector.config, sensor=detector.sensor, num_close=num_close)
+        tell_truncation(cloud, detector.config)
         detections = detector.detect(cloud)
         expect_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
         yield Found(sweep, cloud, aligned.back(detections))
