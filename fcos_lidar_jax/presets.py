@@ -126,6 +126,16 @@ not in the paper; ``python -m experiments.studies.post_processing`` measures wha
 are not in the paper either; ``experiments/LOG.md`` compares them with the paper's.
 """
 
+KITTI_COMPACT = dataclasses.replace(
+    KITTI,
+    name="kitti_compact",
+    **{part: getattr(COMPACT, part) for part in ("projection", "loss", "inference", "optimizer")},
+    model=dataclasses.replace(
+        COMPACT.model, channel_mean=KITTI.model.channel_mean, channel_scale=KITTI.model.channel_scale
+    ),
+)
+"""The network, losses and post-processing of ``compact`` for KITTI. No weights have been trained with it."""
+
 CENTERPOINT_PILLARS = CenterPointConfig.of(
     NUSCENES,
     name="centerpoint_pillars",
@@ -162,7 +172,7 @@ PRESETS: dict[str, Config] = {
     c.name: c
     for c in (
         *(NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, KITTI, ARGOVERSE2, COMPACT, QUICKSTART),
-        *(CENTERPOINT_PILLARS, CENTERPOINT_COMPACT),
+        *(KITTI_COMPACT, CENTERPOINT_PILLARS, CENTERPOINT_COMPACT),
     )
 }
 """Configurations by name."""

@@ -23,6 +23,7 @@ from fcos_lidar_jax.cli import demo
 from fcos_lidar_jax.cli.commands import parse
 from fcos_lidar_jax.evaluation.kitti_results import kitti_types
 from fcos_lidar_jax.input_pipeline.open import READERS
+from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import SHORT_RANGE, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
@@ -180,6 +181,13 @@ def test_json_of_the_pages_parses():
 def test_the_page_names_every_field_of_a_sensor_file():
     text = (DOCS / "own_data.md").read_text()
     assert [f.name for f in dataclasses.fields(Sensor) if not re.search(rf"[`\"]{f.name}[`\"]", text)] == []
+
+
+def test_the_page_has_every_preset():
+    rows = re.findall(
+        r"^\| (`.*?) \|", (DOCS / "commands.md").read_text().partition("## Presets")[2], re.MULTILINE
+    )
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(PRESETS)
 
 
 def test_the_page_has_the_class_maps_and_the_types_of_result_files():
