@@ -58,7 +58,7 @@ def bev_on(
 ) -> set[int]:
     """Plot the view of :func:`draw_bev` on an axis, by default the whole square, else the limits of x and y
     f64[2, 2]; returns the visible labels."""
-    view = _square(limit_m) if view is None else view
+    view = np.array([[-limit_m, limit_m]] * 2) if view is None else view
     _draw_points(axis, points, limit_m)
     axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
     present: set[int] = set()
@@ -84,15 +84,11 @@ def bev_on(
     return present
 
 
-def _square(limit_m: float) -> np.ndarray:
-    return np.array([[-limit_m, limit_m]] * 2)
-
-
 def _fitted(points: np.ndarray, boxes: Sequence[np.ndarray], limit_m: float) -> np.ndarray:
     """Limits of x and y, f64[2, 2]: the square, or what is in it of a cloud to one side of the sensor."""
     xy = _visible(points, limit_m)[:, :2]
     if not len(xy) or ((xy.min(axis=0) < -_MARGIN_M).all() and (xy.max(axis=0) > _MARGIN_M).all()):
-        return _square(limit_m)
+        return np.array([[-limit_m, limit_m]] * 2)
     corners = [corners_from_above(box) for box in boxes if _in_view(box, limit_m)]
     shown = np.concatenate([np.zeros((2, 1)), xy.T, *corners], axis=1)  # with the cross at the origin
     low, high = shown.min(axis=1) - _MARGIN_M, shown.max(axis=1) + _MARGIN_M
