@@ -11,7 +11,7 @@ import tyro
 
 from fcos_lidar_jax.cli import demo_training
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder, option_name
-from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, write_scores
+from fcos_lidar_jax.cli.scoring import Task, run_detector, write_reports, write_scores
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
@@ -66,7 +66,7 @@ def run(args: Demo) -> None:
     frames = _simulate(args, detector)
     comparison = compare_by_benchmark(frames, "the drive", detector.classes)
     task = Task("the drive", comparison, detector.sensor, detector, frames)
-    write_detections(task, args.out)
+    run_detector(task, args.out)
     compared = comparison.read(args.out / comparison.file)
     evaluation = write_scores(task, compared, args.out, bootstrap=200)
     _draw(args.out, title, evaluation, frames)

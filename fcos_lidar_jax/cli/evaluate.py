@@ -22,7 +22,7 @@ from fcos_lidar_jax.cli.checks import (
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
-from fcos_lidar_jax.cli.scoring import Task, write_detections, write_recording, write_reports, write_scores
+from fcos_lidar_jax.cli.scoring import Task, run_detector, write_recording, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
@@ -90,7 +90,7 @@ def run(args: Evaluate) -> None:
             if is_main_process:
                 locked.enter_context(folder_lock(args.out, "evaluating"))
         if compared is None:
-            write_detections(task, args.out, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
+            run_detector(task, args.out, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
             take_sigterm_back()
         with agreed("cannot evaluate"):
             if is_main_process:  # the others wait, because the first one would report their exit

@@ -42,8 +42,8 @@ class Task:
     frames: FrameSet | None = None  # None if the report has no points
 
 
-def write_detections(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float | None = None) -> None:
-    """Write the detections, and count the removed points, except for close ones."""
+def run_detector(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float | None = None) -> None:
+    """Detect and write the detections; print the numbers of removed points, except for close ones."""
     assert task.detector is not None
     assert task.frames is not None
     comparison = task.comparison

@@ -27,7 +27,7 @@ from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.stream import Found, detect_stream
+from fcos_lidar_jax.inference.stream import SweepDetections, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
@@ -197,8 +197,8 @@ class _Timing(contextlib.AbstractContextManager):
         self._programs += event.endswith("/backend_compile_duration")
 
     def detect(
-        self, sweeps: Iterable[Sweep], detect: Callable[[Iterable[Sweep]], Iterator[Found]]
-    ) -> Iterator[Found]:
+        self, sweeps: Iterable[Sweep], detect: Callable[[Iterable[Sweep]], Iterator[SweepDetections]]
+    ) -> Iterator[SweepDetections]:
         """Detections in sweeps. What the caller does with one until it takes the next one counts as writing."""
         reading, began = 0.0, time.perf_counter()
 
@@ -274,7 +274,7 @@ def _open(args: Stream, kind: Recording, detector: CloudDetector, sensor: Sensor
     return drive
 
 
-def _record(found: Found, classes: tuple[str, ...], drive: Drive) -> dict[str, Any]:
+def _record(found: SweepDetections, classes: tuple[str, ...], drive: Drive) -> dict[str, Any]:
     """A line with the fields of ``fcos-lidar detect``; unknown values are null."""
     sweep = found.sweep
     return {

@@ -15,7 +15,7 @@ from fcos_lidar_jax.types import Detections
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class SweepDetections:
     """Detections in one sweep, fused with the sweeps before it."""
 
     sweep: Sweep  # the current sweep, unchanged
@@ -31,7 +31,7 @@ def detect_stream(
     at_us: Collection[int] | None = None,
     sensor: Sensor | None = None,
     yaw_rad: float | None = None,
-) -> Iterator[Found]:
+) -> Iterator[SweepDetections]:
     """Detect boxes in every sweep as it arrives, fused with the sweeps before it.
 
     The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps.
@@ -78,4 +78,4 @@ def detect_stream(
         cloud = make_cloud(points, detector.config, sensor=detector.sensor, num_close=num_close)
         detections = detector.detect(cloud)
         expect_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
-        yield Found(sweep, cloud, aligned.back(detections))
+        yield SweepDetections(sweep, cloud, aligned.back(detections))

@@ -25,7 +25,7 @@ from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row, spread_indices
-from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
+from fcos_lidar_jax.input_pipeline.copy_paste import Paste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack, pack_row
 from fcos_lidar_jax.types import Batch, HostBatch
@@ -87,7 +87,7 @@ class _BatchOf:
     order: SampleOrder
     rows: range  # this process's rows of the global batch
     fade_step: int  # first step without pasted objects
-    paste: MakePaste | None
+    paste: Paste | None
     packing: Packing | None
     alone: bool  # no other process runs the program
     misfits: list[str] = dataclasses.field(default_factory=list)  # samples that did not fit the packing

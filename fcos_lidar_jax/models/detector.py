@@ -119,16 +119,16 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     if (other := config.build(sensor)) is not None:
         return other
     network, layout = Network(config.model, len(config.classes)), image_layout(sensor, config.model)
-    num_rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
-    image_of = image_sensor(sensor, config.model)
+    projection, sensor_of_image = config.projection, image_sensor(sensor, config.model)
+    options = {"num_rounds": projection.num_rounds, "prioritize_current": projection.prioritize_current}
 
     def prepare(points: Array | np.ndarray, valid: Array | np.ndarray) -> RangeImage:
         with jax.named_scope("mrv"):
-            return project_points(points, valid, image_of, num_rounds=num_rounds, prioritize_current=current_first)
+            return project_points(points, valid, sensor_of_image, **options)
 
     def init(key: Any) -> Variables:
         # Parameters do not depend on the image's size; the forward pass is not computed.
-        image = jax.ShapeDtypeStruct((1, 32, 32, len(CHANNELS) * num_rounds), jnp.float32)
+        image = jax.ShapeDtypeStruct((1, 32, 32, len(CHANNELS) * projection.num_rounds), jnp.float32)
         return network.lazy_init(key, image, train=False)  # type: ignore[return-value]
 
     def apply(variables: Variables, images: RangeImage, *, train: bool = False) -> tuple[Outputs, Any]:

@@ -178,7 +178,7 @@ def test_a_cloud_of_another_sensor_causes_one_warning(tmp_path, capsys):
 def messages(tmp_path, capsys, monkeypatch):
     """``messages(command)`` runs a command on own data up to the training or detection; returns its messages."""
     root, data = own_data(tmp_path, train=2, val=1)
-    for name in ("train.train", "evaluate.write_detections"):
+    for name in ("train.train", "evaluate.run_detector"):
         monkeypatch.setattr(f"fcos_lidar_jax.cli.{name}", Mock(side_effect=KeyboardInterrupt))
 
     def run(line: str, splits: dict[str, list[str]] | None) -> str:
