@@ -197,7 +197,7 @@ class NuScenesLayout:
         """Fill in the defaults.
 
         Raises:
-            ValueError: data, index or splits are missing, also those of --test-version.
+            ValueError: data, index or splits are missing, in --test-version too.
         """
         if self.data_root is None:
             raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")

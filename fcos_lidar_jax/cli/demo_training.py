@@ -135,7 +135,7 @@ def _report(out: Path, test_frames: int, metrics: dict[str, Any], pictures: list
     caption = f"Average precision per class, mean over the matching distances {distances} m"
     write_report(
         out / "report.html",
-        title="FCOS-LiDAR: first contact",
+        title="FCOS-LiDAR: quickstart",
         lead=f"{lead}.",
         summary={**summary, "total minutes": metrics["minutes"]},
         tables=[(caption, ("class", *(_TITLES[model] for model in models)), rows)],

@@ -1,4 +1,4 @@
-"""``fcos-lidar evaluate``: detection metrics, for nuScenes those of the official benchmark."""
+"""``fcos-lidar evaluate``: detection metrics; for nuScenes, the official ones."""
 
 import contextlib
 import dataclasses

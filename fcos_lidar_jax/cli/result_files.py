@@ -25,7 +25,7 @@ Write = Callable[[dict[str, Any]], None]
 
 
 class ResultFormat(NamedTuple):
-    """What the files of a format are."""
+    """Properties of an output format."""
 
     calibrated: bool = False  # in the frame of a camera, one file per cloud; --out is a folder
     in_world: bool = False  # in the global frame

@@ -86,7 +86,7 @@ class CachedFrames(WrappedFrames):
             return None
         except Exception as error:  # damaged archives raise arbitrary exceptions
             reason = str(error).partition("\n")[0] or type(error).__name__
-            print(f"warning: {file}: damaged ({reason}): made anew", file=sys.stderr, flush=True)
+            print(f"warning: {file}: damaged ({reason}): recreating it", file=sys.stderr, flush=True)
             return None
 
 

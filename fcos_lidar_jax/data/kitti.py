@@ -49,7 +49,7 @@ class KittiFrames(FrameSet):
     to that frame: gravity centre, yaw counter-clockwise from +x. KITTI's boxes are upright for the camera; its
     tilt against the Velodyne, about a degree, is lost. Velocities are unknown: NaN. Labels index :data:`CLASSES`.
 
-    The labels do not tell how many points a box contains, so :meth:`truth` reads the cloud and counts them.
+    The labels lack the number of points in a box, so :meth:`truth` reads the cloud and counts them.
 
     Only objects in the left colour image are labelled. Points outside the image are dropped; otherwise a detector
     would learn that everything behind the car is background.

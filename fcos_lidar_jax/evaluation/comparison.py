@@ -1,4 +1,4 @@
-"""What the detections of a data set are written to, read from and compared with."""
+"""Metric, results file and ground truth of an evaluation."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence

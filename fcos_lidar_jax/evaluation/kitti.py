@@ -11,9 +11,9 @@ from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.kitti import read_objects
 
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
-"""The classes that KITTI evaluates -> overlap that a detection must exceed, from above and in space."""
+"""Class that KITTI evaluates -> overlap that a detection must exceed, from above and in 3D."""
 DIFFICULTIES = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
-"""Of the objects that count: height in the image (pixels) that they exceed, greatest occlusion and truncation."""
+"""Minimum image height (pixels), maximum occlusion and truncation of the evaluated objects."""
 TABLE_HEAD = (*DIFFICULTIES, f"objects: {' / '.join(DIFFICULTIES)}")
 
 _NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
@@ -87,7 +87,7 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
 
 
 def object_counts(scores: dict[str, Any]) -> str:
-    """The numbers of objects of a class that count, as the last cell of a row under :data:`TABLE_HEAD`."""
+    """Format the numbers of evaluated objects of a class as the last cell of a row under :data:`TABLE_HEAD`."""
     return " / ".join(map(str, scores["num_truth"].values()))
 
 
@@ -176,7 +176,7 @@ def _average_precision(
     # First, each object takes the detection of the highest score: their scores are the thresholds.
     taken = _match(truth, column, scores[rows][column], np.ones((len(rows), 1), bool))[:, 0]
     thresholds = _thresholds(scores[pairs[taken & true_positive, 1]], int(counted.sum()))
-    # Then, at each threshold, the one of the greatest overlap; one that does not count only for want of others.
+    # Then, at each threshold, the one with the greatest overlap; ignored detections only if no other is left.
     present = scores[rows][:, None] >= thresholds
     taken = _match(truth, column, np.where(valid, overlap, 0.0), present)
     num_true = (taken & true_positive[:, None]).sum(axis=0)

@@ -53,8 +53,8 @@ def predict(
 ) -> Iterator[Prediction]:
     """Detect boxes in frames, in order.
 
-    Clouds are turned and shifted to the frame that the detector expects, as far as the sensors of frames and
-    detector tell, which one line on standard error says; boxes are in the frame of the data.
+    Clouds are rotated and shifted to the frame that the detector expects, if the sensors of frames and detector
+    differ; one line on standard error reports it. Boxes are in the frame of the data.
 
     Every device runs the program for a single cloud, so the boxes are bit-identical for any number of devices and
     processes. Threads read frames while the devices work.
@@ -65,7 +65,7 @@ def predict(
         devices: devices to use; by default all, including those of other processes. Then every process makes the
             same call, reads its share of the frames, and gets all predictions.
         yaw_rad: rotation of the clouds about z before detection, undone for the boxes, counter-clockwise; by
-            default the one between the headings that the sensors tell.
+            default the angle between the headings of the sensors.
 
     Raises:
         ValueError: a batch size below 1, or a frame that cannot be read.

@@ -90,7 +90,7 @@ def without_file(lines):
     return [{name: value for name, value in line.items() if name != "file"} for line in lines]
 
 
-def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path, capsys):
+def test_boxes_equal_detect_with_the_same_sweeps(home, tmp_path, capsys):
     lines = stream(home, tmp_path / "boxes.jsonl", home / "drive", "--poses", home / "poses.json")
     listed = json.loads((home / "poses.json").read_text())
     assert len(lines) == SWEEPS

@@ -1,4 +1,4 @@
-"""Clouds of other axes: turned and shifted for the detector, and boxes brought back."""
+"""Clouds of other axes: turned and shifted for the detector, and boxes back."""
 
 import dataclasses
 
@@ -35,7 +35,7 @@ def test_boxes_are_brought_back_by_the_inverse_of_rotation_matrices():
 
 def test_one_line_says_what_is_done():
     line = Alignment(KITTI_HDL64E, NUSCENES_HDL32E).describe()
-    assert line == "clouds turned by 90 degrees, and boxes brought back: the detector expects y ahead"
+    assert line == "clouds turned by 90 degrees, and boxes back: the detector expects y ahead"
     assert Alignment(VLP16, NUSCENES_HDL32E).describe() == "" == Alignment(TINY, NUSCENES_HDL32E).describe()
 
 

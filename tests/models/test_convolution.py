@@ -210,6 +210,6 @@ for case in CASES:
 """
 
 
-def test_two_devices_exchange_the_sums_alone():
+def test_two_devices_exchange_only_the_sums():
     done = run_python("-c", "import sys; sys.path.insert(0, 'tests/models')\n" + SHARDED, JAX_NUM_CPU_DEVICES="2")
     assert done.returncode == 0, done.stderr

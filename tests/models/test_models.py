@@ -358,7 +358,7 @@ def test_network_input_normalises_joins_by_type_and_keeps_empty_slots_zero():
 
 
 @pytest.mark.parametrize("shape", [(3, 3, 5, 7), (1,), (4, 16)])
-def test_random_weights_are_those_of_the_library(shape):
+def test_random_weights_equal_the_librarys(shape):
     key = jax.random.key(7)
     np.testing.assert_array_equal(layers.normal(key, shape, 0.01), jax.random.normal(key, shape) * 0.01)
     he = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
