@@ -1,7 +1,6 @@
 """``fcos-lidar demo``: a trained detector on a simulated drive, without any data."""
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +17,7 @@ from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
 from fcos_lidar_jax.evaluation.metrics import Evaluation
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.input_pipeline import open_frames
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
 from fcos_lidar_jax.simulation.render import DatasetSpec
@@ -61,7 +60,7 @@ def run(args: Demo) -> None:
         if getattr(args, name) != getattr(Demo, name):
             raise ValueError(f"{option_name(name)}: expected --train with it")
     began = time.monotonic()
-    print(f"simulating a drive of {args.keyframes} keyframes", file=sys.stderr, flush=True)
+    tell(f"simulating a drive of {args.keyframes} keyframes")
     detector, title = load_detector(WEIGHTS), f"{WEIGHTS} on an unseen simulated drive"
     frames = _simulate(args, detector)
     comparison = compare_by_benchmark(frames, "the drive", detector.classes)

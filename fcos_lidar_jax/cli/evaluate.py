@@ -21,7 +21,7 @@ from fcos_lidar_jax.cli.checks import (
 )
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
-from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.cli.scoring import Task, run_detector, write_recording, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
@@ -31,6 +31,7 @@ from fcos_lidar_jax.evaluation.truth import read_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.visualization.evaluation_report import PAGE
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun

@@ -1,4 +1,4 @@
-"""KITTI's own metric: average precision at 40 recall positions, by overlap from above and in space."""
+"""KITTI's own metric: average precision at 40 recall positions, by overlap from above and in 3D."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -118,7 +118,7 @@ def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str
 
 
 def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """IoU from above and in space, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of the files."""
+    """IoU from above and in 3D, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of the files."""
     (ha, wa, la, _, ya, _, _), (hb, wb, lb, _, yb, _, _) = a.T, b.T
     area = _shared_area(a, b)
     volume = area * np.maximum(np.minimum(ya, yb) - np.maximum(ya - ha, yb - hb), 0.0)
@@ -126,7 +126,7 @@ def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shared_area(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Area that boxes share from above: in float64 what :mod:`fcos_lidar_jax.iou` explains."""
+    """Overlap area of boxes from above, in float64; see :mod:`fcos_lidar_jax.iou`."""
     half = a[:, None, [2, 1]] / 2
     cos, sin = np.cos(a[:, 6]), np.sin(a[:, 6])
     dx, dz = b[:, 3] - a[:, 3], b[:, 5] - a[:, 5]

@@ -1,7 +1,6 @@
 """Detection in many frames, read ahead and spread over the devices, and its evaluation."""
 
 import dataclasses
-import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.detector import CloudDetector
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.types import Detections
 
 _AHEAD = 2  # number of groups of frames to read ahead of the devices
@@ -97,8 +96,8 @@ def predict_groups(
     check(batch_size >= 1, "batch_size", batch_size, "at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
     aligned = Alignment(frames.sensor, sensor, yaw_rad)
-    if (line := aligned.describe()) and jax.process_index() == 0:
-        print(line, file=sys.stderr, flush=True)
+    if line := aligned.describe():
+        tell(line)
     program = detector.program(mesh, batch_size)
     todo = list(range(len(frames)) if indices is None else indices)
     size = batch_size * mesh.size
@@ -114,7 +113,7 @@ def predict_groups(
                 frame = frames.frame(group[row])
                 given = aligned.points(frame.points)
                 if group is groups[0] and slot == 0 and (line := sensor_mismatch(given, sensor)):
-                    print(f"warning: {line}", file=sys.stderr, flush=True)
+                    tell(f"warning: {line}")
                 cloud = make_cloud(given, config, sensor=sensor, num_close=frame.num_close)
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud

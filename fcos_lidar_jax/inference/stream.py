@@ -1,7 +1,6 @@
 """Detection in a drive, sweep by sweep, with a rolling window of sweeps and one compiled program."""
 
 import dataclasses
-import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
@@ -10,6 +9,7 @@ from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detector import CloudDetector
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
@@ -61,7 +61,7 @@ def detect_stream(
     """
     reading, aligned = reading or detector.config.reading, align(detector.sensor, sensor, yaw_rad=yaw_rad)
     if line := aligned.describe():
-        print(line, file=sys.stderr, flush=True)
+        tell(line)
     window: deque[Sweep] = deque(maxlen=reading.num_sweeps)
     before: Sweep | None = None
     for sweep in sweeps:

@@ -10,7 +10,6 @@ import dataclasses
 import os
 import shutil
 import signal
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +27,7 @@ from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row, spread
 from fcos_lidar_jax.input_pipeline.copy_paste import Paste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack, pack_row
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.types import Batch, HostBatch
 from fcos_lidar_jax.workers import end_with_parent
 
@@ -297,8 +297,7 @@ class _OwnedBatches:
     def __next__(self) -> HostBatch:
         host = next(self._batches)
         if host.misfit is not None and not self._told:
-            line = f"{host.misfit}: such batches stay unpacked, which compiles the step once more"
-            print(line, file=sys.stderr, flush=True)
+            tell(f"{host.misfit}: such batches stay unpacked, which compiles the step once more")
             self._told = True
         return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch)) if self._copied else host
 

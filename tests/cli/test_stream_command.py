@@ -143,7 +143,7 @@ def test_keyframes_option_skips_the_boxes_of_other_sweeps(home, tmp_path, capsys
     for more, told in (("", 1), ("--yaw-deg 0", 0)):
         capsys.readouterr()
         command("stream", data, more, "--keyframes --out", tmp_path / "ahead.jsonl")
-        assert capsys.readouterr().err.count("clouds turned by -90 degrees") == told
+        assert capsys.readouterr().err.count("clouds rotated by -90 degrees") == told
 
 
 def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys):
