@@ -145,37 +145,6 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     return Detector(prepare, init, apply, make_sums(config, sensor), candidates, config, sensor)
 
 
-class Parts(NamedTuple):
-    """Compiled parts of FCOS-LiDAR's network. All but the first take all variables and the previous output."""
-
-    preprocess: Callable[[Any], Image]
-    stem: Callable[[Variables, Any], Any]
-    backbone: Callable[[Variables, Any], Any]
-    fpn: Callable[[Variables, Any], Any]
-    heads: Callable[[Variables, Any], Any]
-
-
-def network_parts(config: Config, sensor: Sensor) -> Parts:
-    """Split the network of a configuration without ``local_geometry`` into parts, to time each of them.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> network_parts(QUICKSTART, SHORT_RANGE).preprocess(jnp.zeros((1, 32, 128, 9, 1))).shape
-    (1, 32, 128, 9)
-    """
-    layout, network = image_layout(sensor, config.model), Network(config.model, len(config.classes))
-
-    def part(name: str, **options: Any) -> Callable[[Variables, Any], Any]:
-        def apply(variables: Variables, x: Any) -> Any:
-            return network.apply(variables, x, method=lambda whole, x: getattr(whole, name)(x, **options))
-
-        return jax.jit(apply)
-
-    preprocess = jax.jit(lambda features: network_input(features, config.model, layout))
-    front = part("stem", train=False), part("backbone", train=False)
-    return Parts(preprocess, *front, part("fpn"), part("heads"))
-
-
 def count_parameters(params: Any) -> dict[str, int]:
     """Count the parameters of each part of the network, and in total.
 

@@ -13,9 +13,9 @@ import pytest
 from refusal import refused
 from toy_frames import ToyFrames, toy_frame
 
+from experiments.cached import CachedFrames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import SHORT_RANGE, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
