@@ -1,4 +1,4 @@
-"""The way from the frame of a data set to the frame that a detector expects, and back."""
+"""Transformation from the frame of a data set to the frame that a detector expects, and back."""
 
 import dataclasses
 import math
