@@ -18,11 +18,11 @@ import jax
 import numpy as np
 import tyro
 
+from experiments.cached import CachedFrames
 from experiments.changes import change
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemConfig
-from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.index import has_index
@@ -197,7 +197,7 @@ class NuScenesLayout:
         """Fill in the defaults.
 
         Raises:
-            ValueError: data, index or splits are missing, also those of --test-version.
+            ValueError: data, index or splits are missing, in --test-version too.
         """
         if self.data_root is None:
             raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")

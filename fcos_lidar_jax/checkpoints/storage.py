@@ -227,7 +227,7 @@ def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
             return checkpointer.restore(folder, target)
     except CheckpointError:
         raise
-    except Exception as error:  # so does it for corrupt files
+    except Exception as error:  # Orbax raises arbitrary exceptions for corrupt files
         raise CheckpointError(f"{folder}: cannot be read: {_one_line(error)}") from error
 
 

@@ -15,7 +15,7 @@ from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_
 from fcos_lidar_jax.cli.checks import check_out_folder, option_name
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
@@ -25,6 +25,7 @@ from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import PRESETS
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.training.run import run_folder

@@ -10,7 +10,7 @@ from jaxtyping import Array
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.point_files import check_time_lags
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.progress import tell_once
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
 
@@ -182,7 +182,9 @@ def truncation(number: int, config: Config) -> str | None:
 def tell_truncation(cloud: Cloud, config: Config) -> None:
     """Print a line at the first truncated cloud, once per process; :func:`truncation` counts the points."""
     if cloud.num_truncated:
-        tell_once(f"clouds are truncated: the detector takes at most {config.max_points} points (max_points)")
+        tell(
+            f"clouds are truncated: the detector takes at most {config.max_points} points (max_points)", once=True
+        )
 
 
 def _limits(sensor: Sensor) -> str:

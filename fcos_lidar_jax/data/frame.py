@@ -58,8 +58,8 @@ class FrameSet(Protocol):
     def truth(self, index: int) -> Frame:
         """:meth:`frame` with ``num_close`` 0 and no points.
 
-        The points are read only if the data do not tell how many of them each box contains (KITTI, folders of
-        your own data).
+        The points are read only if the data lack the number of points in each box (KITTI, folders of your own
+        data).
         """
         return without_points(self.frame(index))
 

@@ -11,10 +11,10 @@ from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 
-MakePaste = Callable[[Frame, np.random.Generator], tuple[Frame, np.ndarray]]
+Paste = Callable[[Frame, np.random.Generator], tuple[Frame, np.ndarray]]  # See :func:`make_paste`.
 
 
-def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
+def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
     """Make the function that samples objects for a frame.
 
     For each class in order, samples without replacement as many objects as the frame lacks, counting the frame's

@@ -219,7 +219,7 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
         for name, was, now in _differences(own, new, "model"):
             print(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}", file=sys.stderr, flush=True)
         if turn := turn_between(detector.sensor, checkpoint.sensor):
-            told = f"weights trained on clouds turned by {math.degrees(turn):g} degrees relative to these"
+            told = f"weights trained on clouds rotated by {math.degrees(turn):g} degrees relative to these"
             print(f"{folder}: {told}: expect scores to fall at first", file=sys.stderr, flush=True)
     return checkpoint.variables
 

@@ -89,7 +89,7 @@ def write_evaluation_report(
     ``bootstrap.json`` in the folder, of the nuScenes benchmark or any other metric.
 
     Args:
-        examples: samples to plot; ``sensor`` is that of their range images.
+        examples: samples to plot; ``sensor`` defines their range images.
         pictures: additional pictures, placed first.
         links: text and file name of links to files beside the report.
     """

@@ -111,7 +111,7 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
     assert page_content(tmp_path / "page.html")["forward_rad"] == KITTI_HDL64E.forward_rad
     told = capsys.readouterr().err
     assert told.count("recorded by kitti_hdl64e") == told.count("intensities times 255") == 1  # of two files
-    assert told.count("clouds turned by 90 degrees") == 1
+    assert told.count("clouds rotated by 90 degrees") == 1
     assert "no intensity is above 1" not in told
     assert "outside the camera image" not in told
     cropped = detect(tmp_path / "cropped.json", folder)
@@ -151,7 +151,7 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
         assert stream(tmp_path / "boxes.jsonl", source, "--page", tmp_path / "drive.html") == boxes
         assert page_content(tmp_path / "drive.html")["forward_rad"] == KITTI_HDL64E.forward_rad
         told = capsys.readouterr().err
-        assert told.count("clouds turned by 90 degrees") == 1
+        assert told.count("clouds rotated by 90 degrees") == 1
 
 
 def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):

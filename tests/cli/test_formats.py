@@ -21,13 +21,13 @@ from made_kitti import make_kitti
 from tiny_run import NETWORK_OPTIONS, SENSOR
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax import progress
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES
 from fcos_lidar_jax.data.argoverse2 import TO_NUSCENES
 from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.input_pipeline.open import Format
 from fcos_lidar_jax.presets import QUICKSTART
-from fcos_lidar_jax.progress import tell_once
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, sensor_to_json
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -153,7 +153,7 @@ def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):
     np.save(root / "clouds" / "002.npy", dense.astype(np.float32))
 
     def told():
-        tell_once.cache_clear()
+        progress._told.clear()
         return capsys.readouterr().err.splitlines()
 
     told()
@@ -196,7 +196,7 @@ def test_a_cloud_of_another_sensor_causes_one_warning(tmp_path, capsys):
 def messages(tmp_path, capsys, monkeypatch):
     """``messages(command)`` runs a command on own data up to the training or detection; returns its messages."""
     root, data = own_data(tmp_path, train=2, val=1)
-    for name in ("train.train", "evaluate.write_detections"):
+    for name in ("train.train", "evaluate.run_detector"):
         monkeypatch.setattr(f"fcos_lidar_jax.cli.{name}", Mock(side_effect=KeyboardInterrupt))
 
     def run(line: str, splits: dict[str, list[str]] | None) -> str:

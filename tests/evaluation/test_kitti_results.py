@@ -63,7 +63,7 @@ def test_the_camera_frame_is_the_way_back_of_to_lidar(calibration):
     np.testing.assert_allclose(back, labels, atol=1e-9)
 
 
-def test_fields_are_those_of_the_benchmark(tmp_path, calibration):
+def test_fields_match_the_benchmark(tmp_path, calibration):
     """Truncation and occlusion are -1, and alpha is the heading as the camera sees it."""
     write_result(tmp_path / "a.txt", random_boxes(40), ["Car"] * 40, np.full(40, 0.5), calibration)
     rows = [line.split() for line in (tmp_path / "a.txt").read_text().splitlines()]

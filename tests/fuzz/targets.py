@@ -21,6 +21,7 @@ from made_nuscenes import VERSION, make_tables
 from made_nuscenes import write as write_nuscenes
 from toy_frames import ToyFrames
 
+from experiments.cached import CachedFrames
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import read_class_map
@@ -28,7 +29,6 @@ from fcos_lidar_jax.config import CloudReading, config_from_json, config_to_json
 from fcos_lidar_jax.data import argoverse2
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.box_geometry import check_boxes
-from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.drives import read_tum
 from fcos_lidar_jax.data.folder import FolderFrames

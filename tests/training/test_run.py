@@ -108,7 +108,7 @@ def test_initial_weights_for_another_heading_are_reported(finished, capsys):
         sensor = dataclasses.replace(SENSOR, forward_rad=SENSOR.forward_rad - turn)
         plan._initial_weights(build_detector(CONFIG, sensor), finished[0])
     (line,) = capsys.readouterr().err.splitlines()
-    assert "weights trained on clouds turned by 90 degrees relative to these: " in line
+    assert "weights trained on clouds rotated by 90 degrees relative to these: " in line
 
 
 def test_all_documented_metrics_are_recorded(finished):
