@@ -20,7 +20,6 @@ from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
-from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
@@ -237,14 +236,11 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
             f"{folder}: no objects here, expected objects of the training frames: run fcos-lidar prepare{option}, "
             "or train with --no-copy-paste"
         )
-    source = database.read_manifest(folder).source
-    expected = f"at most {database.MAX_SWEEPS} with copy-paste, or --no-copy-paste"
-    check(config.num_sweeps <= database.MAX_SWEEPS, "num_sweeps", config.num_sweeps, expected)
-    # Objects cut from more sweeps fit too: their surplus sweeps are left out.
-    sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
-    if not any(source == args.data.open_whole(split, database.cut_reading(n)).fingerprint() for n in sweeps):
+    objects = database.open_database(folder)
+    reading = database.cut_reading(objects.manifest.num_sweeps)
+    if objects.manifest.source != args.data.open_whole(split, reading, report_missing=False).fingerprint():
         raise ValueError(
-            f"{folder}: cut from other frames than split {split!r}, with another --class-map, or from fewer than "
-            f"{config.num_sweeps} sweeps: run fcos-lidar prepare again, with the same data options"
+            f"{folder}: cut from other frames than split {split!r}, or with another --class-map: run fcos-lidar "
+            "prepare again, with the same data options"
         )
-    return database.open_database(folder)
+    return objects

@@ -19,6 +19,7 @@ from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
 from fcos_lidar_jax import cli
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.cli import data
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
@@ -186,7 +187,7 @@ BAD = mistakes(r"""
 --val-split none --val-samples 0:1 => --val-samples: got '0:1' with --val-split none, which turns evaluation off
 --copy-paste.min-points 3 => copy_paste.min_points: got 3, expected at least the database's 5
 --sensor sonar => sonar: no such sensor
---num-sweeps 2 => cut from other frames than split 'train'
+--num-sweeps 2 => num_sweeps: got 2, expected at most the 1 of .*/train: run fcos-lidar prepare --num-sweeps 2$
 --train-split val => objects/val: no objects here, .* prepare --train-split val
 """)
 
@@ -204,6 +205,21 @@ def test_rejects_options_that_simulate_all_frames_before_the_first_step(tmp_path
     for more, line in (((), f"{message} --no-copy-paste"), (("--no-copy-paste",), message)):
         assert_one_line_error(capsys, [*args, *more], f"{line}, or at most 2000 of them by --samples")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_objects_of_more_sweeps_are_taken_and_their_frames_opened_once(root, tmp_path, monkeypatch, capsys):
+    where = ["--data-root", root, "--version", VERSION, "--index", tmp_path / "index"]
+    command("prepare --num-sweeps 3", *where)
+    opened, given = [], []
+    open_frames = data.open_frames
+    monkeypatch.setattr(data, "open_frames", lambda *args, **kw: opened.append(kw) or open_frames(*args, **kw))
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", lambda *_, objects, **__: given.append(objects) or 1 / 0)
+    args = train(root, tmp_path / "out", "--index", str(tmp_path / "index"), "--val-split", "none")
+    cli.main(args)
+    assert [kw["reading"].num_sweeps for kw in opened] == [1, 3]
+    assert given[0].manifest.num_sweeps == 3
+    capsys.readouterr()
+    assert_one_line_error(capsys, [*args, "--class-map", "kitti"], "cut from other frames than split 'train', or")
 
 
 def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
