@@ -1,6 +1,5 @@
 """``fcos-lidar train``: train a preset on a data set."""
 
-import contextlib
 import dataclasses
 import json
 from functools import reduce
@@ -114,27 +113,24 @@ def run(args: Train) -> None:
         tell(f"{args.out}: no run to resume, starting one")
     checkpoints = Checkpoints(args.out / CHECKPOINTS)
     try:
-        with contextlib.ExitStack() as held:
-            with agreed("cannot train"):
-                if task.cuts_objects and is_main_process:  # the other processes open the result
-                    held.enter_context(run_folder(args.out, resume=resume))
-                    assert task.config.copy_paste is not None
-                    min_points = task.config.copy_paste.min_points
-                    database.prepare_database(task.frames, args.out / _OBJECTS, min_points=min_points)
-            with agreed("cannot train"):
-                objects = _objects(args, task)
-            state = train(
-                task.config,
-                task.frames,
-                args.out,
-                steps=task.steps,
-                tests=task.tests,
-                objects=objects,
-                schedule=schedule,
-                packing=False if args.no_packing else None,
-                resume=resume,
-                **{name: getattr(args, name) for name in ("seed", "weights", "threads", "workers")},
-            )
+        with agreed("cannot train"):
+            if task.cuts_objects and is_main_process:  # the other processes open the result
+                with run_folder(args.out, resume=resume):
+                    _cut_objects(args, task)
+        with agreed("cannot train"):
+            objects = _objects(args, task)
+        state = train(
+            task.config,
+            task.frames,
+            args.out,
+            steps=task.steps,
+            tests=task.tests,
+            objects=objects,
+            schedule=schedule,
+            packing=False if args.no_packing else None,
+            resume=resume,
+            **{name: getattr(args, name) for name in ("seed", "weights", "threads", "workers")},
+        )
     except (KeyboardInterrupt, SystemExit):
         if checkpoints.paths():
             tell(f"the same command {'' if args.auto_resume else 'with --resume '}continues")
@@ -222,13 +218,21 @@ def _check_simulated(number: int, config: Config) -> None:
         )
 
 
+def _cut_objects(args: Train, task: _Task) -> None:
+    assert task.config.copy_paste is not None
+    min_points, num_sweeps = task.config.copy_paste.min_points, task.config.num_sweeps
+    folder = args.out / _OBJECTS
+    database.prepare_database(task.frames, folder, min_points=min_points, num_sweeps=num_sweeps)
+
+
 def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
     """Open the objects to paste, just cut or prepared for the split; None without copy-paste."""
     config, split = task.config, task.split
     if config.copy_paste is None:
         return None
     if task.cuts_objects:
-        return database.open_database(args.out / _OBJECTS)
+        # The folder is not locked since they were cut: another process may have cut others.
+        return database.open_database(args.out / _OBJECTS, fingerprint=task.frames.fingerprint())
     folder = database.objects_folder(args.data.index or task.data.index, split)
     if not folder.is_dir():
         option = "" if split is None else f" --train-split {split}"
