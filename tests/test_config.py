@@ -20,6 +20,7 @@ from fcos_lidar_jax.config import (
     config_to_json,
 )
 from fcos_lidar_jax.presets import (
+    ABOUT,
     COMPACT,
     NUSCENES,
     NUSCENES_SINGLE,
@@ -73,6 +74,11 @@ def test_small_presets_differ_in_numbers_only(preset, own):
         for part, name in own:
             del record[part][name]
     assert small == full
+
+
+def test_every_preset_has_one_line_about_it():
+    assert list(ABOUT) == list(PRESETS)
+    assert all(0 < len(line) < 80 and "\n" not in line for line in ABOUT.values())
 
 
 @pytest.mark.parametrize("name", PRESETS)

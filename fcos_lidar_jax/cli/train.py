@@ -22,26 +22,13 @@ from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
-from fcos_lidar_jax.presets import PRESETS
+from fcos_lidar_jax.presets import ABOUT, PRESETS
 from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.training.run import run_folder
 
-_ABOUT = {
-    "nuscenes": "the paper's detector on ten sweeps",
-    "nuscenes_single": "the paper's detector on one sweep",
-    "nuscenes_test": "the paper's test-set model",
-    "kitti": "one sweep of KITTI's camera view, three classes",
-    "argoverse2": "one sweep of Argoverse 2, 26 classes",
-    "compact": "a smaller network on one sweep of nuScenes, for two CPU cores",
-    "quickstart": "smaller still, for a short-range sensor and tests",
-    "centerpoint_pillars": "CenterPoint on ten sweeps, for comparison",
-    "centerpoint_compact": "CenterPoint on one sweep, at about the cost of compact",
-}
 _PRESETS: Any = (
-    Annotated[
-        type(preset), tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT[name])
-    ]
+    Annotated[type(preset), tyro.conf.subcommand(name, default=preset, prefix_name=False, description=ABOUT[name])]
     for name, preset in PRESETS.items()
 )
 _OBJECTS = "objects"  # folder in the run's folder for objects cut from selected frames
