@@ -176,3 +176,17 @@ PRESETS: dict[str, Config] = {
     )
 }
 """Configurations by name."""
+
+ABOUT = {
+    "nuscenes": "the paper's detector on ten sweeps",
+    "nuscenes_single": "the paper's detector on one sweep",
+    "nuscenes_test": "the paper's test-set model",
+    "kitti": "one sweep of KITTI's camera view, three classes",
+    "argoverse2": "one sweep of Argoverse 2, 26 classes",
+    "compact": "a smaller network on one sweep of nuScenes, for two CPU cores",
+    "kitti_compact": "the network of compact for KITTI, without trained weights",
+    "quickstart": "smaller still, for a short-range sensor and tests",
+    "centerpoint_pillars": "CenterPoint on ten sweeps, for comparison",
+    "centerpoint_compact": "CenterPoint on one sweep, at about the cost of compact",
+}
+"""Descriptions of the presets, for ``fcos-lidar train --help``."""

@@ -249,12 +249,7 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     >>> sensor_from_json(sensor_to_json(TINY)) == TINY
     True
     """
-    record = dataclasses.asdict(sensor)
-    if sensor.azimuth_limits_rad is None:  # keeps the JSON of full-turn sensors as it was before sectors existed
-        del record["azimuth_limits_rad"]
-    if sensor.forward_rad == _usual_heading(sensor.name):  # and so for sensors from before the heading was known
-        del record["forward_rad"]
-    return record
+    return dataclasses.asdict(sensor)
 
 
 def _usual_heading(name: object) -> float | None:

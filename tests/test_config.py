@@ -20,6 +20,7 @@ from fcos_lidar_jax.config import (
     config_to_json,
 )
 from fcos_lidar_jax.presets import (
+    ABOUT,
     COMPACT,
     KITTI,
     KITTI_COMPACT,
@@ -95,6 +96,11 @@ def test_kitti_compact_has_the_data_of_kitti_and_the_network_of_compact():
     )
     assert KITTI_COMPACT.model == scaled
     assert (KITTI_COMPACT.optimizer, KITTI_COMPACT.inference) == (COMPACT.optimizer, COMPACT.inference)
+
+
+def test_every_preset_has_one_line_about_it():
+    assert list(ABOUT) == list(PRESETS)
+    assert all(0 < len(line) < 80 and "\n" not in line for line in ABOUT.values())
 
 
 @pytest.mark.parametrize("name", PRESETS)

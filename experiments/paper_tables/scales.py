@@ -253,7 +253,7 @@ class NuScenesLayout:
         }
 
     def objects(self, frames: NuScenesFrames) -> GroundTruthDatabase:
-        """Open the database that fcos-lidar prepare has cut from the training frames, of at least as many sweeps.
+        """Open the database that fcos-lidar prepare has cut from the training frames.
 
         Raises:
             ValueError: there is no such database.
@@ -263,9 +263,8 @@ class NuScenesLayout:
         if not folder.is_dir():
             raise ValueError(f"{folder}: no objects here, expected some: run fcos-lidar prepare")
         objects = database.open_database(folder)
-        sweeps = range(frames.reading.num_sweeps, NUSCENES.num_sweeps + 1)
-        sources = [dataclasses.replace(frames, reading=database.cut_reading(n)).fingerprint() for n in sweeps]
-        if objects.manifest.source not in sources:
+        reading = database.cut_reading(objects.manifest.num_sweeps)
+        if objects.manifest.source != dataclasses.replace(frames, reading=reading).fingerprint():
             origin = f"cut from other frames than {self.train_split}"
             raise ValueError(f"{folder}: {origin}: run fcos-lidar prepare again")
         return objects

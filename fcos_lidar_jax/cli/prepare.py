@@ -70,7 +70,7 @@ def _prepare(args: Prepare, data: DataSet, folder: Path) -> dict[str, Any]:
     frames = args.data.open_whole(split, cut_reading(args.num_sweeps))
     progress = Progress("frames", len(frames))
     objects = objects_folder(folder, split)
-    options = {"min_points": args.min_points, "workers": args.workers}
+    options = {name: getattr(args, name) for name in ("min_points", "num_sweeps", "workers")}
     database = prepare_database(frames, objects, **options, report=lambda done, _: progress.show(done))
     return record | {"train_split": split, "frames": len(frames), "objects": len(database)}
 

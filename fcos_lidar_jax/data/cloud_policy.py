@@ -182,9 +182,8 @@ def truncation(number: int, config: Config) -> str | None:
 def tell_truncation(cloud: Cloud, config: Config) -> None:
     """Print a line at the first truncated cloud, once per process; :func:`truncation` counts the points."""
     if cloud.num_truncated:
-        tell(
-            f"clouds are truncated: the detector takes at most {config.max_points} points (max_points)", once=True
-        )
+        line = f"clouds are truncated: the detector takes at most {config.max_points} points (max_points)"
+        tell(line, once=True)
 
 
 def _limits(sensor: Sensor) -> str:

@@ -28,7 +28,8 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
         ``config.classes``. The result is deterministic in the frame and the generator.
 
     Raises:
-        ValueError: the database has a higher ``min_points`` than the configuration, or shares no class with it.
+        ValueError: the database has a higher ``min_points`` or fewer sweeps than the configuration, or shares no
+            class with it.
     """
     assert config.copy_paste is not None
     targets, min_points, manifest = config.paste_targets, config.copy_paste.min_points, objects.manifest
@@ -40,6 +41,11 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
         raise ValueError(f"{objects.folder}: classes: got {got}, expected some of {expected}")
     boxes, labels = objects.table["box"], of_class[objects.table["label"]]
     current, pasted = objects.num_points(1), objects.num_points(config.num_sweeps)
+    sweeps = config.num_sweeps
+    expected = (
+        f"at most the {manifest.num_sweeps} of {objects.folder}: run fcos-lidar prepare --num-sweeps {sweeps}"
+    )
+    check(sweeps <= manifest.num_sweeps, "num_sweeps", sweeps, expected)
     usable = (pasted >= min_points) & (current >= 1)
     pools = [np.flatnonzero(usable & (labels == label)) for label in range(len(targets))]
 

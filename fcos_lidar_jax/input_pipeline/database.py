@@ -31,7 +31,7 @@ from fcos_lidar_jax.workers import end_with_parent
 
 MAX_SWEEPS = 20  # number of sweeps for which an object's points are counted
 
-_FORMAT, _VERSION = "fcos_lidar_jax objects", 2
+_FORMAT, _VERSION = "fcos_lidar_jax objects", 3
 _REBUILD = "rebuild it with fcos-lidar prepare"
 _MANIFEST = "manifest.json"
 _ROW = np.dtype(
@@ -69,6 +69,7 @@ class Manifest(_Header, forbid_unknown_fields=True):
     source: str
     classes: list[str]
     min_points: int
+    num_sweeps: int
     columns: int
     shards: list[Shard]
 
@@ -123,7 +124,7 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
     Missing, unfinished, altered and truncated databases, and databases of another version, are refused.
     """
     folder = Path(folder)
-    manifest = read_manifest(folder)
+    manifest = _read_manifest(folder)
     file = folder / _MANIFEST
     expected = f"{fingerprint!r}: built from other data, {_REBUILD}"
     check(fingerprint in (None, manifest.source), f"{file}: source", manifest.source, expected)
@@ -155,7 +156,7 @@ def objects_folder(index: Path, split: str | None) -> Path:
     return index / "objects" / name
 
 
-def read_manifest(folder: Path) -> Manifest:
+def _read_manifest(folder: Path) -> Manifest:
     """Read a finished database's manifest; errors as in :func:`open_database`."""
     file = folder / _MANIFEST
     header = read_json(file, _Header, what="a finished ground-truth database")
@@ -174,6 +175,7 @@ def prepare_database(
     folder: str | Path,
     *,
     min_points: int = 5,
+    num_sweeps: int = MAX_SWEEPS,
     workers: int = 1,
     report: Callable[[int, int], None] | None = None,
 ) -> GroundTruthDatabase:
@@ -186,6 +188,7 @@ def prepare_database(
     Args:
         frames: frames of any classes; must be picklable for several workers.
         folder: contains only the database.
+        num_sweeps: maximum number of sweeps that the frames fuse; detectors of more sweeps refuse the objects.
         workers: number of processes; 1 works in this process.
         report: called with (frames done, total) at the start, including frames of an earlier run, and after every
             shard.
@@ -222,7 +225,7 @@ def prepare_database(
         report(done, len(frames))
     tables = {name: _read_shard(folder, name, columns) for name in shards}
     entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
-    manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, columns, entries)
+    manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, num_sweeps, columns, entries)
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
     atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
     return open_database(folder, fingerprint=source)

@@ -284,8 +284,8 @@ MANIFEST, TABLE, POINTS = "manifest.json", "scene-b.objects.npz", "scene-c.point
 DAMAGE = {
     "no manifest": (MANIFEST, Path.unlink, "no such file, expected a finished"),
     "truncated manifest": (MANIFEST, lambda f: cut(f, 100), "not JSON"),
-    "older version": (MANIFEST, lambda f: edit(f, version=1), "version 1, expected", "version 2; rebuild it with"),
-    "other format": (MANIFEST, lambda f: edit(f, format="x"), "got 'x' version 2"),
+    "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 3; rebuild it with"),
+    "other format": (MANIFEST, lambda f: edit(f, format="x"), "got 'x' version 3"),
     "no shards": (MANIFEST, lambda f: edit(f, shards=3), "$.shards: got 3, expected array"),
     "empty shard": (MANIFEST, lambda f: edit(f, shards=[{}]), "$.shards[0]: Object missing required field `name`"),
     "path": (MANIFEST, lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]), "shards: name: got '/etc/x', exp"),
