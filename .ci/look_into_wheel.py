@@ -31,7 +31,7 @@ if not any(name.endswith("LICENSE") for name in names):
     sys.exit(f"{wheel}: no licence in it")
 own = [p for p in inside if p.parts[0] == "fcos_lidar_jax" and (p.suffix in KINDS or "weights" in p.parts)]
 if strangers := sorted(set(inside) - set(own)):
-    sys.exit(f"{wheel}: holds {strangers[0]}, expected the package alone")
+    sys.exit(f"{wheel}: contains {strangers[0]}, expected only the package")
 with tarfile.open(source) as archive:
     packed = [PurePosixPath(*PurePosixPath(m.name).parts[1:]) for m in archive.getmembers() if m.isfile()]
 for name in (*BESIDE, *(f"fcos_lidar_jax/{name}" for name in NEEDED)):

@@ -55,7 +55,7 @@ autodoc_default_options = {"members": True}
 # Fields and constants are described by plain comments behind them.
 sphinx.pycode.parser.comment_re = re.compile(r"^\s*#:? ?(.*)\r?\n?$")
 
-# Names within the package must lead somewhere; those of other packages are text.
+# Names of the package must be links; names of other packages are text.
 nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!fcos_lidar_jax).*"),

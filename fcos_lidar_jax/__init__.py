@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from fcos_lidar_jax.sensors import load_sensor
     from fcos_lidar_jax.training import train
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 __all__ = ["PRESETS", "evaluate", "load_detector", "load_sensor", "open_frames", "predict", "train"]
 
 _HOME = {

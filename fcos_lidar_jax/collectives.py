@@ -47,7 +47,7 @@ def sum_over_devices(tree: _Tree) -> _Tree:
 
 
 def varying(tree: _Tree) -> _Tree:
-    """Mark equal leaves as values of one device each, so that their gradients are of one device as well.
+    """Mark replicated leaves as device-varying, so that each device computes its own gradient.
 
     Without the mark, ``jax.shard_map`` adds up the gradients of replicated leaves by itself, unlike ``jax.pmap``.
 

@@ -397,7 +397,7 @@ def _kind_of(record: Mapping[str, Any]) -> type[Config]:
     for kind in kinds:
         kinds += kind.__subclasses__()
     for kind in reversed(kinds[1:]):
-        if any(record.get(name) is not None for name in _names(kind) - _names(kind.__base__)):
+        if record.keys() & (_names(kind) - _names(kind.__base__)):
             return kind
     return Config
 
@@ -409,8 +409,7 @@ def _names(kind: Any) -> set[str]:
 def config_from_json(record: Any, where: str = "config") -> Config:
     """Create a configuration from the JSON object that :func:`config_to_json` wrote.
 
-    The fields determine the class, among the subclasses of :class:`Config` that are already imported. A section
-    of another detector may be null.
+    The fields determine the class, among the subclasses of :class:`Config` that are already imported.
 
     Raises:
         ValueError: naming ``where``, the field, the found and the expected value.
@@ -419,8 +418,5 @@ def config_from_json(record: Any, where: str = "config") -> Config:
     Traceback (most recent call last):
     ValueError: mine.json: sensor: missing, expected str
     """
-    if not isinstance(record, Mapping):
-        return from_json(Config, record, where)
-    kind = _kind_of(record)
-    given = {name: value for name, value in record.items() if value is not None or name in _names(kind)}
-    return from_json(kind, given, where)
+    kind = _kind_of(record) if isinstance(record, Mapping) else Config
+    return from_json(kind, record, where)

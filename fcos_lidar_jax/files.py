@@ -8,7 +8,6 @@ import os
 import re
 import secrets
 import socket
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -242,37 +241,29 @@ def file_checksum(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
-_holders: dict[Path, int] = {}  # folders locked by this process -> thread that holds the lock
-
-
 @contextlib.contextmanager
 def folder_lock(folder: Path, doing: str) -> Iterator[None]:
     """Lock a folder against other processes with a file ``.lock`` that says what this process is ``doing``.
 
-    The holding thread may take the lock again. The lock is released when the process ends.
+    The lock is released when the process ends.
 
     Raises:
         OSError: another process holds the lock; the message contains its id, machine and activity.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
-    >>> with folder_lock(folder, "writing"), folder_lock(folder, "writing"):
+    >>> with folder_lock(folder, "writing"):
     ...     (folder / ".lock").read_text().split()[-2:]
     ['is', 'writing']
     """
-    file, key = folder / ".lock", folder.resolve()
-    if _holders.get(key) == threading.get_ident():
-        yield
-        return
+    file = folder / ".lock"
     with file_lock(file) as held:
         if not held:
             owner = file.read_text(encoding="utf-8", errors="replace")[:200] or "another process"
             raise BlockingIOError(f"{folder}: in use: {owner}, expected no other process")
-        _holders[key] = threading.get_ident()
         try:
             file.write_text(f"process {os.getpid()} on {socket.gethostname()} is {doing}", encoding="utf-8")
             yield
         finally:
-            del _holders[key]
             with contextlib.suppress(OSError):  # the folder may have been removed
                 os.truncate(file, 0)

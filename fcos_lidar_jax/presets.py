@@ -126,6 +126,16 @@ not in the paper; ``python -m experiments.studies.post_processing`` measures wha
 are not in the paper either; ``experiments/LOG.md`` compares them with the paper's.
 """
 
+KITTI_COMPACT = dataclasses.replace(
+    KITTI,
+    name="kitti_compact",
+    **{part: getattr(COMPACT, part) for part in ("projection", "loss", "inference", "optimizer")},
+    model=dataclasses.replace(
+        COMPACT.model, channel_mean=KITTI.model.channel_mean, channel_scale=KITTI.model.channel_scale
+    ),
+)
+"""The network, losses and post-processing of ``compact`` for KITTI. No weights have been trained with it."""
+
 CENTERPOINT_PILLARS = CenterPointConfig.of(
     NUSCENES,
     name="centerpoint_pillars",
@@ -162,7 +172,21 @@ PRESETS: dict[str, Config] = {
     c.name: c
     for c in (
         *(NUSCENES, NUSCENES_SINGLE, NUSCENES_TEST, KITTI, ARGOVERSE2, COMPACT, QUICKSTART),
-        *(CENTERPOINT_PILLARS, CENTERPOINT_COMPACT),
+        *(KITTI_COMPACT, CENTERPOINT_PILLARS, CENTERPOINT_COMPACT),
     )
 }
 """Configurations by name."""
+
+ABOUT = {
+    "nuscenes": "the paper's detector on ten sweeps",
+    "nuscenes_single": "the paper's detector on one sweep",
+    "nuscenes_test": "the paper's test-set model",
+    "kitti": "one sweep of KITTI's camera view, three classes",
+    "argoverse2": "one sweep of Argoverse 2, 26 classes",
+    "compact": "a smaller network on one sweep of nuScenes, for two CPU cores",
+    "kitti_compact": "the network of compact for KITTI, without trained weights",
+    "quickstart": "smaller still, for a short-range sensor and tests",
+    "centerpoint_pillars": "CenterPoint on ten sweeps, for comparison",
+    "centerpoint_compact": "CenterPoint on one sweep, at about the cost of compact",
+}
+"""Descriptions of the presets, for ``fcos-lidar train --help``."""

@@ -1,8 +1,9 @@
 """Lines on stderr: progress of long operations, with rate and time left, and notes."""
 
-import functools
 import sys
 import time
+
+import jax
 
 
 class Progress:
@@ -33,7 +34,13 @@ class Progress:
         print(line, file=sys.stderr, flush=True)
 
 
-@functools.cache
-def tell_once(line: str) -> None:
-    """Print a line to stderr, once per process."""
+_told: set[str] = set()
+
+
+def tell(line: str, *, once: bool = False) -> None:
+    """Print a line to stderr, in the first process only; with ``once``, the same line is not printed again."""
+    if (once and line in _told) or (jax.distributed.is_initialized() and jax.process_index() > 0):
+        return
+    if once:
+        _told.add(line)
     print(line, file=sys.stderr, flush=True)

@@ -142,7 +142,7 @@ def sector(sensor: Sensor, middle_rad: float, num_columns: int) -> Sensor:
 
 
 def turn_between(data: Sensor, other: Sensor) -> float:
-    """Rotation about z, radians, from the frame of a sensor's points to that of another sensor's.
+    """Rotation about z, radians, from one sensor's frame to another's.
 
     It brings the heading of the ego vehicle in one frame to that in the other; 0 if one of them is unknown.
 
@@ -249,16 +249,11 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     >>> sensor_from_json(sensor_to_json(TINY)) == TINY
     True
     """
-    record = dataclasses.asdict(sensor)
-    if sensor.azimuth_limits_rad is None:  # keeps the JSON of full-turn sensors as it was before sectors existed
-        del record["azimuth_limits_rad"]
-    if sensor.forward_rad == _usual_heading(sensor.name):  # and so for sensors from before the heading was known
-        del record["forward_rad"]
-    return record
+    return dataclasses.asdict(sensor)
 
 
 def _usual_heading(name: object) -> float | None:
-    """The heading that a sensor without the field has: that of the preset of its name."""
+    """Heading of a sensor without the field: the heading of the preset with its name."""
     preset = PRESETS.get(name) if isinstance(name, str) else None
     return None if preset is None else preset.forward_rad
 
@@ -283,7 +278,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
 
     ``inclinations_rad`` and ``inclinations_deg`` are lists of beams, highest first. Evenly spaced beams can be
     given as ``inclinations_deg: {"lowest": .., "highest": .., "rows": ..}`` instead. Without ``forward_rad``, the
-    heading is that of the preset of the same name, else unknown.
+    heading is the heading of the preset with the same name, or unknown.
 
     Raises:
         ValueError: naming ``where``, the field, the found and the expected value.

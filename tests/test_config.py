@@ -20,7 +20,10 @@ from fcos_lidar_jax.config import (
     config_to_json,
 )
 from fcos_lidar_jax.presets import (
+    ABOUT,
     COMPACT,
+    KITTI,
+    KITTI_COMPACT,
     NUSCENES,
     NUSCENES_SINGLE,
     NUSCENES_TEST,
@@ -45,34 +48,59 @@ def test_presets_are_the_papers():
     assert (NUSCENES_TEST.model.head_channels, NUSCENES_TEST.fade_epochs) == (128, 5)
 
 
+COMPACT_METHODS = (
+    ("model", "circular_width"),
+    ("model", "regression_axes"),
+    ("model", "local_geometry"),
+    ("inference", "merge_iou"),
+)
+
+
 @pytest.mark.parametrize(
-    ("preset", "own"),
+    ("preset", "large", "own"),
     [
-        (QUICKSTART, ()),
-        (
-            COMPACT,
-            (
-                ("model", "circular_width"),
-                ("model", "regression_axes"),
-                ("model", "local_geometry"),
-                ("inference", "merge_iou"),
-            ),
-        ),
+        (QUICKSTART, NUSCENES, ()),
+        (COMPACT, NUSCENES, COMPACT_METHODS),
+        (KITTI_COMPACT, KITTI, COMPACT_METHODS),
     ],
 )
-def test_small_presets_differ_in_numbers_only(preset, own):
+def test_small_presets_differ_in_numbers_only(preset, large, own):
     def kinds(value):
         if dataclasses.is_dataclass(value):
             return {f.name: kinds(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return value if isinstance(value, bool | str) else type(value)
 
-    small, full = kinds(preset), kinds(NUSCENES)
+    small, full = kinds(preset), kinds(large)
     for record in (small, full):
         del record["name"], record["sensor"]
         del record["projection"]["remove_close"]  # as the shipped weights were trained
         for part, name in own:
             del record[part][name]
     assert small == full
+
+
+def test_kitti_compact_has_the_data_of_kitti_and_the_network_of_compact():
+    of_data = (
+        "sensor",
+        "classes",
+        "max_points",
+        "max_boxes",
+        "class_balanced",
+        "num_sweeps",
+        "augment",
+        "copy_paste",
+    )
+    assert [getattr(KITTI_COMPACT, name) for name in of_data] == [getattr(KITTI, name) for name in of_data]
+    scaled = dataclasses.replace(
+        COMPACT.model, channel_mean=KITTI.model.channel_mean, channel_scale=KITTI.model.channel_scale
+    )
+    assert KITTI_COMPACT.model == scaled
+    assert (KITTI_COMPACT.optimizer, KITTI_COMPACT.inference) == (COMPACT.optimizer, COMPACT.inference)
+
+
+def test_every_preset_has_one_line_about_it():
+    assert list(ABOUT) == list(PRESETS)
+    assert all(0 < len(line) < 80 and "\n" not in line for line in ABOUT.values())
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -175,5 +203,5 @@ def test_the_papers_presets_keep_close_points_of_the_current_sweep():
     """Which gives its numbers of points; the presets of the shipped weights do without them."""
     modes = {name: preset.projection.remove_close for name, preset in PRESETS.items()}
     assert modes == dict.fromkeys(PRESETS, "sweeps") | dict.fromkeys(
-        ("compact", "centerpoint_compact", "quickstart"), "all"
+        ("compact", "kitti_compact", "centerpoint_compact", "quickstart"), "all"
     )

@@ -18,8 +18,12 @@ import numpy as np
 import pytest
 
 import fcos_lidar_jax
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import demo
 from fcos_lidar_jax.cli.commands import parse
+from fcos_lidar_jax.evaluation.kitti_results import kitti_types
+from fcos_lidar_jax.input_pipeline.open import READERS
+from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import SHORT_RANGE, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
@@ -164,7 +168,7 @@ def test_the_profile_of_the_paper_s_training_starts_and_stops_once(monkeypatch):
     for step in range(1, 201):
         given["profile"](step, {"loss/total": 1.0})
         if step % 10 == 0:  # hooks are called after an evaluation again
-            given["profile"](step, {"loss/total": 1.0, "test/mAP": 0.1})
+            given["profile"](step, {"test/mAP": 0.1})
     assert calls == ["start_trace", "stop_trace"]
 
 
@@ -177,6 +181,38 @@ def test_json_of_the_pages_parses():
 def test_the_page_names_every_field_of_a_sensor_file():
     text = (DOCS / "own_data.md").read_text()
     assert [f.name for f in dataclasses.fields(Sensor) if not re.search(rf"[`\"]{f.name}[`\"]", text)] == []
+
+
+def test_the_page_has_every_preset():
+    rows = re.findall(
+        r"^\| (`.*?) \|", (DOCS / "commands.md").read_text().partition("## Presets")[2], re.MULTILINE
+    )
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(PRESETS)
+
+
+def test_the_page_has_the_class_maps_and_the_types_of_result_files():
+    maps = {(reader.name, name): names for reader in READERS for name, names in reader.class_maps.items()}
+    types = kitti_types(maps["kitti", "nuscenes"]) | kitti_types()
+    assert maps.keys() == {
+        ("kitti", "nuscenes"),
+        ("argoverse2", "nuscenes"),
+        ("nuscenes", "kitti"),
+        ("simulated", "kitti"),
+    }
+
+    def cell(names):
+        return ", ".join(f"`{name}`" for name in names if name) or "-"
+
+    def row(name):
+        sources = [
+            [old for old, new in maps[data, "nuscenes"].items() if new == name] for data in ("kitti", "argoverse2")
+        ]
+        return [cell(names) for names in (*sources, [maps["nuscenes", "kitti"].get(name)], [types.get(name)])]
+
+    rows = [[f"`{name}`", *row(name)] for name in NUSCENES_CLASSES] + [["left out", *row(None)[:2], "", ""]]
+    text = (DOCS / "commands.md").read_text().partition("### Class maps")[2]
+    table = [line for line in text.splitlines() if line.startswith("|") and line.count("|") == 6]
+    assert [[each.strip() for each in line.split("|")[1:-1]] for line in table[2:]] == rows
 
 
 def test_blocks_of_code_are_run_or_marked():

@@ -93,11 +93,13 @@ def test_waiting_for_a_lock_ends_when_it_is_released(tmp_path):
             assert second.stdout.read() == "True\n"
 
 
-def test_a_folder_lock_excludes_other_threads_and_processes_but_not_its_holder(tmp_path):
-    with folder_lock(tmp_path, "writing"), folder_lock(tmp_path, "reading"), ThreadPoolExecutor() as pool:
+def test_a_folder_lock_excludes_its_holder_other_threads_and_processes(tmp_path):
+    with folder_lock(tmp_path, "writing"), ThreadPoolExecutor() as pool:
         for another in (folder_lock(tmp_path, "x"), folder_lock(tmp_path / "." / "", "x")):
             with pytest.raises(BlockingIOError, match=rf"in use: process {os.getpid()} on .* is writing, exp"):
                 pool.submit(another.__enter__).result()
+        with pytest.raises(BlockingIOError, match="is writing"), folder_lock(tmp_path, "reading"):
+            pass
         with holding(tmp_path / ".lock") as other:
             assert other.stdout.readline() == "False\n"
     assert (tmp_path / ".lock").read_text() == ""

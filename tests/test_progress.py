@@ -1,9 +1,11 @@
-"""Check progress lines."""
+"""Check progress lines and notes."""
 
 import re
 import time
 
-from fcos_lidar_jax.progress import Progress
+import jax
+
+from fcos_lidar_jax.progress import Progress, tell
 
 
 def test_the_first_and_last_item_print_a_line(capsys):
@@ -27,3 +29,14 @@ def test_the_rate_of_resumed_work_counts_only_new_items(capsys):
     left = re.search(r"(\d+\.\d\d) steps/s, (\d+) s left", lines[1])
     assert left is not None
     assert float(left[1]) <= 20
+
+
+def test_a_line_is_told_once_and_only_by_the_first_process(capsys, monkeypatch):
+    for _ in range(2):
+        tell("often")
+        tell("told once", once=True)
+    assert capsys.readouterr().err == "often\ntold once\noften\n"
+    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    tell("by another process")
+    assert capsys.readouterr().err == ""

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from packaging.version import Version
 
 from fcos_lidar_jax import __version__
 
@@ -14,11 +15,13 @@ ROOT = Path(__file__).parents[1]
 SCRIPTS = ROOT / ".ci"
 
 
-def test_changelog_and_citation_have_the_version_and_its_date():
-    versions = re.findall(r"^## (\S+)(?: - (\S+))?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    version, date = next((version, date) for version, date in versions if version != "Unreleased")
+def test_changelog_and_citation_have_the_released_version_and_its_date():
+    """The package has a newer version as soon as there are unreleased changes."""
+    sections = re.findall(r"^## (\S+)(?: - (\S+))?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    version, date = next((version, date) for version, date in sections if version != "Unreleased")
     citation = (ROOT / "CITATION.cff").read_text()
-    assert version == __version__
+    is_newer = Version(__version__) > Version(version)
+    assert is_newer if sections[0][0] == "Unreleased" else version == __version__
     assert f"\nversion: {version}\n" in citation
     assert f"\ndate-released: {date}\n" in citation
 

@@ -78,13 +78,12 @@ def test_a_sector_keeps_the_column_width_and_survives_a_round_trip(tmp_path, mid
     path = tmp_path / "sensor.json"
     path.write_text(json.dumps(sensor_to_json(part)))
     assert load_sensor(path) == part
-    assert "azimuth_limits_rad" not in sensor_to_json(TINY)  # the JSON of full-turn sensors is unchanged
 
 
 def test_the_heading_of_files_without_it_is_that_of_the_preset_of_the_same_name():
     for sensor in PRESETS.values():
         record = sensor_to_json(sensor)
-        assert "forward_rad" not in record  # files, checkpoints and fingerprints stay as they were
+        assert record.pop("forward_rad") == sensor.forward_rad
         assert sensor_from_json(record).forward_rad == sensor.forward_rad
         assert sensor_from_json({**record, "name": "mine"}).forward_rad is None
         for heading in (None, -1.0):

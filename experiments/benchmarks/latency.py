@@ -7,7 +7,7 @@ All stages of one sweep and of ten run in turns. The paper's "Backbone" is taken
 repeat rows, pad), stem and backbone, its "Heads" as pyramid and heads, which are also timed separately. Its table
 omits post-processing. Reading files and composing poses is timed on a simulated data set with sweep files of the
 real size. The background prior is 0.5, so that an untrained network proposes boxes everywhere, the worst case for
-NMS. The stages use the forms of stem and NMS that suit the platform.
+NMS. NMS has the form that suits the platform.
 
 Cost: 15 repeats take about six minutes on two CPU cores. Expected: MRV takes well below one per cent of the time,
 and the network's time does not depend on the number of sweeps, since the number of rounds is the same.
@@ -17,9 +17,9 @@ import contextlib
 import dataclasses
 import functools
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -32,8 +32,10 @@ from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.inference import make_detect, make_stages
 from fcos_lidar_jax.inference.timing import Call, interleaved
+from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import Variables, build_detector
-from fcos_lidar_jax.models.detector import network_parts
+from fcos_lidar_jax.models.convolution import Image
+from fcos_lidar_jax.models.detector import Network, network_input
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, PRESETS
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
@@ -93,6 +95,31 @@ def padded(cloud: np.ndarray, setting: str, sensor: Sensor) -> Cloud:
     projection = dataclasses.replace(NUSCENES.projection, remove_close="all")
     config = dataclasses.replace(NUSCENES, max_points=ROWS[setting], projection=projection)
     return make_cloud(points, config, sensor=sensor)
+
+
+class Parts(NamedTuple):
+    """Compiled parts of FCOS-LiDAR's network. All but the first take all variables and the previous output."""
+
+    preprocess: Callable[[Any], Image]
+    stem: Callable[[Variables, Any], Any]
+    backbone: Callable[[Variables, Any], Any]
+    fpn: Callable[[Variables, Any], Any]
+    heads: Callable[[Variables, Any], Any]
+
+
+def network_parts(config: Config, sensor: Sensor) -> Parts:
+    """Split the network of a configuration without ``local_geometry`` into parts, to time each of them."""
+    layout, network = image_layout(sensor, config.model), Network(config.model, len(config.classes))
+
+    def part(name: str, **options: Any) -> Callable[[Variables, Any], Any]:
+        def apply(variables: Variables, x: Any) -> Any:
+            return network.apply(variables, x, method=lambda whole, x: getattr(whole, name)(x, **options))
+
+        return jax.jit(apply)
+
+    preprocess = jax.jit(lambda features: network_input(features, config.model, layout))
+    front = part("stem", train=False), part("backbone", train=False)
+    return Parts(preprocess, *front, part("fpn"), part("heads"))
 
 
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:

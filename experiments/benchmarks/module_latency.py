@@ -1,10 +1,8 @@
 """Times of the modality-wise convolutions in the variants of tables 3, 4 and 5.
 
     python -m experiments.benchmarks.module_latency  # only the stem, at full size: 64x1088x45
-    python -m experiments.benchmarks.module_latency --include-grouped  # feature_group_count too, slow on a CPU
 
-Each variant uses the fastest of its formulations (see ``Stem``), found by a short run of all of them; then all
-variants run in turns. ``needed`` counts the operations of the definition, ``executed`` the operations that XLA
+All variants run in turns. ``needed`` counts the operations of the definition, ``executed`` the operations that XLA
 counts in the compiled program: without the zero padding, but with the zeros of block-diagonal kernels. Cost: 15
 repeats take some minutes on two CPU cores. README.md has the result.
 """
@@ -21,11 +19,10 @@ from experiments.script import Options, run_measurement
 from fcos_lidar_jax.config import StemConfig
 from fcos_lidar_jax.inference.timing import Call, interleaved
 from fcos_lidar_jax.locations import image_layout
-from fcos_lidar_jax.models.modality import Form, Stem, channel_groups
+from fcos_lidar_jax.models.modality import Stem, channel_groups
 from fcos_lidar_jax.presets import NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 
-STEM_FORMS: tuple[Form, ...] = ("split", "dense", "grouped")
 BASE = NUSCENES.model.stem
 _LAYOUT = image_layout(NUSCENES_HDL32E, NUSCENES.model)
 SHAPE = (1, _LAYOUT.height, _LAYOUT.width, 9 * NUSCENES.projection.num_rounds)  # Shape of the network's input.
@@ -61,7 +58,6 @@ class Args(Options):
     """Options of the measurement."""
 
     only: tuple[str, ...] = ()  # Names of variants, in addition to "9 types"; default: all.
-    include_grouped: bool | None = None  # Also try feature_group_count; default: not on a CPU.
     precision: Literal["float32", "bfloat16"] = "float32"  # Precision of the convolutions after the first.
     repeats: int = 15  # Timed calls per variant.
 
@@ -80,17 +76,9 @@ def needed_gflop(stem: StemConfig) -> float:
     return 2 * height * width * len(stem.dilations) * (9 * (first + later) + merge) / 1e9
 
 
-def forms_of(stem: StemConfig, include_grouped: bool) -> tuple[Form, ...]:
-    """List the distinct formulations: one for one group; feature_group_count needs groups of equal size."""
-    sizes = channel_groups(stem, SHAPE[-1] // 9)
-    if len(sizes) == 1:
-        return ("split",)
-    return STEM_FORMS if include_grouped and len(set(sizes)) == 1 else STEM_FORMS[:2]
-
-
-def compiled(stem: StemConfig, precision: str, form: Form) -> tuple[Call, float]:
-    """Compile a formulation with random weights and input; returns a call and its executed 10^9 operations."""
-    module = Stem(stem, precision=precision, form=form)
+def compiled(stem: StemConfig, precision: str) -> tuple[Call, float]:
+    """Compile a stem with random weights and input; returns a call and its executed 10^9 operations."""
+    module = Stem(stem, precision=precision)
     image = jax.random.normal(jax.random.key(0), SHAPE, jnp.float32)
     variables = jax.jit(lambda: module.init(jax.random.key(1), jnp.zeros((1, 8, 8, SHAPE[-1])), train=False))()
     program = jax.jit(lambda v, x: module.apply(v, x, train=False)).lower(variables, image).compile()
@@ -112,9 +100,9 @@ def measure(args: Args) -> dict[str, Any]:
     """Time the variants.
 
     Returns:
-        ``variants``, for each: ``form`` (the fastest), ``forms_ms`` (the short run of all), ``median_ms``,
-        ``p99_ms``, ``ratio`` to the reference, ``needed_gflop``, ``executed_gflop``, ``executed_gflop_per_s``;
-        ``paper``, ``{"table, row": {"time_ms", "ratio"}}`` if it has any. Beside them the options.
+        ``variants``, for each: ``median_ms``, ``p99_ms``, ``ratio`` to the reference, ``needed_gflop``,
+        ``executed_gflop``, ``executed_gflop_per_s``; ``paper``, ``{"table, row": {"time_ms", "ratio"}}`` if it has
+        any. Beside them the options.
 
     Raises:
         ValueError: an unknown variant in ``only``.
@@ -122,28 +110,18 @@ def measure(args: Args) -> dict[str, Any]:
     for name in args.only:
         if name not in VARIANTS:
             raise ValueError(f"--only: got {name!r}, expected some of {', '.join(VARIANTS)}")
-    grouped = jax.default_backend() != "cpu" if args.include_grouped is None else args.include_grouped
     variants = {n: v for n, v in VARIANTS.items() if not args.only or n in (*args.only, REFERENCE)}
-    forms, chosen, programs, executed = {}, {}, {}, {}
-    for name, variant in variants.items():
-        tried = {form: compiled(variant.stem, args.precision, form) for form in forms_of(variant.stem, grouped)}
-        times = interleaved({form: call for form, (call, _) in tried.items()}, 2 if len(tried) > 1 else 1)
-        forms[name] = {form: ms["median_ms"] for form, ms in times.items()}
-        chosen[name] = min(tried, key=lambda form: times[form]["median_ms"])
-        programs[name], executed[name] = tried[chosen[name]]
-        print(f"{name}: " + ", ".join(f"{form} {ms:.1f} ms" for form, ms in forms[name].items()), flush=True)
-    found = interleaved(programs, args.repeats)
+    compiled_stems = {name: compiled(variant.stem, args.precision) for name, variant in variants.items()}
+    found = interleaved({name: call for name, (call, _) in compiled_stems.items()}, args.repeats)
     records = {}
     for name, variant in variants.items():
-        ms = found[name]["median_ms"]
+        ms, executed = found[name]["median_ms"], compiled_stems[name][1]
         records[name] = {
-            "form": chosen[name],
-            "forms_ms": forms[name],
             **found[name],
             "ratio": round(ms / found[REFERENCE]["median_ms"], 3),
             "needed_gflop": round(needed_gflop(variant.stem), 2),
-            "executed_gflop": round(executed[name], 2),
-            "executed_gflop_per_s": round(1e3 * executed[name] / ms, 1),
+            "executed_gflop": round(executed, 2),
+            "executed_gflop_per_s": round(1e3 * executed / ms, 1),
             "paper": _paper_times(variant),
         }
     return {"variants": records, "precision": args.precision, "repeats": args.repeats}

@@ -1,4 +1,4 @@
-"""The same network in PyTorch, as a peer for timings: what its users would write.
+"""The same network for timings, written like PyTorch's users would write it.
 
 Modality-wise stem by ``groups=9``, LiDAR-Net, feature pyramid, heads with group norm, 1x1 merges per branch.
 Sizes come from the environment: ``BATCH``, ``HEIGHT`` and ``WIDTH`` of the image, its ``ROUNDS``, and the

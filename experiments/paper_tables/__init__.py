@@ -1,1 +1,1 @@
-"""The tables of the paper, a file each, and the scales and cells that they are trained by."""
+"""The tables of the paper, and the scales and cells to train them."""

@@ -18,11 +18,11 @@ import jax
 import numpy as np
 import tyro
 
+from experiments.cached import CachedFrames
 from experiments.changes import change
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemConfig
-from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.index import has_index
@@ -197,7 +197,7 @@ class NuScenesLayout:
         """Fill in the defaults.
 
         Raises:
-            ValueError: data, index or splits are missing, also those of --test-version.
+            ValueError: data, index or splits are missing, in --test-version too.
         """
         if self.data_root is None:
             raise ValueError("--data-root: missing, expected the data set for --scale nuscenes")
@@ -253,7 +253,7 @@ class NuScenesLayout:
         }
 
     def objects(self, frames: NuScenesFrames) -> GroundTruthDatabase:
-        """Open the database that fcos-lidar prepare has cut from the training frames, of at least as many sweeps.
+        """Open the database that fcos-lidar prepare has cut from the training frames.
 
         Raises:
             ValueError: there is no such database.
@@ -263,9 +263,8 @@ class NuScenesLayout:
         if not folder.is_dir():
             raise ValueError(f"{folder}: no objects here, expected some: run fcos-lidar prepare")
         objects = database.open_database(folder)
-        sweeps = range(frames.reading.num_sweeps, NUSCENES.num_sweeps + 1)
-        sources = [dataclasses.replace(frames, reading=database.cut_reading(n)).fingerprint() for n in sweeps]
-        if objects.manifest.source not in sources:
+        reading = database.cut_reading(objects.manifest.num_sweeps)
+        if objects.manifest.source != dataclasses.replace(frames, reading=reading).fingerprint():
             origin = f"cut from other frames than {self.train_split}"
             raise ValueError(f"{folder}: {origin}: run fcos-lidar prepare again")
         return objects

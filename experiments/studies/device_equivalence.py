@@ -4,7 +4,7 @@
 
 Computes one gradient and five steps in float32 and float64 from the same state, on meshes of 1, 2, 4 and 8 virtual
 CPU devices in one process, and of 8 devices in two processes, on very unequal samples. In one process it also
-computes one step under ``jax.pmap``; ``losses`` are those of one device, of the mesh and under ``pmap``. A
+computes one step under ``jax.pmap``; ``losses`` are the losses on one device, on the mesh and under ``pmap``. A
 difference is the largest over all leaves, relative to the leaf's largest value. Expected: identical owners, labels
 and K; differences of gradient, one step and five steps below 1e-9 in float64; in float32 a gradient that differs
 by less than twice ``rounding``, the difference between float32 and float64 on one device. In float32 the steps are

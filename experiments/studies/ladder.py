@@ -18,6 +18,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+from experiments.cached import CachedFrames
 from experiments.changes import Change, change
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
@@ -25,7 +26,6 @@ from experiments.script import Options, run_script, save
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.config import CloudReading, Config
-from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.models import count_parameters

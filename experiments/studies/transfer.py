@@ -123,7 +123,7 @@ def fine_tuning(args: Args) -> dict[str, Any]:
     model = load_trained(args.checkpoint).config.model
     scratch = change(model=model, copy_paste=None, class_balanced=False)(COMPACT)
     fine_tuned = change(optimizer__peak_learning_rate=1e-3)(scratch)
-    # The hash tells weights of the same name apart.
+    # The hash distinguishes weights of the same name.
     runs = args.work / read_description(find_checkpoint(args.checkpoint))["hash"][:12]
     for name, config, weights in (
         ("from the checkpoint", fine_tuned, args.checkpoint),

@@ -2,11 +2,14 @@
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType
 
 import jax
+
+from fcos_lidar_jax.signals import watch_signals
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -18,14 +21,16 @@ class StopRequest:
 
 
 @contextlib.contextmanager
-def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
+def stop_requests(line: str | None = None, *, active: bool = True) -> Iterator[StopRequest]:
     """Turn the first Ctrl-C or SIGTERM into a request that the run checks between steps; a second Ctrl-C ends it.
 
     Further SIGTERMs change nothing, because clusters may send two within a second; the entry point of the command
     line ends the process at one that comes later. Signals keep their handlers with ``active=False`` and outside
     the main thread, where Python delivers none.
+
+    The first signal prints the line, if one is given, on standard error at once, even while XLA compiles.
     """
-    request = StopRequest()
+    request, told = StopRequest(), False
     in_main_thread = threading.current_thread() is threading.main_thread()
     handlers = {number: signal.getsignal(number) for number in _SIGNALS if active and in_main_thread}
 
@@ -33,10 +38,19 @@ def stop_requests(*, active: bool = True) -> Iterator[StopRequest]:
         request.signal = request.signal or number
         signal.signal(signal.SIGINT, handlers[signal.SIGINT])
 
+    def tell(number: int) -> None:
+        nonlocal told
+        if number in _SIGNALS and not told:
+            told = True
+            again = "; press Ctrl-C again to stop now, without saving" if number == signal.SIGINT else ""
+            with contextlib.suppress(OSError):  # nobody reads it
+                print(f"{line}{again}", file=sys.stderr, flush=True)
+
     for number in handlers:
         signal.signal(number, ask)
     try:
-        yield request
+        with watch_signals(tell) if line and handlers else contextlib.nullcontext():
+            yield request
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -21,7 +21,6 @@ import numpy as np
 import fcos_lidar_jax.presets  # noqa: F401  (a checkpoint may hold the configuration of any of them)
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints.preemption import after_the_block
-from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
 from fcos_lidar_jax.files import atomic_write, checksum, local_path, naming, read_json
 from fcos_lidar_jax.models import Variables, build_detector
@@ -29,7 +28,6 @@ from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
 from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
-_OLD_FORMAT = 2
 LATER_FIELDS = {
     "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False},
     "loss": {"quality": "iou", "centreness_m": 0.75},
@@ -227,7 +225,7 @@ def _load_arrays(folder: Path, expected: Any, config: Config) -> Any:
             return checkpointer.restore(folder, target)
     except CheckpointError:
         raise
-    except Exception as error:  # so does it for corrupt files
+    except Exception as error:  # Orbax raises arbitrary exceptions for corrupt files
         raise CheckpointError(f"{folder}: cannot be read: {_one_line(error)}") from error
 
 
@@ -279,7 +277,7 @@ def read_description(folder: Path) -> dict[str, Any]:
         description = read_json(file)
     except ValueError as error:
         raise CheckpointError(str(error)) from None
-    if not isinstance(description, dict) or description.get("format") not in (_OLD_FORMAT, _FORMAT):
+    if not isinstance(description, dict) or description.get("format") != _FORMAT:
         version = description.get("format") if isinstance(description, dict) else type(description).__name__
         raise CheckpointError(f"{file}: format: got {version!r}, expected {_FORMAT}")
     if description.get("hash") != checksum(_canonical(description)):
@@ -287,19 +285,7 @@ def read_description(folder: Path) -> dict[str, Any]:
     for name, kind in (("step", int), ("config", dict), ("sensor", dict), ("files", dict)):
         if not isinstance(description.get(name), kind):
             raise CheckpointError(f"{file}: {name}: got {description.get(name)!r}, expected {kind.__name__}")
-    try:
-        config = with_later_fields(_converted(description["config"], description["format"]))
-    except (KeyError, TypeError, AttributeError):  # forged, since the hash matches
-        version = description["format"]
-        raise CheckpointError(f"{file}: config: got fields that format {version} does not have") from None
-    return {**description, "format": _FORMAT, "config": config}
-
-
-def _converted(config: dict[str, Any], version: int) -> dict[str, Any]:
-    if version == _OLD_FORMAT:
-        del config["model"]["stem"]["form"], config["model"]["num_classes"], config["inference"]["nms_form"]
-        config |= {"classes": list(NUSCENES_CLASSES), "class_ranges_m": []}
-    return config
+    return {**description, "config": with_later_fields(description["config"])}
 
 
 def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:

@@ -9,23 +9,19 @@ import select
 import signal
 import sys
 import tempfile
-import threading
-import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from typing import NoReturn, TextIO
+from typing import TextIO
 
 from fcos_lidar_jax import __version__
+from fcos_lidar_jax.cli.signals import ended_by_a_second, ended_while_importing, ending_signals, raising_again
 
 _LESS_MEMORY = (
     "for training, --optimizer.accumulate N splits each batch into N parts, --model.precision bfloat16 halves the "
     "activations, and --model.remat recomputes the largest ones; other commands need the least with --batch-size 1"
 )
 _MAX_LINE = 1000
-_REPEATED_S = {signal.SIGINT: 1.0, signal.SIGTERM: 5.0, signal.SIGHUP: 5.0}
-"""Until then a signal belongs to the first one: `timeout` and schedulers send signals twice, to a process and its
-group, and clusters may repeat them."""
 _CLOSED_CONNECTION = "closed by peer|reset by peer|Broken pipe|Read error|Write error"
 _CLOSED_PIPE = 128 + signal.SIGPIPE
 
@@ -43,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if words == ["--version"]:
             print(f"fcos-lidar {__version__}")
             return
-        with _importing("fcos-lidar"):
+        with ended_while_importing("fcos-lidar"):
             from fcos_lidar_jax.cli.commands import parse
         parse(words)()
 
@@ -71,7 +67,7 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
             sys.stdout.reconfigure(errors="replace")
     stopped = None
     try:
-        with _ending_signals() as numbers, _ended_by_a_second(numbers, program):
+        with ending_signals() as numbers, ended_by_a_second(numbers, program):
             code = _attempt(program, work)
     except BrokenPipeError:
         code = _CLOSED_PIPE
@@ -90,7 +86,7 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
 
 def _attempt(program: str, work: Callable[[], object]) -> int:
     try:
-        with _raising_again():
+        with raising_again():
             work()
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
@@ -164,124 +160,3 @@ def _flush(stream: TextIO) -> OSError | None:
     if failure is not None or _is_unread(stream):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
     return failure
-
-
-@contextlib.contextmanager
-def _ending_signals() -> Iterator[list[signal.Signals]]:
-    """Raise SystemExit in the main thread for SIGTERM and SIGHUP, unless they have handlers already.
-
-    Yields the signals that end the work, Ctrl-C too.
-    """
-    is_main = threading.current_thread() is threading.main_thread()
-    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if is_main and signal.getsignal(n) is signal.SIG_DFL]
-
-    def end(number: int, _: object) -> NoReturn:
-        for repeated in numbers:
-            signal.signal(repeated, lambda *_: None)  # it would interrupt the removal of half-written files
-        raise SystemExit(128 + number)
-
-    for number in numbers:
-        signal.signal(number, end)
-    interrupts = is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    try:
-        yield [*numbers, *([signal.SIGINT] if interrupts else [])]
-    finally:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
-
-
-@contextlib.contextmanager
-def _ended_by_a_second(numbers: Sequence[signal.Signals], program: str) -> Iterator[None]:
-    """End the process at the second of the signals.
-
-    Python calls handlers only when the main thread returns from C, where XLA may compile for minutes. But it
-    writes the number of each signal to a pipe at once, which another thread reads.
-    """
-    if not numbers:
-        yield
-        return
-    read, write = os.pipe()
-
-    def watch() -> None:
-        first_s = None
-        while number := os.read(read, 1):
-            if number[0] in numbers:
-                now_s = time.monotonic()
-                first_s = now_s if first_s is None else first_s
-                if now_s - first_s > _REPEATED_S[signal.Signals(number[0])]:
-                    _end(program, number[0])
-
-    os.set_blocking(write, False)
-    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-    (watching := threading.Thread(target=watch, daemon=True)).start()
-    try:
-        yield
-    finally:
-        signal.set_wakeup_fd(before)
-        os.close(write)
-        watching.join()
-        os.close(read)
-
-
-def _end(program: str, number: int) -> NoReturn:
-    if number == signal.SIGINT:
-        os.write(2, f"{program}: interrupted\n".encode())
-    os._exit(128 + number)
-
-
-@contextlib.contextmanager
-def _raising_again() -> Iterator[None]:
-    """Raise the exception of a signal again if it was lost.
-
-    Python drops exceptions from finalizers and callbacks of weak references, and some libraries replace them.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    report, dropped = sys.unraisablehook, list[BaseException]()
-
-    def keep(unraisable: "sys.UnraisableHookArgs") -> None:
-        if isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
-            dropped.append(unraisable.exc_value)
-            signal.setitimer(signal.ITIMER_REAL, 0.01)
-        else:
-            report(unraisable)
-
-    def raise_again(*_: object) -> NoReturn:
-        raise dropped[-1]
-
-    before = signal.signal(signal.SIGALRM, raise_again)
-    sys.unraisablehook = keep
-    try:
-        yield
-        if dropped:
-            raise dropped[-1]
-    except Exception as error:
-        cause: BaseException | None = error
-        while (cause := cause.__cause__ or cause.__context__) is not None:
-            if isinstance(cause, KeyboardInterrupt | SystemExit):  # replaced by a library
-                raise cause from None
-        raise
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-        sys.unraisablehook = report
-
-
-@contextlib.contextmanager
-def _importing(program: str) -> Iterator[None]:
-    """End the process at once on Ctrl-C: an interrupted import may raise any other error."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
-        yield
-        return
-
-    signal.signal(signal.SIGINT, lambda number, _: _end(program, number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

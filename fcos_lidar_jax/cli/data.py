@@ -7,7 +7,6 @@ from typing import Annotated, Literal, get_args
 
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.cli.processes import tell
 from fcos_lidar_jax.config import CloudReading, Config
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
@@ -23,6 +22,7 @@ from fcos_lidar_jax.input_pipeline.open import (
     find_data_set,
     open_frames,
 )
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 
 _PASSED_ON = ("splits", "allow_missing_sweeps", "follow_links", "full_turn", "intensity_scale")

@@ -1,7 +1,6 @@
 """``fcos-lidar demo``: a trained detector on a simulated drive, without any data."""
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +10,7 @@ import tyro
 
 from fcos_lidar_jax.cli import demo_training
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder, option_name
-from fcos_lidar_jax.cli.scoring import Task, write_detections, write_reports, write_scores
+from fcos_lidar_jax.cli.scoring import Task, run_detector, write_reports, write_scores
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.comparison import compare_by_benchmark
@@ -19,7 +18,7 @@ from fcos_lidar_jax.evaluation.metrics import Evaluation
 from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.input_pipeline import open_frames
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL
 from fcos_lidar_jax.simulation.render import DatasetSpec
@@ -62,13 +61,13 @@ def run(args: Demo) -> None:
         if getattr(args, name) != getattr(Demo, name):
             raise ValueError(f"{option_name(name)}: expected --train with it")
     began = time.monotonic()
-    print(f"simulating a drive of {args.keyframes} keyframes", file=sys.stderr, flush=True)
+    tell(f"simulating a drive of {args.keyframes} keyframes")
     detector, title = load_detector(WEIGHTS), f"{WEIGHTS} on an unseen simulated drive"
     frames = _simulate(args, detector)
     truth = split_truth(frames.nuscenes, frames.tokens)
     comparison = compare_by_benchmark(truth, "the drive", detector.classes, frames)
     task = Task("the drive", comparison, detector.sensor, detector, frames)
-    write_detections(task, args.out)
+    run_detector(task, args.out)
     compared = comparison.read(args.out / comparison.file)
     evaluation = write_scores(task, compared, args.out, bootstrap=200)
     _draw(args.out, title, evaluation, frames)

@@ -1,6 +1,5 @@
 """The training of ``fcos-lidar demo --train``: the quickstart preset from scratch, beside its shipped weights."""
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from fcos_lidar_jax.evaluation.metrics import DISTANCES_M
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.inference import TrainedDetector, evaluate, load_trained, predict
 from fcos_lidar_jax.presets import QUICKSTART
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.simulation.frame_set import fresh_streets, unseen_frames
 from fcos_lidar_jax.training import Schedule, train
@@ -88,7 +88,7 @@ def run(out: Path, steps: int, test_frames: int, seed: int) -> None:
 def _train(folder: Path, steps: int, test_frames: int, seed: int) -> None:
     config, frames = fresh_streets(QUICKSTART, steps=steps, seed=seed)
     every = max(-(-steps // _NUM_EVALUATIONS), 1)
-    print(f"training from random weights on {len(frames)} simulated frames", file=sys.stderr)
+    tell(f"training from random weights on {len(frames)} simulated frames")
     try:
         train(
             config,
@@ -105,7 +105,7 @@ def _train(folder: Path, steps: int, test_frames: int, seed: int) -> None:
     except KeyboardInterrupt:
         if find_checkpoint(folder) == folder:  # no checkpoint yet
             raise
-        print("evaluating the last checkpoint", file=sys.stderr)
+        tell("evaluating the last checkpoint")
 
 
 def _training_record(folder: Path) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def _report(out: Path, test_frames: int, metrics: dict[str, Any], pictures: list
     caption = f"Average precision per class, mean over the matching distances {distances} m"
     write_report(
         out / "report.html",
-        title="FCOS-LiDAR: first contact",
+        title="FCOS-LiDAR: quickstart",
         lead=f"{lead}.",
         summary={**summary, "total minutes": metrics["minutes"]},
         tables=[(caption, ("class", *(_TITLES[model] for model in models)), rows)],

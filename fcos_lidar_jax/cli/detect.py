@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,7 +35,7 @@ from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.inference.prediction_log import detections_fingerprint
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import Sensor, sensor_to_json
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
@@ -91,7 +90,7 @@ def run(args: Detect) -> None:
     check_results(args, detector.classes, posed=bool(sweeps), clouds=parts[:1] or files)
     if len(parts) > (num_sweeps := detector.config.num_sweeps):
         line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
-        print(f"{args.sweeps}: {line}", file=sys.stderr)
+        tell(f"{args.sweeps}: {line}")
     aligned = alignment_of(args, detector.sensor, parts or files)
     clouds = _clouds(args, files, detector, aligned.data)
     states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file in files]
@@ -210,7 +209,7 @@ def _detect(
         clear = sum(score >= shown_score for score in scores)
         progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
     if line := truncation(num_truncated, detector.config):
-        print(line, file=sys.stderr)
+        tell(line)
 
 
 def _draw(

@@ -1,4 +1,4 @@
-"""``fcos-lidar evaluate``: detection metrics, for nuScenes those of the official benchmark."""
+"""``fcos-lidar evaluate``: detection metrics; for nuScenes, the official ones."""
 
 import contextlib
 import dataclasses
@@ -21,8 +21,8 @@ from fcos_lidar_jax.cli.checks import (
 )
 from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
-from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
-from fcos_lidar_jax.cli.scoring import Task, write_detections, write_recording, write_reports, write_scores
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
+from fcos_lidar_jax.cli.scoring import Task, run_detector, write_recording, write_reports, write_scores
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
@@ -31,6 +31,7 @@ from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.visualization.evaluation_report import PAGE
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun
@@ -90,7 +91,7 @@ def run(args: Evaluate) -> None:
             if is_main_process:
                 locked.enter_context(folder_lock(args.out, "evaluating"))
         if compared is None:
-            write_detections(task, args.out, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
+            run_detector(task, args.out, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
             take_sigterm_back()
         with agreed("cannot evaluate"):
             if is_main_process:  # the others wait, because the first one would report their exit

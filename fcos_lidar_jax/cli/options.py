@@ -13,10 +13,10 @@ from fcos_lidar_jax.inference.alignment import Alignment, align
 
 
 def option(metavar: str | None = None, *, default: str | None = None, text: str | None = None) -> Any:
-    """Describe an option in the help: what stands for the value, and what for a default that is None.
+    """Describe an option in the help: the placeholder of its value, and the text shown for a default of None.
 
-    Without ``default`` the help calls an option of None optional. By default the text is the comment or docstring
-    of the field.
+    Without ``default``, the help calls an option optional if its default is None. By default, the text is the
+    comment or docstring of the field.
     """
 
     def hint(label: str) -> str:

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +21,7 @@ from fcos_lidar_jax.files import folder_lock
 from fcos_lidar_jax.input_pipeline.database import cut_reading, objects_folder, prepare_database
 from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import NUSCENES
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +70,7 @@ def _prepare(args: Prepare, data: DataSet, folder: Path) -> dict[str, Any]:
     frames = args.data.open_whole(split, cut_reading(args.num_sweeps))
     progress = Progress("frames", len(frames))
     objects = objects_folder(folder, split)
-    options = {"min_points": args.min_points, "workers": args.workers}
+    options = {name: getattr(args, name) for name in ("min_points", "num_sweeps", "workers")}
     database = prepare_database(frames, objects, **options, report=lambda done, _: progress.show(done))
     return record | {"train_split": split, "frames": len(frames), "objects": len(database)}
 
@@ -96,7 +95,7 @@ def _make_index(tables: Path, folder: Path) -> Index:
         try:
             return open_index(folder, tables=tables)
         except ValueError as error:
-            print(f"{error}: rebuilding it", file=sys.stderr)
+            tell(f"{error}: rebuilding it")
     for left_over in folder.glob(".*"):
         if re.fullmatch(r"\.[0-9a-f]{12}\.(npy|json)", left_over.name):  # of a killed process
             left_over.unlink()
@@ -107,7 +106,7 @@ def _make_index(tables: Path, folder: Path) -> Index:
         now = time.monotonic()
         if now > last + 5:
             last = now
-            print(f"{file}: {rows} rows, {now - began:.0f} s", file=sys.stderr, flush=True)
+            tell(f"{file}: {rows} rows, {now - began:.0f} s")
 
     save_index(build_index(tables, report), folder, tables=tables)
     return open_index(folder, tables=tables)

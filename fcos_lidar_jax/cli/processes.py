@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import sys
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -61,9 +60,3 @@ def join_processes(options: ProcessOptions, environment: Mapping[str, str] = os.
         ) from None
     except RuntimeError as error:
         raise OSError(f"{cluster}: the processes did not connect: {error}") from None
-
-
-def tell(line: str) -> None:
-    """Print a line on standard error, in the first process only."""
-    if not jax.distributed.is_initialized() or jax.process_index() == 0:
-        print(line, file=sys.stderr, flush=True)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,8 +15,10 @@ from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
 from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
+from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import load_sensor
 
@@ -60,8 +61,8 @@ def run(args: Project) -> None:
     image = jax.device_get(project_points(cloud.points, cloud.valid, sensor, **rounds))
     dropped = int(image.num_dropped)
     expect_points(args.file, cloud, dropped, sensor)
-    if line := sensor_mismatch(points, sensor):
-        print(f"warning: {args.file}: {line}", file=sys.stderr)
+    if line := sensor_mismatch(points, sensor, recorded_by([args.file])):
+        tell(f"warning: {args.file}: {line}")
     counts: dict[str, Any] = {"num_points": cloud.num_points, "num_dropped": dropped + cloud.num_removed}
     kept = (image.point_index >= 0).sum(axis=(0, 1)).tolist()
     counts |= {"num_close": cloud.num_close, "kept_by_round": kept}

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from fcos_lidar_jax.evaluation.kitti_results import kitti_types, write_result
 from fcos_lidar_jax.evaluation.openlabel import write_openlabel
 from fcos_lidar_jax.evaluation.records import read_boxes
 from fcos_lidar_jax.evaluation.results import result_entries, write_results
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.types import Detections
 
 Format = Literal["json", "nuscenes", "kitti", "openlabel"]
@@ -25,7 +25,7 @@ Write = Callable[[dict[str, Any]], None]
 
 
 class ResultFormat(NamedTuple):
-    """What the files of a format are."""
+    """Properties of an output format."""
 
     calibrated: bool = False  # in the frame of a camera, one file per cloud; --out is a folder
     in_world: bool = False  # in the global frame
@@ -136,13 +136,13 @@ def _kitti(folder: Path, classes: Sequence[str], calibration: Path | None) -> It
     yield write
     if num_left_out:
         why = "outside of the image, or of a class without a type of KITTI"
-        print(f"{folder}: {num_left_out} of {num_boxes} boxes left out: {why}", file=sys.stderr)
+        tell(f"{folder}: {num_left_out} of {num_boxes} boxes left out: {why}")
     if others := [file.name for file in sorted(folder.glob("*.txt")) if file.stem not in written]:
-        print(f"{folder}: also contains {len(others)} .txt of other clouds, such as {others[0]}", file=sys.stderr)
+        tell(f"{folder}: also contains {len(others)} .txt of other clouds, such as {others[0]}")
 
 
 def _stem(cloud: str | Path, number: int) -> str:
-    """Name of a cloud's file of results: that of its point file, else the number of the sweep."""
+    """Name of a cloud's results file: the name of its point file, or the number of the sweep."""
     name = Path(cloud).name
     ending = next((ending for ending in ENDINGS if name.lower().endswith(ending)), None)
     return name[: -len(ending)] if ending else f"{number:06d}"

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fcos_lidar_jax.cli.processes import tell
 from fcos_lidar_jax.data.cloud_policy import truncation
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.comparison import Compared, Comparison
@@ -18,7 +17,7 @@ from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.evaluation.summary import describe, warnings, write_evaluation
 from fcos_lidar_jax.inference import CloudDetector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.evaluation_report import (
     PAGE,
@@ -42,8 +41,8 @@ class Task:
     frames: FrameSet | None = None  # None if the report has no points
 
 
-def write_detections(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float | None = None) -> None:
-    """Write the detections, and count the removed points, except for close ones."""
+def run_detector(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float | None = None) -> None:
+    """Detect and write the detections; print the numbers of removed points, except for close ones."""
     assert task.detector is not None
     assert task.frames is not None
     comparison = task.comparison

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import json
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -22,14 +21,15 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import with_heading
+from fcos_lidar_jax.data.recorded import recorded_by, with_heading
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.stream import Found, detect_stream
+from fcos_lidar_jax.inference.stream import SweepDetections, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
@@ -105,10 +105,11 @@ def run(args: Stream) -> None:
     detector = load_detector(args.checkpoint, backend=args.backend)
     source = args.source or args.data_root or Path()
     paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
+    usual = NUSCENES_HDL32E if kind is SCENE else recorded_by(paths[:1])
     ahead = with_heading(sensor, NUSCENES_HDL32E) if kind is SCENE else sensor
     aligned = alignment_of(args, sensor, paths, None if ahead == sensor else ahead)
     drive = _open(args, kind, detector, aligned.data)
-    _tell(drive.notes)
+    _tell_notes(drive.notes)
     frames: list[PageFrame] = []
     tracks, before_us, num_truncated = Tracks(), None, 0
     shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
@@ -123,8 +124,8 @@ def run(args: Stream) -> None:
         detect = functools.partial(detect_stream, detector=detector, **how)
         for found in timing.detect(_announcing(drive.sweeps), detect):
             points = found.cloud.points[found.cloud.valid]
-            if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
-                print(f"warning: {line}", file=sys.stderr)
+            if before_us is None and (line := sensor_mismatch(points, detector.sensor, usual)):
+                tell(f"warning: {line}")
             kept = select(found.detections, detector.classes, min_score=args.min_score, labels=args.labels)
             record = _record(dataclasses.replace(found, detections=kept), detector.classes, drive)
             boxes, labels, scores = confident(kept, 0.0)
@@ -143,10 +144,10 @@ def run(args: Stream) -> None:
             if args.page is not None:
                 frames.append(page_frame(points, (boxes, labels, scores), **details))
             before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
-    _tell(drive.notes)
+    _tell_notes(drive.notes)
     if line := truncation(num_truncated, detector.config):
-        print(line, file=sys.stderr)
-    print(timing.summary(), file=sys.stderr)
+        tell(line)
+    tell(timing.summary())
     if args.page is not None:
         title = args.scene or str(args.source)
         write_page(args.page, frames, aligned.data, classes=detector.classes, title=title, min_score=shown_score)
@@ -174,13 +175,13 @@ def _announcing(sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
     """The sweeps. After reading the first one, say that the detector is compiled."""
     for number, sweep in enumerate(sweeps):
         if not number:
-            print("compiling the detector", file=sys.stderr, flush=True)
+            tell("compiling the detector")
         yield sweep
 
 
-def _tell(notes: list[str]) -> None:
+def _tell_notes(notes: list[str]) -> None:
     while notes:
-        print(f"note: {notes.pop(0)}", file=sys.stderr)
+        tell(f"note: {notes.pop(0)}")
 
 
 class _Timing(contextlib.AbstractContextManager):
@@ -197,8 +198,8 @@ class _Timing(contextlib.AbstractContextManager):
         self._programs += event.endswith("/backend_compile_duration")
 
     def detect(
-        self, sweeps: Iterable[Sweep], detect: Callable[[Iterable[Sweep]], Iterator[Found]]
-    ) -> Iterator[Found]:
+        self, sweeps: Iterable[Sweep], detect: Callable[[Iterable[Sweep]], Iterator[SweepDetections]]
+    ) -> Iterator[SweepDetections]:
         """Detections in sweeps. What the caller does with one until it takes the next one counts as writing."""
         reading, began = 0.0, time.perf_counter()
 
@@ -270,11 +271,11 @@ def _open(args: Stream, kind: Recording, detector: CloudDetector, sensor: Sensor
         raise ValueError("--track: found no poses, expected --poses FILE, or --odometry for a ROS recording")
     check_results(args, detector.classes, posed=drive.posed)
     if not drive.posed:
-        print("no poses: every sweep is detected on its own, without earlier sweeps", file=sys.stderr)
+        tell("no poses: every sweep is detected on its own, without earlier sweeps")
     return drive
 
 
-def _record(found: Found, classes: tuple[str, ...], drive: Drive) -> dict[str, Any]:
+def _record(found: SweepDetections, classes: tuple[str, ...], drive: Drive) -> dict[str, Any]:
     """A line with the fields of ``fcos-lidar detect``; unknown values are null."""
     sweep = found.sweep
     return {

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +9,7 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.class_mapping import unknown_name
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
@@ -62,7 +61,7 @@ def run(args: Synthesize) -> None:
     sweeps = args.scenes * spec.sweeps
     progress = Progress("sweeps", sweeps)
     if not write_dataset(spec, args.out, workers=args.workers, report=progress.show):
-        print(f"{args.out}: was there already", file=sys.stderr)
+        tell(f"{args.out}: was there already")
     record = {
         "data_root": str(args.out),
         "version": args.version,

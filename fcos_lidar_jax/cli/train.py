@@ -1,6 +1,5 @@
 """``fcos-lidar train``: train a preset on a data set."""
 
-import contextlib
 import dataclasses
 import json
 from functools import reduce
@@ -15,35 +14,22 @@ from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, best_
 from fcos_lidar_jax.cli.checks import check_out_folder, option_name
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes, tell
+from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
-from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.loader import check_loader_options, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import DataSet
-from fcos_lidar_jax.presets import PRESETS
+from fcos_lidar_jax.presets import ABOUT, PRESETS
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training import Schedule, train
 from fcos_lidar_jax.training.plan import RUN_SPEC
 from fcos_lidar_jax.training.run import run_folder
 
-_ABOUT = {
-    "nuscenes": "the paper's detector on ten sweeps",
-    "nuscenes_single": "the paper's detector on one sweep",
-    "nuscenes_test": "the paper's test-set model",
-    "kitti": "one sweep of KITTI's camera view, three classes",
-    "argoverse2": "one sweep of Argoverse 2, 26 classes",
-    "compact": "a smaller network on one sweep of nuScenes, for two CPU cores",
-    "quickstart": "smaller still, for a short-range sensor and tests",
-    "centerpoint_pillars": "CenterPoint on ten sweeps, for comparison",
-    "centerpoint_compact": "CenterPoint on one sweep, at about the cost of compact",
-}
 _PRESETS: Any = (
-    Annotated[
-        type(preset), tyro.conf.subcommand(name, default=preset, prefix_name=False, description=_ABOUT[name])
-    ]
+    Annotated[type(preset), tyro.conf.subcommand(name, default=preset, prefix_name=False, description=ABOUT[name])]
     for name, preset in PRESETS.items()
 )
 _OBJECTS = "objects"  # folder in the run's folder for objects cut from selected frames
@@ -115,27 +101,24 @@ def run(args: Train) -> None:
         tell(f"{args.out}: no run to resume, starting one")
     checkpoints = Checkpoints(args.out / CHECKPOINTS)
     try:
-        with contextlib.ExitStack() as held:
-            with agreed("cannot train"):
-                if task.cuts_objects and is_main_process:  # the other processes open the result
-                    held.enter_context(run_folder(args.out, resume=resume))
-                    assert task.config.copy_paste is not None
-                    min_points = task.config.copy_paste.min_points
-                    database.prepare_database(task.frames, args.out / _OBJECTS, min_points=min_points)
-            with agreed("cannot train"):
-                objects = _objects(args, task)
-            state = train(
-                task.config,
-                task.frames,
-                args.out,
-                steps=task.steps,
-                tests=task.tests,
-                objects=objects,
-                schedule=schedule,
-                packing=False if args.no_packing else None,
-                resume=resume,
-                **{name: getattr(args, name) for name in ("seed", "weights", "threads", "workers")},
-            )
+        with agreed("cannot train"):
+            if task.cuts_objects and is_main_process:  # the other processes open the result
+                with run_folder(args.out, resume=resume):
+                    _cut_objects(args, task)
+        with agreed("cannot train"):
+            objects = _objects(args, task)
+        state = train(
+            task.config,
+            task.frames,
+            args.out,
+            steps=task.steps,
+            tests=task.tests,
+            objects=objects,
+            schedule=schedule,
+            packing=False if args.no_packing else None,
+            resume=resume,
+            **{name: getattr(args, name) for name in ("seed", "weights", "threads", "workers")},
+        )
     except (KeyboardInterrupt, SystemExit):
         if checkpoints.paths():
             tell(f"the same command {'' if args.auto_resume else 'with --resume '}continues")
@@ -223,13 +206,21 @@ def _check_simulated(number: int, config: Config) -> None:
         )
 
 
+def _cut_objects(args: Train, task: _Task) -> None:
+    assert task.config.copy_paste is not None
+    min_points, num_sweeps = task.config.copy_paste.min_points, task.config.num_sweeps
+    folder = args.out / _OBJECTS
+    database.prepare_database(task.frames, folder, min_points=min_points, num_sweeps=num_sweeps)
+
+
 def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
     """Open the objects to paste, just cut or prepared for the split; None without copy-paste."""
     config, split = task.config, task.split
     if config.copy_paste is None:
         return None
     if task.cuts_objects:
-        return database.open_database(args.out / _OBJECTS)
+        # The folder is not locked since they were cut: another process may have cut others.
+        return database.open_database(args.out / _OBJECTS, fingerprint=task.frames.fingerprint())
     folder = database.objects_folder(args.data.index or task.data.index, split)
     if not folder.is_dir():
         option = "" if split is None else f" --train-split {split}"
@@ -237,14 +228,11 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
             f"{folder}: no objects here, expected objects of the training frames: run fcos-lidar prepare{option}, "
             "or train with --no-copy-paste"
         )
-    source = database.read_manifest(folder).source
-    expected = f"at most {database.MAX_SWEEPS} with copy-paste, or --no-copy-paste"
-    check(config.num_sweeps <= database.MAX_SWEEPS, "num_sweeps", config.num_sweeps, expected)
-    # Objects cut from more sweeps fit too: their surplus sweeps are left out.
-    sweeps = range(config.num_sweeps, database.MAX_SWEEPS + 1)
-    if not any(source == args.data.open_whole(split, database.cut_reading(n)).fingerprint() for n in sweeps):
+    objects = database.open_database(folder)
+    reading = database.cut_reading(objects.manifest.num_sweeps)
+    if objects.manifest.source != args.data.open_whole(split, reading, report_missing=False).fingerprint():
         raise ValueError(
-            f"{folder}: cut from other frames than split {split!r}, with another --class-map, or from fewer than "
-            f"{config.num_sweeps} sweeps: run fcos-lidar prepare again, with the same data options"
+            f"{folder}: cut from other frames than split {split!r}, or with another --class-map: run fcos-lidar "
+            "prepare again, with the same data options"
         )
-    return database.open_database(folder)
+    return objects

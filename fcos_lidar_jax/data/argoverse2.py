@@ -62,6 +62,7 @@ class Argoverse2Frames(FrameSet):
     """
 
     classes = ARGOVERSE2_CLASSES
+    usual_sensor = ARGOVERSE2
 
     def __init__(
         self,

@@ -9,6 +9,8 @@ from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.point_files import check_time_lags
+from fcos_lidar_jax.presets import PRESETS
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
 
@@ -176,6 +178,13 @@ def truncation(number: int, config: Config) -> str | None:
     return f"{number} points {how}" if number else None
 
 
+def tell_truncation(cloud: Cloud, config: Config) -> None:
+    """Print a line at the first truncated cloud, once per process; :func:`truncation` counts the points."""
+    if cloud.num_truncated:
+        line = f"clouds are truncated: the detector takes at most {config.max_points} points (max_points)"
+        tell(line, once=True)
+
+
 def _limits(sensor: Sensor) -> str:
     low, high = sensor.limit_z_m
     return f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m"
@@ -191,12 +200,12 @@ def _coordinate_hint(points: np.ndarray) -> str:
     return f"; the values of {'xyz'[axis]} are about {medians[axis]:.4g}, expected {expected}"
 
 
-def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
+def sensor_mismatch(points: np.ndarray, sensor: Sensor, usual: Sensor | None = None) -> str | None:
     """A warning that another sensor probably recorded a cloud, or None.
 
     Uses the current sweep: the share of points beyond the sensor's limits and outside its vertical field of view,
     points per image cell, the share of points with a neighbour in the next column and in the next row, and the
-    scale of the intensity.
+    scale of the intensity. The warning names the sensor that usually records such data, and its presets.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame
@@ -218,8 +227,18 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
         points = points[behind < sensor.num_columns * sensor.column_rad]
     if len(points) < _MIN_ROWS:
         return None
-    reason = "; ".join(_mismatch(points, sensor))
-    return None if not reason else f"points do not fit {about}: {reason}; expect poor detections"
+    if not (reason := "; ".join(_mismatch(points, sensor))):
+        return None
+    return f"points do not fit {about}: {reason}; expect poor detections{_fitting(sensor, usual)}"
+
+
+def _fitting(sensor: Sensor, usual: Sensor | None) -> str:
+    """The options for data that another sensor usually records, as the end of a warning; else empty."""
+    if usual is None or usual.name == sensor.name:
+        return ""
+    presets = ", ".join(name for name, config in PRESETS.items() if config.sensor == usual.name)
+    options = f"--sensor {usual.name} (train, project) or a preset ({presets})"
+    return f". Data like these are usually of {usual.name}: expected {options}"
 
 
 def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:

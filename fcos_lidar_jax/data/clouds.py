@@ -10,6 +10,7 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points
 from fcos_lidar_jax.data.kitti import in_camera
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
+from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.data.sweeps import read_sweeps
 from fcos_lidar_jax.sensors import Sensor
 
@@ -26,6 +27,10 @@ class CloudFiles(FrameSet):
     max_points: int = MAX_POINTS  # larger clouds are refused
     full_turn: bool = False  # keep the points of KITTI's files outside the camera image
     classes: tuple[str, ...] = ()
+
+    @property
+    def usual_sensor(self) -> Sensor | None:  # type: ignore[override]
+        return recorded_by(self.files[:1])
 
     def __len__(self) -> int:
         return len(self.files)

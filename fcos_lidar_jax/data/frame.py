@@ -47,6 +47,7 @@ class FrameSet(Protocol):
 
     classes: tuple[str, ...]  # Class names, which labels index.
     sensor: Sensor  # Sensor that recorded the points.
+    usual_sensor: Sensor | None = None  # Preset of the sensor that records such data; None if there is none.
 
     def __len__(self) -> int: ...
 
@@ -57,8 +58,8 @@ class FrameSet(Protocol):
     def truth(self, index: int) -> Frame:
         """:meth:`frame` with ``num_close`` 0 and no points.
 
-        The points are read only if the data do not tell how many of them each box contains (KITTI, folders of
-        your own data).
+        The points are read only if the data lack the number of points in each box (KITTI, folders of your own
+        data).
         """
         return without_points(self.frame(index))
 
@@ -140,6 +141,10 @@ class WrappedFrames(FrameSet):
 
     def _source(self, index: int) -> int:
         return index
+
+    @property
+    def usual_sensor(self) -> Sensor | None:  # type: ignore[override]
+        return self.frames.usual_sensor
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -12,7 +12,7 @@ _MAX_LISTED = 20  # frames listed in a message
 
 
 def printable(text: str) -> str:
-    """A recording's text, made fit for one line of a message: at most 500 printable characters.
+    """A recording's text for one line of a message: at most 500 printable characters.
 
     >>> printable("/points"), printable("a\\nb")
     ('/points', "'a\\\\nb'")

@@ -12,7 +12,7 @@ from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
-from fcos_lidar_jax.progress import tell_once
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 
 CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
@@ -49,7 +49,7 @@ class KittiFrames(FrameSet):
     to that frame: gravity centre, yaw counter-clockwise from +x. KITTI's boxes are upright for the camera; its
     tilt against the Velodyne, about a degree, is lost. Velocities are unknown: NaN. Labels index :data:`CLASSES`.
 
-    The labels do not tell how many points a box contains, so :meth:`truth` reads the cloud and counts them.
+    The labels lack the number of points in a box, so :meth:`truth` reads the cloud and counts them.
 
     Only objects in the left colour image are labelled. Points outside the image are dropped; otherwise a detector
     would learn that everything behind the car is background.
@@ -66,6 +66,7 @@ class KittiFrames(FrameSet):
     """
 
     classes = CLASSES
+    usual_sensor = KITTI_HDL64E
 
     def __init__(
         self,
@@ -171,8 +172,8 @@ def in_image(points: np.ndarray, velo_to_image: np.ndarray, image_size: tuple[in
 def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
     """The points of a file in KITTI's folders inside the left colour image, as in :class:`KittiFrames`.
 
-    Files elsewhere, or without ``calib/NAME.txt`` beside the folder, keep all points. A line says once per folder
-    that points are left out.
+    Files elsewhere, or without ``calib/NAME.txt`` beside the folder, keep all points. Otherwise a note is
+    printed, once per folder.
 
     >>> in_camera(Path("street.bin"), np.zeros((9, 5))).shape
     (9, 5)
@@ -181,7 +182,7 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
     if recorded_by([file]) != KITTI_HDL64E or not calibration.is_file():
         return points
     matrices = read_calibration(calibration)
-    tell_once(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them")
+    tell(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them", once=True)
     return points[in_image(points, matrices["P2"] @ matrices["velo_to_rect"], IMAGE_SIZE)]
 
 

@@ -50,7 +50,7 @@ def read_points(
     not look like metres, or if another layout fits them clearly better.
 
     Args:
-        sensor: scales the intensity, except in ``.pcd.bin``, and tells whether laser numbers are needed.
+        sensor: scales the intensity, except in ``.pcd.bin``, and determines whether laser numbers are needed.
         columns: values per point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
         max_points: larger clouds are refused by their header or size, before they take memory.

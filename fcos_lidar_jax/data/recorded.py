@@ -17,7 +17,7 @@ RECORDED_BY = {
 
 
 def recorded_by(paths: Iterable[Path]) -> Sensor | None:
-    """The one sensor that recorded point files, or recordings in folders, as far as their paths tell.
+    """The one sensor that recorded point files, or recordings in folders, if their paths name it.
 
     >>> recorded_by([Path("KITTI/training/velodyne/000000.bin")]).name, recorded_by([Path("000000.bin")])
     ('kitti_hdl64e', None)

@@ -56,8 +56,8 @@ def ros_bag_drive(
     Args:
         topic: topic of the clouds (``PointCloud2``); may be omitted if there is only one.
         odometry: topic of ``Odometry``, ``PoseStamped`` or ``PoseWithCovarianceStamped``; or ``"tf"``: the
-            transforms from the cloud's frame up to ``odom``, or to the root. If odometry is of another frame than
-            the cloud's, as its child frame tells, the transforms between the two complete it.
+            transforms from the cloud's frame up to ``odom``, or to the root. If the child frame of the odometry
+            is not the cloud's frame, the transforms between the two complete it.
         poses: instead of odometry, a file for :func:`~fcos_lidar_jax.data.drives.read_tum` of the cloud's frame.
     """
     with _Bag(path) as bag:

@@ -79,7 +79,7 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
 
 
 def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any) -> tuple[np.ndarray, int]:
-    """Fuse the sweeps of a JSON list, at most ``reading.num_sweeps``; the result is that of :func:`fuse_sweeps`.
+    """Fuse the sweeps of a JSON list, at most ``reading.num_sweeps``; returns the result of :func:`fuse_sweeps`.
 
     ``layout`` are options of :func:`~fcos_lidar_jax.data.point_files.read_points`, for each file of the list.
     """

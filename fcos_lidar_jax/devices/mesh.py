@@ -82,7 +82,7 @@ def pmap_step(step: Step, mesh: Mesh) -> Callable[[Any, Any], Any]:
     """Map a step over the devices of a mesh with ``jax.pmap``; the buffers of the state are donated.
 
     State, batch and results have a leading axis with one entry per device. The step must reduce over the mapped
-    axis, as that of :func:`fcos_lidar_jax.training.make_train_step` does. New code should use :func:`jit_step`.
+    axis, like the step of :func:`fcos_lidar_jax.training.make_train_step`. New code should use :func:`jit_step`.
 
     >>> from fcos_lidar_jax.collectives import sum_over_devices
     >>> def step(state, batch):

@@ -1,4 +1,4 @@
-"""What the detections of a data set are written to, read from and compared with."""
+"""Metric, results file and ground truth of an evaluation."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
@@ -44,7 +44,7 @@ RESULT_FILES = ("results_nusc.json", "detections.json")
 def compare_by_benchmark(
     truth: GroundTruth, of: str, classes: Sequence[str] = NUSCENES_CLASSES, frames: FrameSet | None = None
 ) -> Comparison:
-    """By nuScenes' own metric.
+    """Compare by the metric of nuScenes.
 
     ``of`` describes the samples in messages. The labels of detections index ``classes``. Detections can only be
     written if the samples are ``frames``, whose poses lead to the global frame.
@@ -63,7 +63,7 @@ def compare_by_benchmark(
 
 
 def compare_by_distance(frames: FrameSet, ranges_m: dict[str, float]) -> Comparison:
-    """By the average precision and the errors of centre distance, over the classes of ``ranges_m``."""
+    """Compare by average precision and errors, matched by centre distance, over the classes of ``ranges_m``."""
     classes, names = tuple(ranges_m), [frames.name(index) for index in range(len(frames))]
 
     def read(file: Path) -> Compared:

@@ -11,7 +11,7 @@ import numpy as np
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.data.sweeps import FARTHEST_M
 from fcos_lidar_jax.evaluation.boxes import NO_BOXES, BoxColumns, GroundTruth, join, make_columns
-from fcos_lidar_jax.evaluation.json_io import expect, expect_samples, index_of, read_json, write_lines
+from fcos_lidar_jax.evaluation.json_io import expect, expect_samples, index_of, read_source, write_lines
 from fcos_lidar_jax.evaluation.metrics import Evaluation, Metric, evaluate
 from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.types import Detections
@@ -97,7 +97,7 @@ def read_detections(path: Path, names: Sequence[str], classes: Sequence[str]) ->
     ``classes`` are the class names by label.
     """
     by_name: dict[str, list[_Box]] = {}
-    for frame in read_json(path, _DetectionsFile)[0].frames:
+    for frame in read_source(path, _DetectionsFile)[0].frames:
         if frame.name in by_name:
             raise ValueError(f"{path}: frame {frame.name}: occurs twice")
         by_name[frame.name] = frame.boxes

@@ -34,7 +34,7 @@ class JsonBox(msgspec.Struct, gc=False):
     attribute_name: str
 
 
-def read_json(source: str | Path | dict[str, Any], kind: Any, *, given: str = "") -> tuple[Any, str]:
+def read_source(source: str | Path | dict[str, Any], kind: Any, *, given: str = "") -> tuple[Any, str]:
     """Read a JSON file as an object of a type; also returns its name for messages.
 
     ``source`` may also be the result of ``json.load``, optionally with NumPy numbers and arrays; ``given`` names

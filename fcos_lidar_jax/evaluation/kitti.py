@@ -1,4 +1,4 @@
-"""KITTI's own metric: average precision at 40 recall positions, by overlap from above and in space."""
+"""KITTI's own metric: average precision at 40 recall positions, by overlap from above and in 3D."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -11,9 +11,10 @@ from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.kitti import read_objects
 
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
-"""The classes that KITTI evaluates -> overlap that a detection must exceed, from above and in space."""
+"""Class that KITTI evaluates -> overlap that a detection must exceed, from above and in 3D."""
 DIFFICULTIES = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
-"""Of the objects that count: height in the image (pixels) that they exceed, greatest occlusion and truncation."""
+"""Minimum image height (pixels), maximum occlusion and truncation of the evaluated objects."""
+TABLE_HEAD = (*DIFFICULTIES, f"objects: {' / '.join(DIFFICULTIES)}")
 
 _NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _POSITIONS = 40
@@ -70,18 +71,24 @@ def evaluate_kitti(
 
 def describe_kitti(metrics: dict[str, Any]) -> str:
     """What :func:`evaluate_kitti` returns, as lines of text."""
-    rows = [(f"KITTI AP_R40 on {metrics['num_frames']} frames", [*DIFFICULTIES])]
+    rows = [(f"KITTI AP_R40 on {metrics['num_frames']} frames", [*TABLE_HEAD])]
     for name, scores in metrics["classes"].items():
         for kind in ("bev", "3d"):
             values = ["-" if v is None else f"{v:.2f}" for v in scores[kind].values()]
-            rows.append((f"{name} {scores['min_overlap']} {kind}", values))
-    lines = [title.ljust(28) + "".join(value.rjust(9) for value in values) for title, values in rows]
+            rows.append((f"{name} {scores['min_overlap']} {kind}", [*values, object_counts(scores)]))
+    widths = [max(9, len(head) + 1) for head in TABLE_HEAD]
+    lines = [title.ljust(28) + "".join(map(str.rjust, values, widths)) for title, values in rows]
     few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
     if few:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
     if metrics.get("left_out"):
         lines.append(f"left out, not in both the detector and KITTI's metric: {', '.join(metrics['left_out'])}")
     return "\n".join(lines)
+
+
+def object_counts(scores: dict[str, Any]) -> str:
+    """Format the numbers of evaluated objects of a class as the last cell of a row under :data:`TABLE_HEAD`."""
+    return " / ".join(map(str, scores["num_truth"].values()))
 
 
 class _Objects:
@@ -111,7 +118,7 @@ def _overlapping(truth: _Objects, found: _Objects) -> tuple[np.ndarray, dict[str
 
 
 def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """IoU from above and in space, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of the files."""
+    """IoU from above and in 3D, f64[n] each, of boxes f64[n, 7]: ``height`` to ``rotation_y`` of the files."""
     (ha, wa, la, _, ya, _, _), (hb, wb, lb, _, yb, _, _) = a.T, b.T
     area = _shared_area(a, b)
     volume = area * np.maximum(np.minimum(ya, yb) - np.maximum(ya - ha, yb - hb), 0.0)
@@ -119,7 +126,7 @@ def overlaps(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shared_area(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Area that boxes share from above: in float64 what :mod:`fcos_lidar_jax.iou` explains."""
+    """Overlap area of boxes from above, in float64; see :mod:`fcos_lidar_jax.iou`."""
     half = a[:, None, [2, 1]] / 2
     cos, sin = np.cos(a[:, 6]), np.sin(a[:, 6])
     dx, dz = b[:, 3] - a[:, 3], b[:, 5] - a[:, 5]
@@ -169,7 +176,7 @@ def _average_precision(
     # First, each object takes the detection of the highest score: their scores are the thresholds.
     taken = _match(truth, column, scores[rows][column], np.ones((len(rows), 1), bool))[:, 0]
     thresholds = _thresholds(scores[pairs[taken & true_positive, 1]], int(counted.sum()))
-    # Then, at each threshold, the one of the greatest overlap; one that does not count only for want of others.
+    # Then, at each threshold, the one with the greatest overlap; ignored detections only if no other is left.
     present = scores[rows][:, None] >= thresholds
     taken = _match(truth, column, np.where(valid, overlap, 0.0), present)
     num_true = (taken & true_positive[:, None]).sum(axis=0)

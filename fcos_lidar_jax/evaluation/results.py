@@ -62,7 +62,7 @@ def read_results(
 
     ``of`` describes the expected samples in messages.
     """
-    file, name = json_io.read_json(source, ResultsFile, given="results")
+    file, name = json_io.read_source(source, ResultsFile, given="results")
     warnings = _check_meta(file.meta, name)
     row = {token: i for i, token in enumerate(tokens)}
     found, parts = list[str](), [NO_BOXES]

@@ -41,7 +41,7 @@ class Sample(msgspec.Struct, gc=False):
 
 def read_truth(source: str | Path | dict[str, Any]) -> GroundTruth:
     """Ground truth ``{sample_token: {"ego_translation", "boxes"}}``, as a JSON file or its content."""
-    raw, name = json_io.read_json(source, msgspec.Raw, given="ground truth")
+    raw, name = json_io.read_source(source, msgspec.Raw, given="ground truth")
     ego, parts, rotations = dict[str, json_io.Vector](), [NO_BOXES], [np.zeros((0, 4))]
     for row, (token, sample) in enumerate(json_io.decode_samples(raw, Sample, name)):
         if not max(map(abs, sample.ego_translation)) <= FARTHEST_M:

@@ -1,4 +1,4 @@
-"""The way from the frame of a data set to the frame that a detector expects, and back."""
+"""Transformation from the frame of a data set to the frame that a detector expects, and back."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ import numpy as np
 from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
 from fcos_lidar_jax.inference.tracks import to_world
-from fcos_lidar_jax.progress import tell_once
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor, in_frame_of, turn_between
 from fcos_lidar_jax.types import Detections
 
@@ -62,14 +62,14 @@ class Alignment:
         if (pose := self.pose) is None:
             return ""
         turn = math.degrees(self.turn_rad)
-        steps = [f"turned by {turn:g} degrees"] if turn else []
+        steps = [f"rotated by {turn:g} degrees"] if turn else []
         if (shift := pose[:3, 3]).any():
             steps.append(f"shifted by ({', '.join(f'{v:.2f}' for v in shift)}) m")
         ahead = self.detector.forward_rad
         axes = {0.0: "x", 90.0: "y", 180.0: "-x", -180.0: "-x", -90.0: "-y"}
         axis = None if ahead is None else axes.get(round(math.degrees(ahead), 2))
         why = f": the detector expects {axis} ahead" if turn and axis else ""
-        return f"clouds {' and '.join(steps)}, and boxes brought back{why}"
+        return f"clouds {' and '.join(steps)}, and boxes transformed back{why}"
 
 
 def align(
@@ -83,7 +83,7 @@ def align(
     """The alignment to a detector of points, which are read with its ``data``.
 
     Args:
-        sensor: recorded the points. By default the one that the paths tell, which a line says, or the detector's.
+        sensor: recorded the points. By default the sensor that the paths name, with a note, or the detector's.
         paths: point files, or recordings in folders.
         yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the one between headings.
         intensity_scale: factor from the intensity in files to the scale 0-255, instead of the sensor's.
@@ -106,6 +106,6 @@ def align(
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
     if sensor is None and recorded is not None and data != detector:
-        told = f"recorded by {recorded.name}, as the path tells, unless --data-sensor names another"
-        tell_once(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}")
+        told = f"recorded by {recorded.name}, as its path says; override with --data-sensor"
+        tell(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}", once=True)
     return Alignment(data, detector, yaw_rad)

@@ -32,7 +32,7 @@ class DetectedBox(NamedTuple):
 class DetectedBoxes:
     """The boxes in a cloud, best score first, in the frame of the points.
 
-    They print as a table. In a notebook, they draw themselves from above, from a score of 0.3.
+    They print as a table. Notebooks show a picture from above, with scores of at least 0.3.
 
     >>> box = np.array([[8, 0, 0, 4, 2, 1.5, 0, 3, 0]], np.float32)
     >>> found = DetectedBoxes(box, np.array([0.5]), np.array([1]), ("car", "bus"), np.zeros((0, 5)), {}, 50.0)

@@ -18,6 +18,7 @@ from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch,
 from fcos_lidar_jax.data.clouds import read_cloud
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import points_from_array
+from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
 from fcos_lidar_jax.inference.alignment import align
@@ -103,14 +104,15 @@ class CloudDetector(abc.ABC):
         """
         is_file = isinstance(points, str | Path)
         sensor = load_sensor(sensor) if isinstance(sensor, str | Path) else sensor
-        aligned = align(self.sensor, sensor, paths=[Path(points)] if is_file else ())
+        paths = [Path(points)] if is_file else []
+        aligned = align(self.sensor, sensor, paths=paths)
         data, reading = aligned.data, self.config.reading
         if is_file:
             rows, num_close = read_cloud(points, data, reading, full_turn=full_turn)
         else:
             rows, num_close = drop_close(points_from_array(points, data), data, reading)
         rows = aligned.points(rows)
-        if line := sensor_mismatch(rows, self.sensor):
+        if line := sensor_mismatch(rows, self.sensor, recorded_by(paths)):
             warnings.warn(line, stacklevel=2)
         cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
         if line := truncation(cloud.num_truncated, self.config):

@@ -11,16 +11,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.config import Config, ModelConfig, StemConfig, config_to_json
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout
-from fcos_lidar_jax.models.layers import EPSILON, norm_groups, pieces
+from fcos_lidar_jax.models.layers import EPSILON, norm_groups
 from fcos_lidar_jax.models.lidar_net import STAGE_STRIDES
 from fcos_lidar_jax.models.local_geometry import COLUMNS, OWN, ROWS, UNIT_M, window
-from fcos_lidar_jax.models.modality import channel_groups
+from fcos_lidar_jax.models.modality import block_diagonal, channel_groups
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import CHANNELS
 
@@ -214,8 +215,9 @@ def _stem(network: _Network, image: str, config: StemConfig, groups: Sequence[tu
         for layer in range(config.num_convs):
             kernels = [network.parameter(f"{path}/conv{layer}_group{g}") for g in range(len(groups))]
             factor, bias = network.batch_norm(f"{path}/norm{layer}")
-            alike = len(set(groups)) == 1 and groups[0][1] % _LANES == 0
-            kernel = np.concatenate(kernels, axis=-1) if alike else _block_diagonal(kernels)
+            alike = len(set(groups)) == 1 and groups[0][1] % _FAST_WIDTH == 0
+            diagonal = np.asarray(block_diagonal([*map(jnp.asarray, kernels)]))
+            kernel = np.concatenate(kernels, axis=-1) if alike else diagonal
             together = len(groups) if alike else 1
             x = network("Relu", network.conv(x, kernel * factor, bias, dilation=dilation, groups=together))
         merge = network.parameter(f"stem/merge{index if config.merge == 'per_branch' else 0}") * gain
@@ -224,16 +226,8 @@ def _stem(network: _Network, image: str, config: StemConfig, groups: Sequence[tu
     return network("Relu", merged)
 
 
-_LANES = 16
+_FAST_WIDTH = 16
 """Grouped convolutions on CPUs are slow unless the width of a group is a multiple of this."""
-
-
-def _block_diagonal(kernels: Sequence[np.ndarray]) -> np.ndarray:
-    rows, columns = (pieces([kernel.shape[axis] for kernel in kernels]) for axis in (2, 3))
-    whole = np.zeros((*kernels[0].shape[:2], rows[-1].stop, columns[-1].stop))
-    for kernel, row, column in zip(kernels, rows, columns, strict=True):
-        whole[:, :, row, column] = kernel
-    return whole
 
 
 def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConfig) -> str:

@@ -77,7 +77,7 @@ def processor_precision() -> Precision:
 def with_openvino(detector: TrainedDetector, *, precision: Precision | None = None) -> OpenVinoDetector:
     """Compile the network of a detector with OpenVINO, for one cloud at a time, on the CPU in one process.
 
-    ``precision`` is that of the network except its input and outputs; by default :func:`processor_precision`.
+    ``precision`` applies to the network except its input and outputs; by default :func:`processor_precision`.
     """
     if jax.default_backend() != "cpu" or jax.process_count() > 1:
         found = f"{jax.process_count()} processes on {jax.default_backend()}"

@@ -1,7 +1,6 @@
 """Detection in many frames, read ahead and spread over the devices, and its evaluation."""
 
 import dataclasses
-import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +11,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.data.class_mapping import MappedFrames
-from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch, tell_truncation
 from fcos_lidar_jax.data.frame import Frame, FrameSet, without_points
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
@@ -21,7 +20,7 @@ from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.detector import CloudDetector
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.types import Detections
 
 _AHEAD = 2  # number of groups of frames to read ahead of the devices
@@ -53,8 +52,8 @@ def predict(
 ) -> Iterator[Prediction]:
     """Detect boxes in frames, in order.
 
-    Clouds are turned and shifted to the frame that the detector expects, as far as the sensors of frames and
-    detector tell, which one line on standard error says; boxes are in the frame of the data.
+    Clouds are rotated and shifted to the frame that the detector expects, if the sensors of frames and detector
+    differ; one line on standard error reports it. Boxes are in the frame of the data.
 
     Every device runs the program for a single cloud, so the boxes are bit-identical for any number of devices and
     processes. Threads read frames while the devices work.
@@ -65,7 +64,7 @@ def predict(
         devices: devices to use; by default all, including those of other processes. Then every process makes the
             same call, reads its share of the frames, and gets all predictions.
         yaw_rad: rotation of the clouds about z before detection, undone for the boxes, counter-clockwise; by
-            default the one between the headings that the sensors tell.
+            default the angle between the headings of the sensors.
 
     Raises:
         ValueError: a batch size below 1, or a frame that cannot be read.
@@ -97,8 +96,8 @@ def predict_groups(
     check(batch_size >= 1, "batch_size", batch_size, "at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
     aligned = Alignment(frames.sensor, sensor, yaw_rad)
-    if (line := aligned.describe()) and jax.process_index() == 0:
-        print(line, file=sys.stderr, flush=True)
+    if line := aligned.describe():
+        tell(line)
     program = detector.program(mesh, batch_size)
     todo = list(range(len(frames)) if indices is None else indices)
     size = batch_size * mesh.size
@@ -113,9 +112,11 @@ def predict_groups(
             if row < len(group):
                 frame = frames.frame(group[row])
                 given = aligned.points(frame.points)
-                if group is groups[0] and slot == 0 and (line := sensor_mismatch(given, sensor)):
-                    print(f"warning: {line}", file=sys.stderr, flush=True)
+                is_first = group is groups[0] and slot == 0
+                if is_first and (line := sensor_mismatch(given, sensor, frames.usual_sensor)):
+                    tell(f"warning: {line}")
                 cloud = make_cloud(given, config, sensor=sensor, num_close=frame.num_close)
+                tell_truncation(cloud, config)
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud
         return loaded, (points, valid)

@@ -1,21 +1,21 @@
 """Detection in a drive, sweep by sweep, with a rolling window of sweeps and one compiled program."""
 
 import dataclasses
-import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud
+from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud, tell_truncation
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detector import CloudDetector
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class SweepDetections:
     """Detections in one sweep, fused with the sweeps before it."""
 
     sweep: Sweep  # the current sweep, unchanged
@@ -31,7 +31,7 @@ def detect_stream(
     at_us: Collection[int] | None = None,
     sensor: Sensor | None = None,
     yaw_rad: float | None = None,
-) -> Iterator[Found]:
+) -> Iterator[SweepDetections]:
     """Detect boxes in every sweep as it arrives, fused with the sweeps before it.
 
     The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps.
@@ -41,7 +41,8 @@ def detect_stream(
         reading: number of sweeps to fuse and points to drop; by default as in training. Use one sweep if the poses
             are unknown.
         at_us: times of the sweeps to detect in; other sweeps are only fused into later ones. By default all.
-        sensor: sensor that recorded the sweeps, by default the detector's. Those of others are turned and shifted.
+        sensor: sensor that recorded the sweeps, by default the detector's. Sweeps of other sensors are rotated and
+            shifted.
         yaw_rad: rotation of the sweeps about z before detection, undone for the boxes, instead of the one between
             the headings: pi / 2 if x points forward in the sweeps and y in the training data. Detection degrades
             for orientations absent from training.
@@ -60,7 +61,7 @@ def detect_stream(
     """
     reading, aligned = reading or detector.config.reading, align(detector.sensor, sensor, yaw_rad=yaw_rad)
     if line := aligned.describe():
-        print(line, file=sys.stderr, flush=True)
+        tell(line)
     window: deque[Sweep] = deque(maxlen=reading.num_sweeps)
     before: Sweep | None = None
     for sweep in sweeps:
@@ -76,6 +77,7 @@ def detect_stream(
         points, num_close = fuse_sweeps(window, aligned.data, reading)
         points = aligned.points(points)
         cloud = make_cloud(points, detector.config, sensor=detector.sensor, num_close=num_close)
+        tell_truncation(cloud, detector.config)
         detections = detector.detect(cloud)
         expect_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
-        yield Found(sweep, cloud, aligned.back(detections))
+        yield SweepDetections(sweep, cloud, aligned.back(detections))

@@ -11,10 +11,10 @@ from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 
-MakePaste = Callable[[Frame, np.random.Generator], tuple[Frame, np.ndarray]]
+Paste = Callable[[Frame, np.random.Generator], tuple[Frame, np.ndarray]]  # See :func:`make_paste`.
 
 
-def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
+def make_paste(objects: GroundTruthDatabase, config: Config) -> Paste:
     """Make the function that samples objects for a frame.
 
     For each class in order, samples without replacement as many objects as the frame lacks, counting the frame's
@@ -28,7 +28,8 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
         ``config.classes``. The result is deterministic in the frame and the generator.
 
     Raises:
-        ValueError: the database has a higher ``min_points`` than the configuration, or shares no class with it.
+        ValueError: the database has a higher ``min_points`` or fewer sweeps than the configuration, or shares no
+            class with it.
     """
     assert config.copy_paste is not None
     targets, min_points, manifest = config.paste_targets, config.copy_paste.min_points, objects.manifest
@@ -40,6 +41,11 @@ def make_paste(objects: GroundTruthDatabase, config: Config) -> MakePaste:
         raise ValueError(f"{objects.folder}: classes: got {got}, expected some of {expected}")
     boxes, labels = objects.table["box"], of_class[objects.table["label"]]
     current, pasted = objects.num_points(1), objects.num_points(config.num_sweeps)
+    sweeps = config.num_sweeps
+    expected = (
+        f"at most the {manifest.num_sweeps} of {objects.folder}: run fcos-lidar prepare --num-sweeps {sweeps}"
+    )
+    check(sweeps <= manifest.num_sweeps, "num_sweeps", sweeps, expected)
     usable = (pasted >= min_points) & (current >= 1)
     pools = [np.flatnonzero(usable & (labels == label)) for label in range(len(targets))]
 

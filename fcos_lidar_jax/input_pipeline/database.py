@@ -31,7 +31,8 @@ from fcos_lidar_jax.workers import end_with_parent
 
 MAX_SWEEPS = 20  # number of sweeps for which an object's points are counted
 
-_FORMAT, _VERSION = "fcos_lidar_jax objects", 2
+_FORMAT, _VERSION = "fcos_lidar_jax objects", 3
+_REBUILD = "rebuild it with fcos-lidar prepare"
 _MANIFEST = "manifest.json"
 _ROW = np.dtype(
     [
@@ -68,6 +69,7 @@ class Manifest(_Header, forbid_unknown_fields=True):
     source: str
     classes: list[str]
     min_points: int
+    num_sweeps: int
     columns: int
     shards: list[Shard]
 
@@ -112,19 +114,19 @@ class GroundTruthDatabase:
         start, count = int(row["start"]) * columns, int(row["count"]) * columns
         values = np.fromfile(file, "<f4", count=count, offset=4 * start)
         if zlib.crc32(values.data) != row["crc32"]:
-            raise ValueError(f"{file}: object {index}: checksum differs from the table's; build it anew")
+            raise ValueError(f"{file}: object {index}: checksum differs from the table's; {_REBUILD}")
         return values.reshape(-1, columns)
 
 
 def open_database(folder: str | Path, *, fingerprint: str | None = None) -> GroundTruthDatabase:
     """Open and check a finished ground-truth database of the frames with a ``fingerprint``; None accepts any.
 
-    Missing, unfinished, altered and truncated databases, and those of another version, are refused.
+    Missing, unfinished, altered and truncated databases, and databases of another version, are refused.
     """
     folder = Path(folder)
-    manifest = read_manifest(folder)
+    manifest = _read_manifest(folder)
     file = folder / _MANIFEST
-    expected = f"{fingerprint!r}: built from other data, build it anew"
+    expected = f"{fingerprint!r}: built from other data, {_REBUILD}"
     check(fingerprint in (None, manifest.source), f"{file}: source", manifest.source, expected)
     tables = []
     for entry in manifest.shards:
@@ -132,12 +134,12 @@ def open_database(folder: str | Path, *, fingerprint: str | None = None) -> Grou
         if (len(table.rows), table.num_points) != (entry.objects, entry.points):
             raise ValueError(
                 f"{file}: {entry.name}: got {entry.objects} objects of {entry.points} points, "
-                f"expected {len(table.rows)} of {table.num_points} as in its table; build it anew"
+                f"expected {len(table.rows)} of {table.num_points} as in its table; {_REBUILD}"
             )
         tables.append(table.rows)
     rows = np.concatenate([np.zeros(0, _ROW), *tables])
     used = int(rows["label"].max(initial=-1)) + 1
-    check(len(manifest.classes) >= used, f"{file}: classes", manifest.classes, f"at least {used}; build it anew")
+    check(len(manifest.classes) >= used, f"{file}: classes", manifest.classes, f"at least {used}; {_REBUILD}")
     shard = np.repeat(np.arange(len(tables), dtype=np.int32), [len(table) for table in tables])
     return GroundTruthDatabase(folder, manifest, rows, shard)
 
@@ -154,13 +156,13 @@ def objects_folder(index: Path, split: str | None) -> Path:
     return index / "objects" / name
 
 
-def read_manifest(folder: Path) -> Manifest:
+def _read_manifest(folder: Path) -> Manifest:
     """Read a finished database's manifest; errors as in :func:`open_database`."""
     file = folder / _MANIFEST
     header = read_json(file, _Header, what="a finished ground-truth database")
     if (header.format, header.version) != (_FORMAT, _VERSION):
         found = f"got {header.format!r} version {header.version}, expected {_FORMAT!r} version {_VERSION}"
-        raise ValueError(f"{file}: {found}; build it anew: fcos-lidar prepare")
+        raise ValueError(f"{file}: {found}; {_REBUILD}")
     manifest = read_json(file, Manifest)
     for shard in manifest.shards:
         leads_elsewhere = set("/\0") & set(shard.name)
@@ -173,6 +175,7 @@ def prepare_database(
     folder: str | Path,
     *,
     min_points: int = 5,
+    num_sweeps: int = MAX_SWEEPS,
     workers: int = 1,
     report: Callable[[int, int], None] | None = None,
 ) -> GroundTruthDatabase:
@@ -185,6 +188,7 @@ def prepare_database(
     Args:
         frames: frames of any classes; must be picklable for several workers.
         folder: contains only the database.
+        num_sweeps: maximum number of sweeps that the frames fuse; detectors of more sweeps refuse the objects.
         workers: number of processes; 1 works in this process.
         report: called with (frames done, total) at the start, including frames of an earlier run, and after every
             shard.
@@ -221,7 +225,7 @@ def prepare_database(
         report(done, len(frames))
     tables = {name: _read_shard(folder, name, columns) for name in shards}
     entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
-    manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, columns, entries)
+    manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, num_sweeps, columns, entries)
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
     atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
     return open_database(folder, fingerprint=source)
@@ -333,22 +337,22 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
         raise ValueError(f"{file}: {error.strerror}, expected a part of a ground-truth database") from None
     digest = checksum(data)
     if expected is not None and digest != expected:
-        raise ValueError(f"{file}: checksum differs from the manifest's; build it anew")
+        raise ValueError(f"{file}: checksum differs from the manifest's; {_REBUILD}")
     try:
         arrays = parse_npz(data, ["rows", "recipe"])
         rows, recipe = arrays["rows"], str(arrays["recipe"])
     except ValueError as error:
         raise ValueError(f"{file}: not a table of objects: {error}") from None
     if rows.dtype != _ROW or rows.ndim != 1:
-        raise ValueError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; build it anew")
+        raise ValueError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; {_REBUILD}")
     ends = rows["count"].cumsum(dtype=np.int64)
     newest = rows["newest"]
     placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)
     if not (placed & (newest >= 0).all(axis=1) & (newest <= rows["count"][:, None]).all(axis=1)).all():
-        raise ValueError(f"{file}: got objects with points outside the shard; build it anew")
+        raise ValueError(f"{file}: got objects with points outside the shard; {_REBUILD}")
     table = _Table(rows, recipe, digest, int(ends[-1]) if len(ends) else 0)
     size = 4 * columns * table.num_points
     found = f"{points_file.stat().st_size} bytes" if points_file.is_file() else "no file"
     if found != f"{size} bytes":
-        raise ValueError(f"{points_file}: got {found}, expected {size} bytes of points; build it anew")
+        raise ValueError(f"{points_file}: got {found}, expected {size} bytes of points; {_REBUILD}")
     return table

@@ -10,7 +10,6 @@ import dataclasses
 import os
 import shutil
 import signal
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,9 +24,10 @@ from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row, spread_indices
-from fcos_lidar_jax.input_pipeline.copy_paste import MakePaste, make_paste
+from fcos_lidar_jax.input_pipeline.copy_paste import Paste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack, pack_row
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.types import Batch, HostBatch
 from fcos_lidar_jax.workers import end_with_parent
 
@@ -87,7 +87,7 @@ class _BatchOf:
     order: SampleOrder
     rows: range  # this process's rows of the global batch
     fade_step: int  # first step without pasted objects
-    paste: MakePaste | None
+    paste: Paste | None
     packing: Packing | None
     alone: bool  # no other process runs the program
     misfits: list[str] = dataclasses.field(default_factory=list)  # samples that did not fit the packing
@@ -297,8 +297,7 @@ class _OwnedBatches:
     def __next__(self) -> HostBatch:
         host = next(self._batches)
         if host.misfit is not None and not self._told:
-            line = f"{host.misfit}: such batches stay unpacked, which compiles the step once more"
-            print(line, file=sys.stderr, flush=True)
+            tell(f"{host.misfit}: such batches stay unpacked, which compiles the step once more")
             self._told = True
         return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch)) if self._copied else host
 

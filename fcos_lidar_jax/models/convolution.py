@@ -36,21 +36,20 @@ def convolve(
     *,
     stride: int = 1,
     dilation: int = 1,
-    groups: int = 1,
     circular: bool = False,
     precision: lax.Precision | None = None,
 ) -> Image:
     """Convolve with ``k // 2 * dilation`` zeros on each side, or with wrap-around along the width.
 
-    Stride and dilation apply to both axes, ``groups`` is ``feature_group_count``, and kernel sizes are odd. The
-    result has the dtype of ``x``. Differentiable in reverse mode.
+    Stride and dilation apply to both axes, and kernel sizes are odd. The result has the dtype of ``x``.
+    Differentiable in reverse mode.
 
     >>> convolve(jnp.ones((1, 8, 8, 2)), jnp.ones((3, 3, 2, 4)), stride=2).shape
     (1, 4, 4, 4)
     """
     kernel = kernel.astype(x.dtype)
     high, wide = (size // 2 * dilation for size in kernel.shape[:2])
-    if kernel.shape[:2] == (1, 1) and groups == 1:
+    if kernel.shape[:2] == (1, 1):
         return pointwise(x, kernel[0, 0], stride=stride, precision=precision)
     if circular and wide:
         x = jnp.concatenate([x[:, :, -wide:], x, x[:, :, :wide]], axis=2)
@@ -61,15 +60,14 @@ def convolve(
         padding=[(high, high), (wide, wide)],
         rhs_dilation=(dilation, dilation),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        feature_group_count=groups,
         precision=precision,
     )
     how: dict[str, Any] = {"sizes": kernel.shape[:2], "dilation": dilation, "padding": (high, wide)}
     forms = {}
-    if stride == groups == 1 and _multiply_adds(x, kernel) >= LOOP * LARGE:
+    if stride == 1 and _multiply_adds(x, kernel) >= LOOP * LARGE:
         forms["cpu"] = functools.partial(_by_rows, **how)
     if stride == 1 and dilation > 1:
-        forms["default"] = functools.partial(_by_phases, **how, groups=groups, precision=precision)
+        forms["default"] = functools.partial(_by_phases, **how, precision=precision)
     return _with_weight_gradient(product, forms, x, kernel)
 
 
@@ -169,7 +167,6 @@ def _by_phases(
     sizes: tuple[int, ...],
     dilation: int,
     padding: tuple[int, int],
-    groups: int,
     precision: lax.Precision | None,
 ) -> Kernel:
     """Weight gradient at stride 1, computed as the weight gradient of an undilated convolution.
@@ -190,10 +187,9 @@ def _by_phases(
         window_strides=(1, 1),
         padding=[(size // dilation, size // dilation) for size in padding],
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        feature_group_count=groups,
         precision=precision,
     )
-    kernel = jax.ShapeDtypeStruct((*sizes, x.shape[-1] // groups, g.shape[-1]), x.dtype)
+    kernel = jax.ShapeDtypeStruct((*sizes, x.shape[-1], g.shape[-1]), x.dtype)
     return jax.linear_transpose(product, kernel)(g)[0]
 
 

@@ -119,16 +119,16 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     if (other := config.build(sensor)) is not None:
         return other
     network, layout = Network(config.model, len(config.classes)), image_layout(sensor, config.model)
-    num_rounds, current_first = config.projection.num_rounds, config.projection.prioritize_current
-    image_of = image_sensor(sensor, config.model)
+    projection, sensor_of_image = config.projection, image_sensor(sensor, config.model)
+    options = {"num_rounds": projection.num_rounds, "prioritize_current": projection.prioritize_current}
 
     def prepare(points: Array | np.ndarray, valid: Array | np.ndarray) -> RangeImage:
         with jax.named_scope("mrv"):
-            return project_points(points, valid, image_of, num_rounds=num_rounds, prioritize_current=current_first)
+            return project_points(points, valid, sensor_of_image, **options)
 
     def init(key: Any) -> Variables:
         # Parameters do not depend on the image's size; the forward pass is not computed.
-        image = jax.ShapeDtypeStruct((1, 32, 32, len(CHANNELS) * num_rounds), jnp.float32)
+        image = jax.ShapeDtypeStruct((1, 32, 32, len(CHANNELS) * projection.num_rounds), jnp.float32)
         return network.lazy_init(key, image, train=False)  # type: ignore[return-value]
 
     def apply(variables: Variables, images: RangeImage, *, train: bool = False) -> tuple[Outputs, Any]:
@@ -143,37 +143,6 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
         return select_candidates(outputs, locate(image, layout), config=config.inference, layout=layout, axes=axes)
 
     return Detector(prepare, init, apply, make_sums(config, sensor), candidates, config, sensor)
-
-
-class Parts(NamedTuple):
-    """Compiled parts of FCOS-LiDAR's network. All but the first take all variables and the previous output."""
-
-    preprocess: Callable[[Any], Image]
-    stem: Callable[[Variables, Any], Any]
-    backbone: Callable[[Variables, Any], Any]
-    fpn: Callable[[Variables, Any], Any]
-    heads: Callable[[Variables, Any], Any]
-
-
-def network_parts(config: Config, sensor: Sensor) -> Parts:
-    """Split the network of a configuration without ``local_geometry`` into parts, to time each of them.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> network_parts(QUICKSTART, SHORT_RANGE).preprocess(jnp.zeros((1, 32, 128, 9, 1))).shape
-    (1, 32, 128, 9)
-    """
-    layout, network = image_layout(sensor, config.model), Network(config.model, len(config.classes))
-
-    def part(name: str, **options: Any) -> Callable[[Variables, Any], Any]:
-        def apply(variables: Variables, x: Any) -> Any:
-            return network.apply(variables, x, method=lambda whole, x: getattr(whole, name)(x, **options))
-
-        return jax.jit(apply)
-
-    preprocess = jax.jit(lambda features: network_input(features, config.model, layout))
-    front = part("stem", train=False), part("backbone", train=False)
-    return Parts(preprocess, *front, part("fpn"), part("heads"))
 
 
 def count_parameters(params: Any) -> dict[str, int]:

@@ -12,7 +12,7 @@ from fcos_lidar_jax.models.layers import Conv, GroupNorm, at_least_float32, norm
 from fcos_lidar_jax.types import Outputs
 
 _REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}  # Numbers per class of the sibling layers.
-_LANES = 32
+_CHANNEL_MULTIPLE = 32
 """The channels of fused predictions are padded to a multiple of this: on a CPU, 110 run at half the speed of
 128."""
 
@@ -50,7 +50,7 @@ class Predictions(nn.Module):
             biases.append(self.param(f"{name}_bias", lambda _, start=start: start))
         total = sum(self.sizes.values())
         kernel = jnp.concatenate(kernels, axis=-1)
-        kernel = jnp.pad(kernel, [(0, 0)] * 3 + [(0, -total % _LANES)])
+        kernel = jnp.pad(kernel, [(0, 0)] * 3 + [(0, -total % _CHANNEL_MULTIPLE)])
         # Rounding to TF32 on GPUs moves a centre by a millimetre only, since it is relative to its point.
         y = convolve(x, kernel, circular=self.circular)[..., :total] + jnp.concatenate(biases)
         cuts = pieces(list(self.sizes.values()))

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import Literal
 
 import flax.linen as nn
 import jax
@@ -14,7 +13,6 @@ from fcos_lidar_jax.models.convolution import FULL, Image, Kernel, convolve, poi
 from fcos_lidar_jax.models.layers import BatchNorm, kernel_init, pieces
 from fcos_lidar_jax.types import CHANNELS
 
-Form = Literal["split", "dense", "grouped"]  # Formulation of the stem's convolutions, see :class:`Stem`.
 _MODALITIES = (3, 3, 1, 1, 1)
 """Channel types per modality: (x, y, z), (range, azimuth, inclination), intensity, existence, time lag."""
 _WIDE = 24
@@ -35,25 +33,18 @@ def channel_groups(config: StemConfig, num_rounds: int) -> list[tuple[int, int]]
     return [(count * num_rounds, count * width) for count in types]
 
 
-def bundles(groups: Sequence[tuple[int, int]], form: str) -> list[slice]:
-    """Assign groups to convolutions.
+def bundles(groups: Sequence[tuple[int, int]]) -> list[slice]:
+    """Assign groups to convolutions: as many convolutions as possible that have enough output channels.
 
-    ``"dense"`` has one convolution of all groups, ``"grouped"`` one per run of equal groups, and ``"split"`` as
-    many as possible that have enough output channels.
-
-    >>> bundles([(5, 8)] * 9, "split")
+    >>> bundles([(5, 8)] * 9)
     [slice(0, 3, None), slice(3, 6, None), slice(6, 9, None)]
-    >>> bundles([(5, 4)] * 9, "split") == bundles([(5, 8)] * 9, "dense") == [slice(0, 9)]
-    True
-    >>> bundles([(15, 96), (15, 96), (5, 32)], "grouped")
-    [slice(0, 2, None), slice(2, 3, None)]
+    >>> bundles([(5, 4)] * 9)
+    [slice(0, 9, None)]
     """
-    if form == "grouped":
-        return pieces([len(list(run)) for _, run in itertools.groupby(groups)])
     cuts, width = [0], 0
     for end, (_, outputs) in enumerate(groups, 1):
         width += outputs
-        if form == "split" and width >= _WIDE:
+        if width >= _WIDE:
             cuts.append(end)
             width = 0
     # Remaining narrow groups join the last bundle.
@@ -81,13 +72,12 @@ class ModalityBranch(nn.Module):
     config: StemConfig
     groups: tuple[tuple[int, int], ...]
     dilation: int
-    form: Form
     circular: bool = False
     precision: str = "float32"
 
     @nn.compact
     def __call__(self, parts: Sequence[Image], *, train: bool) -> list[Image]:
-        cuts = bundles(self.groups, self.form)
+        cuts = bundles(self.groups)
         sizes, widths = zip(*self.groups, strict=True)
         for layer in range(self.config.num_convs):
             kernels = [
@@ -103,10 +93,8 @@ class ModalityBranch(nn.Module):
         return list(parts)
 
     def _convolve(self, x: Image, kernels: Sequence[Kernel], precision: lax.Precision | None) -> Image:
-        grouped = self.form == "grouped"  # All kernels have the same shape.
-        kernel = jnp.concatenate(kernels, axis=-1) if grouped else block_diagonal(kernels)
         options = {"dilation": self.dilation, "circular": self.circular, "precision": precision}
-        return convolve(x, kernel, groups=len(kernels) if grouped else 1, **options)
+        return convolve(x, block_diagonal(kernels), **options)
 
 
 class Stem(nn.Module):
@@ -114,23 +102,20 @@ class Stem(nn.Module):
 
     The input is a normalised image with ``9 r`` channels, ordered by type.
 
-    Three forms compute the same function with the same parameters: ``"split"`` has independent chains, of which
-    narrow ones are joined; ``"dense"`` has one block-diagonal kernel and several times the operations;
-    ``"grouped"`` uses ``feature_group_count``. The last two are for comparison: on CPUs the grouped form is slow,
-    and if a batch is split over devices XLA gathers its images on each of them.
+    Groups have independent convolutions, of which narrow ones are joined by block-diagonal kernels.
+    ``feature_group_count`` is slow on CPUs, and if a batch is split over devices XLA gathers its images on each of
+    them.
     """
 
     config: StemConfig
     circular: bool = False
     precision: str = "float32"
-    form: Form = "split"
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
-        config, form = self.config, self.form
-        num_rounds = image.shape[-1] // 9
+        config, num_rounds = self.config, image.shape[-1] // 9
         groups = channel_groups(config, num_rounds)
-        sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups, form)]
+        sizes = [sum(size for size, _ in groups[cut]) for cut in bundles(groups)]
         parts = [image[..., cut] for cut in pieces(sizes)]
         merged = jnp.zeros((), image.dtype)  # The sum over all groups has the image's precision.
         computed = image.dtype
@@ -143,7 +128,7 @@ class Stem(nn.Module):
                 parts, merged = lax.platform_dependent(
                     (parts, merged), cpu=lambda both: both, default=lax.optimization_barrier
                 )
-            options = dilation, form, self.circular, self.precision
+            options = dilation, self.circular, self.precision
             branch = ModalityBranch(config, tuple(groups), *options, name=f"branch{index}")
             features = branch(parts, train=train)
             computed = features[0].dtype

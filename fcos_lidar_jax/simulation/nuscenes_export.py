@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from fcos_lidar_jax.files import atomic_write, file_checksum, folder_lock, naming, read_json
-from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.simulation.nuscenes_tables import CHANNEL, MAP_FILE, fixed_tables, scene_name, sweep_file
 from fcos_lidar_jax.simulation.render import DatasetSpec, render_scene
 from fcos_lidar_jax.workers import end_with_parent
@@ -66,7 +65,8 @@ def _write_rest(spec: DatasetSpec, root: Path, workers: int, report: Callable[[i
 
 def _check_order(spec: DatasetSpec, root: Path) -> dict[str, Any]:
     """Specification of the data set as JSON; rejects a folder with other contents."""
-    order = {"format": _FORMAT, **dataclasses.asdict(spec), "sensor": sensor_to_json(spec.sensor)}
+    order = {"format": _FORMAT, **dataclasses.asdict(spec)}
+    del order["sensor"]["forward_rad"]  # changes no file
     if root.exists() and not root.is_dir():
         raise ValueError(f"{root}: found a file, expected a folder")
     file = root / _ORDER

@@ -92,10 +92,10 @@ def fit(
         done += 1
         read()
         unread = done, host, metrics, waited
-        stop = stopping(done)
-        if stop or done == num_steps or pause_at(done):
+        stop, pausing = stopping(done), pause_at(done)
+        if stop or pausing or done == num_steps:
             read()
-        if pause is not None and pause_at(done):
+        if pause is not None and pausing:
             pause(done, state)
             before = time.monotonic()
         if stop:

@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
-from fcos_lidar_jax.checkpoints.storage import CheckpointError, check_arrays, read_checkpoint, with_later_fields
+from fcos_lidar_jax.checkpoints.storage import CheckpointError, check_arrays, read_checkpoint
 from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
@@ -32,7 +32,6 @@ from fcos_lidar_jax.training.metrics_log import evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.step import make_state
 
-_LATER_FIELDS = ("ground_truth_database", "tests")  # fields that were added to the specification later
 NUM_SEEDS = 2**32  # JAX uses 32 bits of a seed, so larger seeds would repeat smaller ones
 RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 
@@ -166,7 +165,7 @@ def plan_run(
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
     clouds = (frames.frame(index).points for index in spread_indices(len(frames), 5))
     first = next(clouds)
-    if mismatch := sensor_mismatch(first, frames.sensor):
+    if mismatch := sensor_mismatch(first, frames.sensor, frames.usual_sensor):
         yield f"{frames.name(0)}: {mismatch}"
     if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in (first, *clouds)):
         yield (
@@ -175,11 +174,10 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
         )
 
 
-def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> list[str]:
+def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> None:
     """Check that a run can be started or resumed in a folder; names the first field in which another run differs.
 
-    ``spec`` is the expected content of ``run.json``; None checks only whether there is a run. Returns the fields
-    that the specification of an older run lacks and that were not compared.
+    ``spec`` is the expected content of ``run.json``; None checks only whether there is a run.
     """
     folder = local_path(folder)
     file = folder / RUN_SPEC
@@ -188,19 +186,14 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     if not file.is_file():
         if resume:
             raise ValueError(f"{file}: found nothing, expected the run to resume")
-        return []
+        return
     if not resume:
         raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
     recorded = read_json(file, dict[str, Any], what="the specification of a run")
     if spec is None:
-        return []
-    missing = [name for name in _LATER_FIELDS if name in spec and name not in recorded]
-    recorded |= {name: spec[name] for name in missing}
-    if isinstance(config := recorded.get("config"), dict):
-        recorded["config"] = with_later_fields(config)
+        return
     for name, was, now in _differences(recorded, spec):
         raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
-    return missing
 
 
 def _initial_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
@@ -219,7 +212,7 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
         for name, was, now in _differences(own, new, "model"):
             print(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}", file=sys.stderr, flush=True)
         if turn := turn_between(detector.sensor, checkpoint.sensor):
-            told = f"weights trained on clouds turned by {math.degrees(turn):g} degrees relative to these"
+            told = f"weights trained on clouds rotated by {math.degrees(turn):g} degrees relative to these"
             print(f"{folder}: {told}: expect scores to fall at first", file=sys.stderr, flush=True)
     return checkpoint.variables
 
@@ -227,6 +220,7 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
 def _differences(was: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
     if isinstance(was, dict) and isinstance(now, dict):
         for key in sorted(was.keys() | now.keys()):
-            yield from _differences(was.get(key), now.get(key), f"{name}.{key}" if name else key)
+            values = was.get(key, "nothing"), now.get(key, "nothing")
+            yield from _differences(*values, f"{name}.{key}" if name else key)
     elif was != now:
         yield name, was, now

@@ -10,12 +10,13 @@ import json
 import math
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 from jax.experimental import multihost_utils
+from jax.sharding import Mesh
 
 from fcos_lidar_jax.checkpoints.preemption import stop_requests
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, NonFiniteStateError
@@ -32,16 +33,16 @@ from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Variables
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
-from fcos_lidar_jax.training.metrics_log import MetricsLog, read_metrics
+from fcos_lidar_jax.training.metrics_log import MetricsLog
 from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, plan_run
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
-from fcos_lidar_jax.types import TrainState
+from fcos_lidar_jax.types import HostBatch, TrainState
 
 _NUM_PICTURES = 2  # number of test frames drawn at an evaluation
 
 Hook = Callable[[int, Record], None]
-"""Called with the number of steps and the metrics of the last one; after an evaluation with its scores too."""
+"""Called with the number of steps and the metrics of the last one, or the scores of the evaluation after it."""
 
 
 def train(
@@ -74,8 +75,8 @@ def train(
         resume: resume the same run from the newest intact checkpoint in the folder.
         weights: initial weights, as a checkpoint or arrays; random by default.
         devices: devices that share each batch; by default all.
-        hooks: functions ``(number of steps, metrics)`` to call in every process: after every step, and after every
-            evaluation with the same metrics and the scores ``test/mAP`` and ``test/AP/CLASS``.
+        hooks: functions ``(number of steps, values)`` to call in every process: after every step with its metrics,
+            and after every evaluation with the scores ``test/mAP`` and ``test/AP/CLASS``.
         schedule: when to save and evaluate.
         threads, workers: number of threads and additional processes that prepare batches; by default as many
             threads as ``input_pipeline.loader.default_threads`` returns, and no processes.
@@ -131,37 +132,11 @@ def train(
         if first == steps and not pending:
             print(f"{run.folder}: the run is complete, with {first} steps", file=sys.stderr)
             return start
-        step = jit_step(make_train_step(run.detector, run.optimizer), mesh)
-        metrics = MetricsLog(run.folder, first_step=first) if is_main_process else None
+        log = MetricsLog(run.folder, first_step=first) if is_main_process else None
         if is_main_process:
             for line in run.warnings:
                 print(f"warning: {line}", file=sys.stderr, flush=True)
             print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
-
-        # Hooks may expect the metrics, also after the evaluation with which an interrupted run resumes.
-        latest: Record = _last_metrics(run, first) if pending and hooks else {}
-
-        def report(number: int, record: Record) -> None:
-            nonlocal latest
-            latest = record
-            if metrics is not None:
-                samples = config.optimizer.batch_size / max(float(record["seconds"]), 1e-9)  # type: ignore[arg-type]
-                metrics.write(number, record | {"samples_per_second": samples})
-            for hook in hooks:
-                hook(number, record)
-
-        def evaluate_at(number: int, state: TrainState) -> None:
-            scores = _evaluate(run, number, state, metrics)
-            for hook in hooks:
-                hook(number, latest | scores)
-
-        def pause(number: int, state: TrainState) -> None:
-            if metrics is not None:
-                metrics.flush()
-                _save(run, state)  # before the evaluation, which may take long
-            if run.evaluates_at(number):
-                evaluate_at(number, state)
-
         batches = make_batches(
             run.frames,
             config,
@@ -177,46 +152,84 @@ def train(
             lend=True,
             order=run.order,
         )
-        with stop_requests(active=not several) as request, batches as prepared, feed(prepared, mesh) as stream:
+        asked = stop_requests("stopping after this step or evaluation, which is saved", active=not several)
+        with asked as request, batches as prepared, feed(prepared, mesh) as stream:
 
             def stopping(done: int) -> bool:
                 if several:  # all stop after the same step, whichever of them received the signal
                     return multihost_utils.reached_preemption_sync_point(done)
                 return request.signal is not None
 
-            try:
-                state = replicate(start, mesh)
-                if pending:
-                    evaluate_at(first, state)
-                state = fit(
-                    step,
-                    state,
-                    stream,
-                    num_steps=steps,
-                    report=report,
-                    pause_at=run.saves_at,
-                    pause=pause,
-                    stopping=stopping,
-                    log_every_s=10.0 if is_main_process else math.inf,
-                )
-                done = int(state.step)
-                if is_main_process and not run.saves_at(done):
-                    _save(run, state)
-            except (NonFiniteLossError, NonFiniteStateError) as error:
-                saved = run.checkpoints.paths()
-                last = f"the last checkpoint is {saved[-1]}" if saved else "there is no checkpoint yet"
-                raise type(error)(f"{error}; {last}") from None
-            finally:
-                if metrics is not None:
-                    metrics.close()
+            state = _take_steps(run, mesh, start, stream, pending, log, hooks, stopping)
         if is_main_process:
             draw_metrics(run.folder)
-    if done < steps or request.signal is not None:
+    if (done := int(state.step)) < steps or request.signal is not None:
         print(f"stopped after step {done}, which is saved", file=sys.stderr)
         if request.signal == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + signal.SIGTERM)
     return state
+
+
+def _take_steps(
+    run: Run,
+    mesh: Mesh,
+    start: TrainState,
+    batches: Iterable[HostBatch],
+    pending: bool,
+    log: MetricsLog | None,
+    hooks: Sequence[Hook],
+    stopping: Callable[[int], bool],
+) -> TrainState:
+    """Take the remaining steps of a run and return the last state; the process with a log saves and records.
+
+    ``pending`` tells whether the evaluation of the first state is missing.
+    """
+    batch_size = run.detector.config.optimizer.batch_size
+
+    def report(number: int, record: Record) -> None:
+        if log is not None:
+            samples = batch_size / max(float(record["seconds"]), 1e-9)  # type: ignore[arg-type]
+            log.write(number, record | {"samples_per_second": samples})
+        _call(hooks, number, record)
+
+    def pause(number: int, state: TrainState) -> None:
+        if log is not None:
+            log.flush()
+            _save(run, state)  # before the evaluation, which may take long
+        if run.evaluates_at(number):
+            _call(hooks, number, _evaluate(run, number, state, log))
+
+    try:
+        state = replicate(start, mesh)
+        if pending:
+            _call(hooks, int(start.step), _evaluate(run, int(start.step), state, log))
+        state = fit(
+            jit_step(make_train_step(run.detector, run.optimizer), mesh),
+            state,
+            batches,
+            num_steps=run.num_steps,
+            report=report,
+            pause_at=run.saves_at,
+            pause=pause,
+            stopping=stopping,
+            log_every_s=math.inf if log is None else 10.0,
+        )
+        if log is not None and not run.saves_at(int(state.step)):
+            _save(run, state)
+        return state
+    except (NonFiniteLossError, NonFiniteStateError) as error:
+        saved = run.checkpoints.paths()
+        last = f"the last checkpoint is {saved[-1]}" if saved else "there is no checkpoint yet"
+        raise type(error)(f"{error}; {last}") from None
+    finally:
+        if log is not None:
+            log.close()
+
+
+def _call(hooks: Sequence[Hook], number: int, values: Record) -> None:
+    for hook in hooks:
+        hook(number, values)
 
 
 @contextlib.contextmanager
@@ -227,9 +240,7 @@ def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool
     """
     check_run(folder, spec, resume=resume)  # before the lock, which makes the folder
     with folder_lock(folder, "training"):
-        missing = check_run(folder, spec, resume=resume)  # another process may have been faster
-        if missing:
-            print(f"{folder}: an older run; not compared: {', '.join(missing)}", file=sys.stderr)
+        check_run(folder, spec, resume=resume)  # another process may have been faster
         if spec is not None and not resume:
             text = json.dumps(spec, indent=1)
             atomic_write(folder / RUN_SPEC, lambda path: path.write_text(text, encoding="utf-8"))
@@ -246,14 +257,7 @@ def _start(run: Run, *, resume: bool) -> TrainState:
     return make_state(run.detector, run.optimizer, key, variables=run.weights)
 
 
-def _last_metrics(run: Run, step: int) -> Record:
-    """The recorded metrics of a step; empty if there are none."""
-    with contextlib.suppress(OSError):
-        return next((r for r in read_metrics(run.folder) if r["step"] == step and "loss/total" in r), {})
-    return {}
-
-
-def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | None) -> Record:
+def _evaluate(run: Run, number: int, state: TrainState, log: MetricsLog | None) -> Record:
     """Evaluate on the test frames in all processes and return the scores; the main process draws and records."""
     assert run.tests is not None
     trained = TrainedDetector(run.detector, _local_variables(state))
@@ -263,14 +267,14 @@ def _evaluate(run: Run, number: int, state: TrainState, metrics: MetricsLog | No
     scores |= {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
     first = range(min(_NUM_PICTURES, len(run.tests)))
     examples = list(predict(trained, run.tests, indices=first, devices=run.devices))
-    if metrics is not None:
+    if log is not None:
         print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
         prefix, title = f"step_{number:06d}_frame", f"step {number}, test frame"
         pictures = draw_predictions(run.folder / "pictures", examples, run.tests, prefix=prefix, title=title)
-        metrics.write_pictures(number, pictures)
+        log.write_pictures(number, pictures)
         if not math.isnan(score):
             run.checkpoints.record_score(number, score)
-        metrics.write(number, scores)  # last, because a recorded evaluation is not repeated
+        log.write(number, scores)  # last, because a recorded evaluation is not repeated
     return scores
 
 

@@ -13,6 +13,8 @@ _SIZE_IN = 9.0
 _DASHES = (0, (3, 2))
 _LEGEND_CLASSES = 30
 _HIGH_M = 3.0  # height above ground from which points have the darkest colour
+_MARGIN_M = 2.0  # around a fitted view; also how far a full turn reaches at least to all sides
+_TALLEST = 1.4  # height of a fitted view relative to its width, at most
 
 
 def draw_bev(
@@ -30,10 +32,14 @@ def draw_bev(
     Detections have solid outlines in the colour of their class, with class and score, or only the score, where
     there is room, highest scores first. Truth has thin dashed black outlines filled with the colour of its class.
     A line from the centre through the front marks the heading. Half the side of the plotted square is ``limit_m``.
+    If all points are to one side of the sensor, as in a camera image, the view is fitted to points and boxes.
     """
-    figure = new_figure(_SIZE_IN, _SIZE_IN + 0.5)
+    boxes = [box for each in (detections, truth) if each is not None for box in each[0]]
+    view = _fitted(points, boxes, limit_m)
+    width_m, height_m = np.ptp(view, axis=1)
+    figure = new_figure(_SIZE_IN, _SIZE_IN * float(np.clip(height_m / width_m, 1 / _TALLEST, _TALLEST)) + 0.5)
     options = {"limit_m": limit_m, "classes": classes, "detections": detections, "truth": truth}
-    present = bev_on(figure.add_subplot(), points, **options)
+    present = bev_on(figure.add_subplot(), points, view=view, **options)
     class_legend(figure, sorted(present), classes, detections=detections is not None, truth=truth is not None)
     if title:
         set_title(figure.axes[0], title, fontsize=11)
@@ -48,8 +54,11 @@ def bev_on(
     classes: Sequence[str],
     detections: ScoredBoxes | None = None,
     truth: TrueBoxes | None = None,
+    view: np.ndarray | None = None,
 ) -> set[int]:
-    """Plot the view of :func:`draw_bev` on an axis; returns the visible labels."""
+    """Plot the view of :func:`draw_bev` on an axis, by default the whole square, else the limits of x and y
+    f64[2, 2]; returns the visible labels."""
+    view = np.array([[-limit_m, limit_m]] * 2) if view is None else view
     _draw_points(axis, points, limit_m)
     axis.plot(0, 0, marker="+", color="black", markersize=8, zorder=2)
     present: set[int] = set()
@@ -62,8 +71,9 @@ def bev_on(
     for box, label, _ in visible:
         _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
         present.add(int(label))
-    axis.set(xlim=(-limit_m, limit_m), ylim=(-limit_m, limit_m), aspect="equal")
-    point_m = 2 * limit_m / (0.88 * 72 * axis.get_figure().get_figwidth())
+    axis.set(xlim=view[0], ylim=view[1], aspect="equal")
+    width_m, height_m = np.ptp(view, axis=1)
+    point_m = max(width_m, height_m / _TALLEST) / (0.88 * 72 * axis.get_figure().get_figwidth())
     labels = (
         (box[:2], np.ptp(corners_from_above(box), axis=1) / 2, label, score) for box, label, score in visible
     )
@@ -74,10 +84,25 @@ def bev_on(
     return present
 
 
+def _fitted(points: np.ndarray, boxes: Sequence[np.ndarray], limit_m: float) -> np.ndarray:
+    """Limits of x and y, f64[2, 2]: the square, or what is in it of a cloud to one side of the sensor."""
+    xy = _visible(points, limit_m)[:, :2]
+    if not len(xy) or ((xy.min(axis=0) < -_MARGIN_M).all() and (xy.max(axis=0) > _MARGIN_M).all()):
+        return np.array([[-limit_m, limit_m]] * 2)
+    corners = [corners_from_above(box) for box in boxes if _in_view(box, limit_m)]
+    shown = np.concatenate([np.zeros((2, 1)), xy.T, *corners], axis=1)  # with the cross at the origin
+    low, high = shown.min(axis=1) - _MARGIN_M, shown.max(axis=1) + _MARGIN_M
+    return np.stack([low, high], axis=1).clip(-limit_m, limit_m)
+
+
+def _visible(points: np.ndarray, limit_m: float) -> np.ndarray:
+    return points[np.isfinite(points[:, :3]).all(axis=1) & (np.abs(points[:, :2]) < limit_m).all(axis=1)]
+
+
 def _draw_points(axis: Any, points: np.ndarray, limit_m: float) -> None:
     from matplotlib.colors import LinearSegmentedColormap
 
-    cloud = points[np.isfinite(points[:, :3]).all(axis=1) & (np.abs(points[:, :2]) < limit_m).all(axis=1)]
+    cloud = _visible(points, limit_m)
     if len(cloud):
         # Heights are relative to the ground: the ground is light and objects on it are dark.
         ground = np.quantile(cloud[:, 2], 0.1)

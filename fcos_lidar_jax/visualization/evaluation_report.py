@@ -11,7 +11,7 @@ import numpy as np
 
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.evaluation.examples import sensor_boxes
-from fcos_lidar_jax.evaluation.kitti import DIFFICULTIES
+from fcos_lidar_jax.evaluation.kitti import TABLE_HEAD, object_counts
 from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC, Evaluation
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes
@@ -89,7 +89,7 @@ def write_evaluation_report(
     ``bootstrap.json`` in the folder, of the nuScenes benchmark or any other metric.
 
     Args:
-        examples: samples to plot; ``sensor`` is that of their range images.
+        examples: samples to plot; ``sensor`` defines their range images.
         pictures: additional pictures, placed first.
         links: text and file name of links to files beside the report.
     """
@@ -131,12 +131,16 @@ def _kitti_table(file: Path) -> list[tuple[str, tuple[str, ...], list[tuple[Cell
         return []
     metrics = json.loads(file.read_text())
     rows = [
-        (f"{name}, {kind}", *(float("nan") if value is None else value for value in scores[kind].values()))
+        (
+            f"{name}, {kind}",
+            *(float("nan") if value is None else value for value in scores[kind].values()),
+            object_counts(scores),
+        )
         for name, scores in metrics["classes"].items()
         for kind in ("bev", "3d")
     ]
     head = f"KITTI's metric: AP_R40 in percent, on {metrics['num_frames']} frames"
-    return [(head, ("class", *DIFFICULTIES), rows)]
+    return [(head, ("class", *TABLE_HEAD), rows)]
 
 
 def clear_report(out: Path) -> None:

@@ -41,7 +41,8 @@ def test_a_file_says_by_its_fields_which_detector_it_is_of():
     record = json.loads(json.dumps(config_to_json(CENTERPOINT_PILLARS)))
     assert record["pillars"]["pillar_m"] == 0.2
     assert type(config_from_json(record)) is CenterPointConfig
-    assert config_from_json({**config_to_json(NUSCENES), "pillars": None}) == NUSCENES
+    with pytest.raises(ValueError, match=r"run: pillars: got NoneType, expected a JSON object"):
+        config_from_json({**config_to_json(NUSCENES), "pillars": None}, "run")
     with pytest.raises(ValueError, match=r"run: pillars\.range_m: missing"):
         config_from_json({**record, "pillars": {"pillar_m": 0.2}}, "run")
 

@@ -61,7 +61,7 @@ def test_outputs_do_not_depend_on_the_order_or_on_the_rest_of_the_batch(scene):
     assert float(jnp.abs(outputs.heat[0] - outputs.heat[1]).max()) > 1e-4
 
 
-def test_statistics_are_those_of_the_points_that_count(scene):
+def test_statistics_use_only_valid_points(scene):
     """Padding changes nothing, nor do points that are dropped."""
     apply, variables, make, points, valid = scene
     kept = apply(variables, make(points[1:, :500], valid[1:, :500]), train=True)

@@ -59,7 +59,7 @@ def test_candidates_are_the_best_pairs_of_cell_and_class(outputs, form):
         np.testing.assert_allclose(boxes[slot], expected, atol=1e-4)
 
 
-def test_boxes_are_those_of_class_wise_suppression(outputs):
+def test_boxes_equal_class_wise_suppression(outputs):
     candidates = centre_candidates(outputs, config=SMALL, grid=GRID)
     boxes, scores, labels, used = suppress(*candidates, SMALL.inference)
     kept = oracles.nms(

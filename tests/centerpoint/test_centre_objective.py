@@ -42,7 +42,7 @@ def ground_truth():
 
 
 @pytest.mark.parametrize("config", [CONFIG, GROUPED], ids=["one group", "six groups"])
-def test_sums_are_those_of_a_loop_over_boxes(config):
+def test_sums_equal_a_loop_over_boxes(config):
     boxes, labels, valid = ground_truth()
     boxes = boxes.at[::2, 7:].set(jnp.nan)
     predicted = outputs(config)

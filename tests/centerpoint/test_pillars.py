@@ -52,7 +52,7 @@ def by_loops(points, valid):
 
 
 @pytest.mark.parametrize("jit", [True, False])
-def test_pillars_are_those_of_loops(jit):
+def test_pillars_equal_loops(jit):
     points, valid = cloud()
     cells, features = by_loops(points, valid)
     make = lambda p, v: make_pillars(p, v, grid=GRID, sensor=SENSOR)  # noqa: E731
@@ -96,7 +96,7 @@ def test_means_of_many_far_points_are_exact():
     assert set(found[:, 0].tolist()) == {-0.125, 0.125}
 
 
-def test_maxima_are_those_of_a_loop_and_equal_rows_share_the_gradient():
+def test_maxima_equal_a_loop_and_equal_rows_share_the_gradient():
     rng = np.random.default_rng(1)
     values, cell = rng.normal(size=(50, 3)).astype(np.float32), rng.integers(0, 9, 50)
     values[cell == 4] = 2.5
@@ -110,7 +110,7 @@ def test_maxima_are_those_of_a_loop_and_equal_rows_share_the_gradient():
     assert not gradient[cell != 4].any()
 
 
-def test_axes_are_those_of_the_cells_below():
+def test_axes_belong_to_the_cells_below():
     cell, inside = cells_below(cell_positions(jnp.arange(GRID.num_cells), GRID, part=0.5), GRID)
     assert cell.tolist() == list(range(GRID.num_cells))
     assert inside.all()

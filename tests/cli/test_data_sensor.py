@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import warnings
 
@@ -13,7 +14,9 @@ from made_folder import make_folder
 from made_kitti import make_kitti
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax import cli
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
+from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E
 
 HDL32E = "--checkpoint hdl32e --out"
@@ -73,13 +76,42 @@ def assert_turned_back(boxes, expected, origin=(0, 0, 0)):
         np.testing.assert_allclose(one["box"][7:], [vy, -vx], atol=1e-4)
 
 
+def test_commands_name_the_sensor_and_the_presets_that_fit_the_data(kitti, tmp_path, capsys, monkeypatch):
+    def advised(*words, code=0):
+        assert cli.main([str(word) for text in words for word in str(text).split()]) == code
+        return [line for line in capsys.readouterr().err.splitlines() if "do not fit" in line]
+
+    def stop(*_, **__):
+        raise ValueError("enough")
+
+    monkeypatch.setattr("fcos_lidar_jax.training.run.make_batches", stop)
+    cloud, data = kitti / "training" / "velodyne" / "000000.bin", f"--data-root {kitti} --class-map nuscenes"
+    train = f"train compact {data} --no-copy-paste --no-class-balanced --out"
+    presets = ", ".join(name for name, preset in PRESETS.items() if preset.sensor == "kitti_hdl64e")
+    advice = f": expected --sensor kitti_hdl64e (train, project) or a preset ({presets})"
+    for lines in (
+        advised(train, tmp_path / "run", code=1),
+        advised("evaluate", data, "--no-report", HDL32E, tmp_path / "scores"),
+        advised("detect", cloud, HDL32E, tmp_path / "boxes.json"),
+        advised("stream", cloud.parent, HDL32E, tmp_path / "boxes.jsonl"),
+        advised("project", cloud, "--out", tmp_path / "image.npz"),
+    ):
+        [line] = lines
+        assert line.startswith("warning: ")
+        assert line.endswith(advice)
+    with pytest.warns(UserWarning, match=re.escape(advice)):
+        fcos.load_detector("hdl32e")(cloud)
+    assert not advised(train, tmp_path / "fitting", "--sensor kitti_hdl64e", code=1)
+    assert not advised("project", cloud, "--sensor kitti_hdl64e --out", tmp_path / "image.npz")
+
+
 def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
     folder, drive = kitti / "training" / "velodyne", kitti / "day" / "drive"
     boxes = detect(tmp_path / "boxes.json", folder, "--full-turn --page", tmp_path / "page.html")
     assert page_content(tmp_path / "page.html")["forward_rad"] == KITTI_HDL64E.forward_rad
     told = capsys.readouterr().err
     assert told.count("recorded by kitti_hdl64e") == told.count("intensities times 255") == 1  # of two files
-    assert told.count("clouds turned by 90 degrees") == 1
+    assert told.count("clouds rotated by 90 degrees") == 1
     assert "no intensity is above 1" not in told
     assert "outside the camera image" not in told
     cropped = detect(tmp_path / "cropped.json", folder)
@@ -119,7 +151,7 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
         assert stream(tmp_path / "boxes.jsonl", source, "--page", tmp_path / "drive.html") == boxes
         assert page_content(tmp_path / "drive.html")["forward_rad"] == KITTI_HDL64E.forward_rad
         told = capsys.readouterr().err
-        assert told.count("clouds turned by 90 degrees") == 1
+        assert told.count("clouds rotated by 90 degrees") == 1
 
 
 def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -179,17 +178,6 @@ def test_a_second_signal_ends_the_process_while_c_code_blocks_the_main_thread(nu
         finally:
             process.kill()
         assert process.stderr.read() == ("program: interrupted\n" if number == signal.SIGINT else "")
-
-
-def test_the_watch_for_a_second_signal_leaves_nothing_behind():
-    def state():
-        descriptor = signal.set_wakeup_fd(-1)
-        signal.set_wakeup_fd(descriptor)
-        return descriptor, threading.active_count(), len(os.listdir("/proc/self/fd"))
-
-    before = state()
-    assert exit_code("program", lambda: None) == 0
-    assert state() == before
 
 
 IN_A_CALLBACK = """

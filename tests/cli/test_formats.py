@@ -21,6 +21,7 @@ from made_kitti import make_kitti
 from tiny_run import NETWORK_OPTIONS, SENSOR
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax import progress
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.config import CloudReading
@@ -141,25 +142,42 @@ def test_a_class_map_by_name_trains_on_the_same_frames_as_its_file(tmp_path, mon
         assert_one_line_error(capsys, f"train {line} {given}".split(), message + known)
 
 
-def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path):
+TRUNCATED = "clouds are truncated: the detector takes at most 4096 points (max_points)"
+COUNTED = "points left out: the detector takes at most 4096 per cloud (max_points)"
+
+
+def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):
     """By detect, evaluate and Python, for a cloud with more points than the detector accepts."""
     root, data = own_data(tmp_path, train=2, val=1)
     rng = np.random.default_rng(0)
     dense = np.load(root / "clouds" / "000.npy")
     dense = np.concatenate([dense, dense[rng.integers(0, len(dense), 4000)] + rng.normal(0, 0.05, (4000, 4))])
     np.save(root / "clouds" / "000.npy", dense.astype(np.float32))
+    np.save(root / "clouds" / "002.npy", dense.astype(np.float32))
+
+    def told():
+        progress._told.clear()
+        return capsys.readouterr().err.splitlines()
+
+    told()
     command("detect", root / "clouds", "--checkpoint quickstart --out", tmp_path / "boxes.json")
     by_command = json.loads((tmp_path / "boxes.json").read_text())["files"]
-    assert by_command[0]["num_truncated"] > 0
+    assert by_command[0]["num_truncated"] == by_command[2]["num_truncated"] > 0
+    once, twice = (f"{number * by_command[0]['num_truncated']} {COUNTED}" for number in (1, 2))
+    first, result, *_, last = (line for line in told() if "files " in line or line in (TRUNCATED, once, twice))
+    assert (first, result[:9], last) == (TRUNCATED, "files 1/3", twice)
     command("evaluate", data, "--split train --checkpoint quickstart --no-report --out", tmp_path / "scores")
+    assert [line for line in told() if "at most 4096" in line] == [TRUNCATED, once]
+    command("stream", root / "clouds", "--checkpoint quickstart --out", tmp_path / "boxes.jsonl")
+    assert [line for line in told() if "at most 4096" in line] == [TRUNCATED, twice]
     evaluated = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
     detector = fcos.load_detector("quickstart")
     for i, frame in enumerate(evaluated):
         assert frame["boxes"] == by_command[i]["boxes"]
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             detections = detector(np.load(root / "clouds" / f"{frame['name']}.npy"))
-        found = " and ".join(str(warning.message) for warning in told)
+        found = " and ".join(str(warning.message) for warning in caught)
         assert re.fullmatch(".* points per cell.* points left out.*" if frame["name"] == "000" else "", found)
         assert len(detections) > 0
         assert detections.to_dict()["boxes"] == frame["boxes"]
@@ -181,7 +199,7 @@ def test_a_cloud_of_another_sensor_causes_one_warning(tmp_path, capsys):
 def messages(tmp_path, capsys, monkeypatch):
     """``messages(command)`` runs a command on own data up to the training or detection; returns its messages."""
     root, data = own_data(tmp_path, train=2, val=1)
-    for name in ("train.train", "evaluate.write_detections"):
+    for name in ("train.train", "evaluate.run_detector"):
         monkeypatch.setattr(f"fcos_lidar_jax.cli.{name}", Mock(side_effect=KeyboardInterrupt))
 
     def run(line: str, splits: dict[str, list[str]] | None) -> str:

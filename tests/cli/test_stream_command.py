@@ -90,7 +90,7 @@ def without_file(lines):
     return [{name: value for name, value in line.items() if name != "file"} for line in lines]
 
 
-def test_the_boxes_are_those_of_detect_with_the_same_sweeps(home, tmp_path, capsys):
+def test_boxes_equal_detect_with_the_same_sweeps(home, tmp_path, capsys):
     lines = stream(home, tmp_path / "boxes.jsonl", home / "drive", "--poses", home / "poses.json")
     listed = json.loads((home / "poses.json").read_text())
     assert len(lines) == SWEEPS
@@ -143,7 +143,7 @@ def test_keyframes_option_skips_the_boxes_of_other_sweeps(home, tmp_path, capsys
     for more, told in (("", 1), ("--yaw-deg 0", 0)):
         capsys.readouterr()
         command("stream", data, more, "--keyframes --out", tmp_path / "ahead.jsonl")
-        assert capsys.readouterr().err.count("clouds turned by -90 degrees") == told
+        assert capsys.readouterr().err.count("clouds rotated by -90 degrees") == told
 
 
 def test_without_poses_every_sweep_is_detected_on_its_own(home, tmp_path, capsys):

@@ -19,6 +19,9 @@ from tiny_run import CONFIG, NETWORK_OPTIONS, SENSOR, STEPS, untrained, weights
 from fcos_lidar_jax import cli
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
+from fcos_lidar_jax.cli import data
+from fcos_lidar_jax.data.frame import SelectedFrames
+from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
@@ -118,8 +121,11 @@ def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
     resumed_code, resumed_errors, end = stop(resumed, signal.SIGTERM, out, stopped_at)
     assert (code, resumed_code) == (130, 143), errors + resumed_errors
     assert f"{out}: no run to resume, starting one\n" in errors
-    assert "which is saved\nthe same command continues\n" in errors
-    assert "which is saved\nthe same command with --resume continues\n" in resumed_errors
+    stopping = "\nstopping after this step or evaluation, which is saved"
+    assert f"{stopping}; press Ctrl-C again to stop now, without saving\n" in errors
+    assert f"{stopping}\n" in resumed_errors
+    assert f"stopped after step {stopped_at}, which is saved\nthe same command continues\n" in errors
+    assert f"after step {end}, which is saved\nthe same command with --resume continues\n" in resumed_errors
     assert "Traceback" not in errors + resumed_errors
     assert 0 < stopped_at < end < MANY
     assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, end)]
@@ -186,7 +192,7 @@ BAD = mistakes(r"""
 --val-split none --val-samples 0:1 => --val-samples: got '0:1' with --val-split none, which turns evaluation off
 --copy-paste.min-points 3 => copy_paste.min_points: got 3, expected at least the database's 5
 --sensor sonar => sonar: no such sensor
---num-sweeps 2 => cut from other frames than split 'train'
+--num-sweeps 2 => num_sweeps: got 2, expected at most the 1 of .*/train: run fcos-lidar prepare --num-sweeps 2$
 --train-split val => objects/val: no objects here, .* prepare --train-split val
 """)
 
@@ -206,11 +212,60 @@ def test_rejects_options_that_simulate_all_frames_before_the_first_step(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+def test_objects_of_more_sweeps_are_taken_and_their_frames_opened_once(root, tmp_path, monkeypatch, capsys):
+    where = ["--data-root", root, "--version", VERSION, "--index", tmp_path / "index"]
+    command("prepare --num-sweeps 3", *where)
+    opened, given = [], []
+    open_frames = data.open_frames
+    monkeypatch.setattr(data, "open_frames", lambda *args, **kw: opened.append(kw) or open_frames(*args, **kw))
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", lambda *_, objects, **__: given.append(objects) or 1 / 0)
+    args = train(root, tmp_path / "out", "--index", str(tmp_path / "index"), "--val-split", "none")
+    cli.main(args)
+    assert [kw["reading"].num_sweeps for kw in opened] == [1, 3]
+    assert given[0].manifest.num_sweeps == 3
+    capsys.readouterr()
+    assert_one_line_error(capsys, [*args, "--class-map", "kitti"], "cut from other frames than split 'train', or")
+
+
 def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):
     """Even before objects of --samples are cut, which happens in the run's folder."""
     with in_use(tmp_path / "run"):
         assert_one_line_error(capsys, train(root, tmp_path / "run", "--samples", "0:1"), "run: in use: process ")
         assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"]
+
+
+def test_ctrl_c_while_objects_are_cut_leaves_the_folder_to_the_same_command(root, tmp_path, capsys, monkeypatch):
+    prepare_database, out = database.prepare_database, tmp_path / "run"
+
+    def interrupted(frames, folder, **options):
+        prepare_database(frames, folder, **options)
+        with pytest.raises(BlockingIOError, match=r"run: in use: process .* is training"), in_use(out):
+            pass
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(database, "prepare_database", interrupted)
+    args = train(root, out, "--samples", "0:1", "--val-split", "none")
+    assert cli.main(args) == 130
+    assert {path.name for path in out.iterdir()} == {".lock", "objects"}
+    monkeypatch.setattr(database, "prepare_database", prepare_database)
+    monkeypatch.setattr("fcos_lidar_jax.cli.train.train", lambda *_, objects, **__: print(len(objects)) or 1 / 0)
+    capsys.readouterr()
+    assert cli.main(args) == 1
+    assert int(capsys.readouterr().out) > 0
+
+
+def test_objects_that_another_command_cuts_meanwhile_are_refused(root, tmp_path, capsys, monkeypatch):
+    """The folder is locked while objects are cut and again while it is trained, but not in between."""
+    prepare_database = database.prepare_database
+
+    def cut_twice(frames, folder, **options):
+        prepare_database(frames, folder, **options)
+        prepare_database(SelectedFrames(frames, (1,)), folder, **options)
+
+    monkeypatch.setattr(database, "prepare_database", cut_twice)
+    args = train(root, tmp_path / "run", "--samples", "0:2", "--val-split", "none")
+    assert_one_line_error(capsys, args, r"manifest\.json: source: got '.*', expected '.*': built from other data")
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {".lock", "objects"}
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def test_a_scene_consists_of_all_its_sweeps_or_its_keyframes(tmp_path):
         data.drive("scene-7")
 
 
-def test_keyframe_times_are_those_of_the_keyframes(tmp_path):
+def test_keyframe_times_match_the_keyframes(tmp_path):
     data = NuScenes(write(tmp_path, *make_tables()), VERSION)
     tokens = data.keyframe_tokens("scene-1")
     assert set(tokens) == {k.time_us for k in data.drive("scene-1", keyframes=True)}

@@ -149,7 +149,7 @@ def test_points_inside_the_camera_box_are_inside_the_lidar_box(tmp_path, calibra
         assert not inside_box(drawn(onto_faces * (half + reach)), box).any()
 
 
-def test_types_are_classes_and_can_be_mapped_to_those_of_nuscenes(root):
+def test_types_are_classes_and_map_to_nuscenes(root):
     kinds = [*CLASSES, "DontCare"]
     write(root / L, "".join(label_text(CAR, kind).replace("\n", " 0.9\n") for kind in kinds))
     boxes, labels = read_labels(root / L)

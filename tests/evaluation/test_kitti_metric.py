@@ -125,7 +125,16 @@ def test_few_objects_stay_below_100_as_in_the_development_kit(tmp_path):
     summary = evaluate_texts(tmp_path, few, classes=["Car"])
     assert summary["classes"]["Car"]["bev"] == all_of(50)
     assert "few objects of Car" in describe_kitti(summary)
-    assert "Car 0.7 bev" in describe_kitti(summary)
+
+
+def test_the_table_counts_the_objects_of_each_difficulty(tmp_path):
+    cars = [line("Car", 0.0), *(line("Car", 6.0 * i, high=30) for i in range(1, 4)), line("Van", 30.0)]
+    summary = evaluate_texts(tmp_path, [("".join(cars), "")], classes=["Car", "Cyclist"])
+    head, bev, *_, cyclist = describe_kitti(summary).splitlines()[:5]
+    assert head.endswith("     hard objects: easy / moderate / hard")
+    assert " ".join(bev.split()) == "Car 0.7 bev 0.00 0.00 0.00 1 / 4 / 4"
+    assert " ".join(cyclist.split()) == "Cyclist 0.5 3d - - - 0 / 0 / 0"
+    assert len(head) == len(bev) == len(cyclist)
 
 
 @pytest.mark.parametrize(

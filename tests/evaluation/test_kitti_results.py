@@ -63,7 +63,7 @@ def test_the_camera_frame_is_the_way_back_of_to_lidar(calibration):
     np.testing.assert_allclose(back, labels, atol=1e-9)
 
 
-def test_fields_are_those_of_the_benchmark(tmp_path, calibration):
+def test_fields_match_the_benchmark(tmp_path, calibration):
     """Truncation and occlusion are -1, and alpha is the heading as the camera sees it."""
     write_result(tmp_path / "a.txt", random_boxes(40), ["Car"] * 40, np.full(40, 0.5), calibration)
     rows = [line.split() for line in (tmp_path / "a.txt").read_text().splitlines()]
@@ -193,8 +193,8 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     assert metrics["classes"]["Car"]["3d"] == {"easy": 100.0, "moderate": 100.0, "hard": 100.0}
     assert list(metrics["classes"]) == ["Car", "Pedestrian", "Cyclist"]
     ((_, header, rows),) = evaluation_report._kitti_table(tmp_path / "out" / "metrics_kitti.json")
-    assert header == ("class", "easy", "moderate", "hard")
-    assert rows[1] == ("Car, 3d", 100.0, 100.0, 100.0)
+    assert header == ("class", "easy", "moderate", "hard", "objects: easy / moderate / hard")
+    assert rows[1] == ("Car, 3d", 100.0, 100.0, 100.0, "54 / 54 / 54")
     assert evaluation_report._kitti_table(tmp_path / "none.json") == []
     printed = capsys.readouterr().out
     assert "KITTI AP_R40 on 6 frames" in printed

@@ -40,7 +40,7 @@ def test_a_committed_table_is_that_of_its_cells(tmp_path, file):
     assert as_markdown(table, again) == file.read_text()
 
 
-def test_cells_are_told_apart_by_what_decides_them():
+def test_cells_are_identified_by_their_changes():
     changes = {"model__tied_heads": True, "projection__prioritize_current": False, "copy_paste": None}
     changes |= {"class_ranges_m": (30.0,) * 10, "classes": tuple("abcdefghij")}
     changes |= {"copy_paste__min_points": 6, "augment__scale_range": (0.9, 1.1)}

@@ -43,7 +43,7 @@ def train_table(tmp_path, monkeypatch):
     return run
 
 
-def test_a_row_is_told_when_its_training_begins_and_not_when_it_is_known(train_table, capsys):
+def test_a_row_is_announced_when_its_training_begins_and_not_when_it_is_known(train_table, capsys):
     rows = (Row("one", change(projection__num_rounds=1)), Row("three", change(projection__num_rounds=3)))
     table = Table("own", "Own", rows, reference="one")
     train_table(table, rows=("one",))

@@ -64,7 +64,7 @@ def test_all_programs_hold_every_preset_and_the_check():
 
 
 @pytest.mark.parametrize("name", ["train-compact", "train-nuscenes-8-devices", "detect-nuscenes", "train-kitti"])
-def test_programs_are_those_of_the_package(name):
+def test_programs_match_the_package(name):
     """Shapes of the arguments, which of them are split over the devices, and what is given away."""
     program = PROGRAMS[name]
     function, given, split, donated = gpu_programs._function(program)
@@ -79,7 +79,7 @@ def test_programs_are_those_of_the_package(name):
         assert (split, donated) == ((False,) * 3, ())
 
 
-def test_a_program_that_kills_the_compiler_is_told_in_its_line(tmp_path, monkeypatch, capsys):
+def test_a_program_that_kills_the_compiler_is_reported_in_its_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "nvidia/cuda_nvcc").mkdir(parents=True)
     good = {**dataclasses.asdict(PROGRAMS["detect-compact"]), "seconds": 3, "gflop_per_frame": 2.0, "slow": 0}
     good |= {"temporary_mib": 5, "kernels": 7, "loops": [[5, 2], [None, 4]]}

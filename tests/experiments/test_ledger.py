@@ -18,7 +18,7 @@ def test_the_document_holds_the_ledger_of_the_files():
 
 
 @pytest.mark.parametrize("score", ["mAP", "NDS"])
-def test_gains_are_differences_of_cells_that_differ_in_the_rounds_alone(score):
+def test_gains_are_differences_of_cells_that_differ_only_in_the_rounds(score):
     """Five rounds instead of one, by a loop over the rows of the file."""
     folder, found = RESULTS / "tables/sector", {}
     names = {"num_sweeps=1, projection.num_rounds=1": (1, 1), "num_sweeps=1": (1, 5)}

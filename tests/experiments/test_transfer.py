@@ -68,7 +68,7 @@ def average_precision(pairs, num_truths):
     return float(np.mean(np.maximum(curve - 0.1, 0)) / 0.9)
 
 
-def test_scores_of_a_span_are_those_of_its_boxes_alone():
+def test_scores_of_a_span_use_only_its_boxes():
     found, frames = random_frames(1)
     near, far = SPANS_M[1]
     record = scores_by_range(found, frames, repeats=20)[f"{near}-{far} m"]
@@ -189,7 +189,7 @@ def test_weights_beyond_float16_are_not_exported(tmp_path):
         save_checkpoint(tmp_path / "c", half_precision(Checkpoint(CONFIG, TINY, large, 1)))
 
 
-def test_a_card_has_the_figures_of_its_own_weights_alone(shipped, tmp_path):
+def test_a_card_has_only_the_figures_of_its_weights(shipped, tmp_path):
     package, record = shipped
     card = package / "hdl32e" / "README.md"
     assert "Not measured yet" in card.read_text()

@@ -1,4 +1,4 @@
-"""Clouds of other axes: turned and shifted for the detector, and boxes brought back."""
+"""Clouds of other axes: rotated and shifted for the detector, and boxes transformed back."""
 
 import dataclasses
 
@@ -35,7 +35,7 @@ def test_boxes_are_brought_back_by_the_inverse_of_rotation_matrices():
 
 def test_one_line_says_what_is_done():
     line = Alignment(KITTI_HDL64E, NUSCENES_HDL32E).describe()
-    assert line == "clouds turned by 90 degrees, and boxes brought back: the detector expects y ahead"
+    assert line == "clouds rotated by 90 degrees, and boxes transformed back: the detector expects y ahead"
     assert Alignment(VLP16, NUSCENES_HDL32E).describe() == "" == Alignment(TINY, NUSCENES_HDL32E).describe()
 
 
@@ -48,7 +48,7 @@ def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(capsys):
         list(predict(detector, InMemoryFrames((dataclasses.replace(frame, points=p),), sensor, ("car",))))
         for p, sensor in ((frame.points, detector.sensor), (points, ahead))
     )
-    assert capsys.readouterr().err.count("clouds turned by 90 degrees") == 1
+    assert capsys.readouterr().err.count("clouds rotated by 90 degrees") == 1
     valid = np.asarray(expected.detections.valid)
     assert valid.any()
     np.testing.assert_array_equal(found.detections.scores, expected.detections.scores)

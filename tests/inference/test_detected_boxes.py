@@ -111,7 +111,7 @@ def test_a_detector_takes_arrays_of_jax_and_lists_and_prints_in_one_line():
         detector([[1, 2, 3], [4, 5]])
 
 
-def test_truncated_points_are_told():
+def test_truncated_points_are_reported():
     detector = load_detector("quickstart")
     points = unseen_frames(detector.sensor, 1).frame(0).points
     with pytest.warns(UserWarning, match="point") as told:

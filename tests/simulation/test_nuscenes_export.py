@@ -308,6 +308,8 @@ def test_another_specification_in_the_same_folder_is_rejected(made, tmp_path, ca
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
     line = refusal(capsys, made, "--sensor", str(tmp_path / "near.json"))
     assert f"sensor.limit_xy_m: got 9.0, expected {TINY.limit_xy_m} as in the data set begun there" in line
+    (tmp_path / "turned.json").write_text(json.dumps({**sensor_to_json(TINY), "forward_rad": 0.0}))
+    synthesize(made, "--sensor", str(tmp_path / "turned.json"))  # the heading changes no file
     assert contents(made) == before
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from fcos_lidar_jax.data.cached import CachedFrames
+from experiments.cached import CachedFrames
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, city_frames
 from fcos_lidar_jax.simulation.frames import make_frame

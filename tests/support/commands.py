@@ -1,13 +1,11 @@
 """Run commands of ``fcos-lidar`` in this process and in others."""
 
-import contextlib
 import json
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -50,16 +48,9 @@ def assert_one_line_error(capsys, args: list[str], message: str) -> None:
     assert re.search(message, errors[0]), errors[0]
 
 
-@contextlib.contextmanager
-def in_use(folder: Path) -> Iterator[None]:
-    """Lock a folder from another thread, which looks like another process to commands."""
-    with ThreadPoolExecutor(1) as other:
-        lock = folder_lock(folder, "at work")
-        other.submit(lock.__enter__).result()
-        try:
-            yield
-        finally:
-            other.submit(lock.__exit__, None, None, None).result()
+def in_use(folder: Path) -> AbstractContextManager[None]:
+    """Lock a folder, which commands of this process find like those of another one."""
+    return folder_lock(folder, "at work")
 
 
 def run_python(*words: object, **variables: str) -> subprocess.CompletedProcess[str]:

@@ -98,6 +98,24 @@ def test_class_and_score_stand_beside_boxes_without_overlaps(drawn):
     assert beside.max() < 80  # pixels
 
 
+def test_the_view_fits_points_to_one_side_and_their_boxes_but_no_full_turn(drawn):
+    """Ahead: a square picture of the camera's view would be three quarters empty."""
+    ahead = np.array([[4, -1, 0], [20, -6, 0], [30, 30, 0], [90, 0, 0], [9, np.nan, 0]])
+    options = {"limit_m": 50, "classes": NUSCENES_CLASSES, "truth": (boxes_at((38, 3), (60, 0)), np.zeros(2, int))}
+    around = np.concatenate([ahead, [[-9, -3, 0]]])
+    for points in (ahead, ahead[:, [1, 0, 2]], around, np.zeros((0, 3))):
+        bev.draw_bev(points, "x.png", **options)
+    fitted, upright, *whole = (figure.axes[0] for figure in drawn)
+    # The origin and the points with a margin of 2 m, and the box from 36 to 40 m.
+    np.testing.assert_allclose([*fitted.get_xlim(), *fitted.get_ylim()], [-2, 42, -8, 32])
+    np.testing.assert_allclose([*upright.get_xlim(), *upright.get_ylim()], [-8, 42, -2, 32])
+    assert all((*axis.get_xlim(), *axis.get_ylim()) == (-50, 50) * 2 for axis in whole)
+    assert {axis.get_aspect() for axis in (fitted, upright, *whole)} == {1.0}
+    width, height = np.transpose([figure.get_size_inches() for figure in drawn])
+    assert (width == 9).all()
+    assert height[1] < height[0] < height[2] == height[3] == 9.5
+
+
 @pytest.mark.parametrize(
     "name", ["a word after another " * 12, "n015__LIDAR_TOP__" * 12, "W$^{MW}_$" * 25, "ÄÖ\udcff" * 60, ""]
 )

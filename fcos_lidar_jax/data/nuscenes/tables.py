@@ -170,7 +170,7 @@ def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, first_row: 
 
 
 def _record_at(piece: bytes, place: int) -> str:
-    """The record and field of a byte, as far as the text before it tells."""
+    """The record and field of a byte, if the preceding text identifies them."""
     row = piece[piece.rfind(b"{", 0, place) + 1 : place]
     tokens = re.findall(rb'"token"\s*:\s*"([^"]*)"', row)
     fields = re.findall(rb'"(\w+)"\s*:', row)

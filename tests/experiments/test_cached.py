@@ -1,4 +1,4 @@
-"""The cache of frames: made once, bit-identical, made anew if damaged, refused for other frame sets."""
+"""The cache of frames: made once, bit-identical, recreated if damaged, refused for other frame sets."""
 
 import dataclasses
 import json
@@ -13,9 +13,9 @@ import pytest
 from refusal import refused
 from toy_frames import ToyFrames, toy_frame
 
+from experiments.cached import CachedFrames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.cached import CachedFrames
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import SHORT_RANGE, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -70,7 +70,7 @@ def test_only_requested_frames_are_made_and_only_once(tmp_path, toy):
     assert Path(toy.log).read_text().split() == ["7", "2"]
 
 
-def test_truncated_and_altered_files_are_made_anew(tmp_path, toy, capsys):
+def test_truncated_and_altered_files_are_recreated(tmp_path, toy, capsys):
     cached, right = CachedFrames(toy, tmp_path / "cache"), toy.frame(5)
     cached.frame(5)
     file = cached.folder / "000005.npz"
@@ -84,7 +84,7 @@ def test_truncated_and_altered_files_are_made_anew(tmp_path, toy, capsys):
         file.write_bytes(content)
         assert_same(cached.frame(5), right)
         if warning := capsys.readouterr().err:  # some bytes do not matter, such as dates
-            assert re.fullmatch(rf"warning: {re.escape(str(file))}: damaged \(.*\): made anew\n", warning)
+            assert re.fullmatch(rf"warning: {re.escape(str(file))}: damaged \(.*\): recreating it\n", warning)
             assert_same(cached.frame(5), right)
             assert capsys.readouterr().err == ""
             warned += 1

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from fcos_lidar_jax import __version__
 from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames, no_points, without_points
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.files import atomic_write, read_json
+from fcos_lidar_jax.progress import tell
 
 _DESCRIPTION = "frames.json"
 _TRUTH = ("boxes", "labels", "num_points")
@@ -86,7 +86,7 @@ class CachedFrames(WrappedFrames):
             return None
         except Exception as error:  # damaged archives raise arbitrary exceptions
             reason = str(error).partition("\n")[0] or type(error).__name__
-            print(f"warning: {file}: damaged ({reason}): made anew", file=sys.stderr, flush=True)
+            tell(f"warning: {file}: damaged ({reason}): recreating it")
             return None
 
 
