@@ -101,8 +101,9 @@ def test_commands_name_the_sensor_and_the_presets_that_fit_the_data(kitti, tmp_p
         assert line.endswith(advice)
     with pytest.warns(UserWarning, match=re.escape(advice)):
         fcos.load_detector("hdl32e")(cloud)
-    assert not advised(train, tmp_path / "fitting", "--sensor kitti_hdl64e", code=1)
-    assert not advised("project", cloud, "--sensor kitti_hdl64e --out", tmp_path / "image.npz")
+    fitting = advised(train, tmp_path / "fitting", "--sensor kitti_hdl64e", code=1)
+    fitting += advised("project", cloud, "--sensor kitti_hdl64e --out", tmp_path / "image.npz")
+    assert not any("expected --sensor" in line for line in fitting)  # others are about the 512 columns
 
 
 def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
