@@ -69,14 +69,8 @@ def find_owners(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return owner
 
 
-def count(index: np.ndarray, points: np.ndarray, owner: np.ndarray, moving: np.ndarray) -> Counts:
-    """Compare the later rounds with the first.
-
-    Args:
-        index: i32[s, r], point of each cell and round, -1 if empty.
-        points: f32[n, 5].
-        owner: i64[n], number of the object of each point, -1 for the background.
-        moving: bool[m], which objects move.
+def contents(points: np.ndarray, boxes: np.ndarray) -> Counts:
+    """Project a cloud f32[n, 5] and compare the later rounds with the first; boxes f32[m, 9] are current.
 
     Returns:
         by group of the first-round point: ``cells``, and of these ``history``, in which a later point is of the
@@ -84,11 +78,14 @@ def count(index: np.ndarray, points: np.ndarray, owner: np.ndarray, moving: np.n
         ``objects``, the moving ones with a cell, with a cell with history, and with points of the current and an
         older sweep in the first round.
     """
+    image = project_points(points, np.ones(len(points), bool), SENSOR, num_rounds=ROUNDS)
+    index = np.asarray(image.point_index).reshape(-1, ROUNDS)
     index = index[index[:, 0] >= 0]
     first, later, there = index[:, 0], index[:, 1:], index[:, 1:] >= 0
     distance_m = np.linalg.norm(points[later, :3] - points[first, None, :3], axis=2)
     kind = np.digitize(distance_m, _EDGES_M)[..., None] == np.arange(len(KINDS))
     age_s, first_age_s = points[later, 4], points[first, 4]
+    owner, moving = find_owners(points, boxes), np.hypot(boxes[:, 7], boxes[:, 8]) > _MOVING_MPS
     older = there & (age_s > first_age_s[:, None])
     history = (owner[first] >= 0) & (older & (owner[later] == owner[first, None])).any(axis=1)
     values = {"cells": np.ones(len(first), int), "history": history}
@@ -100,13 +97,6 @@ def count(index: np.ndarray, points: np.ndarray, owner: np.ndarray, moving: np.n
         for cells in (first_age_s == 0, first_age_s > 0, history)
     )
     return sums | {"objects": np.array([(now | before).sum(), remembered.sum(), (now & before).sum()])}
-
-
-def contents(points: np.ndarray, boxes: np.ndarray) -> Counts:
-    """Project a cloud f32[n, 5] and :func:`count`; boxes f32[m, 9] are at the time of the current sweep."""
-    image = project_points(points, np.ones(len(points), bool), SENSOR, num_rounds=ROUNDS)
-    moving = np.hypot(boxes[:, 7], boxes[:, 8]) > _MOVING_MPS
-    return count(np.asarray(image.point_index).reshape(-1, ROUNDS), points, find_owners(points, boxes), moving)
 
 
 def summarize(frames: Sequence[Counts], groups: Sequence[str] = GROUPS) -> dict[str, Any]:
