@@ -12,8 +12,8 @@ row of a table of the paper, and its verdict follows from the 95 % interval of t
 """
 
 import dataclasses
-import math
 import re
+import statistics
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,11 @@ from experiments.paper_tables.cells import changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
 from experiments.paper_tables.tables import Row, Table
 from experiments.script import run_script, write_text
-from experiments.statistics import interval
+from experiments.statistics import MIN_SEEDS, interval, seeds_needed
 from fcos_lidar_jax.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
-_MIN_SEEDS = 3  # Seeds needed for a verdict.
-_MAX_SEEDS = 100  # Largest number of seeds that is worth naming.
 _DIRECTION = "agrees only in direction"
 _OUR_NDS = (
     " Simulated objects have no attributes: their error is 1 in every row, so NDS is at most 90 here, and the\n"
@@ -145,28 +143,14 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     ('undecided', 'more seeds')
     """
     bounds = interval(gains)
-    if bounds is None or len(gains) < _MIN_SEEDS:
+    if bounds is None or len(gains) < MIN_SEEDS:
         return "undecided", "more seeds"
     _, low, high = bounds
     if low <= 0 <= high and low <= paper <= high:
-        needed = _seeds_needed(gains, abs(paper))
-        number = str(needed) if needed <= _MAX_SEEDS else f"over {_MAX_SEEDS}"
-        return "undecided", f"{number} seeds, or a longer training"
+        return "undecided", f"{seeds_needed(gains, paper)} seeds, or a longer training"
     if (low > 0 and paper > 0) or (high < 0 and paper < 0):
         return "agrees" if low <= paper <= high else _DIRECTION, ""
     return "disagrees", "a training as long as the paper's"
-
-
-def _seeds_needed(gains: list[float], gain: float) -> int:
-    """Number of seeds with which the interval's half-width falls below a gain, at the deviation of these gains."""
-    import numpy as np
-    from scipy.stats import t
-
-    deviation = float(np.std(gains, ddof=1))
-    number = len(gains)
-    while t.ppf(0.975, number - 1) * deviation / math.sqrt(number) >= gain and number <= _MAX_SEEDS:
-        number += 1
-    return number
 
 
 def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str = "mAP") -> tuple[list[float], int]:
@@ -214,16 +198,21 @@ def training_lines(results: Path, score: str) -> tuple[list[str], list[str]]:
         mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
         ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
         source = f"{scale.name}, {len(gains)} seed{'s' if len(gains) > 1 else ''}, {samples:,} samples"
-        lines.append(f"| {claim} | {paper:+.2f} | {ours} | {source} | {said} | {decides} |")
+        deviation = f"{statistics.stdev(gains):.2f}" if len(gains) > 1 else "-"
+        power = f"{deviation} | {seeds_needed(gains)}"
+        lines.append(f"| {claim} | {paper:+.2f} | {ours} | {power} | {source} | {said} | {decides} |")
     return lines, missing
+
+
+def _head(*columns: str) -> str:
+    names = ("claim", "paper", *columns, "verdict", "what would settle or reverse it")
+    return f"| {' | '.join(names)} |\n{'|---' * len(names)}|\n"
 
 
 def as_markdown(results: Path) -> str:
     """Format the whole ledger."""
-    head = (
-        "| claim | paper | here | from | verdict | what would settle or reverse it |\n|---|---|---|---|---|---|\n"
-    )
-    parts = [f"Without training:\n\n{head}" + "\n".join(figure_lines(results))]
+    parts = ["Without training:\n\n" + _head("here", "from") + "\n".join(figure_lines(results))]
+    head = _head("here", "deviation", "seeds", "from")
     lines, missing = training_lines(results, "mAP")
     for score, rows, note in (("mAP", lines, ""), ("NDS", training_lines(results, "NDS")[0], _OUR_NDS)):
         parts.append(f"Gains in points of {score}.{note}\n\n{head}" + "\n".join(rows))

@@ -1,7 +1,7 @@
 """Tables: rows, training of their cells, record, Markdown and pictures."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from experiments.paper_tables.cells import Cell
 from experiments.paper_tables.grid import run_cells
 from experiments.paper_tables.scales import NuScenesLayout, Scale, Simulated, quarter, smoke
 from experiments.script import compact_json, write_text
-from experiments.statistics import interval
+from experiments.statistics import MIN_SEEDS, interval, seeds_needed
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import file_lock
@@ -205,7 +205,11 @@ def _row_record(table: Table, row: Row, cells: dict[str, list[Cell]]) -> dict[st
         for s in SCORES:
             record[s] = _summary([100 * cell[s] for cell in scores if cell])
             pairs = [(cell, other) for cell, other in zip(scores, base, strict=True) if cell and other]
-            record[f"{s}_difference"] = _summary([100 * (cell[s] - other[s]) for cell, other in pairs])
+            gains = [100 * (cell[s] - other[s]) for cell, other in pairs]
+            record[f"{s}_difference"] = _summary(gains)
+            if row is not reference and len(gains) >= MIN_SEEDS:
+                power = {"deviation": float(np.std(gains, ddof=1)), "seeds": seeds_needed(gains)}
+                record[f"{s}_difference"] |= power
     return record
 
 
@@ -236,7 +240,7 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
         cells += [_number(columns.get(row["label"], {}).get(name)) for name in extra]
         lines.append("| " + " | ".join(cells) + " |")
     drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
-    lines += ["", f"Differences are to {_references(record)}{drawn}.", *_warnings(record), ""]
+    lines += ["", f"Differences are to {_references(record)}{drawn}.", *_power(record), *_warnings(record), ""]
     lines += [f"{row['label']}: {line}" for row in record["rows"] for line in row.get("diverged", ())]
     lines += by_distance(record["rows"])
     if trained:
@@ -265,6 +269,16 @@ def by_distance(rows: list[dict[str, Any]]) -> list[str]:
     rule = "|---" * len(header) + "|"
     said = f"Minutes of the training's steps, on machines that may have done other things: {', '.join(seconds)}."
     return [title, "", "| " + " | ".join(header) + " |", rule, *table, "", said, ""]
+
+
+def _power(record: dict[str, Any]) -> Iterator[str]:
+    """Seeds that each difference would need, for the reader of a table with intervals."""
+    for s in SCORES:
+        differences = {row["label"]: row.get(f"{s}_difference") or {} for row in record["rows"]}
+        shown = [f"{n}: {d['seeds']} ({d['deviation']:.2f})" for n, d in differences.items() if "seeds" in d]
+        if shown:
+            assumed = "if the mean and the deviation (in brackets) of the differences stay"
+            yield f"Seeds with which the interval of {s} would exclude zero, {assumed}: {'; '.join(shown)}."
 
 
 def _warnings(record: dict[str, Any]) -> list[str]:

@@ -98,6 +98,28 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_
     assert (tmp_path / "smoke" / "table1.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_table_names_the_seeds_that_each_difference_needs():
+    """Gains of 1, 2 and 3 points: t(0.975, 2) / sqrt(3) = 2.48, t(0.975, 3) / sqrt(4) = 1.59."""
+    rows = (Row("one", change(projection__num_rounds=1)), Row("three", change(projection__num_rounds=3)))
+    table, gains = Table("own", "Own", rows, reference="one"), {"mAP": (1, 2, 3), "NDS": (-1, 0, 1)}
+
+    def cell(seed, share):
+        scores = {name: 0.1 + share * own[seed] / 100 for name, own in gains.items()}
+        return {"seed": seed, "scores": scores, "git": "1234567", "device": "cpu"}
+
+    def text(seeds):
+        cells = {row.label: [cell(seed, share) for seed in range(seeds)] for share, row in enumerate(rows)}
+        scale = Pretended()
+        return tables.as_markdown(table, tables.make_record(table, "sector", scale, cells, {}))
+
+    assert "mAP would exclude zero, if the mean and the deviation (in brackets) of the differences stay: " in text(
+        3
+    )
+    assert ": three: 4 (1.00).\n" in text(3)
+    assert ": three: over 100 (1.00).\n" in text(3)
+    assert "would exclude zero" not in text(2)
+
+
 def test_chosen_rows_come_with_their_references():
     chosen = TABLES["table1"].only(("single, 5 rounds",))
     assert [row.label for row in chosen.rows] == ["single, 1 round", "single, 5 rounds", "multi, 1 round"]

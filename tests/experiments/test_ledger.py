@@ -1,11 +1,12 @@
 """The ledger says what the result files say."""
 
 import csv
+import math
 from pathlib import Path
 
 import pytest
 
-from experiments.ledger import README, RESULTS, as_markdown, claims, gains_of, verdict, with_ledger
+from experiments.ledger import README, RESULTS, as_markdown, claims, gains_of, training_lines, verdict, with_ledger
 from experiments.paper_tables.paper_rows import PAPER_TABLES
 from experiments.paper_tables.scales import quarter
 
@@ -34,6 +35,20 @@ def test_gains_are_differences_of_cells_that_differ_only_in_the_rounds(score):
         assert seeds
         expected = [100 * (found[sweeps, 5, seed] - found[sweeps, 1, seed]) for seed in seeds]
         assert (gains, samples) == (pytest.approx(expected), 8000)
+
+
+def test_the_ledger_shows_the_deviation_of_the_gains_and_the_seeds_they_need():
+    """Priority of the current sweep, by a loop over the rows of the file: t(0.975, 3) / sqrt(4) = 1.591."""
+    scores = {}
+    with (RESULTS / "tables/sector/cells.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            scores[row["changes"], int(row["seed"])] = 100 * float(row["scores.mAP"])
+    gains = [scores["base", s] - scores["projection.prioritize_current=false", s] for s in (0, 1, 2)]
+    mean = sum(gains) / 3
+    deviation = math.sqrt(sum((gain - mean) ** 2 for gain in gains) / 2)
+    assert 1.591 * deviation < mean < 4.303 * deviation / math.sqrt(3)
+    (line,) = [line for line in training_lines(RESULTS, "mAP")[0] if line.startswith("| Table 2")]
+    assert f" | {deviation:.2f} | 4 | " in line
 
 
 def test_a_claim_is_in_the_ledger_with_its_gain_or_as_not_run():
