@@ -75,7 +75,7 @@ class Stream:
     index: Annotated[Path | None, option("DIR", default="DATA_ROOT/.fcos_lidar/VERSION")] = None
     """With --data-root: folder of the index, as given to `fcos-lidar prepare --index`."""
     keyframes: bool = False  # With --data-root: detect in keyframes only, still fusing the sweeps between them.
-    allow_missing_sweeps: bool = False  # With --data-root: skip sweeps whose file is missing.
+    allow_missing_sweeps: bool = False  # With --data-root: skip missing sweeps, but no keyframe.
     follow_links: bool = False  # With --data-root: follow links that lead out of DATA_ROOT.
     page: options.Page = None
     rrd: options.Rrd = None
