@@ -27,6 +27,7 @@ from fcos_lidar_jax.cli.result_files import check_result_files, check_results, r
 from fcos_lidar_jax.data.cloud_policy import expect_points, truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
+from fcos_lidar_jax.data.kitti import camera_calibration
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.sweeps import read_list
 from fcos_lidar_jax.evaluation.json_io import write_lines
@@ -95,7 +96,7 @@ def run(args: Detect) -> None:
             print(f"{file}: {line}", file=sys.stderr)
     aligned = alignment_of(args, detector.sensor, [*itertools.chain(*inputs.values())] or inputs)
     clouds = _clouds(args, inputs, detector, aligned.data)
-    states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file, parts in inputs.items()]
+    states = [files_fingerprint(_files_read(args, *item), Path("/"), str(item[0])) for item in inputs.items()]
     with _resume_log(args, detector, aligned) as log:
         _detect(args, detector, clouds, states, log)
         lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
@@ -114,6 +115,8 @@ def _check(args: Detect) -> dict[Path, tuple[Path, ...]]:
     """Check the options; returns the inputs, each with the point files that it lists."""
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected either point files or --sweeps")
+    if args.sweeps is not None and args.full_turn:
+        raise ValueError("--full-turn: expected none with --sweeps, which keeps all points")
     check_at_least(args, 1, "batch_size", "max_file_points")
     check_score(args)
     for file in args.files:
@@ -142,6 +145,12 @@ def _place(sweeps: Path) -> dict[str, Any]:
     """File, time and pose of the current sweep of a list."""
     current = read_list(sweeps)[0]
     return {**msgspec.to_builtins(current), "file": str(sweeps.parent / current.file)}
+
+
+def _files_read(args: Detect, file: Path, parts: Sequence[Path]) -> list[Path]:
+    """An input and the files beside it on which its points depend."""
+    calibration = None if args.full_turn else camera_calibration(file)
+    return [file, *parts, *([calibration] if calibration else [])]
 
 
 def _clouds(args: Detect, files: Iterable[Path], detector: CloudDetector, sensor: Sensor) -> CloudFiles:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, mistakes, page_content
+from made_kitti import make_kitti
 from PIL import Image
 from tiny_run import TINY_CONFIG, bits, untrained
 
@@ -154,6 +155,21 @@ def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more
         assert names == [f"000{i}_{name}.npy.png" for i, name in enumerate("abcd", 1)]
 
 
+def test_a_resumed_detect_repeats_clouds_with_another_calibration(home, tmp_path, capsys):
+    root = make_kitti(tmp_path / "kitti", train=3, val=1, sensor=TINY)
+    calibrations, folder, out = root / "training" / "calib", root / "training" / "velodyne", tmp_path / "x.json"
+    calibrations.rename(tmp_path / "calib")
+    missing = detect(home, *sorted(folder.iterdir()), folder / "none.bin", "--out", out)
+    assert_one_line_error(capsys, missing, "none.bin: no such file")
+    (tmp_path / "calib").rename(calibrations)
+    command(*detect(home, folder, "--out", out))
+    assert "detected before" not in capsys.readouterr().err
+    assert_one_line_error(capsys, [*missing, "--full-turn"], "none.bin: no such file")
+    shutil.rmtree(calibrations)
+    command(*detect(home, folder, "--out", out), "--full-turn")
+    assert "detected before" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["x.resume_log", "x", "x.json"])
 def test_detect_accepts_any_name_for_its_output(home, tmp_path, name):
     command(*detect(home, home / "good.npy", "--out", tmp_path / name))
@@ -260,6 +276,7 @@ detect => expected either point files or --sweeps
 detect HOME/empty.bin --columns 9 => columns: got 9
 detect HOME/good.npy --columns 5 => are for raw .bin files
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
+detect --sweeps HOME/s.json --full-turn => --full-turn: expected none with --sweeps
 detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
 detect HOME/good.npy --out OUT --page OUT/../.out.resume_log => --page: .*the same file as
 detect --sweeps HOME/s.json => s.json: no such file
