@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from fcos_lidar_jax.cli.checks import (
 )
 from fcos_lidar_jax.cli.options import alignment_of, option, radians
 from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import expect_points, truncation
+from fcos_lidar_jax.data.cloud_policy import no_usable_points, truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.kitti import camera_calibration
@@ -203,7 +204,7 @@ def _detect(
         for index, (state, picture) in enumerate(zip(states, pictures, strict=True))
         if state not in log or (picture is not None and not picture.exists())
     ]
-    progress, num_truncated = Progress("files", len(clouds)), 0
+    progress, num_truncated, unusable = Progress("files", len(clouds)), 0, dict[str, Any]()
     if done := len(states) - len(todo):
         progress.show(done, "detected before")
     found = predict(detector, clouds, indices=todo, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
@@ -212,17 +213,25 @@ def _detect(
         assert prediction.frame is not None
         assert cloud is not None
         file, points = clouds.files[index], prediction.frame.points
-        expect_points(file, cloud, int(detections.num_dropped), detector.sensor)
-        detections = select(detections, detector.classes, min_score=args.min_score, labels=args.labels)
+        line = no_usable_points(file, cloud, int(detections.num_dropped), detector.sensor)
+        min_score = args.min_score if line is None else math.inf
+        detections = select(detections, detector.classes, min_score=min_score, labels=args.labels)
         shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
         if (picture := pictures[index]) is not None:
             _draw(picture, points, detections, detector, shown_score)
         record = cloud_record(detections, cloud, detector.classes)
-        log.add(states[index], [{"file": str(file), **record}])
+        if line is None:
+            log.add(states[index], [{"file": str(file), **record}])
+        else:
+            unusable[line] = states[index], [{"file": str(file), **record}]
         num_truncated += cloud.num_truncated
         scores = [box["score"] for box in record["boxes"]]
         clear = sum(score >= shown_score for score in scores)
         progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
+    if line := unusable_clouds([*unusable], len(clouds)):
+        print(f"note: {line}", file=sys.stderr)
+    for state, entries in unusable.values():  # not before: if all are unusable, the next call must fail, too
+        log.add(state, entries)
     if line := truncation(num_truncated, detector.config):
         print(line, file=sys.stderr)
 

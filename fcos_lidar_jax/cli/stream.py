@@ -18,7 +18,7 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.result_files import FORMATS, check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
@@ -110,7 +110,8 @@ def run(args: Stream) -> None:
     drive = _open(args, kind, detector, aligned.data)
     _tell(drive.notes)
     frames: list[PageFrame] = []
-    tracks, before_us, num_truncated = Tracks(), None, 0
+    tracks, before_us, num_truncated, num_points = Tracks(), None, 0, 0
+    unusable = list[str | None]()
     shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
     with (
         rerun_recording(args.rrd, detector.classes, min_score=shown_score) as record_rerun,
@@ -123,8 +124,10 @@ def run(args: Stream) -> None:
         detect = functools.partial(detect_stream, detector=detector, **how)
         for found in timing.detect(_announcing(drive.sweeps), detect):
             points = found.cloud.points[found.cloud.valid]
-            if before_us is None and (line := sensor_mismatch(points, detector.sensor)):
+            if not num_points and (line := sensor_mismatch(points, detector.sensor)):
                 print(f"warning: {line}", file=sys.stderr)
+            num_points += len(points)
+            unusable.append(found.unusable)
             kept = select(found.detections, detector.classes, min_score=args.min_score, labels=args.labels)
             record = _record(dataclasses.replace(found, detections=kept), detector.classes, drive)
             boxes, labels, scores = confident(kept, 0.0)
@@ -143,6 +146,8 @@ def run(args: Stream) -> None:
             if args.page is not None:
                 frames.append(page_frame(points, (boxes, labels, scores), **details))
             before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
+        if line := unusable_clouds([*filter(None, unusable)], len(unusable)):
+            drive.notes.append(line)
     _tell(drive.notes)
     if line := truncation(num_truncated, detector.config):
         print(line, file=sys.stderr)

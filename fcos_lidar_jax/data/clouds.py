@@ -36,7 +36,7 @@ class CloudFiles(FrameSet):
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
-            points = read_points(file, self.sensor, **layout)
+            points = read_points(file, self.sensor, allow_empty=True, **layout)
             points = points if self.full_turn else in_camera(file, points)
             points, num_close = drop_close(points, self.sensor, self.reading)
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)

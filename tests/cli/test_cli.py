@@ -50,6 +50,7 @@ def home(tmp_path_factory):
     points[11, 1] = np.nan
     np.save(folder / "nan.npy", points)
     np.save(folder / "away.npy", points + np.array([500, 500, 0, 0, 0], np.float32))
+    np.save(folder / "no_rows.npy", points[:0])
     np.save(folder / "all_nan.npy", np.full((5, 5), np.nan, np.float32))
     np.save(folder / "pickled.npy", np.array([{"a": 1}], object), allow_pickle=True)
     np.save(folder / "flat.npy", np.zeros(4, np.float32))
@@ -153,6 +154,24 @@ def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more
         assert page["score"] == 0.3
         names = sorted(picture.name for picture in (tmp_path / "pictures").iterdir())
         assert names == [f"000{i}_{name}.npy.png" for i, name in enumerate("abcd", 1)]
+
+
+def test_clouds_without_usable_points_have_no_boxes_and_are_counted(home, tmp_path, capsys):
+    out, page = tmp_path / "boxes.json", tmp_path / "page.html"
+    clouds = [home / f"{name}.npy" for name in ("no_rows", "good", "away")]
+    command(*detect(home, *clouds, "--out", out, "--page", page, "--pictures", tmp_path))
+    files = files_of(out)
+    assert [file["file"] for file in files] == [*map(str, clouds)]
+    assert [len(file["boxes"]) > 0 for file in files] == [False, True, False]
+    assert [file["num_points"] > file["num_dropped"] for file in files] == [False, True, False]
+    assert len(page_content(page)["frames"]) == len(list(tmp_path.glob("*.png"))) == 3
+    note = "note: 2 of 3 clouds without usable points, and so without boxes: the first is "
+    assert capsys.readouterr().err.count(f"{note}{clouds[0]}: no points in it") == 1
+    for _ in range(2):  # also the second time, although the files are finished
+        words = detect(home, clouds[0], clouds[2], "--out", tmp_path / "x.json")
+        assert_one_line_error(capsys, words, "no_rows.npy: no points in it, expected at least one$")
+        assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".html", ".png"}
+        assert not (tmp_path / "x.json").exists()
 
 
 def test_a_resumed_detect_repeats_clouds_with_another_calibration(home, tmp_path, capsys):
@@ -270,6 +289,7 @@ detect HOME/flat.npy => flat.npy: shape
 detect HOME/future.npy => future.npy: time_lag
 detect HOME/broken.pcd => broken.pcd: not a PCD file
 detect HOME/away.npy => away.npy: none of its .* points is usable
+detect HOME/no_rows.npy => no_rows.npy: no points in it, expected at least one
 detect HOME/all_nan.npy => all_nan.npy: none .*\(5 not finite
 detect HOME/good.npy HOME/none.npy => none.npy: no such file
 detect => expected either point files or --sweeps
