@@ -214,7 +214,7 @@ def _detect(
         assert cloud is not None
         file, points = clouds.files[index], prediction.frame.points
         line = no_usable_points(file, cloud, int(detections.num_dropped), detector.sensor)
-        min_score = args.min_score if line is None else math.inf
+        min_score = args.min_score if line is None else math.inf  # without usable points, no boxes
         detections = select(detections, detector.classes, min_score=min_score, labels=args.labels)
         shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
         if (picture := pictures[index]) is not None:

@@ -37,7 +37,8 @@ def detect_stream(
 ) -> Iterator[Found]:
     """Detect boxes in every sweep as it arrives, fused with the sweeps before it.
 
-    The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps.
+    The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps. A sweep without usable
+    points has no boxes, whatever the sweeps before it.
 
     Args:
         sweeps: sweeps in temporal order; may be an iterator that waits for the next sweep.
