@@ -269,7 +269,7 @@ class OptimizerConfig:
 
     peak_learning_rate: float = 1e-2  # Learning rate at the end of the warm-up.
     initial_divisor: float = 10.0  # The first learning rate is the peak divided by this.
-    final_divisor: float = 1e4  # The last learning rate is the first divided by this.
+    final_divisor: float = 1e4  # The learning rate falls towards the first divided by this.
     warmup_fraction: float = 0.4  # Fraction of the steps that belong to the warm-up.
     b1_range: tuple[float, float] = (0.85, 0.95)
     """Momentum range: high at both ends, low at the peak of the learning rate; cosine (our choice)."""

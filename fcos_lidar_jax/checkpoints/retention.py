@@ -93,13 +93,20 @@ def find_checkpoint(folder: Path) -> Path:
     The folder of a checkpoint stands for itself, the folder of a run for its last checkpoint, and ``RUN/best`` for
     the checkpoint with the best score. The name of shipped weights stands for them unless a folder has that name.
 
+    Raises:
+        CheckpointError: ``RUN/best`` of a run whose checkpoints have no score.
+
     >>> find_checkpoint(Path("nowhere"))
     PosixPath('nowhere')
     """
     if not local_path(folder).exists():
-        shipped = shipped_checkpoints()
-        run_best = best_of(Checkpoints(folder.parent / CHECKPOINTS).paths()) if folder.name == BEST else None
-        return run_best or shipped.get(str(folder), folder)
+        of_run = Checkpoints(folder.parent / CHECKPOINTS).paths() if folder.name == BEST else []
+        if not of_run:
+            return shipped_checkpoints().get(str(folder), folder)
+        if (best := best_of(of_run)) is None:
+            how = "train gives one on --val-split, every --evaluate-every steps"
+            raise CheckpointError(f"{folder}: found no checkpoint of this run with a score, expected one: {how}")
+        return best
     paths = Checkpoints(folder / CHECKPOINTS).paths()
     return paths[-1] if paths else folder
 

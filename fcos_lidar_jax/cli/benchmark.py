@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ import tyro
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
@@ -83,6 +84,8 @@ def measure(
     sensor = detector.sensor
     read = functools.partial(read_points, sensor=sensor)
     arrays = [read(file) for file in files] or [make_frame(seed, sensor).points for seed in range(_NUM_SIMULATED)]
+    if line := sensor_mismatch(arrays[0], sensor):
+        print(f"warning: {line}", file=sys.stderr)
     clean = functools.partial(make_cloud, config=detector.config, sensor=sensor)
     clouds = [clean(points) for points in arrays]
     takes = detector.record["batch"] if isinstance(detector, ExportedDetector) else "any"

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,9 +23,10 @@ from fcos_lidar_jax.cli.checks import (
 )
 from fcos_lidar_jax.cli.options import alignment_of, option, radians
 from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import expect_points, truncation
+from fcos_lidar_jax.data.cloud_policy import no_usable_points, truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
+from fcos_lidar_jax.data.kitti import camera_calibration
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.json_io import write_lines
@@ -93,7 +95,7 @@ def run(args: Detect) -> None:
         tell(f"{args.sweeps}: {line}")
     aligned = alignment_of(args, detector.sensor, parts or files)
     clouds = _clouds(args, files, detector, aligned.data)
-    states = [files_fingerprint([file, *parts], Path("/"), str(file)) for file in files]
+    states = [files_fingerprint(_files_read(args, file, parts), Path("/"), str(file)) for file in files]
     with _resume_log(args, detector, aligned) as log:
         _detect(args, detector, clouds, states, log)
         lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
@@ -112,6 +114,8 @@ def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
     """The files, each once; or the list of sweeps, and its entries with the paths of their files."""
     if bool(args.files) == (args.sweeps is not None):
         raise ValueError("detect: expected either point files or --sweeps")
+    if args.sweeps is not None and args.full_turn:
+        raise ValueError("--full-turn: expected none with --sweeps, which keeps all points")
     for file in args.files:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
@@ -136,6 +140,12 @@ def _check(args: Detect, read: Sequence[Path]) -> None:
     if args.pictures is not None:
         check_outside("--pictures", args.pictures, args.checkpoint)
         check_out_folder(args.pictures, "--pictures")
+
+
+def _files_read(args: Detect, file: Path, parts: Sequence[Path]) -> list[Path]:
+    """An input and the files beside it on which its points depend."""
+    calibration = None if args.full_turn else camera_calibration(file)
+    return [file, *parts, *([calibration] if calibration else [])]
 
 
 def _clouds(args: Detect, files: tuple[Path, ...], detector: CloudDetector, sensor: Sensor) -> CloudFiles:
@@ -188,7 +198,7 @@ def _detect(
         for index, (state, picture) in enumerate(zip(states, pictures, strict=True))
         if state not in log or (picture is not None and not picture.exists())
     ]
-    progress, num_truncated = Progress("files", len(clouds)), 0
+    progress, num_truncated, unusable = Progress("files", len(clouds)), 0, dict[str, Any]()
     if done := len(states) - len(todo):
         progress.show(done, "detected before")
     found = predict(detector, clouds, indices=todo, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
@@ -197,17 +207,25 @@ def _detect(
         assert prediction.frame is not None
         assert cloud is not None
         file, points = clouds.files[index], prediction.frame.points
-        expect_points(file, cloud, int(detections.num_dropped), detector.sensor)
-        detections = select(detections, detector.classes, min_score=args.min_score, labels=args.labels)
+        line = no_usable_points(file, cloud, int(detections.num_dropped), detector.sensor)
+        min_score = args.min_score if line is None else math.inf  # without usable points, no boxes
+        detections = select(detections, detector.classes, min_score=min_score, labels=args.labels)
         shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
         if (picture := pictures[index]) is not None:
             _draw(picture, points, detections, detector, shown_score)
         record = cloud_record(detections, cloud, detector.classes)
-        log.add(states[index], [{"file": str(file), **record}])
+        if line is None:
+            log.add(states[index], [{"file": str(file), **record}])
+        else:
+            unusable[line] = states[index], [{"file": str(file), **record}]
         num_truncated += cloud.num_truncated
         scores = [box["score"] for box in record["boxes"]]
         clear = sum(score >= shown_score for score in scores)
         progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
+    if line := unusable_clouds([*unusable], len(clouds)):
+        tell(f"note: {line}")
+    for state, entries in unusable.values():  # not before: if all are unusable, the next call must fail, too
+        log.add(state, entries)
     if line := truncation(num_truncated, detector.config):
         tell(line)
 

@@ -13,7 +13,7 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_file
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
-from fcos_lidar_jax.data.cloud_policy import expect_points, make_cloud, sensor_mismatch
+from fcos_lidar_jax.data.cloud_policy import make_cloud, no_usable_points, sensor_mismatch
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.fields import check
@@ -60,7 +60,8 @@ def run(args: Project) -> None:
     rounds = {"num_rounds": args.rounds, "prioritize_current": args.prioritize_current}
     image = jax.device_get(project_points(cloud.points, cloud.valid, sensor, **rounds))
     dropped = int(image.num_dropped)
-    expect_points(args.file, cloud, dropped, sensor)
+    if line := no_usable_points(args.file, cloud, dropped, sensor):
+        raise ValueError(line)
     if line := sensor_mismatch(points, sensor, recorded_by([args.file])):
         tell(f"warning: {args.file}: {line}")
     counts: dict[str, Any] = {"num_points": cloud.num_points, "num_dropped": dropped + cloud.num_removed}

@@ -17,7 +17,7 @@ from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.result_files import FORMATS, check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
@@ -75,7 +75,7 @@ class Stream:
     index: Annotated[Path | None, option("DIR", default="DATA_ROOT/.fcos_lidar/VERSION")] = None
     """With --data-root: folder of the index, as given to `fcos-lidar prepare --index`."""
     keyframes: bool = False  # With --data-root: detect in keyframes only, still fusing the sweeps between them.
-    allow_missing_sweeps: bool = False  # With --data-root: skip sweeps whose file is missing.
+    allow_missing_sweeps: bool = False  # With --data-root: skip missing sweeps, but no keyframe.
     follow_links: bool = False  # With --data-root: follow links that lead out of DATA_ROOT.
     page: options.Page = None
     rrd: options.Rrd = None
@@ -111,7 +111,8 @@ def run(args: Stream) -> None:
     drive = _open(args, kind, detector, aligned.data)
     _tell_notes(drive.notes)
     frames: list[PageFrame] = []
-    tracks, before_us, num_truncated = Tracks(), None, 0
+    tracks, before_us, num_truncated, num_points = Tracks(), None, 0, 0
+    unusable = list[str | None]()
     shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
     with (
         rerun_recording(args.rrd, detector.classes, min_score=shown_score) as record_rerun,
@@ -124,8 +125,10 @@ def run(args: Stream) -> None:
         detect = functools.partial(detect_stream, detector=detector, **how)
         for found in timing.detect(_announcing(drive.sweeps), detect):
             points = found.cloud.points[found.cloud.valid]
-            if before_us is None and (line := sensor_mismatch(points, detector.sensor, usual)):
+            if not num_points and (line := sensor_mismatch(points, detector.sensor, usual)):
                 tell(f"warning: {line}")
+            num_points += len(points)
+            unusable.append(found.unusable)
             kept = select(found.detections, detector.classes, min_score=args.min_score, labels=args.labels)
             record = _record(dataclasses.replace(found, detections=kept), detector.classes, drive)
             boxes, labels, scores = confident(kept, 0.0)
@@ -144,6 +147,8 @@ def run(args: Stream) -> None:
             if args.page is not None:
                 frames.append(page_frame(points, (boxes, labels, scores), **details))
             before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
+        if line := unusable_clouds([*filter(None, unusable)], len(unusable)):
+            drive.notes.append(line)
     _tell_notes(drive.notes)
     if line := truncation(num_truncated, detector.config):
         tell(line)

@@ -155,16 +155,36 @@ def _newest(lags: np.ndarray, number: int) -> np.ndarray:
     return np.flatnonzero(kept)
 
 
-def expect_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> None:
-    """Refuse a cloud without a single point in the range image: the projection dropped all valid rows."""
+def no_usable_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: Sensor) -> str | None:
+    """A line about a cloud without a point in the range image, because the projection dropped all valid rows, or
+    None."""
     if np.count_nonzero(cloud.valid) > num_dropped:
-        return
-    raise ValueError(
+        return None
+    if not cloud.num_points:
+        return f"{name}: no points in it, expected at least one"
+    return (
         f"{name}: none of its {cloud.num_points} points is usable ({cloud.num_invalid} not finite or beyond "
         f"physical limits, {cloud.num_close} on the ego vehicle, the others out of range or view), expected some "
         f"with {_limits(sensor)} in the field of view of {sensor.name}"
         f"{_coordinate_hint(cloud.points[cloud.valid])}"
     )
+
+
+def unusable_clouds(lines: Sequence[str], number: int) -> str | None:
+    """A line about the clouds of :func:`no_usable_points` among a number of clouds, or None.
+
+    Raises:
+        ValueError: the first line, if no cloud has usable points.
+
+    >>> unusable_clouds(["7.npy: no points in it, expected at least one"], 9)
+    '1 of 9 clouds without usable points, and so without boxes: 7.npy: no points in it, expected at least one'
+    """
+    if not lines:
+        return None
+    if len(lines) == number:
+        raise ValueError(lines[0])
+    first = "" if len(lines) == 1 else "the first is "
+    return f"{len(lines)} of {number} clouds without usable points, and so without boxes: {first}{lines[0]}"
 
 
 def truncation(number: int, config: Config) -> str | None:

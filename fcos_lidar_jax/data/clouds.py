@@ -41,7 +41,8 @@ class CloudFiles(FrameSet):
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
-            points, num_close = read_cloud(file, self.sensor, self.reading, full_turn=self.full_turn, **layout)
+            how = {"full_turn": self.full_turn, "allow_empty": True, **layout}
+            points, num_close = read_cloud(file, self.sensor, self.reading, **how)
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 
     def truth(self, index: int) -> Frame:

@@ -93,7 +93,7 @@ def folder_drive(folder: Path, sensor: Sensor, poses: Path | None = None, **layo
     """The clouds of a folder, or one file.
 
     Args:
-        folder: point files, see :func:`read_points`; without poses sorted by name.
+        folder: point files, see :func:`read_points`; sorted by time if all names are times, else by name.
         poses: from the sensor to the world. ``.json``: a list of ``{"file", "timestamp_us", "sensor_to_world"}``
             in temporal order, files relative to the list. Other names: lines ``t x y z qx qy qz qw`` (TUM), t in
             seconds. If the clouds' names are times (seconds with a decimal point, or nanoseconds), poses are
@@ -103,6 +103,7 @@ def folder_drive(folder: Path, sensor: Sensor, poses: Path | None = None, **layo
     """
     files = list(find_clouds((folder,)))
     if poses is None:
+        files, _ = _in_order(files, folder)
         times, matrices = list(range(len(files))), [np.eye(4)] * len(files)
     elif poses.suffix == ".json":
         files, times, matrices = _listed(files, poses)
@@ -111,7 +112,7 @@ def folder_drive(folder: Path, sensor: Sensor, poses: Path | None = None, **layo
 
     def read() -> Iterator[Sweep]:
         for file, time_us, matrix in zip(files, times, matrices, strict=True):
-            yield Sweep(read_points(file, sensor, **layout), matrix, time_us, str(file))
+            yield Sweep(read_points(file, sensor, allow_empty=True, **layout), matrix, time_us, str(file))
 
     return Drive(read(), posed=poses is not None, timed=poses is not None)
 
@@ -134,23 +135,29 @@ def _listed(files: list[Path], poses: Path) -> tuple[list[Path], list[int], list
 def _posed(files: list[Path], path: Path) -> tuple[list[Path], list[int], list[np.ndarray]]:
     """Clouds in temporal order, with times and poses from a file of lines."""
     track = read_tum(path)
-    times = [_time_of(file) for file in files]
-    if any(time is None for time in times):
+    files, times = _in_order(files, path)
+    if times is None:
         if len(files) != len(track.times_us):
             raise ValueError(
                 f"{path}: got {len(track.times_us)} poses for {len(files)} clouds, expected one per cloud, or "
                 f"clouds whose names are times (seconds with a decimal point, or nanoseconds)"
             )
-        for before, after in itertools.pairwise(files):
-            if _in_parts(before.name) > _in_parts(after.name):
-                raise ValueError(
-                    f"{path}: poses are assigned to clouds sorted by name: got {before.name} before {after.name}, "
-                    f"expected numbers of one length, or FILE.json"
-                )
         return files, track.times_us.tolist(), list(pose_matrix(track.rotations, track.translations))
-    timed = sorted((time, file) for time, file in zip(times, files, strict=True) if time is not None)
-    matrices = [track.at(time, f"{path}: {file}") for time, file in timed]
-    return [file for _, file in timed], [time for time, _ in timed], matrices
+    return files, times, [track.at(time, f"{path}: {file}") for file, time in zip(files, times, strict=True)]
+
+
+def _in_order(files: list[Path], where: Path) -> tuple[list[Path], list[int] | None]:
+    """Clouds in temporal order: with their times if all names are times, else sorted by name, and None."""
+    timed = sorted((time, file) for file in files if (time := _time_of(file)) is not None)
+    if len(timed) == len(files):
+        return [file for _, file in timed], [time for time, _ in timed]
+    for before, after in itertools.pairwise(files):
+        if _in_parts(before.name) > _in_parts(after.name):
+            raise ValueError(
+                f"{where}: clouds are sorted by name: got {before.name} before {after.name}, expected numbers of "
+                f"one length, or poses in FILE.json"
+            )
+    return files, None
 
 
 def _in_parts(name: str) -> list[str | int]:

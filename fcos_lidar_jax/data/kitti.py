@@ -178,12 +178,18 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
     >>> in_camera(Path("street.bin"), np.zeros((9, 5))).shape
     (9, 5)
     """
-    calibration = file.parent.parent / "calib" / f"{file.stem}.txt"
-    if recorded_by([file]) != KITTI_HDL64E or not calibration.is_file():
+    calibration = camera_calibration(file)
+    if calibration is None:
         return points
     matrices = read_calibration(calibration)
     tell(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them", once=True)
     return points[in_image(points, matrices["P2"] @ matrices["velo_to_rect"], IMAGE_SIZE)]
+
+
+def camera_calibration(file: Path) -> Path | None:
+    """The calibration by which :func:`in_camera` crops a file, or None."""
+    calibration = file.parent.parent / "calib" / f"{file.stem}.txt"
+    return calibration if calibration.is_file() and recorded_by([file]) == KITTI_HDL64E else None
 
 
 def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:

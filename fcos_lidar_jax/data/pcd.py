@@ -38,8 +38,6 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
     header, body = _read_header(content)
     fields = _read_fields(header)
     number = _num_points(header)
-    if number == 0:
-        raise ValueError("POINTS: got 0, no points in it, expected at least one")
     if number > max_points or number * _size(fields) > max_bytes:
         size = f"{number} points of {_size(fields)} bytes"
         raise ValueError(f"POINTS: got {size}, expected at most {max_points} and {max_bytes} bytes in all")
@@ -49,6 +47,8 @@ def parse_pcd(content: bytes, *, max_points: int, max_bytes: int) -> dict[str, n
     for field in (fields[place] for place in places.values()):
         if field.count != 1:
             raise ValueError(f"COUNT: got {field.count} for field {field.name}, expected 1")
+    if number == 0:
+        return dict.fromkeys(places, np.zeros(0))
     columns = _FORMS[form](body, fields, number, list(places.values()))
     return dict(zip(places, columns, strict=True))
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.pcd import find_columns
 from fcos_lidar_jax.data.point_files import assemble_points
 from fcos_lidar_jax.sensors import Sensor
@@ -27,12 +28,11 @@ def parse_point_cloud2(cloud: Any, where: str, sensor: Sensor, *, max_points: in
     if height and width and len(cloud.data) < (needed := (height - 1) * pitch + width * step):
         sizes = f"got {len(cloud.data)} bytes, expected at least {needed}"
         raise ValueError(f"{where}: data: {sizes} for {height} rows of {width} points of {step}")
+    if not width * height:
+        return no_points(sensor)
     columns = {}
     for column, dtype, offset in _find_columns(cloud, where):
-        if width and height:
-            values = np.ndarray((height, width), dtype, cloud.data.data, offset, (pitch, step))
-        else:
-            values = np.zeros(0, dtype)
+        values = np.ndarray((height, width), dtype, cloud.data.data, offset, (pitch, step))
         columns[column] = values.reshape(-1)
     return assemble_points(where, sensor, columns)
 

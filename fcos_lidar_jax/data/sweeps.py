@@ -86,7 +86,7 @@ def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any
 
     def read(index: int, each: ListedSweep) -> Sweep:
         try:
-            points = read_points(path.parent / each.file, sensor, **layout)
+            points = read_points(path.parent / each.file, sensor, allow_empty=index > 0, **layout)
         except ValueError as error:
             raise ValueError(f"{path}: $[{index}].file: {error}") from None
         return Sweep(points, np.array(each.sensor_to_world), each.timestamp_us)

@@ -4,8 +4,10 @@ import dataclasses
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
+import numpy as np
+
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.cloud_policy import Cloud, expect_points, make_cloud, tell_truncation
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, no_usable_points, tell_truncation
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
 from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detector import CloudDetector
@@ -21,6 +23,7 @@ class SweepDetections:
     sweep: Sweep  # the current sweep, unchanged
     cloud: Cloud  # input of the network: the sweeps of the window in the frame of the current one, rotated
     detections: Detections  # NumPy arrays, in the frame of the sweep
+    unusable: str | None = None  # a line if the sweep has no usable points, and so no boxes
 
 
 def detect_stream(
@@ -34,7 +37,8 @@ def detect_stream(
 ) -> Iterator[SweepDetections]:
     """Detect boxes in every sweep as it arrives, fused with the sweeps before it.
 
-    The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps.
+    The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps. A sweep without usable
+    points has no boxes, whatever the sweeps before it.
 
     Args:
         sweeps: sweeps in temporal order; may be an iterator that waits for the next sweep.
@@ -48,7 +52,7 @@ def detect_stream(
             for orientations absent from training.
 
     Raises:
-        ValueError: names a sweep that is not later than the sweep before, or has no usable points.
+        ValueError: names a sweep that is not later than the sweep before.
 
     >>> import numpy as np
     >>> from fcos_lidar_jax.data.sweeps import Sweep
@@ -79,5 +83,9 @@ def detect_stream(
         cloud = make_cloud(points, detector.config, sensor=detector.sensor, num_close=num_close)
         tell_truncation(cloud, detector.config)
         detections = detector.detect(cloud)
-        expect_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
-        yield SweepDetections(sweep, cloud, aligned.back(detections))
+        line = no_usable_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
+        if line is None and cloud.points[cloud.valid, 4].min() > 0:
+            line = f"{sweep.name}: only older sweeps have usable points"
+        if line is not None:
+            detections = dataclasses.replace(detections, valid=np.zeros_like(detections.valid))
+        yield SweepDetections(sweep, cloud, aligned.back(detections), line)

@@ -41,8 +41,11 @@ def _scene_drive(
         root, version, index=index, allow_missing_sweeps=allow_missing_sweeps, follow_links=follow_links
     )
     tokens = data.keyframe_tokens(scene)
-    sweeps = data.drive(scene, keyframes=keyframes and num_sweeps == 1)
-    return Drive(sweeps, at_us=frozenset(tokens) if keyframes else None, tokens=tokens)
+    only_keyframes = keyframes and num_sweeps == 1
+    skipped, number = (0, 0) if only_keyframes else data.skipped_sweeps(scene)
+    notes = [f"skipped {skipped} of {number} sweeps, whose files are missing"] if skipped else []
+    sweeps = data.drive(scene, keyframes=only_keyframes)
+    return Drive(sweeps, at_us=frozenset(tokens) if keyframes else None, tokens=tokens, notes=notes)
 
 
 FOLDER = Recording("a folder of point files", None, folder_drive, ("poses", "columns", "dtype", "max_points"))

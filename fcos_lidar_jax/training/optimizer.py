@@ -12,11 +12,13 @@ _FIXED = ("b2", "eps", "eps_root", "mu_dtype", "weight_decay", "mask", "nesterov
 
 
 def learning_rate_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule:
-    """Cosine schedule from a fraction of the peak to the peak at the end of the warm-up, then to the final rate.
+    """Cosine schedule from a fraction of the peak to the peak at the end of the warm-up, then towards the last.
+
+    The last of ``num_steps`` updates is slightly above the last rate, which belongs to the step after it.
 
     >>> schedule = learning_rate_schedule(OptimizerConfig(), 1000)
-    >>> [f"{float(schedule(step)):.1e}" for step in (0, 400, 1000)]
-    ['1.0e-03', '1.0e-02', '1.0e-07']
+    >>> [f"{float(schedule(step)):.1e}" for step in (0, 400, 999, 1000)]
+    ['1.0e-03', '1.0e-02', '1.7e-07', '1.0e-07']
     """
     return optax.cosine_onecycle_schedule(
         num_steps,

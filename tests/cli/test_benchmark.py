@@ -75,8 +75,16 @@ def test_counts_the_operations_of_the_convolutions():
     assert 1e9 * gflop == pytest.approx(operations, rel=0.03)
 
 
-def test_without_files_the_clouds_are_simulated(home, tmp_path):
+def test_clouds_of_another_sensor_get_one_warning(home, tmp_path, capsys):
+    far = make_frame(0, TINY).points * np.array([100, 100, 1, 1, 1], np.float32)
+    np.save(tmp_path / "far.npy", far)
+    command("benchmark", tmp_path / "far.npy", home / "0.npy", "--repeats 1 --checkpoint", home / "detector.fcos")
+    assert capsys.readouterr().err.count("warning: points do not fit sensor 'tiny'") == 1
+
+
+def test_without_files_the_clouds_are_simulated(home, tmp_path, capsys):
     command("benchmark --repeats 1 --checkpoint", home / "detector.fcos", "--out", tmp_path / "a.json")
+    assert "warning" not in capsys.readouterr().err
     record = json.loads((tmp_path / "a.json").read_text())
     assert list(record["stages"]) == ["clean", "detect", "whole"]
     assert list(record["throughput"]) == ["1"]

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, mistakes, page_content
+from made_kitti import make_kitti
 from PIL import Image
 from tiny_run import TINY_CONFIG, bits, untrained
 
@@ -49,6 +50,7 @@ def home(tmp_path_factory):
     points[11, 1] = np.nan
     np.save(folder / "nan.npy", points)
     np.save(folder / "away.npy", points + np.array([500, 500, 0, 0, 0], np.float32))
+    np.save(folder / "no_rows.npy", points[:0])
     np.save(folder / "all_nan.npy", np.full((5, 5), np.nan, np.float32))
     np.save(folder / "pickled.npy", np.array([{"a": 1}], object), allow_pickle=True)
     np.save(folder / "flat.npy", np.zeros(4, np.float32))
@@ -154,6 +156,39 @@ def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more
         assert names == [f"000{i}_{name}.npy.png" for i, name in enumerate("abcd", 1)]
 
 
+def test_clouds_without_usable_points_have_no_boxes_and_are_counted(home, tmp_path, capsys):
+    out, page = tmp_path / "boxes.json", tmp_path / "page.html"
+    clouds = [home / f"{name}.npy" for name in ("no_rows", "good", "away")]
+    command(*detect(home, *clouds, "--out", out, "--page", page, "--pictures", tmp_path))
+    files = files_of(out)
+    assert [file["file"] for file in files] == [*map(str, clouds)]
+    assert [len(file["boxes"]) > 0 for file in files] == [False, True, False]
+    assert [file["num_points"] > file["num_dropped"] for file in files] == [False, True, False]
+    assert len(page_content(page)["frames"]) == len(list(tmp_path.glob("*.png"))) == 3
+    note = "note: 2 of 3 clouds without usable points, and so without boxes: the first is "
+    assert capsys.readouterr().err.count(f"{note}{clouds[0]}: no points in it") == 1
+    for _ in range(2):  # also the second time, although the files are finished
+        words = detect(home, clouds[0], clouds[2], "--out", tmp_path / "x.json")
+        assert_one_line_error(capsys, words, "no_rows.npy: no points in it, expected at least one$")
+        assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".html", ".png"}
+        assert not (tmp_path / "x.json").exists()
+
+
+def test_a_resumed_detect_repeats_clouds_with_another_calibration(home, tmp_path, capsys):
+    root = make_kitti(tmp_path / "kitti", train=3, val=1, sensor=TINY)
+    calibrations, folder, out = root / "training" / "calib", root / "training" / "velodyne", tmp_path / "x.json"
+    calibrations.rename(tmp_path / "calib")
+    missing = detect(home, *sorted(folder.iterdir()), folder / "none.bin", "--out", out)
+    assert_one_line_error(capsys, missing, "none.bin: no such file")
+    (tmp_path / "calib").rename(calibrations)
+    command(*detect(home, folder, "--out", out))
+    assert "detected before" not in capsys.readouterr().err
+    assert_one_line_error(capsys, [*missing, "--full-turn"], "none.bin: no such file")
+    shutil.rmtree(calibrations)
+    command(*detect(home, folder, "--out", out), "--full-turn")
+    assert "detected before" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["x.resume_log", "x", "x.json"])
 def test_detect_accepts_any_name_for_its_output(home, tmp_path, name):
     command(*detect(home, home / "good.npy", "--out", tmp_path / name))
@@ -257,12 +292,14 @@ detect HOME/flat.npy => flat.npy: shape
 detect HOME/future.npy => future.npy: time_lag
 detect HOME/broken.pcd => broken.pcd: not a PCD file
 detect HOME/away.npy => away.npy: none of its .* points is usable
+detect HOME/no_rows.npy => no_rows.npy: no points in it, expected at least one
 detect HOME/all_nan.npy => all_nan.npy: none .*\(5 not finite
 detect HOME/good.npy HOME/none.npy => none.npy: no such file
 detect => expected either point files or --sweeps
 detect HOME/empty.bin --columns 9 => columns: got 9
 detect HOME/good.npy --columns 5 => are for raw .bin files
 detect HOME/s.json => s.json: expected a point file, or --sweeps before a list of sweeps
+detect --sweeps HOME/s.json --full-turn => --full-turn: expected none with --sweeps
 detect --sweeps HOME/good.npy => good.npy: expected a file that ends in .json
 detect HOME/good.npy --out OUT --page OUT/../.out.resume_log => --page: .*the same file as
 detect --sweeps HOME/s.json => s.json: no such file

@@ -209,6 +209,41 @@ def test_sweeps_before_an_invalid_cloud_are_written(home, tmp_path, capsys):
     ]
 
 
+def test_empty_sweeps_have_no_boxes_and_are_counted(home, tmp_path, capsys):
+    clouds = [structured(make_frame(0, TINY).points[:number]) for number in (0, 9999, 0, 9999)]
+    for index, cloud in enumerate(clouds):
+        np.save(tmp_path / f"{index}.npy", np.array(cloud.tolist(), np.float32).reshape(-1, 4))
+    bag = write_recording(
+        tmp_path / "bag", "sqlite", lambda make: (("/p", make.cloud(STEP * i, c)) for i, c in enumerate(clouds))
+    )
+    page, found = tmp_path / "page.html", []
+    for source in (bag, tmp_path):
+        capsys.readouterr()
+        lines = stream(home, tmp_path / "boxes.jsonl", source, "--page", page)
+        assert [line["num_points"] > 0 for line in lines] == [False, True, False, True]
+        assert [len(line["boxes"]) > 0 for line in lines] == [False, True, False, True]
+        assert len(page_content(page)["frames"]) == 4
+        told = capsys.readouterr().err
+        assert told.count("note: 2 of 4 clouds without usable points, and so without boxes: the first is ") == 1
+        found.append([line["boxes"] for line in lines])
+    assert found[0] == found[1]
+    for index in (1, 3):
+        (tmp_path / f"{index}.npy").unlink()
+    args = ["stream", str(tmp_path), "--checkpoint", str(home / "checkpoint"), "--output-format", "openlabel"]
+    out = tmp_path / "labels.json"
+    assert_one_line_error(capsys, [*args, "--out", str(out)], "0.npy: no points in it, expected at least one$")
+    assert not out.exists()
+
+
+def test_the_first_sweep_with_points_tells_another_sensor(home, tmp_path, capsys):
+    np.save(tmp_path / "0.npy", np.zeros((0, 4), np.float32))
+    points = make_frame(0, TINY).points
+    np.save(tmp_path / "1.npy", points * np.array([1, 1, 1, 1 / 255, 1], np.float32))
+    np.save(tmp_path / "2.npy", points)
+    stream(home, tmp_path / "boxes.jsonl", tmp_path)
+    assert capsys.readouterr().err.count("no intensity is above 1") == 1
+
+
 def test_an_interruption_leaves_whole_lines(home, tmp_path, monkeypatch):
     def interrupted(*args, **options):
         for number, found in enumerate(detect_stream(*args, **options)):

@@ -12,9 +12,10 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.cloud_policy import (
     MAX_INTENSITY,
     MAX_TIME_LAG_S,
-    expect_points,
     make_cloud,
+    no_usable_points,
     sensor_mismatch,
+    unusable_clouds,
 )
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.presets import QUICKSTART
@@ -146,17 +147,27 @@ def test_a_wrong_number_of_columns_is_refused(shape, sensor, expected):
         cloud_of(np.zeros(shape, np.float32), sensor=sensor)
 
 
-def test_a_cloud_without_usable_points_is_refused_with_the_counts():
+def test_a_line_tells_a_cloud_without_usable_points_with_the_counts():
     points = numbered()
     points[:20, 2], points[20:50, :2] = np.nan, 0
     cloud = cloud_of(points)
-    expect_points("a.bin", cloud, 99, TINY)
-    with refused("a.bin: none of its 150 points", "(20 not finite", ", 30 on the ego vehicle"):
-        expect_points("a.bin", cloud, 100, TINY)
-    assert not cloud_of(points[:0]).valid.any()
+    assert no_usable_points("a.bin", cloud, 99, TINY) is None
+    line = no_usable_points("a.bin", cloud, 100, TINY)
+    assert line.startswith("a.bin: none of its 150 points")
+    assert "(20 not finite or beyond physical limits, 30 on the ego vehicle" in line
+    line = no_usable_points("a.bin", cloud_of(points[:0]), 0, TINY)
+    assert line == "a.bin: no points in it, expected at least one"
     points[:, 0] = 1.533e9  # the time, as the first column
-    with refused("of tiny; the values of x are about 1.533e+09, expected metres in the columns x, y"):
-        expect_points("a.bin", cloud_of(points), 130, TINY)
+    line = no_usable_points("a.bin", cloud_of(points), 130, TINY)
+    assert "of tiny; the values of x are about 1.533e+09, expected metres in the columns x, y" in line
+
+
+def test_one_line_tells_all_unusable_clouds_and_none_usable_is_refused():
+    assert unusable_clouds([], 0) is None
+    line = unusable_clouds(["a: no", "b: no"], 3)
+    assert line == "2 of 3 clouds without usable points, and so without boxes: the first is a: no"
+    with refused("a: no"):
+        unusable_clouds(["a: no", "b: no"], 2)
 
 
 @pytest.fixture(scope="module")

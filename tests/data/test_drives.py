@@ -12,6 +12,7 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.drives import folder_drive, read_tum
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
+from fcos_lidar_jax.input_pipeline.open_drive import SCENE
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY
 
 CLOUD = np.array([[5, 0, 0, 1, 0]], np.float32)
@@ -43,7 +44,10 @@ def test_clouds_named_by_times_are_in_temporal_order(poses):
         np.save(poses / "clouds" / f"{name}.npy", CLOUD)
     sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
     assert [sweep.time_us for sweep in sweeps] == [9_800_000, 9_900_000, 10_000_000, 10_100_000]
-    assert [sweep.name.rpartition("/")[2] for sweep in sweeps] == ["9.8.npy", "9.9.npy", "10.0.npy", "10.1.npy"]
+    names = [sweep.name.rpartition("/")[2] for sweep in sweeps]
+    assert names == ["9.8.npy", "9.9.npy", "10.0.npy", "10.1.npy"]
+    unposed = folder_drive(poses / "clouds", TINY).sweeps
+    assert [sweep.name.rpartition("/")[2] for sweep in unposed] == names
     np.testing.assert_allclose([sweep.sensor_to_world[0, 3] for sweep in sweeps], [0, 1, 2, 3], atol=1e-12)
 
 
@@ -61,8 +65,9 @@ def test_clouds_with_other_names_need_one_pose_each(poses):
 def test_names_that_are_not_sorted_by_their_numbers_are_refused(poses):
     for name in ("sweep_9", "sweep_10"):
         np.save(poses / "clouds" / f"{name}.npy", CLOUD)
-    with refused("got sweep_10.npy before sweep_9.npy, expected numbers of one length"):
-        folder_drive(poses / "clouds", TINY, poses / "poses.txt")
+    for more, where in (((poses / "poses.txt",), "poses.txt"), ((), "clouds")):
+        with refused(f"{where}: clouds are sorted by name: got sweep_10.npy before sweep_9.npy, expected numbers"):
+            folder_drive(poses / "clouds", TINY, *more)
     (poses / "clouds" / "sweep_9.npy").rename(poses / "clouds" / "sweep_09.npy")
     np.save(poses / "clouds" / "._sweep_09.npy", CLOUD)  # hidden files of macOS are skipped
     sweeps = list(folder_drive(poses / "clouds", TINY, poses / "poses.txt").sweeps)
@@ -110,12 +115,14 @@ def test_keyframe_times_match_the_keyframes(tmp_path):
         assert data.index.sweep_time_us[data.index.sample_sweep[data.sample_tokens.index(token)]] == time_us
 
 
-def test_a_scene_without_any_file_is_refused(tmp_path):
+@pytest.mark.parametrize("keyframes", [False, True])
+def test_missing_keyframes_are_never_skipped(tmp_path, keyframes):
     root = write(tmp_path, *make_tables())
-    for sweep in list(NuScenes(root, VERSION).drive("scene-1")):
-        (root / sweep.name).unlink()
-    with refused("scene scene-1: found no file of "):
-        NuScenes(root, VERSION, allow_missing_sweeps=True).drive("scene-1")
+    data = NuScenes(root, VERSION, allow_missing_sweeps=True)
+    *_, last = data.drive("scene-1", keyframes=True)
+    (root / last.name).unlink()
+    with refused(f"{last.name}: no such file, expected a sweep that sample_data.json names"):
+        list(data.drive("scene-1", keyframes=keyframes))
 
 
 def test_missing_sweeps_are_skipped_if_allowed_but_a_scene_needs_keyframes(tmp_path):
@@ -126,6 +133,9 @@ def test_missing_sweeps_are_skipped_if_allowed_but_a_scene_needs_keyframes(tmp_p
     with refused("no such file, expected a sweep that sample_data.json names"):
         list(data.drive("scene-1"))
     assert len(list(NuScenes(root, VERSION, allow_missing_sweeps=True).drive("scene-1"))) == number - 1
+    for allow, expected in ((True, ["skipped 1 of 12 sweeps, whose files are missing"]), (False, [])):
+        drive = SCENE.open(root, TINY, scene="scene-1", keyframes=True, num_sweeps=2, allow_missing_sweeps=allow)
+        assert drive.notes == expected
     scenes = root / VERSION / "scene.json"
     rows = json.loads(scenes.read_text())
     scenes.write_text(json.dumps([*rows, rows[0] | {"token": "9" * 32, "name": "scene-9"}]))

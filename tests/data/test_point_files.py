@@ -400,6 +400,19 @@ def test_damaged_point_files_are_refused(tmp_path, name):
         read_points(tmp_path / name, NUSCENES_HDL32E)
 
 
+def test_files_that_say_that_they_have_no_points_are_accepted_if_allowed(tmp_path):
+    files = {"a.npy": np.zeros((0, 4), np.float32), "a.npz": {"points": np.zeros((0, 5))}}
+    files |= {f"{form}.pcd": pcd_header(form, 0) for form in ("ascii", "binary", "binary_compressed")}
+    for name, content in files.items():
+        path = save(tmp_path / name, content)
+        assert read_points(path, NUSCENES_HDL32E, allow_empty=True).shape == (0, 5)
+        with refused(f"{path}: no points in it, expected at least one"):
+            read_points(path, NUSCENES_HDL32E)
+    for name in ("a.bin", "a.npy", "a.pcd"):
+        with refused("empty file, expected points"):
+            read_points(save(tmp_path / name, b""), NUSCENES_HDL32E, allow_empty=True)
+
+
 def test_an_archive_is_unpacked_no_further_than_its_stated_size(tmp_path):
     path = save(tmp_path / "a.npz", with_size(zipped(zipfile.ZIP_DEFLATED, 2**27), 1000))
     tracemalloc.start()

@@ -341,7 +341,6 @@ WRONG_CLOUDS = {
     "narrow rows": ({"row_step": 100, "width": 7, "height": 2}, "row_step: got 100, expected 112, width x"),
     "no step": ({"point_step": 0}, "field x: got 4 bytes at offset 0, expected a place within point_step 0"),
     "narrow step": ({"point_step": 10}, "field z: got 4 bytes at offset 8, expected a place within point_step 10"),
-    "no points": ({"width": 0}, "no points in it, expected at least one"),
     "no fields": ({"fields": []}, "fields: got none, expected one named x"),
     "no datatype": (("x", 0, 9, 1), "field x: got 1 of datatype 9, expected one number of datatype 1 to 8"),
     "several numbers": (("x", 0, 7, 3), "field x: got 3 of datatype 7"),
@@ -363,6 +362,15 @@ def test_damaged_clouds_are_refused(tmp_path, case):
     bag = write_recording(tmp_path / "a", "sqlite", content)
     with refused(f"{bag}: /p: message 0: ", message):
         list(ros_bag_drive(bag, TINY).sweeps)
+
+
+@pytest.mark.parametrize(
+    "changed", [{}, {"fields": [], "point_step": 0, "row_step": 0}, {"height": 0, "width": 9}]
+)
+def test_messages_without_points_are_empty_sweeps(tmp_path, changed):
+    bag = write_recording(tmp_path / "a", "sqlite", lambda make: [("/p", make.cloud(1, POINTS[:0], **changed))])
+    [sweep] = ros_bag_drive(bag, NUSCENES_HDL32E).sweeps
+    assert sweep.points.shape == (0, 5)
 
 
 def test_too_many_points_and_missing_laser_numbers_are_refused(tmp_path):

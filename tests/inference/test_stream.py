@@ -50,6 +50,23 @@ def test_detections_in_a_rolling_window_are_bit_identical_and_compiled_once(dete
     assert _split_detect(detector.model, make_mesh(jax.local_devices()[:1]), 1)._cache_size() == 1
 
 
+def test_sweeps_without_usable_points_have_no_boxes_and_a_line(detector):
+    sweeps = list(drive(4))
+    sweeps[0] = dataclasses.replace(sweeps[0], points=sweeps[0].points[:0])
+    sweeps[2] = dataclasses.replace(sweeps[2], points=sweeps[2].points * np.float32(np.nan))
+    stream = list(detect_stream(sweeps, detector))
+    assert [each.unusable for each in stream] == [
+        "sweep 0: no points in it, expected at least one",
+        None,
+        "sweep 2: only older sweeps have usable points",
+        None,
+    ]
+    assert [bool(each.detections.valid.any()) for each in stream] == [False, True, False, True]
+    reading = dataclasses.replace(detector.config.reading, num_sweeps=1)
+    *_, third, _ = detect_stream(sweeps, detector, reading=reading)
+    assert third.unusable.startswith("sweep 2: none of its")
+
+
 def test_a_window_of_one_sweep_ignores_earlier_sweeps(detector):
     reading = dataclasses.replace(detector.config.reading, num_sweeps=1)
     stream = list(detect_stream(drive(3), detector, reading=reading))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ class NuScenes:
         version: the folder of the tables, such as ``v1.0-trainval``.
         index: folder of the index; default: ``ROOT/.fcos_lidar/VERSION``.
         allow_missing_sweeps: skip older sweeps with a missing file instead of refusing them;
-            :meth:`missing_sweeps` counts them. Only :meth:`drive` ever skips the current sweep.
+            :meth:`missing_sweeps` counts them. Keyframes to detect in are never skipped.
         follow_links: also read files outside the root to which links lead.
 
     Raises:
@@ -144,18 +144,18 @@ class NuScenes:
     def drive(self, scene: str, *, keyframes: bool = False) -> Iterator[Sweep]:
         """The sweeps (or only keyframes) of a scene in temporal order, read on demand.
 
+        With ``allow_missing_sweeps``, sweeps without a file are skipped, but never a keyframe.
+
         Raises:
             ValueError: no such scene; the message lists the scenes.
         """
-        rows = self._keyframe_rows(scene)
-        if not keyframes:
-            following = {int(before): row for row, before in enumerate(self.index.sweep_previous) if before >= 0}
-            while rows[-1] in following:
-                rows.append(following[rows[-1]])
-            rows = self._chain(rows[-1], len(self.index.sweep_file))[::-1]
-        if not (present := self._present(rows)):
-            raise ValueError(f"{self.root}: scene {scene}: found no file of {len(rows)} sweeps, expected some")
-        return map(self._read, present)
+        own = self._keyframe_rows(scene)
+        return map(self._read, own if keyframes else self._present(self._scene_rows(scene), keep=own))
+
+    def skipped_sweeps(self, scene: str) -> tuple[int, int]:
+        """Number of sweeps that :meth:`drive` skips in a scene, and number of all its sweeps."""
+        rows, own = self._scene_rows(scene), self._keyframe_rows(scene)
+        return len(rows) - len(self._present(rows, keep=own)), len(rows)
 
     def keyframe_tokens(self, scene: str) -> dict[int, str]:
         """Time of a scene's keyframes -> sample token; errors as in :meth:`drive`."""
@@ -170,6 +170,13 @@ class NuScenes:
         if not rows:
             raise ValueError(f"{self.tables / 'sample.json'}: scene {scene}: found no keyframe, expected one")
         return rows
+
+    def _scene_rows(self, scene: str) -> list[int]:
+        last = self._keyframe_rows(scene)[-1]
+        following = {int(before): row for row, before in enumerate(self.index.sweep_previous) if before >= 0}
+        while last in following:
+            last = following[last]
+        return self._chain(last, len(self.index.sweep_file))[::-1]
 
     def boxes(self, sample_token: str) -> Boxes:
         """The boxes of the ten classes in the keyframe's LiDAR frame, including boxes without points.
@@ -247,8 +254,11 @@ class NuScenes:
     def _path(self, row: int) -> Path:
         return self.root / self.index.sweep_file[row].decode()
 
-    def _present(self, rows: list[int]) -> list[int]:
-        return [row for row in rows if os.path.isfile(self._path(row))] if self.allow_missing_sweeps else rows
+    def _present(self, rows: list[int], keep: Collection[int] = ()) -> list[int]:
+        """Rows without those to skip: their file is missing, and they are not to be kept."""
+        if not self.allow_missing_sweeps:
+            return rows
+        return [row for row in rows if row in keep or os.path.isfile(self._path(row))]
 
     def _read(self, row: int) -> Sweep:
         path = self._path(row)
