@@ -6,6 +6,7 @@ older checkpoint, and lets two processes write into one folder (``tests/checkpoi
 
 import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 from fcos_lidar_jax.checkpoints.storage import (
@@ -17,6 +18,7 @@ from fcos_lidar_jax.checkpoints.storage import (
     save_checkpoint,
     save_score,
     shipped_checkpoints,
+    verify,
 )
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.types import TrainState
@@ -51,7 +53,10 @@ class Checkpoints:
         # The run resumed before any later checkpoints because they are corrupt. They must not count as the newest.
         paths, corrupt = ([p for p in self.paths() if (p > newest) == later] for later in (False, True))
         for old in {*corrupt, *paths[: -self.keep]} - {best_of(paths)}:
-            shutil.rmtree(old)
+            # Network file systems cannot remove the folder while another process reads it: the next save does.
+            leftover = Path(tempfile.mkdtemp(dir=self.folder, prefix="."))
+            old.rename(leftover / old.name)
+            shutil.rmtree(leftover, ignore_errors=True)
 
     def paths(self) -> list[Path]:
         """All checkpoints, oldest first, without verification."""
@@ -61,14 +66,17 @@ class Checkpoints:
         """The newest intact checkpoint with its state; None if the folder has no checkpoints.
 
         Corrupt checkpoints are skipped with a warning on standard error; if all are corrupt, a CheckpointError
-        says so. ``like`` is any state of the same run.
+        says so. Other failures, such as too little memory, end in their own error: an intact checkpoint must not
+        be taken for a corrupt one, because the next save removes it. ``like`` is any state of the same run.
         """
         paths = self.paths()
         for path in reversed(paths):
             try:
-                return read_checkpoint(path), read_state(path, like)
+                verify(path)
             except CheckpointError as error:
                 print(f"warning: {error}: going back to the checkpoint before", file=sys.stderr)
+            else:
+                return read_checkpoint(path), read_state(path, like)
         if paths:
             raise CheckpointError(f"{self.folder}: all {len(paths)} checkpoints are damaged, expected a whole one")
         return None

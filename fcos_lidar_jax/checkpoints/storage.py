@@ -148,7 +148,7 @@ def _with_hash(description: dict[str, Any]) -> str:
 def read_checkpoint(folder: Path) -> Checkpoint:
     """Read the checkpoint in a folder, see :func:`~fcos_lidar_jax.checkpoints.load_checkpoint`."""
     folder = local_path(folder).absolute()
-    description = _verify(folder)
+    description = verify(folder)
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
     sensor = sensor_from_json(description["sensor"], f"{folder / _DESCRIPTION}: sensor")
     expected = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
@@ -161,7 +161,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 def read_state(folder: Path, like: TrainState) -> TrainState:
     """Read the state in the folder of a checkpoint, see :func:`~fcos_lidar_jax.checkpoints.load_state`."""
     folder = local_path(folder).absolute()
-    description = _verify(folder)
+    description = verify(folder)
     if not (folder / _STATE).is_dir():
         raise CheckpointError(f"{folder}: found a detector without a training state, expected both")
     config = config_from_json(description["config"], f"{folder / _DESCRIPTION}: config")
@@ -247,7 +247,7 @@ def _hashes(folder: Path) -> dict[str, str]:
     }
 
 
-def _verify(folder: Path) -> dict[str, Any]:
+def verify(folder: Path) -> dict[str, Any]:
     """Check the hashes of all files of a checkpoint, and return its description."""
     if not folder.is_dir():
         if folder.exists():

@@ -138,6 +138,29 @@ def test_a_run_with_only_corrupt_checkpoints_is_not_started_again(copy):
         copy.newest(state_at(0))
 
 
+@pytest.mark.parametrize("error", [OSError(24, "Too many open files"), MemoryError()])
+def test_an_intact_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_corrupt_one(copy, monkeypatch, error):
+    def failing(*_, **__):
+        raise error
+
+    monkeypatch.setattr(storage, "_checkpointer", failing)
+    with pytest.raises(CheckpointError, match="00000006/variables: cannot be read") as raised:
+        copy.newest(state_at(0))
+    assert raised.value.__cause__ is error
+
+
+def test_a_checkpoint_whose_folder_cannot_be_removed_yet_does_not_fail_the_save(copy, monkeypatch):
+    """As on a network file system, while another process reads a file in it."""
+    remove = shutil.rmtree
+    monkeypatch.setattr(shutil, "rmtree", lambda path, ignore_errors=False: ignore_errors or remove("in use"))
+    save(copy, 8)
+    save(copy, 9)
+    assert steps(copy) == [2, 6, 8, 9]  # step 2 is the best
+    monkeypatch.undo()
+    save(copy, 10)
+    assert list(copy.folder.glob(".*")) == []
+
+
 def test_leftovers_of_killed_saves_are_ignored_and_removed_by_the_next_save(copy):
     (copy.folder / ".00000008.abc" / "variables").mkdir(parents=True)
     shutil.copytree(copy.folder / "00000006", copy.folder / ".00000006.abc.old")
