@@ -43,7 +43,8 @@ class Train:
 
     Every field of the preset is an option, see fcos-lidar train PRESET --help. The command writes checkpoints,
     metrics.jsonl, TensorBoard events, curves and pictures to OUT. Each batch is split over all local devices.
-    Ctrl-C and SIGTERM save a checkpoint and stop. The same command with --resume continues.
+    Ctrl-C and SIGTERM save a checkpoint and stop (with several processes, only SIGTERM). The same command with
+    --resume continues.
     """
 
     config: Annotated[_Preset, tyro.conf.arg(name=""), tyro.conf.AvoidSubcommands]  # type: ignore[valid-type]

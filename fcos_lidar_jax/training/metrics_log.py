@@ -94,5 +94,13 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 
 def evaluated_steps(folder: Path) -> set[int]:
     """Steps after which a run was evaluated; empty without records."""
-    lines = read_metrics(folder) if (folder / _FILE).exists() else []
-    return {line["step"] for line in lines if "test/mAP" in line}
+    return {line["step"] for line in _records(folder) if "test/mAP" in line}
+
+
+def last_step(folder: Path) -> int:
+    """The last step of which a run has metrics; 0 without records."""
+    return max((line["step"] for line in _records(folder)), default=0)
+
+
+def _records(folder: Path) -> list[dict[str, Any]]:
+    return read_metrics(folder) if (folder / _FILE).exists() else []

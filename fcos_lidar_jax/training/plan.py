@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options, packing_for
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.packing import Packing
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import sensor_to_json, turn_between
 from fcos_lidar_jax.training.metrics_log import evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
@@ -186,6 +186,8 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     if not file.is_file():
         if resume:
             raise ValueError(f"{file}: found nothing, expected the run to resume")
+        if saved := Checkpoints(folder / CHECKPOINTS).paths():  # a new run would remove them
+            raise ValueError(f"{saved[-1]}: found a checkpoint without {RUN_SPEC}, expected another folder")
         return
     if not resume:
         raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
@@ -207,13 +209,12 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
         raise CheckpointError(f"{folder}: classes: got {classes}, expected the classes to be trained, {expected}")
     shapes = jax.eval_shape(detector.init, jax.random.key(0))
     check_arrays(folder, shapes, checkpoint.variables, whose="the network to be trained")
-    if jax.process_index() == 0:
-        own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
-        for name, was, now in _differences(own, new, "model"):
-            print(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}", file=sys.stderr, flush=True)
-        if turn := turn_between(detector.sensor, checkpoint.sensor):
-            told = f"weights trained on clouds rotated by {math.degrees(turn):g} degrees relative to these"
-            print(f"{folder}: {told}: expect scores to fall at first", file=sys.stderr, flush=True)
+    own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
+    for name, was, now in _differences(own, new, "model"):
+        tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
+    if turn := turn_between(detector.sensor, checkpoint.sensor):
+        told = f"weights trained on clouds rotated by {math.degrees(turn):g} degrees relative to these"
+        tell(f"{folder}: {told}: expect scores to fall at first")
     return checkpoint.variables
 
 

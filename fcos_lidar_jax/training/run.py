@@ -9,7 +9,6 @@ import dataclasses
 import json
 import math
 import signal
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,8 +31,9 @@ from fcos_lidar_jax.inference.prediction import evaluate, predict
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Variables
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
-from fcos_lidar_jax.training.metrics_log import MetricsLog
+from fcos_lidar_jax.training.metrics_log import MetricsLog, last_step
 from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, plan_run
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
@@ -126,17 +126,21 @@ def train(
         with agreed("cannot train"):
             if is_main_process:
                 held.enter_context(run_folder(run.folder, run.spec, resume=resume))
-        start = _start(run, resume=resume)
-        first = int(start.step)
-        pending = run.evaluation_pending(first)
+        with agreed("cannot train"):
+            start = _start(run, resume=resume)
+            first = int(start.step)
+            pending = run.evaluation_pending(first)
+        # Processes that see other checkpoints, as in folders of their own, would train different networks.
+        check_same(checksum(f"{first} {pending}".encode()), "checkpoint to resume from")
         if first == steps and not pending:
-            print(f"{run.folder}: the run is complete, with {first} steps", file=sys.stderr)
+            tell(f"{run.folder}: the run is complete, with {first} steps")
             return start
         log = MetricsLog(run.folder, first_step=first) if is_main_process else None
-        if is_main_process:
-            for line in run.warnings:
-                print(f"warning: {line}", file=sys.stderr, flush=True)
-            print("compiling the training step: a minute or more on a CPU", file=sys.stderr, flush=True)
+        for line in run.warnings:
+            tell(f"warning: {line}")
+        if resume:
+            tell(f"{run.folder}: resuming after step {first}")
+        tell("compiling the training step: a minute or more on a CPU")
         batches = make_batches(
             run.frames,
             config,
@@ -164,7 +168,7 @@ def train(
         if is_main_process:
             draw_metrics(run.folder)
     if (done := int(state.step)) < steps or request.signal is not None:
-        print(f"stopped after step {done}, which is saved", file=sys.stderr)
+        tell(f"stopped after step {done}, which is saved")
         if request.signal == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + signal.SIGTERM)
@@ -185,7 +189,7 @@ def _take_steps(
 
     ``pending`` tells whether the evaluation of the first state is missing.
     """
-    batch_size = run.detector.config.optimizer.batch_size
+    batch_size, stop = run.detector.config.optimizer.batch_size, False
 
     def report(number: int, record: Record) -> None:
         if log is not None:
@@ -197,8 +201,13 @@ def _take_steps(
         if log is not None:
             log.flush()
             _save(run, state)  # before the evaluation, which may take long
-        if run.evaluates_at(number):
+        if run.evaluates_at(number) and not (stop and number < run.num_steps):  # resuming evaluates
             _call(hooks, number, _evaluate(run, number, state, log))
+
+    def stops(number: int) -> bool:
+        nonlocal stop
+        stop = stopping(number)
+        return stop
 
     try:
         state = replicate(start, mesh)
@@ -212,7 +221,7 @@ def _take_steps(
             report=report,
             pause_at=run.saves_at,
             pause=pause,
-            stopping=stopping,
+            stopping=stops,
             log_every_s=math.inf if log is None else 10.0,
         )
         if log is not None and not run.saves_at(int(state.step)):
@@ -254,6 +263,10 @@ def _start(run: Run, *, resume: bool) -> TrainState:
         like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
         if (newest := run.checkpoints.newest(like)) is not None:
             return newest[1]
+        # Only a run that was killed before its first checkpoint begins again; the metrics of others would be lost.
+        if (done := last_step(run.folder)) > (first := next(filter(run.saves_at, range(1, run.num_steps + 1)))):
+            found = f"found none, but metrics of {done} steps, of which step {first} was saved"
+            raise ValueError(f"{run.checkpoints.folder}: {found}, expected the checkpoints of the run")
     return make_state(run.detector, run.optimizer, key, variables=run.weights)
 
 
@@ -268,7 +281,7 @@ def _evaluate(run: Run, number: int, state: TrainState, log: MetricsLog | None) 
     first = range(min(_NUM_PICTURES, len(run.tests)))
     examples = list(predict(trained, run.tests, indices=first, devices=run.devices))
     if log is not None:
-        print(f"step {number}: mAP by centre distance {score:.3f}", file=sys.stderr, flush=True)
+        tell(f"step {number}: mAP by centre distance {score:.3f}")
         prefix, title = f"step_{number:06d}_frame", f"step {number}, test frame"
         pictures = draw_predictions(run.folder / "pictures", examples, run.tests, prefix=prefix, title=title)
         log.write_pictures(number, pictures)

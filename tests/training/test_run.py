@@ -241,6 +241,18 @@ def test_a_run_that_stops_fails_and_resumes_is_bit_identical(finished, tmp_path,
     assert resumed == uninterrupted
 
 
+def test_a_run_that_is_stopped_at_an_evaluation_step_evaluates_when_it_resumes(finished, tmp_path, monkeypatch):
+    folder, options = tmp_path / "run", {"evaluate": 2, "tests": TESTS}
+    disturb(monkeypatch, 1, signalled(signal.SIGTERM))
+    with pytest.raises(SystemExit):
+        train_tiny(folder, weights=weights(), **options)
+    assert checkpoint_names(folder) == ["00000001", "00000002"]
+    assert scores(folder) == {}
+    disturb(monkeypatch, -1, None)
+    assert bits(train_tiny(folder, resume=True, **options)) == bits(finished[1])
+    assert scores(folder) == scores(finished[0])
+
+
 def test_a_run_with_packed_batches_is_bit_identical(finished, tmp_path, monkeypatch):
     kinds = []
 
@@ -272,6 +284,31 @@ def test_processes_with_other_data_or_packing_are_refused_before_the_run_starts(
     assert len(set(checksums)) == 3
     assert checksums[2] == checksums[3]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_processes_that_find_other_checkpoints_are_refused(finished, tmp_path, monkeypatch):
+    def refuse(checksum, what):
+        if what == "checkpoint to resume from":
+            checksums.append(checksum)
+            raise ValueError(f"process 1: {what}")
+
+    checksums = []
+    monkeypatch.setattr(runs, "check_same", refuse)
+    done, new = shutil.copytree(finished[0], tmp_path / "done"), tmp_path / "new"
+    for folder, options in ((done, {"resume": True}), (new, {}), (new, {"resume": True})):
+        with pytest.raises(ValueError, match=r"^process 1: checkpoint to resume from$"):
+            train_tiny(folder, evaluate=2, tests=TESTS, **options)
+    assert checksums[0] != checksums[1] == checksums[2]
+
+
+def test_a_run_without_its_checkpoints_keeps_its_metrics(finished, tmp_path):
+    folder = shutil.copytree(finished[0], tmp_path / "run")
+    shutil.rmtree(folder / "checkpoints")
+    before = contents(folder)
+    message = "checkpoints: found none, but metrics of 4 steps, of which step 1 was saved, expected the checkpoints"
+    with pytest.raises(ValueError, match=message):
+        train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+    assert contents(folder) == before
 
 
 STOPPED = """
@@ -384,6 +421,10 @@ def test_a_folder_with_another_run_or_none_is_refused(begun, tmp_path):
     (begun / "run.json").write_text("{")
     with pytest.raises(ValueError, match=r"run.json: not JSON"):
         train_tiny(begun, resume=True)
+    (begun / "run.json").unlink()
+    (begun / "checkpoints" / "00000900").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"00000900: found a checkpoint without run.json, expected another folder"):
+        train_tiny(begun)
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="found a file, expected a folder"):
         train_tiny(tmp_path / "file")
