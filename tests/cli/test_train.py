@@ -223,8 +223,9 @@ def test_objects_of_more_sweeps_are_taken_and_their_frames_opened_once(root, tmp
     cli.main(args)
     assert [kw["reading"].num_sweeps for kw in opened] == [1, 3]
     assert given[0].manifest.num_sweeps == 3
-    capsys.readouterr()
-    assert_one_line_error(capsys, [*args, "--class-map", "kitti"], "cut from other frames than split 'train', or")
+    (tmp_path / "map.json").write_text('{"car": "truck"}')
+    renamed = [*args, "--class-map", str(tmp_path / "map.json")]
+    assert_one_line_error(capsys, renamed, "cut from other frames than split 'train', or with another --class-map")
 
 
 def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):

@@ -193,7 +193,7 @@ def test_the_optimizer_clips_decays_and_reports():
 
 def test_the_loop_reads_all_metrics_before_a_pause_and_stops_when_asked(trainer):
     _, state, _, _ = trainer
-    calls = []
+    calls, asked = [], []
 
     def count(state, batch):
         one = jnp.float32(1)
@@ -206,12 +206,13 @@ def test_the_loop_reads_all_metrics_before_a_pause_and_stops_when_asked(trainer)
         host_batches(empty_batch(0), 9),
         num_steps=9,
         report=lambda number, record: calls.append((number, record["truncated_points"])),
-        pause_at=lambda number: number % 2 == 0,
+        pause_at=lambda number: asked.append(number) or number % 2 == 0,
         pause=lambda number, state: calls.append(("pause", number, int(state.step))),
         stopping=lambda number: number == 5,
     )
     assert int(final.step) == 5
     assert calls == [(1, 0), (2, 0), ("pause", 2, 2), (3, 0), (4, 0), ("pause", 4, 4), (5, 0)]
+    assert asked == [1, 2, 3, 4, 5]
 
 
 def test_augmentation_depends_only_on_seed_step_and_sample():
