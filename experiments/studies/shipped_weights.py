@@ -110,9 +110,9 @@ def train(args: Args, work: Path) -> dict[str, Any]:
 
 def training_record(run: Path) -> dict[str, Any]:
     """Summarise the training of a run."""
-    config = load_checkpoint(run).config
-    spec, records = read_json(run / "run.json", dict[str, Any]), read_metrics(run)
-    done = max((r["step"] for r in records if "seconds" in r), default=0)
+    checkpoint, spec = load_checkpoint(run), read_json(run / "run.json", dict[str, Any])
+    config, done = checkpoint.config, checkpoint.step
+    records = [record for record in read_metrics(run) if record["step"] <= done]  # may go on after the checkpoint
     batch = config.optimizer.batch_size
     return {
         "preset": config.name,

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.changes import change
 from experiments.studies.shipped_weights import CONFIGS
 from fcos_lidar_jax.checkpoints import load_checkpoint
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint, shipped_checkpoints
@@ -25,8 +24,6 @@ def test_shipped_weights_are_small_and_match_the_preset(name):
     assert sum(path.stat().st_size for path in folder.rglob("*")) < 8 * 2**20
     shipped = load_checkpoint(folder)
     assert shipped.sensor == load_sensor(config.sensor)
-    if name == "hdl32e":  # trained before the preset had local geometry
-        config = change(model__local_geometry=False)(config)
     assert dataclasses.replace(shipped.config, optimizer=config.optimizer) == config
 
 
