@@ -68,6 +68,12 @@ def _optimisation(request: pytest.FixtureRequest) -> None:
     compile_quickly(_is_quick(request.path))
 
 
+@pytest.fixture(autouse=True)
+def _nothing_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Notes that are printed once per process are printed in each test."""
+    monkeypatch.setattr("fcos_lidar_jax.progress._told", set())
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder with real LiDAR data; the test is skipped where there is none."""

@@ -136,6 +136,8 @@ def train(
             tell(f"{run.folder}: the run is complete, with {first} steps")
             return start
         log = MetricsLog(run.folder, first_step=first) if is_main_process else None
+        if log is not None:
+            held.callback(log.close)
         for line in run.warnings:
             tell(f"warning: {line}")
         if resume:
@@ -231,9 +233,6 @@ def _take_steps(
         saved = run.checkpoints.paths()
         last = f"the last checkpoint is {saved[-1]}" if saved else "there is no checkpoint yet"
         raise type(error)(f"{error}; {last}") from None
-    finally:
-        if log is not None:
-            log.close()
 
 
 def _call(hooks: Sequence[Hook], number: int, values: Record) -> None:

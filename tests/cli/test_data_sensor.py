@@ -128,7 +128,7 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
         command("evaluate", data, more, HDL32E, tmp_path / f"scores{more}")
         [evaluated] = json.loads((tmp_path / f"scores{more}" / "detections.json").read_text())["frames"]
         assert evaluated["boxes"] == expected
-    assert len(cropped) > 20
+    assert 0 < len(cropped) < len(boxes)
     assert cropped != boxes
 
     detector = fcos.load_detector("hdl32e")

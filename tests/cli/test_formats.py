@@ -156,7 +156,7 @@ def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):
     np.save(root / "clouds" / "002.npy", dense.astype(np.float32))
 
     def told():
-        progress._told.clear()
+        progress._told.clear()  # commands of one test print notes again
         return capsys.readouterr().err.splitlines()
 
     told()

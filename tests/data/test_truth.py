@@ -14,9 +14,9 @@ from made_kitti import make_kitti
 from made_nuscenes import make_tables, write
 from toy_frames import toy_frame
 
+from experiments import cached
 from experiments.cached import CachedFrames
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data import cached
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.clouds import CloudFiles
 from fcos_lidar_jax.data.frame import (
