@@ -66,8 +66,8 @@ class Checkpoints:
         """The newest intact checkpoint with its state; None if the folder has no checkpoints.
 
         Corrupt checkpoints are skipped with a warning on standard error; if all are corrupt, a CheckpointError
-        says so. Other failures, such as too little memory, end in their own error: an intact checkpoint must not
-        be taken for a corrupt one, because the next save removes it. ``like`` is any state of the same run.
+        says so. An intact checkpoint that cannot be read, for lack of memory for example, is an error and not
+        skipped, because the next save would remove it. ``like`` is any state of the same run.
         """
         paths = self.paths()
         for path in reversed(paths):

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import itertools
 import json
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +27,7 @@ from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.inference.export import ExportedDetector
 from fcos_lidar_jax.inference.openvino import OpenVinoDetector
 from fcos_lidar_jax.inference.timing import Call, Times, interleaved, machine
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.simulation.frames import make_frame
 
 _NUM_SIMULATED = 3  # clouds, without files
@@ -85,7 +85,7 @@ def measure(
     read = functools.partial(read_points, sensor=sensor)
     arrays = [read(file) for file in files] or [make_frame(seed, sensor).points for seed in range(_NUM_SIMULATED)]
     if line := sensor_mismatch(arrays[0], sensor):
-        print(f"warning: {line}", file=sys.stderr)
+        tell(f"warning: {line}")
     clean = functools.partial(make_cloud, config=detector.config, sensor=sensor)
     clouds = [clean(points) for points in arrays]
     takes = detector.record["batch"] if isinstance(detector, ExportedDetector) else "any"

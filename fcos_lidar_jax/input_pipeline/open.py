@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +18,7 @@ from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.data.recorded import check_scale, with_heading
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of
 from fcos_lidar_jax.simulation.frame_set import SIMULATED_SPLITS, simulated_split
 
@@ -263,7 +263,7 @@ def open_frames(
         given_scale, sensor = sensor.intensity_scale, data.reader.adapt(sensor, recorded)
         if intensity_scale is None and sensor.intensity_scale != given_scale:
             told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
-            print(f"{told} {data.reader.name}", file=sys.stderr, flush=True)
+            tell(f"{told} {data.reader.name}", once=True)
     open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
     sensor = sensor or recorded
     if intensity_scale is not None:
