@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
-from fcos_lidar_jax.fields import check, check_choices, check_hashable, check_least, from_json
+from fcos_lidar_jax.fields import check, check_least, check_types, from_json
 from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
 
@@ -35,9 +35,9 @@ class CloudReading:
     close_m: float = 1.0  # Half the side of the square around the sensor without points, metres.
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_least(self, 1, "num_sweeps")
         check(0 < self.close_m < math.inf, "close_m", self.close_m, "a positive number of metres")
-        check_choices(self)
 
 
 WHOLE_SWEEP = CloudReading(remove_close="none")
@@ -61,9 +61,9 @@ class ProjectionConfig:
     """Our choice: half the side of the square that ``remove_close`` clears, metres."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         check(1 <= self.num_rounds <= MAX_ROUNDS, "num_rounds", self.num_rounds, f"1 to {MAX_ROUNDS}")
         check(0 < self.close_m < math.inf, "close_m", self.close_m, "a positive number of metres")
-        check_choices(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,12 +85,12 @@ class StemConfig:
     """Our choice: one 1x1 merge per branch, or one shared by all branches."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_least(self, 1, "num_convs", "channels_per_type", "out_channels")
         positive = min(self.dilations, default=0) >= 1
         check(positive, "dilations", self.dilations, "one or more integers of at least 1")
         separable = self.group_rounds or self.groups == "types"
         check(separable, "group_rounds", self.group_rounds, "True unless groups is 'types'")
-        check_choices(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +132,7 @@ class ModelConfig:
     """Our choice: scales by which the nine channels are divided in preprocessing."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_least(self, 1, "row_upscale", "head_convs", "fpn_channels", "head_channels")
         for name in ("backbone_blocks", "backbone_widths"):
             stages = getattr(self, name)
@@ -144,7 +145,6 @@ class ModelConfig:
         check(nine, "channel_mean", self.channel_mean, "nine finite numbers")
         nine = len(self.channel_scale) == 9 and all(0 < scale < math.inf for scale in self.channel_scale)
         check(nine, "channel_scale", self.channel_scale, "nine positive numbers")
-        check_choices(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +173,7 @@ class LossConfig:
     centreness_m: float = 0.75  # Distance between the centres at which the centreness is 1 / e, metres.
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_least(self, 1, "top_q")
         for name, value in vars(self).items():
             if name.endswith("_weight"):
@@ -181,7 +182,6 @@ class LossConfig:
         check(math.isfinite(width) and width > 0, "centreness_m", width, "a positive number of metres")
         relevant = self.quality == "centreness" or width == LossConfig.centreness_m
         check(relevant, "centreness_m", width, f"{LossConfig.centreness_m} unless quality is centreness")
-        check_choices(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,12 +210,12 @@ class InferenceConfig:
     in training are allowed."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         check(0 <= self.min_probability < 1, "min_probability", self.min_probability, "within [0, 1)")
         check(0 <= self.iou_threshold <= 1, "iou_threshold", self.iou_threshold, "within [0, 1]")
         check_least(self, 1, "max_detections", "candidates_per_level")
         check(0 <= self.iou_exponent < math.inf, "iou_exponent", self.iou_exponent, "finite, 0 or more")
         check(self.merge_iou is None or 0 <= self.merge_iou <= 1, "merge_iou", self.merge_iou, "within [0, 1]")
-        check_choices(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,6 +232,7 @@ class AugmentConfig:
     scale_range: tuple[float, float] = (0.95, 1.05)  # The scale is uniform in this range.
 
     def __post_init__(self) -> None:
+        check_types(self)
         for name in ("flip_x_probability", "flip_y_probability"):
             check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
         angle = self.max_rotation_rad
@@ -254,6 +255,7 @@ class CopyPasteConfig:
     min_points: int = 5  # Minimum number of points of an object, over all pasted sweeps.
 
     def __post_init__(self) -> None:
+        check_types(self)
         check(min(self.targets, default=0) >= 0, "targets", self.targets, "counts of at least 0")
         check_least(self, 1, "min_points")
 
@@ -284,6 +286,7 @@ class OptimizerConfig:
     epochs: int = 40  # Passes over the training set.
 
     def __post_init__(self) -> None:
+        check_types(self)
         for name in ("peak_learning_rate", "initial_divisor", "final_divisor", "max_gradient_norm"):
             value = getattr(self, name)
             check(0 < value < math.inf, name, value, "finite, above 0")
@@ -331,7 +334,7 @@ class Config:
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
 
     def __post_init__(self) -> None:
-        check_hashable(self)
+        check_types(self)
         check_least(self, 1, "num_sweeps", "max_points", "max_boxes")
         check_least(self, 0, "fade_epochs")
         names = self.classes

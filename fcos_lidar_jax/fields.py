@@ -23,23 +23,36 @@ def check_least(record: Any, least: int, *fields: str) -> None:
         check(getattr(record, field) >= least, field, getattr(record, field), f"at least {least}")
 
 
-def check_choices(record: Any) -> None:
-    """Check that every ``Literal`` field of a dataclass holds one of its choices."""
-    for name, hint in get_type_hints(type(record)).items():
-        if get_origin(hint) is Literal:
-            choices = get_args(hint)
-            value = getattr(record, name)
-            check(value in choices, name, value, "one of " + ", ".join(map(repr, choices)))
+def check_types(record: Any) -> None:
+    """Check that every field of a dataclass has its annotated type, and that a ``Literal`` is one of its choices.
+
+    Integers fit floats. Lists and arrays do not fit: compiled programs are looked up by the hash of options.
+    """
+    for name, kind in get_type_hints(type(record)).items():
+        value = getattr(record, name)
+        check(_fits(kind, value), name, value, _expected(kind))
 
 
-def check_hashable(record: Any) -> None:
-    """Check that a dataclass has no list or array: compiled programs are looked up by its hash."""
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        if dataclasses.is_dataclass(value):
-            check_hashable(value)
-        else:
-            check(type(value).__hash__ is not None, field.name, value, "a tuple")
+def _fits(kind: Any, value: Any) -> bool:
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return any(type(value) is type(choice) and value == choice for choice in args)
+    if origin is tuple:  # The numbers of values are checked in the words of each field.
+        return isinstance(value, tuple) and all(_fits(args[0], entry) for entry in value)
+    if args:  # AugmentConfig | None
+        return any(_fits(each, value) for each in args)
+    if isinstance(value, bool):
+        return kind is bool
+    return isinstance(value, int | float if kind is float else kind)
+
+
+def _expected(kind: Any) -> str:
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return "one of " + ", ".join(map(repr, args))
+    if origin is tuple:
+        return f"a tuple of {args[0].__name__}"
+    return " or ".join("None" if each is type(None) else each.__name__ for each in args or (kind,))
 
 
 def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> Any:
@@ -62,7 +75,7 @@ def from_json(kind: Any, value: Any, where: str, *, defaults: bool = False) -> A
         return _dataclass_from_json(kind, value, where, defaults)
     origin, args = get_origin(kind), get_args(kind)
     if origin is Literal:
-        return value  # Checked by the dataclass, see check_choices.
+        return value  # Checked by the dataclass, see check_types.
     if origin is tuple:
         check(isinstance(value, list | tuple), where, value, "a list")
         kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args

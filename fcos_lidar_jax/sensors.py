@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fcos_lidar_jax.fields import check, check_choices, check_hashable, from_json
+from fcos_lidar_jax.fields import check, check_types, from_json
 from fcos_lidar_jax.namespaces import own_names
 
 __dir__ = own_names(__name__)
@@ -56,7 +56,7 @@ class Sensor:
     pi/2 where y does. None if unknown; then clouds are never turned."""
 
     def __post_init__(self) -> None:
-        check_hashable(self)
+        check_types(self)
         table = np.asarray(self.inclinations_rad, np.float64)
         if table.ndim != 1 or table.size < 2:
             raise ValueError(f"inclinations_rad: got {table.size} beams, expected at least 2")
@@ -72,7 +72,6 @@ class Sensor:
         for name in ("limit_xy_m", "intensity_scale"):
             value = getattr(self, name)
             check(_finite(value) and value > 0, name, value, "a positive number")
-        check_choices(self)
         if (ends := self.azimuth_limits_rad) is not None:
             within = len(ends) == 2 and abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
             expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
@@ -267,6 +266,7 @@ class _EvenBeams:
     rows: int
 
     def __post_init__(self) -> None:
+        check_types(self)
         for name in ("lowest", "highest"):
             check(_finite(getattr(self, name)), name, getattr(self, name), "a finite number")
         check(self.lowest < self.highest, "highest", self.highest, f"more than the lowest beam, {self.lowest:g}")

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import re
 
 import pytest
 
@@ -205,3 +206,30 @@ def test_the_papers_presets_keep_close_points_of_the_current_sweep():
     assert modes == dict.fromkeys(PRESETS, "sweeps") | dict.fromkeys(
         ("compact", "kitti_compact", "centerpoint_compact", "quickstart"), "all"
     )
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "value", "expected"),
+    [
+        (ProjectionConfig, "num_rounds", 2.5, "int"),
+        (ProjectionConfig, "num_rounds", "5", "int"),
+        (ProjectionConfig, "prioritize_current", 1, "bool"),
+        (LossConfig, "top_q", True, "int"),
+        (LossConfig, "l1_weight", None, "float"),
+        (LossConfig, "iou_loss", "ciou", "one of 'iou', 'log_iou', 'giou', 'diou'"),
+        (InferenceConfig, "merge_iou", "0.5", "float or None"),
+        (StemConfig, "dilations", (1, 2.0), "a tuple of int"),
+        (StemConfig, "dilations", [1, 2], "a tuple of int"),
+        (Config, "loss", None, "LossConfig"),
+        (Config, "projection", {"num_rounds": 1}, "ProjectionConfig"),
+        (Config, "augment", False, "AugmentConfig or None"),
+    ],
+)
+def test_a_value_of_another_type_is_refused(kind, field, value, expected):
+    message = re.escape(f"{field}: got {value!r}, expected {expected}")
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        dataclasses.replace(kind(), **{field: value})
+
+
+def test_integers_are_accepted_as_floats():
+    assert LossConfig(l1_weight=1).l1_weight == 1

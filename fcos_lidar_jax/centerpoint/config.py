@@ -5,7 +5,7 @@ import math
 from typing import Any, Literal
 
 from fcos_lidar_jax.config import Config, LossConfig, ModelConfig
-from fcos_lidar_jax.fields import check, check_choices, check_least
+from fcos_lidar_jax.fields import check, check_least, check_types
 from fcos_lidar_jax.sensors import Sensor
 
 _RANGE_VIEW_LOSSES = (
@@ -40,6 +40,7 @@ class PillarConfig:
     centre_prior: float = 0.1  # Initial probability of a centre.
 
     def __post_init__(self) -> None:
+        check_types(self)
         check(0 < self.range_m < math.inf, "range_m", self.range_m, "a positive number of metres")
         check(0 < self.pillar_m < self.range_m, "pillar_m", self.pillar_m, f"between 0 and {self.range_m} m")
         side = 2 * self.range_m / self.pillar_m
@@ -53,7 +54,6 @@ class PillarConfig:
         check(consecutive, "groups", self.groups, "the numbers from 0 up to the last group")
         for name in ("min_overlap", "centre_prior"):
             check(0 < getattr(self, name) < 1, name, getattr(self, name), "between 0 and 1")
-        check_choices(self)
 
 
 @dataclasses.dataclass(frozen=True)
