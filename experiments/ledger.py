@@ -32,8 +32,8 @@ RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
 _DIRECTION = "agrees only in direction"
 _OUR_NDS = (
-    " Simulated objects have no attributes: their error is 1 in every row, so NDS is at most 90 here, and the\n"
-    "paper's gains hold a part that these cannot."
+    " Simulated objects have no attributes, so the attribute error is 1 in every row, and NDS is at\n"
+    "most 90 here. The paper's gains include gains in this error, which cannot appear here."
 )
 _MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- end of the ledger -->\n")
 
@@ -136,9 +136,9 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     >>> verdict([4.0, 4.1, 4.2], 1.9)[0]
     'agrees only in direction'
     >>> verdict([-2.0, -2.1, -2.2], 1.9)
-    ('disagrees', "a training as long as the paper's")
+    ('disagrees', "a training run as long as the paper's")
     >>> verdict([-1.0, 0.5, 2.0], 1.0)
-    ('undecided', '12 seeds, or a longer training')
+    ('undecided', '12 seeds, or longer training')
     >>> verdict([2.0, 2.1], 1.9)  # two seeds say nothing about their spread
     ('undecided', 'more seeds')
     """
@@ -147,10 +147,10 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
         return "undecided", "more seeds"
     _, low, high = bounds
     if low <= 0 <= high and low <= paper <= high:
-        return "undecided", f"{seeds_needed(gains, paper)} seeds, or a longer training"
+        return "undecided", f"{seeds_needed(gains, paper)} seeds, or longer training"
     if (low > 0 and paper > 0) or (high < 0 and paper < 0):
         return "agrees" if low <= paper <= high else _DIRECTION, ""
-    return "disagrees", "a training as long as the paper's"
+    return "disagrees", "a training run as long as the paper's"
 
 
 def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str = "mAP") -> tuple[list[float], int]:

@@ -32,7 +32,7 @@ class CloudReading:
     remove_close: Literal["all", "sweeps", "none"] = "sweeps"
     """Sweeps from which the points on the ego vehicle are removed, each in its own frame: all, only the older
     ones, or none."""
-    close_m: float = 1.0  # Half the side of the square around the sensor without points, metres.
+    close_m: float = 1.0  # Half the side of the square around the sensor that is cleared, metres.
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -250,8 +250,8 @@ class CopyPasteConfig:
     """
 
     targets: tuple[int, ...] = ()
-    """Our choice: number of boxes per class up to which a frame is filled, including its own boxes; () looks it up
-    by class name, see ``classes.PASTE_TARGETS``."""
+    """Our choice: number of boxes per class up to which a frame is filled, including its own boxes; () for the
+    numbers of ``classes.PASTE_TARGETS``."""
     min_points: int = 5  # Minimum number of points of an object, over all pasted sweeps.
 
     def __post_init__(self) -> None:
@@ -282,7 +282,7 @@ class OptimizerConfig:
     accumulate: int = 1
     """Micro-batches per step. Gradients and counts are summed and divided once; batch norm sees one
     micro-batch."""
-    ema_decay: float = 0.0  # Decay of the moving average of the weights used for detection; 0: none (paper).
+    ema_decay: float = 0.0  # Decay of the moving average of the weights used for detection; 0 for none (paper).
     epochs: int = 40  # Passes over the training set.
 
     def __post_init__(self) -> None:
@@ -314,23 +314,23 @@ class Config:
     (3, False)
     """
 
-    name: str = "nuscenes"  # Name of the preset on which it is based.
+    name: str = "nuscenes"  # Name of the preset on which the configuration is based.
     sensor: str = "nuscenes_hdl32e"  # Sensor preset or path of a sensor file.
     classes: tuple[str, ...] = NUSCENES_CLASSES
     """Names of the detected classes. Each has one logit; the last logit is the background."""
     class_ranges_m: tuple[float, ...] = ()
-    """Evaluation range per class, metres; () looks it up by class name, see ``classes.RANGES_M``."""
+    """Evaluation range per class, metres; () for the ranges of ``classes.RANGES_M``."""
     num_sweeps: int = 10  # Sweeps fused into one cloud, including the current one.
     max_points: int = 300_000  # Our choice: rows to which a fused cloud is padded.
     max_boxes: int = 256  # Our choice: rows to which the ground truth is padded.
     fade_epochs: int = 0  # Last epochs without copy-paste (paper, section 4.5: 5 for the test set).
-    copy_paste: CopyPasteConfig | None = CopyPasteConfig()  # Objects from the ground-truth database; None: none.
+    copy_paste: CopyPasteConfig | None = CopyPasteConfig()  # Objects from the ground-truth database, or None.
     class_balanced: bool = True  # Our choice: frames are resampled so that all classes occur equally often (CBGS).
     projection: ProjectionConfig = ProjectionConfig()  # Points to range image.
     model: ModelConfig = ModelConfig()  # The network.
     loss: LossConfig = LossConfig()  # Assignment and losses.
     inference: InferenceConfig = InferenceConfig()  # Predictions to detections.
-    augment: AugmentConfig | None = AugmentConfig()  # Augmentation in training; None: none.
+    augment: AugmentConfig | None = AugmentConfig()  # Augmentation in training, or None.
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
 
     def __post_init__(self) -> None:

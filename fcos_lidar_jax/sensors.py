@@ -41,7 +41,7 @@ class Sensor:
     """Azimuth bins of one turn, or of the covered sector. Columns run clockwise; column 0 starts at azimuth pi, or
     at the left end of the sector."""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # In the points' frame; subtracted before equation 1.
-    limit_xy_m: float = 54.0  # Points with ``|x|`` or ``|y|`` at or beyond it are dropped.
+    limit_xy_m: float = 54.0  # Points with ``|x|`` or ``|y|`` at or beyond this limit are dropped.
     limit_z_m: tuple[float, float] = (-5.0, 3.0)  # Points with z outside this open interval are dropped.
     intensity_scale: float = 1.0  # Factor from the intensity in files to the scale 0-255.
     row_source: Literal["inclination", "laser"] = "inclination"
@@ -53,7 +53,7 @@ class Sensor:
     # Not in `repr`, which fingerprints of frames contain: it changes no point that is read.
     forward_rad: float | None = dataclasses.field(default=None, repr=False)
     """Azimuth of the ego vehicle's heading in the frame of the points, in [-pi, pi]: 0 where x points forward,
-    pi/2 where y does. None if unknown; then clouds are never turned."""
+    pi/2 where y points forward. None if unknown; clouds are then never rotated."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -143,7 +143,7 @@ def sector(sensor: Sensor, middle_rad: float, num_columns: int) -> Sensor:
 def turn_between(data: Sensor, other: Sensor) -> float:
     """Rotation about z, radians, from one sensor's frame to another's.
 
-    It brings the heading of the ego vehicle in one frame to that in the other; 0 if one of them is unknown.
+    Maps the ego vehicle's heading in the first frame to its heading in the second; 0 if a heading is unknown.
 
     >>> turn_between(KITTI_HDL64E, NUSCENES_HDL32E) == math.pi / 2, turn_between(VLP16, NUSCENES_HDL32E)
     (True, 0.0)
@@ -155,8 +155,8 @@ def turn_between(data: Sensor, other: Sensor) -> float:
 
 
 def in_frame_of(sensor: Sensor, data: Sensor) -> Sensor:
-    """A sensor's rows, columns and limits in the frame and the intensity scale of points that another sensor
-    recorded.
+    """Combine rows, columns and limits of ``sensor`` with frame and intensity scale of ``data``, which recorded
+    the points.
 
     >>> image = in_frame_of(NUSCENES_HDL32E, KITTI_HDL64E)
     >>> image.num_rows, image.intensity_scale, image.forward_rad

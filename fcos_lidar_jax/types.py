@@ -28,7 +28,7 @@ BOX = "x, y, z, l, w, h, yaw, ..."
 def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:
     """Refuse arrays without the expected columns: JAX clamps indices, so results would be wrong without an error.
 
-    ``columns`` are the names of the last axis; ``"..."`` at the end allows more. ``name`` is that of the array.
+    ``columns`` are the names of the last axis; ``"..."`` at the end allows more. ``name`` names the array.
 
     Raises:
         ValueError: too few or too many columns.
@@ -172,7 +172,7 @@ class Targets:
 
 
 class Sums(NamedTuple):
-    """The losses of a batch before the division; all of it adds up over micro-batches and devices.
+    """The losses of a batch before the division. All fields are sums, which add up over micro-batches and devices.
 
     >>> import jax.numpy as jnp
     >>> Sums(losses={"boxes": {"l1": jnp.float32(3)}}, counts={"boxes": jnp.int32(2)}).means
@@ -181,7 +181,7 @@ class Sums(NamedTuple):
 
     losses: dict[str, dict[str, Array]]
     """Name of the count that divides them -> loss -> its sum, unweighted; ``LossConfig`` has the weights."""
-    counts: dict[str, Array]  # Integers, metrics by their names.
+    counts: dict[str, Array]  # Integer counts by name; they are metrics, too.
     means: dict[str, dict[str, Array]] = {}  # noqa: RUF012
     """Further metrics: name of the count that divides them -> metric -> its sum."""
 

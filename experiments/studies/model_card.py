@@ -27,7 +27,7 @@ _UNSEEN = {
     "hdl32e": "with class frequencies of cities and half as many objects as in training",
     "quickstart": "of the same kind of streets",
 }
-_AXES = "x right, y ahead, z up from the sensor, in metres"
+_AXES = "x right, y forward, z up from the sensor, in metres"
 _WEAK_AP, _WEAK_BOXES = 0.05, 10
 """Classes with less AP are listed as hardly detected, if they have at least this many boxes."""
 
@@ -68,11 +68,11 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield f"Preset `{trained['preset']}` for the sensor `{detector.sensor.name}`: {parameters:,} parameters,"
     yield f"{record['bytes'] / 2**20:.1f} MiB as float16, under the licence of the package.\n"
     yield "## What it is for\n"
-    yield f"The input is one sweep of this sensor: {_AXES}, and intensities of 0 to 255. The detected classes are"
+    yield f"The input is one sweep of this sensor: {_AXES}, and intensities from 0 to 255. The classes are"
     yield f"{', '.join(label.replace('_', ' ') for label in detector.classes)}.\n"
-    yield "The weights are a starting point for fine-tuning and for first trials, not a usable detector: they"
-    yield "were trained on simulated streets only, and miss and invent objects, as the tables show. Another sensor"
-    yield "needs other weights.\n"
+    yield "The weights are a starting point for fine-tuning and for first trials, not a usable detector. They were"
+    yield "trained only on simulated streets. As the tables show, they miss objects and report objects that do not"
+    yield "exist. Other sensors need other weights.\n"
     yield "## Scores\n"
     low, high = record["interval"]["low"], record["interval"]["high"]
     scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
@@ -81,14 +81,14 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
 
 def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     trained = record["training"]
-    yield "\n## Trained on\n"
-    yield "Only simulated streets, each frame on another street:\n"
+    yield "\n## Training data\n"
+    yield "Only simulated streets, a different one in each frame:\n"
     for leg in (*record["earlier"], trained):
         done = f"{leg['frames_seen']:,} frames, step {leg['steps']:,} of {leg['steps_planned']:,}"
         hours = f"{leg['seconds_of_steps'] / 3600:.1f} hours of steps"
         yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {hours}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
-        yield f"\nA training from {name} started from the weights of the training before it."
+        yield f"\nA run from {name} started from the weights of the run before it."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
 
@@ -110,11 +110,11 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
     command = "`python -m experiments.studies.transfer --data FOLDER`"
     record = read_json(file, dict[str, Any]) if file.exists() else {}
     if record.get("checkpoint", {}).get("hash") != weights:
-        yield f"Not measured yet with these weights; {command} does."
+        yield f"Not measured yet with these weights: run {command}."
         return
     yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, measured by {command}."
-    yield "Numbers of boxes are in brackets. Bootstrap intervals resample simulated drives or real keyframes; the"
-    yield "latter are too narrow, because keyframes of a scene are similar."
+    yield "Numbers of boxes are in brackets. Bootstrap intervals resample simulated drives or real keyframes."
+    yield "Intervals over keyframes are too narrow, because keyframes of a scene are similar."
     for name, part in record.items():
         if isinstance(part, dict) and "all" in part:
             yield from _part(name, part)

@@ -26,7 +26,7 @@ from fcos_lidar_jax.cli import (
 from fcos_lidar_jax.files import local_path
 
 _COMMANDS = {
-    "demo": (demo.Demo, demo.run, "detect in a simulated drive; needs no data"),
+    "demo": (demo.Demo, demo.run, "detect objects in a simulated drive; needs no data"),
     "synthesize": (synthesize.Synthesize, synthesize.run, "write simulated streets in the nuScenes layout"),
     "prepare": (prepare.Prepare, prepare.run, "extract objects for copy-paste; index nuScenes"),
     "train": (train.Train, train.run, "train a detector, or resume a run"),

@@ -104,7 +104,7 @@ DataSensor = Annotated[
     option(
         "SENSOR",
         default="KITTI's or Argoverse 2's for files in their folders, else the detector's",
-        text="Sensor of the data, a preset or a sensor file, for heading, position and intensity scale.",
+        text="Sensor of the data, a preset or a sensor file; gives heading, position and intensity scale.",
     ),
 ]
 Yaw = Annotated[
@@ -117,7 +117,7 @@ Yaw = Annotated[
     ),
 ]
 IntensityScale = Annotated[
-    float | None, option("FACTOR", default="the sensor's", text="Factor that brings intensities to 0-255.")
+    float | None, option("FACTOR", default="the sensor's", text="Factor that scales intensities to 0-255.")
 ]
 
 

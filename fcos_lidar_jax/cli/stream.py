@@ -46,7 +46,8 @@ _TRACKED_SCORE = 0.5  # Of boxes with lower scores, most are on no object, and t
 
 @dataclasses.dataclass(frozen=True)
 class Stream:
-    """Detect boxes in a drive, and write one line of JSON per sweep as soon as it is ready, or another format.
+    """Detect boxes in a drive, and write one line of JSON per sweep as soon as it is ready, or another file
+    format.
 
     Each sweep is fused with older sweeps, as many as the detector was trained with. The boxes are the same as from
     `fcos-lidar detect --sweeps`.
@@ -62,8 +63,8 @@ class Stream:
     poses: Annotated[
         Path | None, option("FILE", default="the poses of the source; without poses, sweeps are not fused")
     ] = None
-    """Poses from sensor to world for a folder or a ROS recording, lines `t x y z qx qy qz qw` (TUM). For a folder
-    also FILE.json: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], oldest first."""
+    """Poses from sensor to world, for a folder or a ROS recording: lines `t x y z qx qy qz qw` (TUM) or, for a
+    folder, FILE.json: [{"file", "timestamp_us", "sensor_to_world": 4x4}, ...], oldest first."""
     topic: Annotated[str | None, option("T", default="the only one")] = None
     """ROS: topic of the PointCloud2 messages."""
     odometry: Annotated[str | None, option("T|tf")] = None
@@ -75,7 +76,7 @@ class Stream:
     index: Annotated[Path | None, option("DIR", default="DATA_ROOT/.fcos_lidar/VERSION")] = None
     """With --data-root: folder of the index, as given to `fcos-lidar prepare --index`."""
     keyframes: bool = False  # With --data-root: detect in keyframes only, still fusing the sweeps between them.
-    allow_missing_sweeps: bool = False  # With --data-root: skip missing sweeps, but no keyframe.
+    allow_missing_sweeps: bool = False  # With --data-root: skip missing sweeps, but never a keyframe.
     follow_links: bool = False  # With --data-root: follow links that lead out of DATA_ROOT.
     page: options.Page = None
     rrd: options.Rrd = None

@@ -61,19 +61,19 @@ class Cloud:
 def make_cloud(points: np.ndarray, config: Config, *, sensor: Sensor, num_close: int | None = None) -> Cloud:
     """Remove invalid and close points, and truncate or pad to ``config.max_points`` rows.
 
-    If too many rows are left, the oldest sweeps lose theirs first. The sweep at the boundary, possibly the current
-    one, loses random rows by a fixed seed. All clouds have one shape, so nothing is ever compiled again.
+    If too many rows are left, rows of the oldest sweeps are dropped first. In the sweep at the limit, possibly the
+    current one, rows are dropped at random by a fixed seed. All clouds have one shape, so nothing is recompiled.
 
     Args:
         points: f32[n, 3 to 6]: x, y, z, intensity (0-255), time lag (s), laser number. Missing intensities and
             lags become 0; columns that the sensor does not use are dropped.
         config: gives ``max_points`` and ``reading``.
         sensor: sensor that recorded the points.
-        num_close: points on the ego vehicle that the reader removed, in each sweep's own frame; None for points
-            of no reader: those are removed here, and the time lags checked.
+        num_close: points on the ego vehicle that the reader removed, in each sweep's own frame; None if no
+            reader was used: close points are then removed here, and the time lags are checked.
 
     Raises:
-        ValueError: wrong number of columns; for points of no reader also rings instead of time lags.
+        ValueError: wrong number of columns; without a reader also rings instead of time lags.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE

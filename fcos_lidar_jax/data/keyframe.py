@@ -14,7 +14,7 @@ from fcos_lidar_jax.sensors import Sensor
 
 
 def read_keyframe(folder: Path, sensor: Sensor, number: int = 0, reading: CloudReading = WHOLE_SWEEP) -> Frame:
-    """Read a folder's keyframe, or that of a number in a list, with the boxes of the ten nuScenes classes.
+    """Read a folder's keyframe, or a list's keyframe by its number, with the boxes of the ten nuScenes classes.
 
     ``boxes.json`` is ``{"lidar_file": NAME, "boxes": [{"class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy",
     "num_lidar_pts"}]}`` in the LiDAR frame, or a list of such records. The count may also be called

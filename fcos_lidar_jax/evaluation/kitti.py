@@ -28,8 +28,8 @@ def evaluate_kitti(
     Every file of the results is a frame; labels of other frames are not read. An object counts if it has the class
     and is within the limits of the difficulty. Other objects of the class, and its neighbours (vans for cars,
     sitting persons for pedestrians), are ignored: they may be detected or missed. Detections that are lower in the
-    image than the difficulty's limit are ignored, too. DontCare areas excuse no detection: they have no place in
-    space. The overlap of image boxes and the orientation (AOS) are not evaluated.
+    image than the difficulty's limit are ignored, too. DontCare regions do not excuse detections, because
+    they have no position in 3D. The overlap of image boxes and the orientation (AOS) are not evaluated.
 
     The mean is over 40 of 41 positions, without the first. With fewer than 41 objects that count, perfect
     detections therefore stay below 100, as in the development kit.

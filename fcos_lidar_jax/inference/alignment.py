@@ -80,12 +80,14 @@ def align(
     yaw_rad: float | None = None,
     intensity_scale: float | None = None,
 ) -> Alignment:
-    """The alignment to a detector of points, which are read with its ``data``.
+    """Make the alignment of points to a detector. Read the points with its ``data``.
 
     Args:
-        sensor: recorded the points. By default the sensor that the paths name, with a note, or the detector's.
+        sensor: sensor that recorded the points; by default the sensor that the paths name (printed as a note), or
+            the detector's.
         paths: point files, or recordings in folders.
-        yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the one between headings.
+        yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the angle between
+            headings.
         intensity_scale: factor from the intensity in files to the scale 0-255, instead of the sensor's.
 
     Raises:

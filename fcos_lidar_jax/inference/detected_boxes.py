@@ -75,7 +75,7 @@ class DetectedBoxes:
         return (self[index] for index in range(len(self)))
 
     def select(self, *, min_score: float = 0.0, labels: Collection[str] = ()) -> "DetectedBoxes":
-        """The boxes that reach a score, of some classes, by default all; a ValueError names an unknown class."""
+        """Select boxes by score and class, by default of all classes; a ValueError names an unknown class."""
         kept = self.scores >= min_score
         labels = {labels} if isinstance(labels, str) else {*labels}
         for name in labels - {*self.classes}:
@@ -94,8 +94,8 @@ class DetectedBoxes:
         return {**self.counts, "boxes": boxes}
 
     def picture(self, *, min_score: float = SHOWN_SCORE, truth: TrueBoxes | None = None) -> bytes:
-        """Draw the cloud and its boxes from ``min_score`` from above, as a PNG file, with the truth in dashed
-        outlines.
+        """Draw the cloud and the boxes of at least ``min_score`` in bird's-eye view, and the truth dashed; returns
+        the bytes of a PNG file.
         """
         from fcos_lidar_jax.visualization.bev import draw_bev
 

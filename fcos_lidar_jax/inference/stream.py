@@ -47,9 +47,9 @@ def detect_stream(
         at_us: times of the sweeps to detect in; other sweeps are only fused into later ones. By default all.
         sensor: sensor that recorded the sweeps, by default the detector's. Sweeps of other sensors are rotated and
             shifted.
-        yaw_rad: rotation of the sweeps about z before detection, undone for the boxes, instead of the one between
-            the headings: pi / 2 if x points forward in the sweeps and y in the training data. Detection degrades
-            for orientations absent from training.
+        yaw_rad: rotation of the sweeps about z before detection, undone for the boxes, instead of the angle
+            between the headings: pi / 2 if x points forward in the sweeps and y in the training data. Detection
+            degrades for orientations absent from training.
 
     Raises:
         ValueError: names a sweep that is not later than the sweep before.

@@ -32,7 +32,7 @@ class Reader:
     name: Format
     marks: tuple[str, ...]  # glob patterns of folders in this format; () if the frames are not on disk
     sensor: Sensor | None  # default sensor; None if the data name it
-    splits: Callable[["DataSet", str | Path | None], list[str]]  # (data set, file of own splits) -> their names
+    splits: Callable[["DataSet", str | Path | None], list[str]]  # (data set, file of custom splits) -> their names
     open: Callable[..., FrameSet]  # (data set, *, split, sensor, reading, **options) -> frames
     options: tuple[str, ...] = ()  # further options of open_frames that this format takes
     class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)  # by the data set they lead to
@@ -171,9 +171,9 @@ def default_split(
 ) -> str | None:
     """The default split for a purpose: ``train`` or ``val``; ``mini_train`` or ``mini_val`` for nuScenes mini.
 
-    If that split is missing but one is ``required``, take the only other split, unless its name tells the other
-    purpose; of several, none is taken, but an error asks for one. None if the data have no splits or, unless it is
-    required, if that split is missing. ``splits`` is a file of own splits.
+    If that split is missing but one is ``required``, the only other split is taken, unless its name belongs to the
+    other purpose. If there are several others, an error asks for a choice. Returns None if the data have no
+    splits, or if that split is missing and not required. ``splits`` is a file of custom splits.
     """
     name = f"mini_{purpose}" if data.version.endswith("mini") else purpose
     names = data.reader.splits(data, splits)
@@ -219,7 +219,7 @@ def open_frames(
         class_map: name in the data -> name to use instead; None drops objects, other names stay. Or the name of a
             class map: ``"nuscenes"`` (KITTI and Argoverse 2), ``"kitti"`` (nuScenes and simulated frames).
         index: folder of the index that ``prepare`` wrote (nuScenes).
-        splits: JSON file of own splits, ``{"name": [...]}`` of scenes (nuScenes) or frames (folder).
+        splits: JSON file of custom splits, ``{"name": [...]}`` of scenes (nuScenes) or frames (folder).
         allow_missing_sweeps: skip older sweeps with a missing file (nuScenes).
         follow_links: also read files outside the root to which links lead (nuScenes, folder).
         full_turn: keep the points outside the camera's image, where no objects are labelled (KITTI).

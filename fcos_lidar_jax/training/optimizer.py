@@ -12,9 +12,9 @@ _FIXED = ("b2", "eps", "eps_root", "mu_dtype", "weight_decay", "mask", "nesterov
 
 
 def learning_rate_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule:
-    """Cosine schedule from a fraction of the peak to the peak at the end of the warm-up, then towards the last.
+    """Cosine schedule: up from a fraction of the peak during the warm-up, then down towards the final rate.
 
-    The last of ``num_steps`` updates is slightly above the last rate, which belongs to the step after it.
+    The final rate belongs to step ``num_steps``, so the last update, the step before, has a slightly higher rate.
 
     >>> schedule = learning_rate_schedule(OptimizerConfig(), 1000)
     >>> [f"{float(schedule(step)):.1e}" for step in (0, 400, 999, 1000)]

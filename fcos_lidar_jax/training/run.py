@@ -70,7 +70,7 @@ def train(
             their sensor.
         steps: number of updates of the whole run.
         seed: seed of weights, order, pasted objects and augmentation.
-        tests: frames to evaluate on along the way.
+        tests: frames to evaluate on during training.
         objects: ground-truth database for copy-paste; required unless ``config.copy_paste`` is None.
         resume: resume the same run from the newest intact checkpoint in the folder.
         weights: initial weights, as a checkpoint or arrays; random by default.
@@ -242,9 +242,9 @@ def _call(hooks: Sequence[Hook], number: int, values: Record) -> None:
 
 @contextlib.contextmanager
 def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool) -> Iterator[None]:
-    """Hold the folder of a run against other processes; with ``spec``, it becomes the folder of that run.
+    """Lock the folder of a run against other processes; with ``spec``, make it the folder of that run.
 
-    What :func:`~fcos_lidar_jax.training.plan.check_run` refuses is refused before anything is written.
+    Errors of :func:`~fcos_lidar_jax.training.plan.check_run` are raised before anything is written.
     """
     check_run(folder, spec, resume=resume)  # before the lock, which makes the folder
     with folder_lock(folder, "training"):

@@ -334,7 +334,7 @@ def open_keyframes(
     splits: str | Path | None = None,
     **options: Any,
 ) -> NuScenesFrames:
-    """Open the keyframes of a split, or all; ``splits`` is a file of own splits, ``options`` go to NuScenes."""
+    """Open the keyframes of a split, or all; ``splits`` is a file of custom splits, ``options`` go to NuScenes."""
     data = NuScenes(root, version, **options)
     tokens = data.sample_tokens if split is None else data.split(split, file=splits)
     return NuScenesFrames(data, tuple(tokens), reading, sensor)
