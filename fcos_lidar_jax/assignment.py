@@ -97,6 +97,7 @@ def dynamic_k(
     """K of each box: the sum of its ``top_q`` highest IoUs, rounded half up.
 
     K is at least 1 and at most the number of candidates. ``owner`` is -1 for locations without a box.
+    ``num_boxes`` and ``top_q`` are static.
 
     >>> dynamic_k(jnp.array([0, 0, 0, -1]), jnp.array([0.9, 0.6, 0, 0]), num_boxes=2, top_q=20).tolist()
     [2, 0]

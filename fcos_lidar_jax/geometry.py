@@ -72,6 +72,8 @@ def spherical(xyz: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Arra
 def image_columns(azimuth: Float[Array, "n"], sensor: Sensor) -> tuple[Int32[Array, "n"], Bool[Array, "n"]]:
     """Image column of each azimuth, clockwise from the sensor's first azimuth, and whether the sensor covers it.
 
+    The sensor is static.
+
     >>> from fcos_lidar_jax.sensors import TINY, sector
     >>> column, inside = image_columns(jnp.array([0.0, 3.0]), sector(TINY, 0.0, 2))
     >>> column[:1].tolist(), inside.tolist()

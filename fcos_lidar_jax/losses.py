@@ -79,7 +79,7 @@ def iou_loss(
         prediction, target: ``x, y, z, l, w, h, cos yaw, sin yaw``.
         mask: locations to sum over.
         kind: ``"iou"`` is 1 - IoU, ``"log_iou"`` is -ln IoU (UnitBox), ``"giou"`` and ``"diou"`` use the smallest
-            box that encloses both and is aligned with the target.
+            box that encloses both and is aligned with the target (static).
 
     Raises:
         ValueError: unknown kind.
@@ -151,7 +151,7 @@ def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], m
 
 
 def weighted(losses: Mapping[str, Array], config: LossConfig) -> Array:
-    """The weighted sum of losses, ``NAME_weight`` of the configuration times NAME; 1 for names without a weight.
+    """The weighted sum of losses, ``NAME_weight`` of the configuration (static) times NAME, or times 1.
 
     >>> float(weighted({"l1": jnp.float32(4), "mine": jnp.float32(3)}, LossConfig()))
     4.0

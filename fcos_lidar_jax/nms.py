@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
@@ -50,6 +51,9 @@ def rotated_nms(
     Returns:
         indices of the kept boxes by decreasing score, 0 in unused slots, and a mask of the used slots.
 
+    Raises:
+        ValueError: at trace time, if ``max_outputs`` is below 1.
+
     >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0], [9, 0, 0, 4, 2, 1, 0]])
     >>> scores, valid = jnp.array([0.5, 0.9, 0.1]), jnp.ones(3, bool)
     >>> kept, used = rotated_nms(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)
@@ -59,6 +63,7 @@ def rotated_nms(
     >>> compiled(boxes, scores, valid, iou_threshold=0.2, max_outputs=3)[0].tolist()
     [1, 2, 0]
     """
+    check(max_outputs >= 1, "max_outputs", max_outputs, "at least 1")
     if not len(scores):
         return jnp.zeros(max_outputs, jnp.int32), jnp.zeros(max_outputs, bool)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)

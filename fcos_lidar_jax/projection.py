@@ -31,7 +31,7 @@ __dir__ = own_names(__name__)
 def close_to_sensor(
     points: Float32[Array | np.ndarray, "n c"], sensor: Sensor, close_m: float
 ) -> Bool[Array | np.ndarray, "n"]:
-    """Mask of the points on the ego vehicle: ``|x| < close_m`` and ``|y| < close_m`` around the sensor.
+    """Mask of the points on the ego vehicle: ``|x| < close_m`` and ``|y| < close_m`` around the sensor (static).
 
     NumPy input gives NumPy output, which filters clouds of any length on the host without compilation.
 
@@ -53,8 +53,9 @@ def remove_close(
 
     Args:
         points: x, y, z, intensity, time lag. NumPy input gives NumPy output, JAX input gives JAX output.
-        valid, sensor: False for padding; the sensor's position.
-        reading: which sweeps lose their close points, and the size of the emptied square.
+        valid: False for padding.
+        sensor: gives the position (static).
+        reading: which sweeps lose their close points, and the size of the emptied square (static).
 
     >>> me = jnp.zeros((1, 5))
     >>> remove_close(me, jnp.ones(1, bool), Sensor("two", (0.1, 0.0), 8), CloudReading(1, "all")).tolist()
@@ -72,7 +73,7 @@ def remove_close(
 def image_cells(
     points: Float32[Array, "n c"], valid: Bool[Array, "n"], sensor: Sensor
 ) -> tuple[Int32[Array, "n"], tuple[Float32[Array, "n"], ...]]:
-    """Image cell of each point.
+    """Image cell of each point; ``sensor`` is static.
 
     Row centres are the beams, with the highest beam in the top row. Columns run clockwise from azimuth pi, or from
     the left end of the sensor's sector. Points that are invalid, non-finite, outside the limits, outside the
@@ -114,7 +115,7 @@ def _row(inclination: Float32[Array, "n"], sensor: Sensor) -> Int32[Array, "n"]:
 def priority_keys(
     range_m: Float32[Array, "n"], time_lag: Float32[Array, "n"], *, prioritize_current: bool
 ) -> Array:
-    """Exact 32-bit keys, smaller is better: older sweep, then the bits of the range.
+    """Exact 32-bit keys, smaller is better: older sweep (if ``prioritize_current``, static), then range.
 
     The bits of non-negative float32 values order like the values and leave the top bit free.
 
@@ -211,7 +212,8 @@ def project_points(
         the image; ``point_index`` refers to rows of ``points``.
 
     Raises:
-        ValueError: at trace time, if ``points`` has fewer columns than the sensor needs, or without a round.
+        ValueError: at trace time, for arrays of other shapes, if ``points`` has fewer columns than the sensor
+            needs, or without a round.
 
     >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0]], np.float32)
     >>> image = project_points(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2)
@@ -221,6 +223,9 @@ def project_points(
     >>> compiled(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2).features.shape
     (2, 8, 9, 2)
     """
+    if points.ndim != 2 or valid.shape != points.shape[:1]:
+        got = f"got shapes {points.shape} and {valid.shape}"
+        raise ValueError(f"points, valid: {got}, expected (n, c) and (n,); use jax.vmap for batches")
     if points.shape[1] < sensor.point_columns:
         raise ValueError(
             f"points: got {points.shape[1]} columns, expected {sensor.point_columns} for sensor {sensor.name!r}"

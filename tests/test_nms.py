@@ -122,6 +122,8 @@ def test_unknown_options_are_rejected():
     empty = jnp.zeros((1, 7)), jnp.zeros(1), jnp.ones(1, bool)
     with pytest.raises((ValueError, TypeError), match="form"):
         rotated_nms(*empty, iou_threshold=0.2, max_outputs=1, form="fast")
+    with pytest.raises(ValueError, match="max_outputs: got 0, expected at least 1"):
+        rotated_nms(*empty, iou_threshold=0.2, max_outputs=0)
 
 
 def merged_by_loops(boxes, scores, valid, labels, kept, threshold, *, vertical):

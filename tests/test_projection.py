@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -239,6 +240,13 @@ def test_no_rounds_are_rejected():
 def test_too_few_columns_for_the_sensor_are_rejected():
     with pytest.raises(ValueError, match="got 5 columns, expected 6 for sensor 'laser'"):
         project_points(cloud(0), np.ones(400, bool), LASER)
+
+
+@pytest.mark.parametrize(("points", "valid"), [((2, 400, 5), (2, 400)), ((400, 5), (399,)), ((400,), (400,))])
+def test_batches_and_masks_of_other_lengths_are_rejected(points, valid):
+    unchecked = inspect.unwrap(project_points)  # without the shapes that the tests check in signatures
+    with pytest.raises(ValueError, match=r"points, valid: got shapes .* use jax\.vmap for batches"):
+        unchecked(np.zeros(points, np.float32), np.zeros(valid, bool), SMALL)
 
 
 def bits(image):

@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch, truncation
+from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, no_usable_points, sensor_mismatch, truncation
 from fcos_lidar_jax.data.clouds import read_cloud
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import points_from_array
@@ -31,7 +31,7 @@ from fcos_lidar_jax.types import Detections
 Rows = np.ndarray | jax.Array | Sequence[Any]
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)  # equality of weights would be slow
 class CloudDetector(abc.ABC):
     """A detector from a checkpoint or an exported file, which maps point clouds to boxes.
 
@@ -84,7 +84,7 @@ class CloudDetector(abc.ABC):
     ) -> DetectedBoxes:
         """Detect boxes in one cloud of any length; compiled once.
 
-        Warns in one line if the cloud does not fit the sensor of the detector.
+        Warns in one line if the cloud does not fit the sensor of the detector, or has no usable points.
 
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
@@ -117,7 +117,11 @@ class CloudDetector(abc.ABC):
         cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
         if line := truncation(cloud.num_truncated, self.config):
             warnings.warn(line, stacklevel=2)
-        found = aligned.back(self.detect(cloud))
+        found = self.detect(cloud)
+        name = points if is_file else "points"
+        if line := no_usable_points(name, cloud, int(found.num_dropped), self.sensor):
+            warnings.warn(line, stacklevel=2)
+        found = aligned.back(found)
         boxes, labels, scores = confident(found, 0.0)
         counts = ({"file": str(points)} if is_file else {}) | point_counts(found, cloud)
         used = aligned.inverse.points(cloud.points[cloud.valid])
@@ -133,7 +137,7 @@ class CloudDetector(abc.ABC):
         return jax.tree.map(lambda leaf: leaf[0], jax.device_get(found))
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class TrainedDetector(CloudDetector):
     """A network with its weights.
 

@@ -24,7 +24,7 @@ Precision = Literal["float32", "bfloat16"]
 _HINT = {"float32": "f32", "bfloat16": "bf16"}
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class OpenVinoDetector(TrainedDetector):
     """A :class:`TrainedDetector` whose network runs in OpenVINO, see :func:`with_openvino`."""
 

@@ -92,6 +92,18 @@ def test_postprocessing_is_greedy_nms_within_or_across_classes(scene, across):
         assert not array[~used].any()
 
 
+def test_a_detector_warns_about_a_cloud_without_usable_points():
+    detector = TrainedDetector(build_detector(TINY_CONFIG, TINY), untrained(TINY_CONFIG, TINY))
+    with pytest.warns(UserWarning, match="points: none of its 9 points is usable"):
+        assert not len(detector(np.full((9, 4), np.nan)))
+
+
+def test_a_detector_under_jit_names_its_pure_function():
+    detector = TrainedDetector(build_detector(TINY_CONFIG, TINY), untrained(TINY_CONFIG, TINY))
+    with pytest.raises(ValueError, match=r"points: got .*Tracer, .* call the function of make_detect"):
+        jax.jit(detector)(np.zeros((9, 4), np.float32))
+
+
 def test_detection_ignores_padding_and_works_under_vmap():
     detect, variables = make_detect(build_detector(TINY_CONFIG, TINY)), untrained(TINY_CONFIG, TINY)
     scans = [make_frame(seed, TINY).points for seed in range(2)]
