@@ -26,7 +26,6 @@ from fcos_lidar_jax.cli.result_files import check_result_files, check_results, r
 from fcos_lidar_jax.data.cloud_policy import no_usable_points, truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
-from fcos_lidar_jax.data.kitti import camera_calibration
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.json_io import write_lines
@@ -95,7 +94,7 @@ def run(args: Detect) -> None:
         tell(f"{args.sweeps}: {line}")
     aligned = alignment_of(args, detector.sensor, parts or files)
     clouds = _clouds(args, files, detector, aligned.data)
-    states = [files_fingerprint(_files_read(args, file, parts), Path("/"), str(file)) for file in files]
+    states = [files_fingerprint(clouds.sources(i), Path("/"), str(file)) for i, file in enumerate(files)]
     with _resume_log(args, detector, aligned) as log:
         _detect(args, detector, clouds, states, log)
         lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
@@ -140,12 +139,6 @@ def _check(args: Detect, read: Sequence[Path]) -> None:
     if args.pictures is not None:
         check_outside("--pictures", args.pictures, args.checkpoint)
         check_out_folder(args.pictures, "--pictures")
-
-
-def _files_read(args: Detect, file: Path, parts: Sequence[Path]) -> list[Path]:
-    """An input and the files beside it on which its points depend."""
-    calibration = None if args.full_turn else camera_calibration(file)
-    return [file, *parts, *([calibration] if calibration else [])]
 
 
 def _clouds(args: Detect, files: tuple[Path, ...], detector: CloudDetector, sensor: Sensor) -> CloudFiles:

@@ -152,7 +152,7 @@ def _calibration(given: Path | None, cloud: Path, stem: str) -> Path:
     """The given file, or the cloud's in the given folder or in ``calib`` beside the folder of the cloud."""
     if given is not None and not given.is_dir():
         return given
-    file = (given or cloud.parent.parent / "calib") / f"{stem}.txt"
+    file = (given or cloud.absolute().parent.parent / "calib") / f"{stem}.txt"
     if not file.is_file():
         raise ValueError(f"--output-format kitti: {file}: no such file, expected --calibration FILE or DIR")
     return file

@@ -8,10 +8,10 @@ import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points
-from fcos_lidar_jax.data.kitti import in_camera
+from fcos_lidar_jax.data.kitti import camera_calibration, in_camera
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.recorded import recorded_by
-from fcos_lidar_jax.data.sweeps import read_sweeps
+from fcos_lidar_jax.data.sweeps import read_list, read_sweeps
 from fcos_lidar_jax.sensors import Sensor
 
 
@@ -56,9 +56,18 @@ class CloudFiles(FrameSet):
     def name(self, index: int) -> str:
         return str(self.files[index])
 
+    def sources(self, index: int) -> list[Path]:
+        """The files on which the points of a frame depend, absolute: with its sweeps, or its calibration."""
+        file = self.files[index].absolute()
+        if file.suffix == ".json":
+            return [file, *(file.parent / sweep.file for sweep in read_list(file))]
+        calibration = None if self.full_turn else camera_calibration(file)
+        return [file] if calibration is None else [file, calibration]
+
     def fingerprint(self) -> str:
-        reading = self.reading, self.columns, self.dtype, self.full_turn
-        return files_fingerprint([file.absolute() for file in self.files], Path("/"), reading)
+        reading = self.files, self.sensor, self.reading, self.columns, self.dtype, self.full_turn
+        files = {file for index in range(len(self)) for file in self.sources(index)}
+        return files_fingerprint(files, Path("/"), reading)
 
 
 def read_cloud(

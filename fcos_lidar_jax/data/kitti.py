@@ -188,7 +188,7 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
 
 def camera_calibration(file: Path) -> Path | None:
     """The calibration by which :func:`in_camera` crops a file, or None."""
-    calibration = file.parent.parent / "calib" / f"{file.stem}.txt"
+    calibration = file.absolute().parent.parent / "calib" / f"{file.stem}.txt"
     return calibration if calibration.is_file() and recorded_by([file]) == KITTI_HDL64E else None
 
 

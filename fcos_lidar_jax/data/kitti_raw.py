@@ -36,7 +36,7 @@ def kitti_raw_drive(folder: Path, sensor: Sensor, *, max_points: int = MAX_POINT
     if not files:
         raise ValueError(f"{points / 'data'}: no .bin file in it, expected sweeps")
     times = dict(read_lines(points / "timestamps.txt", "the times of the sweeps"))
-    own, of_day = folder / _CALIBRATION, folder.parent / _CALIBRATION
+    own, of_day = folder / _CALIBRATION, folder.absolute().parent / _CALIBRATION
     matrices = read_matrices(own if own.is_file() else of_day, {"R": (3, 3), "T": (3, 1)}, ("R",))
     velodyne_to_imu = np.linalg.inv(np.vstack([np.hstack([matrices["R"], matrices["T"]]), (0, 0, 0, 1)]))
 

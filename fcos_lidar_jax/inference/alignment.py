@@ -103,8 +103,10 @@ def align(
     if recorded is not None:
         data = in_frame_of(detector, recorded)
     else:  # the same place on the ego vehicle, in the axes of the points
-        origin = np.array(detector.origin_m) @ about_z(yaw_rad or 0.0)[:3, :3]
-        data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()))
+        turn, ahead = yaw_rad or 0.0, detector.forward_rad
+        origin = np.array(detector.origin_m) @ about_z(turn)[:3, :3]
+        forward_rad = None if ahead is None else math.remainder(ahead - turn, 2 * math.pi)
+        data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()), forward_rad=forward_rad)
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
     if sensor is None and recorded is not None and data != detector:

@@ -20,6 +20,7 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.mesh import check_batch_size
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import local_path, read_json
+from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts, spread_indices
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
@@ -128,7 +129,9 @@ def plan_run(
         check_augmentation(config.augment, frames.sensor)
     detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, steps)
     jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(seed))
-    # A run resumes only with the same specification. Weights passed as arrays are not recorded.
+    begun = resume and Checkpoints(out / CHECKPOINTS).paths()
+    initial = None if begun else _initial_weights(detector, weights)
+    # A run resumes only with the same specification.
     spec = {
         "config": config_to_json(config),
         "sensor": sensor_to_json(frames.sensor),
@@ -140,6 +143,7 @@ def plan_run(
         "objects": None if objects is None else objects.manifest.source,
         "ground_truth_database": None if objects is None else objects.fingerprint(),
         "weights": str(weights) if isinstance(weights, str | Path) else None,
+        "weights_hash": None if initial is None else TrainedDetector(detector, initial).fingerprint,
     }
     if config.copy_paste is not None and objects is not None:
         make_paste(objects, config)
@@ -156,7 +160,7 @@ def plan_run(
         tests=tests,
         devices=devices,
         spec=json.loads(json.dumps(spec)),
-        weights=None if resume and Checkpoints(out / CHECKPOINTS).paths() else _initial_weights(detector, weights),
+        weights=initial,
         packing=packing_for(frames, config) if packing or (packing is None and not on_cpus) else None,
         warnings=tuple(_warnings(frames, config)),
     )
@@ -195,6 +199,9 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
     if spec is None:
         return
     for name, was, now in _differences(recorded, spec):
+        # Runs of earlier versions lack the hash, and a run with checkpoints does not use its first weights again.
+        if name == "weights_hash" and (name not in recorded or Checkpoints(folder / CHECKPOINTS).paths()):
+            continue
         raise ValueError(f"{file}: {name}: was {was!r}, got {now!r}: only the same run can be resumed")
 
 

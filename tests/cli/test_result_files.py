@@ -202,6 +202,13 @@ def test_a_second_cloud_of_a_name_is_refused(tmp_path):
             write({"file": "b/000000.npy", "boxes": []})
 
 
+def test_calibrations_beside_the_folder_of_the_clouds_are_found_from_within_it(home, tmp_path, monkeypatch):
+    monkeypatch.chdir(home / "training" / "velodyne")
+    with result_files("kitti", tmp_path, ["car"], annotator="") as write:
+        write({"file": "000000.npy", "boxes": []})
+    assert [file.name for file in tmp_path.iterdir()] == ["000000.txt"]
+
+
 @pytest.mark.parametrize("command_line", ["stream", "detect"])
 def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monkeypatch):
     out = named = tmp_path / "kitti"

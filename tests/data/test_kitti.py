@@ -1,6 +1,8 @@
 """KITTI: boxes in the Velodyne's frame against an independent transformation; one-line errors."""
 
+import dataclasses
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,7 +44,7 @@ def root(tmp_path):
     return tmp_path
 
 
-def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, capsys):
+def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, capsys, monkeypatch):
     points = np.array(CLOUD, np.float32)
     file = root / "training" / "velodyne" / "000007.bin"
     cropped = in_camera(file, points)
@@ -52,9 +54,27 @@ def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, c
         read = CloudFiles((file,), KITTI_HDL64E, **how).frame(0).points
         np.testing.assert_array_equal(read[:, :3], expected[:, :3])
     assert capsys.readouterr().err.count("points outside the camera image are left out") == 1
+    monkeypatch.chdir(file.parent)
+    np.testing.assert_array_equal(in_camera(Path(file.name), points), cropped)
     (root / "training" / "calib" / "000003.txt").unlink()
     for other in (file.with_name("000003.bin"), root / "000007.bin"):
         np.testing.assert_array_equal(in_camera(other, points), points)
+
+
+def test_the_fingerprint_of_point_files_depends_on_all_that_their_points_do(root):
+    files = tuple((root / "training" / "velodyne").iterdir())
+    clouds = CloudFiles(files, KITTI_HDL64E)
+    prints = [clouds.fingerprint()]
+    for change in (
+        {"files": files[::-1]},
+        {"sensor": dataclasses.replace(KITTI_HDL64E, intensity_scale=1.0)},
+        {"sensor": dataclasses.replace(KITTI_HDL64E, origin_m=(0.0, 0.0, 1.7))},
+        {"full_turn": True},
+    ):
+        prints.append(dataclasses.replace(clouds, **change).fingerprint())
+    (root / "training" / "calib" / "000007.txt").write_text(calibration_text() + "\n")
+    prints.append(clouds.fingerprint())
+    assert len(set(prints)) == len(prints)
 
 
 def test_frames_are_sorted_by_name_and_have_points_boxes_labels_and_counts(root):

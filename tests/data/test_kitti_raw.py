@@ -1,5 +1,7 @@
 """KITTI raw recordings: poses from GPS and inertial unit; one-line errors."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from refusal import refused
@@ -44,6 +46,11 @@ def test_poses_follow_from_the_positions_on_the_ground(recording):
     # The IMU, which stands at (-0.8, 0.3, -0.8) of the LiDAR's frame, is at its own altitude.
     assert (first.sensor_to_world @ [-0.8, 0.3, -0.8, 1])[2] == pytest.approx(110)
     assert first.points[0].tolist() == [5, 1, 0, 127.5, 0]
+
+
+def test_the_calibration_of_the_day_is_found_from_within_the_drive(recording, monkeypatch):
+    monkeypatch.chdir(recording)
+    assert len(list(kitti_raw_drive(Path(), KITTI_HDL64E).sweeps)) == 2
 
 
 @pytest.mark.parametrize(

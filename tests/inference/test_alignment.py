@@ -6,7 +6,7 @@ import numpy as np
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.data.frame import InMemoryFrames
-from fcos_lidar_jax.inference.alignment import Alignment
+from fcos_lidar_jax.inference.alignment import Alignment, align
 from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.sensors import KITTI_HDL64E, NUSCENES_HDL32E, TINY, VLP16
 from fcos_lidar_jax.simulation.frame_set import unseen_frames
@@ -31,6 +31,12 @@ def test_boxes_are_brought_back_by_the_inverse_of_rotation_matrices():
     np.testing.assert_array_equal(back[:, 3:6], boxes[:, 3:6])
     np.testing.assert_allclose(np.exp(1j * back[:, 6]), np.exp(1j * (boxes[:, 6] + 1.5)), atol=1e-5)
     np.testing.assert_allclose(back[:, 7:], boxes[:, 7:] @ matrix[:2, :2], atol=1e-5)
+
+
+def test_clouds_that_a_given_angle_brings_to_y_ahead_have_x_ahead():
+    assert align(NUSCENES_HDL32E, yaw_rad=np.pi / 2).data.forward_rad == 0.0
+    assert align(NUSCENES_HDL32E).data == NUSCENES_HDL32E
+    assert align(VLP16, yaw_rad=1.0).data.forward_rad is None
 
 
 def test_one_line_says_what_is_done():

@@ -10,6 +10,7 @@ import signal
 from contextlib import contextmanager
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from commands import run_python
@@ -17,7 +18,7 @@ from event_files import summaries
 from PIL import Image
 from tiny_run import CONFIG, FRAMES, SENSOR, STEPS, TESTS, bits, train_tiny, weights
 
-from fcos_lidar_jax.checkpoints import load_checkpoint, load_state
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, load_state, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.config import CopyPasteConfig, config_to_json
@@ -398,6 +399,28 @@ def test_a_different_specification_is_refused_and_the_field_named(begun, change,
     with pytest.raises(ValueError, match=rf"run.json: {message}.*: only the same run can be resumed$"):
         train_tiny(begun, resume=True)
     assert [path.name for path in begun.iterdir()] == ["run.json"]
+
+
+def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(tmp_path):
+    start, run = tmp_path / "start", tmp_path / "run"
+    options = {"weights": start, "steps": 1}
+    first = weights()
+    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, first, 1))
+    train_tiny(run, **options)
+    other = jax.tree.map(lambda leaf: leaf * 2, first)
+    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, other, 1))
+    train_tiny(run, resume=True, **options)  # from its own checkpoint
+    shutil.rmtree(run / "checkpoints")
+    with pytest.raises(ValueError, match=r"run.json: weights_hash: was '\w+', got '\w+': only the same run"):
+        train_tiny(run, resume=True, **options)
+    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, first, 2, score=0.5))  # the same weights
+    train_tiny(run, resume=True, **options)
+    spec = json.loads((run / "run.json").read_text())
+    del spec["weights_hash"]  # as in a run of an earlier version
+    (run / "run.json").write_text(json.dumps(spec))
+    shutil.rmtree(run / "checkpoints")
+    save_checkpoint(start, Checkpoint(CONFIG, SENSOR, other, 1))
+    train_tiny(run, resume=True, **options)
 
 
 def test_a_different_ground_truth_database_of_the_same_frames_is_refused(begun, tmp_path):
