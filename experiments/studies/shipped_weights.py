@@ -10,8 +10,14 @@ few minutes; the same command resumes it with bit-identical results. ``--export`
 averaged weights of the newest checkpoint into the package as float16, scores them on unseen frames, and writes
 ``experiments/results/NAME.json`` and the model card; a training may run at the same time. Without ``--work``, the
 weights in the package are only scored. If the folder of the run is lost, ``--work NEW --warm-start hdl32e --seed
-2`` starts a new one-cycle schedule from the weights in the package, on streets from ``seed * steps``; choose a
+2`` starts a new one-cycle schedule from the weights in the package, on streets from ``seed * frames``; choose a
 seed whose streets no earlier training used.
+
+    python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --steps 30000 --seed 7 \
+        --batch-size 4 --learning-rate 5e-3 --simulators 12 --workers 3  # on a GPU
+
+With ``--simulators``, that many processes simulate streets, and the steps repeat the streets that there are. Such
+a run resumes, but not bit for bit. It does not pause for evaluations; ``--export`` scores its checkpoints instead.
 
 Cost: half a second to three seconds per step on two CPU cores, so hours in total. Expected: an mAP of at least 0.6
 for quickstart.
@@ -27,12 +33,16 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from experiments.cached import CachedFrames
 from experiments.changes import change
+from experiments.hardware import hardware
+from experiments.pool import PooledFrames, count, simulating
 from experiments.runs import detections, trained
-from experiments.script import Options, run_script, save
+from experiments.script import Options, compact_json, run_script, save, write_text
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
@@ -64,6 +74,9 @@ _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the n
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
 _CURVE_FRAMES = 40  # Unseen frames of evaluations during training.
+_STREETS, _POOLED = "streets", "pool.json"  # Folder and record of repeated streets, in the folder of the run.
+_POOL = 100_000  # Streets to simulate at most, if they repeat.
+_KEPT = 50  # Checkpoints of a run without evaluations.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,13 +87,23 @@ class Args(Options):
     work: Path | None = None  # Folder of the training run; default: score the weights in the package.
     steps: int = 20_000  # Updates of the whole run.
     seed: int = 1  # Seed of weights and streets; the demo trains with 0.
+    batch_size: int = 1  # Frames per update.
+    learning_rate: float | None = None  # Peak of the schedule; default: the preset's, for one frame per update.
+    simulators: int = (
+        0  # Processes that simulate streets, which then repeat; default: each frame is another street.
+    )
+    workers: int = 0  # Processes that prepare batches, in addition to a thread.
     warm_start: Path | None = None  # Checkpoint or shipped weights to start from; default: random weights.
     save_every: int = 150  # Steps between two checkpoints.
     export: bool = False  # Write the current weights into the package instead of training.
     test_frames: int = 200  # Unseen frames for the scores.
 
 
-_TRAINING_OPTIONS = ("steps", "seed", "warm_start", "save_every", "export")  # Require ``work``.
+_TRAINING_OPTIONS = (
+    *("steps", "seed", "batch_size", "learning_rate", "simulators", "workers", "warm_start", "save_every"),
+    "export",
+)
+"""Options that require ``work``."""
 
 
 def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, FrameSet]:
@@ -98,14 +121,40 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     """Start or resume the run and train to its end."""
     os.nice(_NICE)
     config = CONFIGS[args.name]
+    given = {"optimizer__batch_size": args.batch_size, "optimizer__peak_learning_rate": args.learning_rate}
+    config = change(**{name: value for name, value in given.items() if value is not None})(config)
     # Rejects before hours of training what the export would reject.
     earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
-    frames, unseen = streets(config, steps=args.steps, seed=args.seed)
-    schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
-    tests = SelectedFrames(unseen, tuple(range(_CURVE_FRAMES)))
-    length = {"steps": args.steps, "seed": args.seed}
-    trained(work, config, frames, **length, tests=tests, schedule=schedule, weights=args.warm_start)
+    number = _POOL // config.optimizer.batch_size if args.simulators else args.steps
+    frames, unseen = streets(config, steps=number, seed=args.seed)
+    run = {"steps": args.steps, "seed": args.seed, "weights": args.warm_start, "workers": args.workers}
+    if not args.simulators:
+        schedule = Schedule(save_every=args.save_every, evaluate_every=-(-args.steps // 10))
+        trained(work, config, frames, **run, tests=_curve_frames(unseen), schedule=schedule)
+        return training_record(work)
+    pool = CachedFrames(frames, work / _STREETS)
+    schedule = Schedule(save_every=args.save_every, keep=_KEPT)
+    with simulating(pool, args.simulators):
+        trained(work, config, PooledFrames(pool), **run, schedule=schedule)
+    record = {"streets": count(pool.folder), "device": hardware()["device"]}
+    write_text(work / _POOLED, compact_json(record) + "\n")
     return training_record(work)
+
+
+def _curve_frames(unseen: FrameSet) -> FrameSet:
+    return SelectedFrames(unseen, tuple(range(_CURVE_FRAMES)))
+
+
+def curve_of(work: Path) -> list[list[float]]:
+    """Score the checkpoints of a run that did not pause for evaluations."""
+    curve = []
+    for path in Checkpoints(work / CHECKPOINTS).paths():
+        detector = load_trained(path)
+        _, unseen = streets(detector.config, steps=1, seed=0)
+        found, frames = detections(detector, _curve_frames(unseen))
+        score = evaluate_frames(found, frames, metric_of(detector.classes)).summary["mean_ap"]
+        curve.append([load_checkpoint(path).step * detector.config.optimizer.batch_size, round(score, 4)])
+    return curve
 
 
 def training_record(run: Path) -> dict[str, Any]:
@@ -114,6 +163,7 @@ def training_record(run: Path) -> dict[str, Any]:
     config, done = checkpoint.config, checkpoint.step
     records = [record for record in read_metrics(run) if record["step"] <= done]  # may go on after the checkpoint
     batch = config.optimizer.batch_size
+    pooled = run / _POOLED
     return {
         "preset": config.name,
         "seed": spec["seed"],
@@ -123,6 +173,7 @@ def training_record(run: Path) -> dict[str, Any]:
         "frames_seen": done * batch,
         "seconds_of_steps": round(sum(r.get("seconds", 0.0) for r in records)),
         "curve": [[r["step"] * batch, round(r["test/mAP"], 4)] for r in records if "test/mAP" in r],
+        **(read_json(pooled, dict[str, Any]) if pooled.exists() else {}),
     }
 
 
@@ -171,6 +222,7 @@ def scores(args: Args) -> dict[str, Any]:
 def export(args: Args, work: Path) -> dict[str, Any]:
     """Write the weights of the newest checkpoint and their model card; returns training and scores."""
     folder, training = SHIPPED / args.name, training_record(work)
+    training["curve"] = training["curve"] or curve_of(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     save_checkpoint(folder, half_precision(checkpoint))
