@@ -27,6 +27,7 @@ _UNSEEN = {
     "hdl32e": "with class frequencies of cities and half as many objects as in training",
     "quickstart": "of the same kind of streets",
 }
+_MACHINE = {"cpu": "two CPU cores"}
 _AXES = "x right, y forward, z up from the sensor, in metres"
 _WEAK_AP, _WEAK_BOXES = 0.05, 10
 """Classes with less AP are listed as hardly detected, if they have at least this many boxes."""
@@ -82,11 +83,14 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
 def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     trained = record["training"]
     yield "\n## Training data\n"
-    yield "Only simulated streets, a different one in each frame:\n"
+    yield "Only simulated streets:\n"
     for leg in (*record["earlier"], trained):
-        done = f"{leg['frames_seen']:,} frames, step {leg['steps']:,} of {leg['steps_planned']:,}"
-        hours = f"{leg['seconds_of_steps'] / 3600:.1f} hours of steps"
-        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {hours}"
+        streets = f"{leg['streets']:,} streets" if "streets" in leg else "as many streets"
+        done = f"{leg['frames_seen']:,} frames of {streets}, step {leg['steps']:,} of {leg['steps_planned']:,}"
+        seconds, device = leg["seconds_of_steps"], leg.get("device", "cpu")
+        time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
+        spent = f"{time} of steps on {_MACHINE.get(device, device)}"
+        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {spent}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
