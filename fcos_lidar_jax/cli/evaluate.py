@@ -207,6 +207,10 @@ def _open(args: Evaluate) -> Task:
         frames = args.data.open(config, split=split, samples=args.samples, sensor=sensor)
         if split is None and args.samples is None:
             tell(f"{data.root}: no splits: evaluating all {len(frames)} frames; {_TOO_HIGH}")
+        if data.on_disk:  # damaged files are named now, and not after the detector was compiled
+            for index in range(len(frames)):
+                frames.labels(index)
+                frames.camera(index)  # reads the calibration of KITTI
         # The report's range images are in the frame of the data.
         return Task(name, compare_by_distance(frames, config.ranges_m), frames.sensor, detector, frames)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)

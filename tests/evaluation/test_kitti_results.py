@@ -9,6 +9,7 @@ from commands import assert_one_line_error, command
 from made_kitti import AXES, MOUNTED, P2, RECTIFIED, calibration_text, label_text, write
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax.cli import evaluate
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.frame import SelectedFrames
 from fcos_lidar_jax.data.kitti import (
@@ -205,6 +206,20 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     assert {**again, "left_out": metrics["left_out"]} == metrics
     assert capsys.readouterr().out.startswith(describe_kitti(again))
     assert {file.name for file in (tmp_path / "again").iterdir()} == {"metrics_kitti.json", ".lock"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("label_2", "000005.txt: line 1: got 3 values, expected 15"),
+        ("calib", "000005.txt: P2: missing, "),
+    ],
+)
+def test_damaged_files_are_named_before_anything_is_detected(root, tmp_path, monkeypatch, capsys, kind, message):
+    monkeypatch.setattr(evaluate, "run_detector", lambda *_, **__: pytest.fail("detects"))
+    write(root / "training" / kind / "000005.txt", "Car 0 0\n")
+    line = f"evaluate --data-root {root} --class-map nuscenes --checkpoint quickstart --out {tmp_path}/out"
+    assert_one_line_error(capsys, line.split(), message)
 
 
 @pytest.mark.parametrize(
