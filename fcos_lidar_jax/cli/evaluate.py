@@ -69,8 +69,8 @@ class Evaluate:
     """Ranges of the split's frames, LAST excluded."""
     checkpoint: Annotated[Path | None, option("C", text=DETECTOR_TEXT)] = None
     results: Annotated[Path | None, option("FILE|DIR")] = None
-    """Results to evaluate: an official results file, detections.json with the --checkpoint it came from, or a
-    folder of KITTI result files, one for each frame of the split."""
+    """Results to evaluate: an official results file, detections.json with the --checkpoint it came from,
+    or a folder of KITTI result files, one for each frame of the split."""
     ground_truth: Annotated[Path | None, option("FILE")] = None
     """Ground truth instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
     yaw_deg: options.Yaw = None
@@ -119,7 +119,7 @@ def run(args: Evaluate) -> None:
 def _has_kitti_results(args: Evaluate) -> bool:
     if args.results is None or args.ground_truth is not None:
         return False
-    return (args.checkpoint is None or args.results.is_dir()) and args.data.data_set.reader.name == "kitti"
+    return (args.checkpoint is None or args.results.is_dir()) and args.data.data_set.reader.result_folders
 
 
 def _score_kitti_results(args: Evaluate) -> None:

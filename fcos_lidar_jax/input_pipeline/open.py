@@ -38,6 +38,7 @@ class Reader:
     class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)  # by the data set they lead to
     adapt: Callable[[Sensor, Sensor], Sensor] = in_frame_of
     """(given sensor, ``sensor``) -> the given one with frame and scale, or only the heading, of ``sensor``."""
+    result_folders: bool = False  # ``evaluate`` takes folders of KITTI result files
 
     @property
     def named_maps(self) -> str:
@@ -64,6 +65,7 @@ READERS = (
         lambda data, **how: kitti.KittiFrames(data.root, **how),
         ("full_turn", "intensity_scale"),
         class_maps={"nuscenes": kitti.TO_NUSCENES},
+        result_folders=True,
     ),
     Reader(
         "argoverse2",
