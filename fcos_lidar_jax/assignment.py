@@ -33,7 +33,8 @@ def owners(
 
     Args:
         points, present: coordinates in metres; False where there is no point.
-        boxes, box_valid: ``x, y, z, l, w, h, yaw, ...``, arbitrary where invalid; False for padding.
+        boxes, box_valid: ``x, y, z, l, w, h, yaw, ...``, arbitrary where invalid; False for padding. A box with
+            NaN contains no point.
         form: ``"loop"`` over the boxes or one ``"reduction"`` over all pairs, with equal results (static). None
             selects the loop on CPUs and the reduction elsewhere, when the program runs.
 
@@ -138,7 +139,8 @@ def assign(
     """Assign the locations of one sample dynamically (paper, section 3.4); all levels compete with each other.
 
     The cost of a candidate is the cross-entropy of the true class plus one minus the IoU of the decoded box.
-    No gradient flows through the assignment.
+    No gradient flows through the assignment. A location with NaN ranks last, and a NaN among the Q highest IoUs
+    makes K 1.
 
     Args:
         owner: box of each location, -1 where there is no box.

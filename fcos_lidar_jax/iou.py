@@ -16,7 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from fcos_lidar_jax.namespaces import own_names
-from fcos_lidar_jax.types import BOX, check_columns
+from fcos_lidar_jax.types import BOX, ORIENTED, check_columns
 
 __dir__ = own_names(__name__)
 
@@ -152,7 +152,7 @@ def oriented_overlap(a: Float[Array, "*m 8"], b: Float[Array, "*n 8"], *, vertic
     [8.0, 8.0]
     """
     for name, boxes in (("a", a), ("b", b)):
-        check_columns(name, boxes, "x, y, z, l, w, h, cos yaw, sin yaw")
+        check_columns(name, boxes, ORIENTED)
     common = jnp.promote_types(a.dtype, b.dtype)
     a, b = jnp.broadcast_arrays(a.astype(common), b.astype(common))
     # Slice: indexing with an array would turn the gradient into a scatter.
@@ -190,7 +190,8 @@ def rotated_iou_bev(
     """IoU in the ground plane, elementwise with broadcasting; differentiable in forward and reverse mode.
 
     Boxes are ``x, y, z, l, w, h, yaw, ...`` in metres and radians; sizes are not negative. Values lie in
-    [0, 1] and are 0 where both areas are zero. Gradients are finite everywhere.
+    [0, 1] and are 0 where both areas are zero. Gradients are finite for finite boxes. A NaN gives 0, and possibly
+    a NaN gradient; here, z and h do not matter.
 
     Raises:
         ValueError: at trace time, if boxes have fewer than seven columns.

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 from fcos_lidar_jax.config import LossConfig
 from fcos_lidar_jax.iou import oriented_overlap
 from fcos_lidar_jax.namespaces import own_names
+from fcos_lidar_jax.types import ORIENTED, check_columns
 
 __dir__ = own_names(__name__)
 
@@ -38,11 +39,14 @@ def classification_loss(
 ) -> SumCount:
     """Cross-entropy over the non-empty locations, given by ``mask``; label k is the background.
 
+    The gradient is zero at all other locations, even if their logits are not finite.
+
     >>> total, count = classification_loss(jnp.zeros((2, 2)), jnp.array([0, 1]), jnp.array([True, False]))
     >>> round(float(total), 4), int(count)
     (0.6931, 1)
     """
-    return _masked(cross_entropy(logits, labels), mask)
+    # Replace masked logits, which may be NaN: 0 * NaN is NaN in the gradient.
+    return _masked(cross_entropy(jnp.where(mask[:, None], logits, 0.0), labels), mask)
 
 
 def l1_loss(
@@ -71,7 +75,7 @@ def l1_loss(
 
 
 def iou_loss(
-    prediction: Float32[Array, "l 8"], target: Float32[Array, "l 8"], mask: Bool[Array, "l"], *, kind: str = "iou"
+    prediction: Float32[Array, "l c"], target: Float32[Array, "l d"], mask: Bool[Array, "l"], *, kind: str = "iou"
 ) -> SumCount:
     """Loss from the rotated 3D IoU of predicted and true boxes.
 
@@ -82,12 +86,14 @@ def iou_loss(
             box that encloses both and is aligned with the target (static).
 
     Raises:
-        ValueError: unknown kind.
+        ValueError: at trace time, for an unknown kind or another number of columns.
 
     >>> box = jnp.array([[0, 0, 0, 4, 2, 1, 1, 0]], jnp.float32)
     >>> float(iou_loss(box, box, jnp.ones(1, bool))[0])
     0.0
     """
+    for name, boxes in (("prediction", prediction), ("target", target)):
+        check_columns(name, boxes, ORIENTED)
     # Replace masked boxes before they can overflow: 0 * inf is NaN in the gradient.
     unit = jnp.array([0, 0, 0, 1, 1, 1, 1, 0], prediction.dtype)
     prediction = jnp.where(mask[:, None], prediction, unit)

@@ -38,7 +38,8 @@ def rotated_nms(
     """Greedy suppression: keep the best box, remove boxes that overlap it by more than the threshold, repeat.
 
     Args:
-        boxes: ``x, y, z, l, w, h, yaw, ...``.
+        boxes: ``x, y, z, l, w, h, yaw, ...``. A box with NaN in a column that ``overlap`` uses overlaps no
+            other box.
         scores: higher is better; the lower index wins among equal scores. NaN counts as invalid.
         valid: False for padding.
         labels: boxes with different labels never suppress each other; None for one class.

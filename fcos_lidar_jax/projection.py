@@ -215,13 +215,15 @@ def project_points(
         ValueError: at trace time, for arrays of other shapes, if ``points`` has fewer columns than the sensor
             needs, or without a round.
 
+    >>> import fcos_lidar_jax as fcos
+    >>> sensor = fcos.load_sensor("short_range")  # a preset, or a file that describes your LiDAR
     >>> cloud = np.array([[0, 9, 0, 50, 0], [0, 5, 0, 60, 0]], np.float32)
-    >>> image = project_points(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2)
+    >>> image = project_points(cloud, np.ones(2, bool), sensor, num_rounds=2)
     >>> image.point_index.max(axis=(0, 1)).tolist()
     [1, 0]
     >>> compiled = jax.jit(project_points, static_argnames=("sensor", "num_rounds"))
-    >>> compiled(cloud, np.ones(2, bool), Sensor("two", (0.1, 0.0), 8), num_rounds=2).features.shape
-    (2, 8, 9, 2)
+    >>> compiled(cloud, np.ones(2, bool), sensor, num_rounds=2).features.shape
+    (32, 128, 9, 2)
     """
     if points.ndim != 2 or valid.shape != points.shape[:1]:
         got = f"got shapes {points.shape} and {valid.shape}"

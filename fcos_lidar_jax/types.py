@@ -23,6 +23,7 @@ CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "exis
 """The nine channel types of a range image (paper, section 3.1)."""
 BOX = "x, y, z, l, w, h, yaw, ..."
 """Columns of boxes that functions need; more may follow."""
+ORIENTED = "x, y, z, l, w, h, cos yaw, sin yaw"
 
 
 def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:

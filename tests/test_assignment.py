@@ -50,6 +50,9 @@ def test_owner_boundary_equal_volumes_and_padding(form):
     assert actual.tolist() == [0, 1, 0, -1, -1]
     endless = f32([[0, 0, 0, np.inf, 2, 2, 0]])
     assert owners(points, present, endless, jnp.array([True]), form=form).tolist() == [-1] * 5
+    for column in range(7):
+        unknown = boxes[:1].at[0, column].set(jnp.nan)
+        assert owners(points, present, unknown, jnp.array([True]), form=form).tolist() == [-1] * 5
 
 
 def test_only_cpu_programs_loop_over_boxes_and_in_searches():
@@ -104,6 +107,8 @@ def test_without_candidates_and_with_one_candidate():
 def test_a_diverged_prediction_ranks_last():
     targets = compute(i32([0, 0, 0]), f32([np.nan, 5, np.inf]), f32([0.0, 0.0, 0.0]), num_boxes=1)
     assert targets.positive.tolist() == [False, True, False]
+    targets = compute(i32([0, 0, 0]), f32([1, 5, 2]), f32([np.nan, 0.9, 0.9]), num_boxes=1)  # without NaN, K is 2
+    assert targets.positive.tolist() == [False, False, True]
 
 
 def test_works_under_vmap_and_passes_no_gradient():

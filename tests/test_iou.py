@@ -127,6 +127,16 @@ def test_degenerate_pairs(name):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * max(1.0, float(jnp.abs(other).max())))
 
 
+def test_a_box_with_nan_has_iou_0():
+    """Except for z and h, which do not matter in the ground plane."""
+    box = np.array([0, 0, 0, 4, 2, 1, 0], np.float32)
+    bad = np.where(np.eye(7, dtype=bool), np.nan, box).astype(np.float32)
+    for compute in (rotated_iou_bev, VALUE[rotated_iou_bev]):
+        assert compute(box, bad).tolist() == compute(bad, box).tolist() == [0, 0, 1, 0, 0, 1, 0]
+    for compute in (rotated_iou_3d, VALUE[rotated_iou_3d]):
+        assert compute(box, bad).tolist() == compute(bad, box).tolist() == [0] * 7
+
+
 def test_broadcasting_and_vmap_match_loops(pairs):
     a, b = jnp.asarray(pairs[0][:6]), jnp.asarray(pairs[1][:5])
     bev, in_space = VALUE[rotated_iou_bev], VALUE[rotated_iou_3d]

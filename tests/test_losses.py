@@ -11,7 +11,15 @@ import pytest
 
 from fcos_lidar_jax.config import LossConfig
 from fcos_lidar_jax.iou import oriented
-from fcos_lidar_jax.losses import centreness, classification_loss, iou_loss, iou_prediction_loss, l1_loss, weighted
+from fcos_lidar_jax.losses import (
+    centreness,
+    classification_loss,
+    cross_entropy,
+    iou_loss,
+    iou_prediction_loss,
+    l1_loss,
+    weighted,
+)
 
 NUMBER = 50
 KINDS = ("iou", "log_iou", "giou", "diou")
@@ -44,6 +52,26 @@ def test_classification_is_the_cross_entropy_over_the_mask(rng):
     p = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
     np.testing.assert_allclose(total, -np.log(p[np.arange(NUMBER), labels])[mask].sum(), rtol=1e-5)
     assert int(count) == mask.sum()
+
+
+def test_masked_logits_do_not_change_the_classification_loss(rng):
+    logits, labels = f32(rng.normal(0, 3, (NUMBER, 11))), jnp.asarray(rng.integers(0, 11, NUMBER), jnp.int32)
+    mask = jnp.asarray(rng.random(NUMBER) < 0.6)
+
+    def without_care(logits):
+        return jnp.where(mask, cross_entropy(logits, labels), 0.0).sum()
+
+    def loss(logits):
+        return classification_loss(logits, labels, mask)[0]
+
+    diverged = logits.at[~mask].set(f32(rng.choice([np.nan, np.inf, -np.inf, 1e38], (int((~mask).sum()), 11))))
+    for wrap in (jax.jit, lambda function: function):
+        value, gradient = wrap(jax.value_and_grad(without_care))(logits)
+        for given in (logits, diverged):
+            actual = wrap(jax.value_and_grad(loss))(given)
+            assert actual[0] == value
+            np.testing.assert_array_equal(actual[1], gradient)
+    assert not np.asarray(gradient)[~mask].any()
 
 
 def test_l1_weights_velocities_and_skips_unknown_ones(rng):
@@ -94,6 +122,15 @@ def test_iou_losses_match_shapely_and_corners(rng, kind):
     assert int(count) == mask.sum()
     assert np.isfinite(gradient).all()
     assert not np.asarray(gradient)[~mask].any()
+
+
+def test_boxes_of_another_layout_are_refused():
+    box, mask = f32([[0, 0, 0, 4, 2, 1, 1, 0]]), jnp.ones(1, bool)
+    for name, boxes in (("prediction", (box[:, :7], box)), ("target", (box, jnp.tile(box, 2)))):
+        with pytest.raises(
+            ValueError, match=rf"^{name}: got shape \(1, \d+\), expected columns .*, cos yaw, sin yaw"
+        ):
+            iou_loss(*boxes, mask)
 
 
 def test_masked_values_get_zero_gradient():

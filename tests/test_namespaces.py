@@ -21,6 +21,7 @@ def test_the_package_offers_its_modules_and_imports_none_of_them():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout == "[] rotated_nms\n"
+    assert {"draw_bev", "draw_range_image", "write_page"} <= set(dir(fcos.visualization))
     with pytest.raises(AttributeError, match="no attribute 'nmss'"):
         _ = fcos.nmss
 

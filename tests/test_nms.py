@@ -67,6 +67,17 @@ def test_the_lower_index_wins_ties_and_nan_scores_are_invalid(form):
 
 
 @FORMS
+@pytest.mark.parametrize(("overlap", "columns"), [("bev", (0, 1, 3, 4, 6)), ("3d", range(7))])
+def test_a_box_with_nan_overlaps_no_box(form, overlap, columns):
+    for column in columns:
+        boxes = np.array([[0, 0, 0, 4, 2, 1, 0.0]] * 4, np.float32)
+        boxes[[1, 3], column] = np.nan
+        args = np.array([0.9, 0.8, 0.7, 0.6], np.float32), np.ones(4, bool), np.zeros(4, np.int32)
+        kept = keep(boxes, *args, iou_threshold=0.0, max_outputs=4, form=form, overlap=overlap)
+        assert kept == [0, 1, 3]
+
+
+@FORMS
 def test_equal_iou_is_not_above_the_threshold(form):
     boxes = np.array([[0, 0, 0, 4, 2, 1, 0], [1, 0, 0, 4, 2, 1, 0]], np.float32)  # IoU 0.6
     args = np.array([0.9, 0.8], np.float32), np.ones(2, bool), np.zeros(2, np.int32)

@@ -171,7 +171,7 @@ class NuScenesLayout:
     version: str | None = None  # Folder of its tables; default: the only one.
     index: Path | None = None
     """Index written by fcos-lidar prepare; default: DATA_ROOT/.fcos_lidar/VERSION."""
-    splits: Path | None = None  # File {name: [scene, ...]} with your own splits.
+    splits: Path | None = None  # File {name: [scene, ...]} with your own splits of --version.
     train_split: str | None = None  # Default: that of fcos-lidar prepare, train or mini_train.
     val_split: str | None = None  # Default: val or mini_val.
     test_version: str | None = None
@@ -238,7 +238,8 @@ class NuScenesLayout:
         version = version or self.version
         assert version is not None
         data = self._data(version)
-        return NuScenesFrames(data, tuple(data.split(split, file=self.splits)), config.reading)
+        splits = self.splits if version == self.version else None  # names scenes of the layout's version
+        return NuScenesFrames(data, tuple(data.split(split, file=splits)), config.reading)
 
     @functools.cache  # noqa: B019
     def describe(self) -> dict[str, Any]:

@@ -23,18 +23,24 @@ from fcos_lidar_jax.cli.data import DataOptions, parse_ranges
 from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.cli.scoring import Task, run_detector, write_recording, write_reports, write_scores
+from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
-from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY
+from fcos_lidar_jax.evaluation.kitti import describe_kitti
+from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, score_kitti, write_summary
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
+from fcos_lidar_jax.inference.alignment import heading
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.visualization.evaluation_report import PAGE
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun
+
+_TOO_HIGH = "scores on training frames are too high"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +52,8 @@ class Evaluate:
     metric.
 
     Give a detector with --checkpoint, or a file of detections with --results. The ground truth comes from a data
-    set (--data-root) or, for an official results file, from a file (--ground-truth).
+    set (--data-root) or, for an official results file, from a file (--ground-truth). For a folder of KITTI result
+    files, only KITTI's metric is computed.
 
     The command writes metrics_summary.json, curves.json, report.html, frames.html (the worst and the best frames),
     and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI, it also writes
@@ -61,8 +68,9 @@ class Evaluate:
     samples: Annotated[str | None, option("FIRST:LAST,...", default="all")] = None
     """Ranges of the split's frames, LAST excluded."""
     checkpoint: Annotated[Path | None, option("C", text=DETECTOR_TEXT)] = None
-    results: Annotated[Path | None, option("FILE")] = None
-    """Results to evaluate: an official results file, or detections.json with the --checkpoint it came from."""
+    results: Annotated[Path | None, option("FILE|DIR")] = None
+    """Results to evaluate: an official results file, detections.json with the --checkpoint it came from,
+    or a folder of KITTI result files, one for each frame of the split."""
     ground_truth: Annotated[Path | None, option("FILE")] = None
     """Ground truth instead of a data set: {sample token: {"ego_translation", "boxes"}}."""
     yaw_deg: options.Yaw = None
@@ -81,6 +89,8 @@ class Evaluate:
 def run(args: Evaluate) -> None:
     """Detect if a detector is given, evaluate, write, and print the scores."""
     _check(args)
+    if _has_kitti_results(args):
+        return _score_kitti_results(args)
     join_processes(args.processes)
     is_main_process = jax.process_index() == 0
     with contextlib.ExitStack() as locked:
@@ -104,6 +114,34 @@ def run(args: Evaluate) -> None:
                     title = f"{(args.checkpoint or args.results or Path()).name} on {task.name}"
                     write_reports(task, compared, evaluation, args.out, title=title)
                 print(f"look at {args.out / ('report.html' if args.report else 'metrics_summary.json')}")
+
+
+def _has_kitti_results(args: Evaluate) -> bool:
+    if args.results is None or args.ground_truth is not None:
+        return False
+    return (args.checkpoint is None or args.results.is_dir()) and args.data.data_set.reader.result_folders
+
+
+def _score_kitti_results(args: Evaluate) -> None:
+    """Compute KITTI's metric of a folder of result files."""
+    assert args.results is not None
+    if not args.results.is_dir():
+        expected = "the folder of KITTI's result files, or --checkpoint too, for the classes of detections.json"
+        raise ValueError(f"--results: {args.results}: found no folder, expected {expected}")
+    taken = {"data": DataOptions(args.data.data_root, args.data.format), "out": args.out, "report": args.report}
+    usual = Evaluate(**taken, split=args.split, results=args.results, processes=args.processes)
+    for given, expected in ((args.data, usual.data), (args, usual)):
+        for name in (field.name for field in dataclasses.fields(given) if field.name != "data"):
+            if (value := getattr(given, name)) != getattr(expected, name):
+                raise ValueError(f"{option_name(name)}: got {value}, expected none with a folder of results")
+    split = _split(args)
+    frames = args.data.open_whole(split, CloudReading())
+    assert isinstance(frames, KittiFrames)
+    metrics = score_kitti(args.results, frames, of=f"split {split!r}" if split else str(frames.root))
+    with folder_lock(args.out, "evaluating"):
+        write_summary(args.out, metrics)
+    print(describe_kitti(metrics))
+    print(f"look at {args.out / KITTI_SUMMARY}")
 
 
 def _copy(args: Evaluate, task: Task) -> None:
@@ -164,17 +202,20 @@ def _open(args: Evaluate) -> Task:
     official = detector is None or (set(detector.classes) <= set(NUSCENES_CLASSES) and args.data.class_map is None)
     benchmark = data.tables is not None and official
     _check_metric(args, detector, benchmark=benchmark)
-    split = args.split or args.data.split("val")
-    too_high = "scores on training frames are too high"
-    if args.split is None and split not in (None, "val", "mini_val"):
-        tell(f"{data.root}: no split val: evaluating {split}, the only split, which train uses too; {too_high}")
+    split = _split(args)
     name = " ".join(filter(None, (str(args.data.data_root or "simulated frames"), data.version, split)))
     if not benchmark:
         frames = args.data.open(config, split=split, samples=args.samples, sensor=sensor)
         if split is None and args.samples is None:
-            tell(f"{data.root}: no splits: evaluating all {len(frames)} frames; {too_high}")
-        # The report's range images are in the frame of the data.
-        return Task(name, compare_by_distance(frames, config.ranges_m), frames.sensor, detector, frames)
+            tell(f"{data.root}: no splits: evaluating all {len(frames)} frames; {_TOO_HIGH}")
+        if data.on_disk:  # damaged files are named now, and not after the detector was compiled
+            for index in range(len(frames)):
+                frames.labels(index)
+                frames.camera(index)  # reads the calibration of KITTI
+        own = frames.sensor  # the report's range images are in the frame of the data
+        if data.reader.sensor is None and (turn := radians(args.yaw_deg)) is not None:
+            own = dataclasses.replace(own, forward_rad=heading(sensor, turn))
+        return Task(name, compare_by_distance(frames, config.ranges_m), own, detector, frames)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
     assert isinstance(frames, NuScenesFrames)
     if args.samples is not None:
@@ -187,6 +228,15 @@ def _open(args: Evaluate) -> Task:
         tell(f"{missing} files of keyframes are missing: the report shows boxes without points")
         return Task(name, comparison, sensor)
     return Task(name, comparison, frames.sensor, detector, frames)
+
+
+def _split(args: Evaluate) -> str | None:
+    """The given split or the default, with a note if that is not a validation split."""
+    split = args.split or args.data.split("val")
+    if args.split is None and split not in (None, "val", "mini_val"):
+        only = f"no split val: evaluating {split}, the only split, which train uses too"
+        tell(f"{args.data.data_set.root}: {only}; {_TOO_HIGH}")
+    return split
 
 
 def _check_metric(args: Evaluate, detector: CloudDetector | None, *, benchmark: bool) -> None:

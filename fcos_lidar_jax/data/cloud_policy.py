@@ -20,6 +20,7 @@ in the network."""
 MAX_TIME_LAG_S = 60.0  # far above any fusion; larger values, like negative ones, are timestamps or damage
 
 _SEED = 0  # of the random choice of truncated rows
+_ORDER = "older sweeps go first, then random points"
 _MIN_ROWS = 500  # too few rows say nothing about the sensor
 _MAX_COORDINATE_M = 1000.0  # a larger median is no distance in metres
 _NEAR_M = 2.0  # points on the ego vehicle say nothing about the sensor
@@ -192,17 +193,17 @@ def truncation(number: int, config: Config) -> str | None:
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> truncation(7, QUICKSTART)
-    '7 points left out: the detector takes at most 4096 per cloud (max_points)'
+    '7 points left out: the detector takes at most 4096 per cloud (max_points); older sweeps go first, ...'
     """
     how = f"left out: the detector takes at most {config.max_points} per cloud (max_points)"
-    return f"{number} points {how}" if number else None
+    return f"{number} points {how}; {_ORDER}" if number else None
 
 
 def tell_truncation(cloud: Cloud, config: Config) -> None:
     """Print a line at the first truncated cloud, once per process; :func:`truncation` counts the points."""
     if cloud.num_truncated:
         line = f"clouds are truncated: the detector takes at most {config.max_points} points (max_points)"
-        tell(line, once=True)
+        tell(f"{line}; {_ORDER}", once=True)
 
 
 def _limits(sensor: Sensor) -> str:

@@ -1,6 +1,7 @@
 """Point files without boxes, as frames for detection."""
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +90,15 @@ def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:
         if not path.is_dir():
             clouds.append(path)
             continue
-        visible = (p for p in path.iterdir() if not p.name.startswith("."))
-        files = sorted(p for p in visible if p.is_file() and p.name.lower().endswith(ENDINGS))
+        files = _point_files(path.iterdir())
         if not files:
-            raise ValueError(f"{path}: no point file in it, expected {', '.join(ENDINGS)}")
+            below = (folder for levels in ("*", "*/*") for folder in sorted(path.glob(levels)) if folder.is_dir())
+            hint = next((f"; found some in {folder}" for folder in below if _point_files(folder.glob("*"))), "")
+            raise ValueError(f"{path}: no point file in it, expected {', '.join(ENDINGS)}{hint}")
         clouds += files
     return tuple(clouds)
+
+
+def _point_files(paths: Iterable[Path]) -> list[Path]:
+    visible = (path for path in paths if not path.name.startswith("."))
+    return sorted(path for path in visible if path.is_file() and path.name.lower().endswith(ENDINGS))

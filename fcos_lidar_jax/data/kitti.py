@@ -199,16 +199,17 @@ def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:
     return fields[kept, 7:14], np.array([CLASSES.index(types[i]) for i in kept], np.int32)
 
 
-def read_objects(file: Path) -> tuple[list[str], np.ndarray]:
+def read_objects(file: Path, *, scored: bool = False) -> tuple[list[str], np.ndarray]:
     """All lines of a label or result file, DontCare too: types, and the numbers that follow them, f64[m, 15].
 
     The columns are truncation, occlusion, alpha, left, top, right, bottom, height, width, length, x, y, z,
-    rotation_y and score; the score is NaN where the line has none.
+    rotation_y and score; the score is NaN where the line has none, which ``scored`` refuses.
     """
+    lengths, expected = ((16,), "16, the score last") if scored else ((15, 16), "15, or 16 with a score")
     types, rows, places = [], [], []
     for where, words in read_lines(file):
-        if len(words) not in (15, 16):
-            raise ValueError(f"{where}: got {len(words)} values, expected 15, or 16 with a score")
+        if len(words) not in lengths:
+            raise ValueError(f"{where}: got {len(words)} values, expected {expected}")
         if words[0] not in (*CLASSES, "DontCare"):
             raise ValueError(f"{where}: type: {unknown_name(words[0], CLASSES)}")
         named = zip(_FIELDS, words[1:], strict=False)

@@ -60,10 +60,7 @@ def evaluate_kitti(
     files = sorted(Path(results_dir).glob("*.txt"))
     if not files:
         raise ValueError(f"{results_dir}: no .txt file in it, expected one for every frame")
-    truth, found = _Objects([Path(label_dir) / file.name for file in files]), _Objects(files)
-    for row in np.flatnonzero(np.isnan(found.scores)):
-        file = files[np.searchsorted(found.ends, row, side="right")]
-        raise ValueError(f"{file}: score: got 15 values in a line, expected 16, the score last")
+    truth, found = _Objects([Path(label_dir) / file.name for file in files]), _Objects(files, scored=True)
     pairs, overlap = _overlapping(truth, found)
     scores = {name: _evaluate_class(name, truth, found, pairs, overlap) for name in classes}
     return {"metric": "AP_R40", "num_frames": len(files), "classes": scores}
@@ -94,8 +91,8 @@ def object_counts(scores: dict[str, Any]) -> str:
 class _Objects:
     """The lines of files as arrays, in their order."""
 
-    def __init__(self, files: Sequence[Path]) -> None:
-        read = [read_objects(file) for file in files]
+    def __init__(self, files: Sequence[Path], *, scored: bool = False) -> None:
+        read = [read_objects(file, scored=scored) for file in files]
         fields = np.concatenate([fields for _, fields in read])
         self.ends = np.cumsum([len(types) for types, _ in read])
         self.types = np.array([name for types, _ in read for name in types], np.str_)

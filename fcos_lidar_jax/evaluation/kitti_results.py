@@ -11,6 +11,7 @@ from fcos_lidar_jax.data.box_geometry import LIMITS
 from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet, WrappedFrames
 from fcos_lidar_jax.data.kitti import CLASSES, IMAGE_SIZE, KittiFrames, read_calibration
+from fcos_lidar_jax.evaluation.json_io import expect_samples
 from fcos_lidar_jax.evaluation.kitti import MIN_OVERLAP, evaluate_kitti
 from fcos_lidar_jax.evaluation.records import confident
 from fcos_lidar_jax.files import atomic_write
@@ -56,8 +57,21 @@ def write_kitti(out: Path, detections: Iterable[Detections], frames: FrameSet | 
     metrics = evaluate_kitti(folder, source.root / "training" / "label_2", classes=classes)
     others = [name for name, kind in zip(frames.classes, kinds, strict=True) if kind not in MIN_OVERLAP]
     metrics["left_out"] = others + [name for name in MIN_OVERLAP if name not in classes]
-    atomic_write(summary, lambda file: file.write_text(json.dumps(metrics, indent=2), encoding="utf-8"))
+    write_summary(out, metrics)
     return metrics
+
+
+def score_kitti(results: Path, frames: KittiFrames, *, of: str) -> dict[str, Any]:
+    """KITTI's metric of a folder of result files, one for each of the frames, which ``of`` describes."""
+    names = [frames.name(index) for index in range(len(frames))]
+    expect_samples(sorted(file.stem for file in results.glob("*.txt")), names, str(results), of=of)
+    return evaluate_kitti(results, frames.root / "training" / "label_2")
+
+
+def write_summary(out: Path, metrics: dict[str, Any]) -> None:
+    """Write KITTI's metric as ``metrics_kitti.json``."""
+    text = json.dumps(metrics, indent=2)
+    atomic_write(out / KITTI_SUMMARY, lambda file: file.write_text(text, encoding="utf-8"))
 
 
 def _kitti_frames(frames: FrameSet | None) -> tuple[KittiFrames, dict[str, str]] | None:

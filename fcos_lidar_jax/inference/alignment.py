@@ -72,6 +72,11 @@ class Alignment:
         return f"clouds {' and '.join(steps)}, and boxes transformed back{why}"
 
 
+def heading(detector: Sensor, turn_rad: float) -> float | None:
+    """Azimuth of the heading in clouds that are rotated by an angle for a detector; None if it is unknown."""
+    return None if detector.forward_rad is None else math.remainder(detector.forward_rad - turn_rad, 2 * math.pi)
+
+
 def align(
     detector: Sensor,
     sensor: Sensor | None = None,
@@ -103,10 +108,9 @@ def align(
     if recorded is not None:
         data = in_frame_of(detector, recorded)
     else:  # the same place on the ego vehicle, in the axes of the points
-        turn, ahead = yaw_rad or 0.0, detector.forward_rad
+        turn = yaw_rad or 0.0
         origin = np.array(detector.origin_m) @ about_z(turn)[:3, :3]
-        forward_rad = None if ahead is None else math.remainder(ahead - turn, 2 * math.pi)
-        data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()), forward_rad=forward_rad)
+        data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()), forward_rad=heading(detector, turn))
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
     if sensor is None and recorded is not None and data != detector:

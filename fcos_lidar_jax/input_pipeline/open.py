@@ -38,6 +38,7 @@ class Reader:
     class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)  # by the data set they lead to
     adapt: Callable[[Sensor, Sensor], Sensor] = in_frame_of
     """(given sensor, ``sensor``) -> the given one with frame and scale, or only the heading, of ``sensor``."""
+    result_folders: bool = False  # ``evaluate`` takes folders of KITTI result files
 
     @property
     def named_maps(self) -> str:
@@ -64,6 +65,7 @@ READERS = (
         lambda data, **how: kitti.KittiFrames(data.root, **how),
         ("full_turn", "intensity_scale"),
         class_maps={"nuscenes": kitti.TO_NUSCENES},
+        result_folders=True,
     ),
     Reader(
         "argoverse2",
@@ -150,14 +152,21 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
 
 
 def _recognise(root: Path) -> Reader:
-    matching = [reader for reader in READERS if any(next(root.glob(mark), None) for mark in reader.marks)]
+    matching = _matching(root)
     if len(matching) > 1:
         names = " and ".join(reader.name for reader in matching)
         raise ValueError(f"{root}: looks like {names}, expected one format: name it")
     if not matching:
         marks = ", ".join(f"{' or '.join(reader.marks)} ({reader.name})" for reader in READERS if reader.marks)
-        raise ValueError(f"{root}: no known data set, expected one of {marks}")
+        near = (*root.resolve().parents[:2], *sorted(folder for folder in root.glob("*") if folder.is_dir()))
+        found = ((folder, readers[0].name) for folder in near if len(readers := _matching(folder)) == 1)
+        hint = next((f"; found {name} in {folder}" for folder, name in found), "")
+        raise ValueError(f"{root}: no known data set, expected one of {marks}{hint}")
     return matching[0]
+
+
+def _matching(root: Path) -> list[Reader]:
+    return [reader for reader in READERS if any(next(root.glob(mark), None) for mark in reader.marks)]
 
 
 def _refuse(data: DataSet, **options: object) -> None:

@@ -20,6 +20,12 @@ def draw_curves(
     """Plot named series of (x, y) in one PNG file.
 
     Non-finite points leave a gap, as do non-positive points on a logarithmic y axis.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "loss.png"
+    >>> draw_curves(file, {"loss": [(1, 0.9), (2, 0.4)]}, x_label="step", y_label="loss", title="training")
+    >>> file.exists()
+    True
     """
     figure, axis = new_axis(8, 4.5)
     for i, (name, points) in enumerate(series.items()):

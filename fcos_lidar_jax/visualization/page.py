@@ -55,6 +55,10 @@ def page_frame(
         points: see :func:`encode_points`; all boxes are in their frame.
         time_us, pose: time, and pose f64[4, 4] in the world; only for frames of the same drive.
         ids: i32[m], identities over time.
+
+    >>> found = np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)
+    >>> page_frame(np.array([[0, 8.0, 0, 50]]), found, name="street").num_points
+    1
     """
     boxes, labels, scores = found
     return PageFrame(
@@ -120,6 +124,14 @@ def write_page(
 
     ``sensor`` gives the heading of the ego vehicle in frames without poses, by default along y; ``min_score`` is
     the initial threshold of the visible boxes.
+
+    >>> import tempfile
+    >>> found = np.array([[0, 9, 0, 4, 2, 2, 0, 0, 0]]), np.array([0]), np.array([0.9])
+    >>> file = Path(tempfile.mkdtemp()) / "page.html"
+    >>> frame = page_frame(np.array([[0, 8.0, 0, 50]]), found, name="street")
+    >>> write_page(file, [frame], classes=["car"], title="one car")
+    >>> "<title>" in file.read_text(encoding="utf-8")
+    True
     """
     content: dict[str, Any] = {"title": title, "step_m": STEP_M, "score": min_score, "classes": list(classes)}
     content |= {"colors": [*map(class_color, range(len(classes)))], "forward_rad": sensor and sensor.forward_rad}

@@ -199,13 +199,14 @@ def test_evaluates_own_data_of_other_axes_and_units(tmp_path):
         file.write_text(json.dumps(record))
     (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
     scores, found = [], []
-    for root, more in ((right, ""), (ahead, "--yaw-deg 90 --intensity-scale 4")):
+    for root, more in ((right, "--no-report"), (ahead, "--yaw-deg 90 --intensity-scale 4")):
         out = tmp_path / f"scores_{root.name}"
-        how = f"--class-map {tmp_path}/map.json --checkpoint quickstart --no-report"
+        how = f"--class-map {tmp_path}/map.json --checkpoint quickstart"
         command("evaluate --data-root", root, how, more, "--out", out)
         scores.append(json.loads((out / "metrics_summary.json").read_text())["mean_ap"])
         found.append(json.loads((out / "detections.json").read_text())["frames"][0]["boxes"])
     assert_turned_back(found[1], found[0])
+    assert page_content(out / "frames.html")["forward_rad"] == 0
     assert scores[1] == pytest.approx(scores[0], abs=1e-6)
     assert scores[0] > 0.01
 

@@ -142,8 +142,9 @@ def test_a_class_map_by_name_trains_on_the_same_frames_as_its_file(tmp_path, mon
         assert_one_line_error(capsys, f"train {line} {given}".split(), message + known)
 
 
-TRUNCATED = "clouds are truncated: the detector takes at most 4096 points (max_points)"
-COUNTED = "points left out: the detector takes at most 4096 per cloud (max_points)"
+ORDER = "(max_points); older sweeps go first, then random points"
+TRUNCATED = f"clouds are truncated: the detector takes at most 4096 points {ORDER}"
+COUNTED = f"points left out: the detector takes at most 4096 per cloud {ORDER}"
 
 
 def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):

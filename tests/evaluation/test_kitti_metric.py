@@ -240,7 +240,7 @@ def test_bad_results_get_one_line(tmp_path):
     with refused(f"{tmp_path / 'none'}: no .txt file in it, expected one for every frame"):
         evaluate_kitti(tmp_path / "none", labels)
     for result, message in (
-        (line(), "000000.txt: score: got 15 values in a line, expected 16"),
+        (line(score=0.5) + line(), "000000.txt: line 2: got 15 values, expected 16, the score last"),
         (line(score=0.5).replace("Car", "car"), "line 1: type: got 'car', expected Car"),
         (line(score=0.5).replace("0.5", "nan"), "line 1: score: got 'nan', expected a finite number"),
     ):

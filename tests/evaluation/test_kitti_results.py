@@ -5,10 +5,11 @@ import re
 
 import numpy as np
 import pytest
-from commands import command
+from commands import assert_one_line_error, command
 from made_kitti import AXES, MOUNTED, P2, RECTIFIED, calibration_text, label_text, write
 
 import fcos_lidar_jax as fcos
+from fcos_lidar_jax.cli import evaluate
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.frame import SelectedFrames
 from fcos_lidar_jax.data.kitti import (
@@ -199,3 +200,51 @@ def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "KITTI AP_R40 on 6 frames" in printed
     assert "mAP by centre distance" in printed
+    # The result files alone give the same numbers.
+    command(f"evaluate --data-root {root} --results {tmp_path}/out/results_kitti --out {tmp_path}/again")
+    again = json.loads((tmp_path / "again" / "metrics_kitti.json").read_text())
+    assert {**again, "left_out": metrics["left_out"]} == metrics
+    assert capsys.readouterr().out.startswith(describe_kitti(again))
+    assert {file.name for file in (tmp_path / "again").iterdir()} == {"metrics_kitti.json", ".lock"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("label_2", "000005.txt: line 1: got 3 values, expected 15"),
+        ("calib", "000005.txt: P2: missing, "),
+    ],
+)
+def test_damaged_files_are_named_before_anything_is_detected(root, tmp_path, monkeypatch, capsys, kind, message):
+    monkeypatch.setattr(evaluate, "run_detector", lambda *_, **__: pytest.fail("detects"))
+    write(root / "training" / kind / "000005.txt", "Car 0 0\n")
+    line = f"evaluate --data-root {root} --class-map nuscenes --checkpoint quickstart --out {tmp_path}/out"
+    assert_one_line_error(capsys, line.split(), message)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--checkpoint quickstart", "--checkpoint: got quickstart, expected none with a folder of results"),
+        ("--samples 0:2", "--samples: got 0:2, expected none with a folder of results"),
+        ("--class-map nuscenes", "--class-map: got nuscenes, expected none with a folder of results"),
+        ("--bootstrap 9", "--bootstrap: got 9, expected none with a folder of results"),
+        ("", "found: sample 000001 and 4 more: missing; sample 9: not expected: expected the 6 samples of "),
+        ("--split some", "found: sample 000001: missing; .*: expected the 2 samples of split 'some'$"),
+        (
+            "--results found/9.txt",
+            "--results: found/9.txt: found no folder, expected the folder of KITTI's result",
+        ),
+    ],
+)
+def test_a_folder_of_results_that_does_not_fit_is_refused(root, tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    write(root / "ImageSets" / "some.txt", "000000\n000001\n")
+    write(tmp_path / "found" / "000000.txt", "")
+    write(tmp_path / "found" / "9.txt", "")
+    line = f"evaluate --data-root {root} --out out " + options
+    line += "" if "--results" in options else " --results found"
+    line += "" if "--split" in options else " --split all"
+    write(root / "ImageSets" / "all.txt", "".join(f"00000{i}\n" for i in range(6)))
+    assert_one_line_error(capsys, line.split(), message)
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -125,6 +126,13 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
         testing.checked()
     splits.write_text(splits.read_text().replace("}", ', "test": ["scene-0002"]}'))
     assert testing.checked().test_version == "v1.0-mini"
+    # Another version has its own splits.
+    tables = shutil.copytree(tmp_path / "one" / "v1.0-mini", tmp_path / "one" / "v1.0-test")
+    (tables / "splits.json").write_text('{"test": ["scene-0001"]}')
+    other = dataclasses.replace(testing, version="v1.0-mini", test_version="v1.0-test").checked()
+    frames = other.frames("test", other.base, other.test_version)
+    assert {frames.scene(i) for i in range(len(frames))} == {"scene-0001"}
+    shutil.rmtree(tables)
     for cloud in (tmp_path / "one" / "samples" / "LIDAR_TOP").iterdir():
         cloud.unlink()
     NuScenesLayout._data.cache_clear()

@@ -282,6 +282,19 @@ def test_options_that_do_not_fit_are_refused(roots, tmp_path, case):
         open_frames(root, **{name: value for name, value in options.items() if name != "root"})
 
 
+def test_the_folder_that_holds_a_data_set_is_named(roots, tmp_path):
+    shutil.copytree(roots["kitti"], tmp_path / "kitti")
+    for near, format, level in (
+        (tmp_path, "kitti", tmp_path / "kitti"),
+        (tmp_path / "kitti" / "training", "kitti", tmp_path / "kitti"),
+        (tmp_path / "kitti" / "training" / "velodyne", "kitti", tmp_path / "kitti"),
+        (roots["nuscenes"] / VERSION, "nuscenes", roots["nuscenes"]),
+        (roots["folder"] / "clouds", "folder", roots["folder"]),
+    ):
+        with refused(f"{near}: no known data set, expected one of ", f"; found {format} in {level.resolve()}"):
+            open_frames(near)
+
+
 def test_one_of_several_formats_or_versions_must_be_named(roots, tmp_path):
     root = shutil.copytree(roots["nuscenes"], tmp_path / "both")
     shutil.copytree(root / VERSION, root / "v2")
