@@ -153,6 +153,7 @@ def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], m
     0.6931
     """
     iou = lax.stop_gradient(iou)
+    logits = jnp.where(mask, logits, 0.0)  # masked logits may be NaN, as above
     return _masked(jax.nn.softplus(logits) - iou * logits, mask)
 
 
