@@ -1,9 +1,9 @@
 """FCOS-LiDAR in JAX: 3D object detection on LiDAR range images with pure functions.
 
->>> import numpy as np
 >>> import fcos_lidar_jax as fcos
 >>> detector = fcos.load_detector("quickstart")
->>> found = detector(np.ones((100, 4), np.float32))
+>>> frames = fcos.open_frames(format="simulated", sensor=detector.sensor)
+>>> found = detector(frames.frame(0).points)
 >>> found.boxes.shape == (len(found), 9)
 True
 

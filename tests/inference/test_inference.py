@@ -188,7 +188,6 @@ def test_weights_are_transferred_once(monkeypatch):
     other = detector.with_inference(max_detections=3)
     other(make_frame(0, TINY).points)
     assert placed == [1, 1]
-    assert dataclasses.replace(detector) == detector
     assert "placed" not in repr(detector)
 
 

@@ -308,7 +308,7 @@ def test_a_run_without_its_checkpoints_keeps_its_metrics(finished, tmp_path):
     before = contents(folder)
     message = "checkpoints: found none, but metrics of 4 steps, of which step 1 was saved, expected"
     with pytest.raises(ValueError, match=message):
-        train_tiny(folder, evaluate=2, tests=TESTS, resume=True)
+        train_tiny(folder, evaluate=2, tests=TESTS, weights=weights(), resume=True)
     assert contents(folder) == before
 
 
