@@ -2,11 +2,13 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import pytest
 from jaxtyping import install_import_hook
+from matplotlib.figure import Figure
 from quick import compile_quickly
 
 # The containers are left out: tree transformations fill their annotated fields with other things. Sensors and
@@ -49,6 +51,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="module", autouse=True)
 def _optimisation(request: pytest.FixtureRequest) -> None:
     compile_quickly(_is_quick(request.path))
+
+
+# Where the question is which pictures there are, not how they look, they have a ninth of the pixels and no layout.
+_COARSE = ("cli", "experiments", "models", "training")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _coarse_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    def coarse(figure: Figure, *args, dpi: float, **options) -> None:
+        figure.set_layout_engine("none")
+        savefig(figure, *args, dpi=dpi / 3, **options)
+
+    savefig = Figure.savefig
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name in _COARSE:
+            patch.setattr(Figure, "savefig", coarse)
+        yield
 
 
 @pytest.fixture(autouse=True)
