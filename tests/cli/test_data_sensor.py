@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import warnings
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,14 +13,30 @@ from commands import assert_one_line_error, command, page_content
 from made_argoverse2 import make_log
 from made_folder import make_folder
 from made_kitti import make_kitti
+from tiny_run import CONFIG, NETWORK_OPTIONS, untrained
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax import cli
+from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
+from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E
 
-HDL32E = "--checkpoint hdl32e --out"
+SMALL = "--checkpoint small --out"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small(tmp_path_factory):
+    """An untrained detector of nuScenes' sensor, called ``small`` in all these tests."""
+    folder = tmp_path_factory.mktemp("detector")
+    sensor = dataclasses.replace(NUSCENES_HDL32E, num_columns=128)
+    inference = InferenceConfig(min_probability=0.5, max_detections=300, candidates_per_level=100)
+    config = dataclasses.replace(CONFIG, max_points=20_000, inference=inference)
+    save_checkpoint(folder / "small", Checkpoint(config, sensor, untrained(config, sensor), 1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +46,7 @@ def kitti(tmp_path_factory):
         tmp_path_factory.mktemp("data") / "kitti",
         train=1,
         val=1,
-        sensor=dataclasses.replace(KITTI_HDL64E, num_columns=512),
+        sensor=dataclasses.replace(KITTI_HDL64E, num_columns=256),
     )
     (root / "map.json").write_text(json.dumps(TO_NUSCENES))
     (root / "elsewhere").mkdir()
@@ -47,13 +64,13 @@ def kitti(tmp_path_factory):
 
 def detect(out, *words):
     """Boxes of the first file."""
-    command("detect", *words, HDL32E, out)
+    command("detect", *words, SMALL, out)
     return json.loads(out.read_text())["files"][0]["boxes"]
 
 
 def stream(out, *words):
     """Boxes of the first sweep."""
-    command("stream", *words, HDL32E, out)
+    command("stream", *words, SMALL, out)
     return json.loads(out.read_text().splitlines()[0])["boxes"]
 
 
@@ -84,26 +101,27 @@ def test_commands_name_the_sensor_and_the_presets_that_fit_the_data(kitti, tmp_p
     def stop(*_, **__):
         raise ValueError("enough")
 
+    monkeypatch.setattr("fcos_lidar_jax.training.run.make_state", Mock(return_value=Mock(step=0)))
     monkeypatch.setattr("fcos_lidar_jax.training.run.make_batches", stop)
     cloud, data = kitti / "training" / "velodyne" / "000000.bin", f"--data-root {kitti} --class-map nuscenes"
-    train = f"train compact {data} --no-copy-paste --no-class-balanced --out"
+    train = f"train compact {data} --no-copy-paste {' '.join(NETWORK_OPTIONS)} --out"
     presets = ", ".join(name for name, preset in PRESETS.items() if preset.sensor == "kitti_hdl64e")
     advice = f": expected --sensor kitti_hdl64e (train, project) or a preset ({presets})"
     for lines in (
         advised(train, tmp_path / "run", code=1),
-        advised("evaluate", data, "--no-report", HDL32E, tmp_path / "scores"),
-        advised("detect", cloud, HDL32E, tmp_path / "boxes.json"),
-        advised("stream", cloud.parent, HDL32E, tmp_path / "boxes.jsonl"),
+        advised("evaluate", data, "--no-report", SMALL, tmp_path / "scores"),
+        advised("detect", cloud, SMALL, tmp_path / "boxes.json"),
+        advised("stream", cloud.parent, SMALL, tmp_path / "boxes.jsonl"),
         advised("project", cloud, "--out", tmp_path / "image.npz"),
     ):
         [line] = lines
         assert line.startswith("warning: ")
         assert line.endswith(advice)
     with pytest.warns(UserWarning, match=re.escape(advice)):
-        fcos.load_detector("hdl32e")(cloud)
+        fcos.load_detector("small")(cloud)
     fitting = advised(train, tmp_path / "fitting", "--sensor kitti_hdl64e", code=1)
     fitting += advised("project", cloud, "--sensor kitti_hdl64e --out", tmp_path / "image.npz")
-    assert not any("expected --sensor" in line for line in fitting)  # others are about the 512 columns
+    assert not any("expected --sensor" in line for line in fitting)  # others are about the 256 columns
 
 
 def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
@@ -125,13 +143,13 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 
     data = f"--data-root {kitti} --format kitti --split train --class-map {kitti}/map.json --no-report"
     for more, expected in (("", cropped), ("--full-turn", boxes)):
-        command("evaluate", data, more, HDL32E, tmp_path / f"scores{more}")
+        command("evaluate", data, more, SMALL, tmp_path / f"scores{more}")
         [evaluated] = json.loads((tmp_path / f"scores{more}" / "detections.json").read_text())["frames"]
         assert evaluated["boxes"] == expected
     assert 0 < len(cropped) < len(boxes)
     assert cropped != boxes
 
-    detector = fcos.load_detector("hdl32e")
+    detector = fcos.load_detector("small")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "points do not fit sensor")  # it has 64 beams
         capsys.readouterr()
@@ -228,10 +246,8 @@ def test_what_cannot_be_meant_is_refused_in_one_line(kitti, tmp_path, capsys):
             "--intensity-scale: expected none with --data-root",
         ),
     ):
-        assert_one_line_error(capsys, [*words.split(), *HDL32E.split(), str(tmp_path / "out")], message)
-    results = (
-        f"evaluate --data-root {kitti} --results {kitti}/map.json --checkpoint hdl32e --out {tmp_path}/scores"
-    )
+        assert_one_line_error(capsys, [*words.split(), *SMALL.split(), str(tmp_path / "out")], message)
+    results = f"evaluate --data-root {kitti} --results {kitti}/map.json --checkpoint small --out {tmp_path}/scores"
     assert_one_line_error(
         capsys, [*results.split(), "--yaw-deg", "9"], "--yaw-deg: got 9.0, expected none with --res"
     )

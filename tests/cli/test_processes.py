@@ -153,6 +153,11 @@ def start_two(how: str, *args: list[str], before: tuple[Callable[[], object], ..
     return [one(index) for index in range(2)]
 
 
+def linear(root: Path) -> list[str]:
+    """The checkpoint of the network of one layer, for tests that compare no boxes; processes call ``use``."""
+    return ["--checkpoint", str(root.parent / "linear")]
+
+
 def ended(processes: list[Forked]) -> list[tuple[int, str, str]]:
     """Wait for the end; returns exit codes and output."""
     try:
@@ -228,24 +233,27 @@ def test_an_unreadable_cloud_ends_both_processes_and_keeps_finished_frames(root,
 
 
 def test_processes_with_different_detectors_are_refused(root, tmp_path):
-    other = tmp_path / "start"
-    save_checkpoint(other, Checkpoint(CONFIG, SENSOR, jax.tree.map(lambda leaf: leaf + 1, weights()), 1))
-    both = [evaluate(root, tmp_path / "both"), evaluate(root, tmp_path / "both", "--checkpoint", str(other))]
+    other = tmp_path / "other"
+    with linear_network():
+        changed = jax.tree.map(lambda leaf: leaf + 1, untrained(CONFIG, SENSOR))
+        save_checkpoint(other, Checkpoint(CONFIG, SENSOR, changed, 1))
+    both = [evaluate(root, tmp_path / "both", *which) for which in (linear(root), ["--checkpoint", str(other)])]
     line = "process 1: detector, frames or batch size: different from process 0, expected the same"
-    for code, _, errors in ended(start_two("coordinator", *both)):
+    for code, _, errors in ended(start_two("coordinator", *both, before=(use, use))):
         assert (code, error_lines(errors)) == (1, [f"fcos-lidar: error: {line}"])
 
 
 def test_a_failure_of_the_first_process_ends_both(root, tmp_path):
     """The folder is in use; then a folder stands in the place of a file."""
     out, line = tmp_path / "both", "fcos-lidar: error: process 0: cannot evaluate, see its output"
+    both = [evaluate(root, out, *linear(root))] * 2
     with in_use(out):
-        first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
+        first, second = ended(start_two("coordinator", *both, before=(use, use)))
     assert (first[0], second[0]) == (1, 1)
     assert "in use: process" in error_lines(first[2])[0]
     assert error_lines(second[2]) == [line]
     (out / "results_nusc.resume_log").mkdir()
-    first, second = ended(start_two("coordinator", *[evaluate(root, out)] * 2))
+    first, second = ended(start_two("coordinator", *both, before=(use, use)))
     assert (first[0], second[0]) == (1, 1)
     assert "results_nusc.resume_log" in error_lines(first[2])[0]
     assert error_lines(second[2]) == ["fcos-lidar: error: process 0: cannot detect, see its output"]
@@ -257,12 +265,19 @@ def start_one(args: list[str], before: Callable[[], object]) -> list[Forked]:
     return [Forked([*args, *place], before)]
 
 
+def use_and_signal_at(*where: object) -> None:
+    use()
+    signal_at(*where)
+
+
 @pytest.mark.parametrize("number", [1, 2])
 def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path, number):
     frames = ["--format", "simulated", "--samples", "0:400", "--no-report"]
-    args = ["evaluate", *frames, "--checkpoint", str(root.parent / "start"), "--out", str(tmp_path / "all")]
-    stop = functools.partial(signal_at, f"{SimulatedFrames.__module__}.SimulatedFrames.frame", signal.SIGTERM, 40)
-    processes = start_one(args, stop) if number == 1 else start_two("coordinator", args, args, before=(int, stop))
+    args = ["evaluate", *frames, *linear(root), "--out", str(tmp_path / "all")]
+    stop = functools.partial(
+        use_and_signal_at, f"{SimulatedFrames.__module__}.SimulatedFrames.frame", signal.SIGTERM, 40
+    )
+    processes = start_one(args, stop) if number == 1 else start_two("coordinator", args, args, before=(use, stop))
     for code, _, errors in ended(processes):
         assert (code, error_lines(errors)) == (143, []), errors
     done = (tmp_path / "all" / "detections.resume_log").read_bytes().count(b"\n") - 1
@@ -271,8 +286,9 @@ def test_sigterm_to_one_process_stops_all_after_the_same_frames(root, tmp_path, 
 
 
 def test_sigterm_ends_the_scoring_too(root, tmp_path):
-    stop = functools.partial(signal_at, "fcos_lidar_jax.evaluation.summary.bootstrap", signal.SIGTERM)
-    ((code, _, errors),) = ended(start_one([*evaluate(root, tmp_path / "alone"), "--bootstrap", "9"], stop))
+    stop = functools.partial(use_and_signal_at, "fcos_lidar_jax.evaluation.summary.bootstrap", signal.SIGTERM)
+    args = evaluate(root, tmp_path / "alone", *linear(root), "--bootstrap", "9")
+    ((code, _, errors),) = ended(start_one(args, stop))
     assert (code, error_lines(errors)) == (143, []), errors
     assert (tmp_path / "alone" / "results_nusc.json").exists()
     assert not (tmp_path / "alone" / "bootstrap.json").exists()

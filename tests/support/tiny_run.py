@@ -10,7 +10,7 @@ import numpy as np
 
 from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
 from fcos_lidar_jax.input_pipeline.loader import make_batches
-from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.models import Detector, build_detector
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -59,10 +59,14 @@ def images_of(features: jax.Array) -> RangeImage:
     return RangeImage(jnp.asarray(features), index, jnp.zeros(batch, jnp.int32))
 
 
-@functools.cache
 def weights():
-    """Random weights, made without compiling."""
-    shapes = jax.eval_shape(build_detector(CONFIG, SENSOR).init, jax.random.key(0))
+    """Random weights of the run's network, made without compiling."""
+    return _weights(build_detector(CONFIG, SENSOR))
+
+
+@functools.cache
+def _weights(detector: Detector):
+    shapes = jax.eval_shape(detector.init, jax.random.key(0))
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda leaf: rng.normal(0, 0.3, leaf.shape).astype(leaf.dtype), shapes["params"])
     statistics = jax.tree.map(lambda leaf: np.ones(leaf.shape, leaf.dtype), shapes["batch_stats"])

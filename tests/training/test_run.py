@@ -1,4 +1,7 @@
-"""Runs: the files they write, how they stop and resume, and what they refuse."""
+"""Runs: the files they write, how they stop and resume, and what they refuse.
+
+The network does not matter here; ``tests/cli/test_train.py`` trains FCOS-LiDAR's.
+"""
 
 import dataclasses
 import functools
@@ -15,6 +18,7 @@ import numpy as np
 import pytest
 from commands import run_python
 from event_files import summaries
+from linear_network import linear_network
 from PIL import Image
 from tiny_run import CONFIG, FRAMES, SENSOR, STEPS, TESTS, bits, train_tiny, weights
 
@@ -30,14 +34,13 @@ from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.training import NonFiniteLossError, plan
 from fcos_lidar_jax.training import run as runs
 from fcos_lidar_jax.training.metrics_log import read_metrics
-from fcos_lidar_jax.types import Batch, PackedBatch
 
 
 @pytest.fixture(scope="module", autouse=True)
 def traces():
     """All runs of this module share one step; the list grows with each trace of it."""
     traces, made = [], {}
-    with pytest.MonkeyPatch.context() as patch:
+    with linear_network(), pytest.MonkeyPatch.context() as patch:
         make_train_step = runs.make_train_step
 
         def shared_step(*args):
@@ -254,23 +257,6 @@ def test_a_run_that_is_stopped_at_an_evaluation_step_evaluates_when_it_resumes(f
     assert scores(folder) == scores(finished[0])
 
 
-def test_a_run_with_packed_batches_is_bit_identical(finished, tmp_path, monkeypatch):
-    kinds = []
-
-    @contextmanager
-    def noted(batches, mesh):
-        with feed(batches, mesh) as stream:
-            yield (kinds.append(type(host.batch)) or host for host in stream)
-
-    monkeypatch.setattr(runs, "feed", noted)
-    packed = train_tiny(tmp_path / "packed", weights=weights(), packing=True)
-    assert kinds == [PackedBatch] * STEPS
-    assert bits(packed) == bits(finished[1])
-    assert losses(tmp_path / "packed") == losses(finished[0])
-    train_tiny(tmp_path / "plain", weights=weights(), steps=1)
-    assert kinds[STEPS:] == [Batch]  # the default for CPUs
-
-
 def test_processes_with_other_data_or_packing_are_refused_before_the_run_starts(tmp_path, monkeypatch):
     def refuse(checksum, what):
         checksums.append(checksum)
@@ -314,10 +300,12 @@ def test_a_run_without_its_checkpoints_keeps_its_metrics(finished, tmp_path):
 
 STOPPED = """
 import os, resource, signal, sys
+import linear_network
 from tiny_run import train_tiny, weights
 from fcos_lidar_jax.cli import exit_code
 from fcos_lidar_jax.training import run
 full, killed = sys.argv[1:]
+linear_network.use()
 make_train_step, made = run.make_train_step, {}
 run.make_train_step = lambda *given: made.setdefault("step", make_train_step(*given))  # compiled once
 limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -30,6 +30,7 @@ from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums
 STEPS = 60
 CONFIG = dataclasses.replace(
     QUICKSTART,
+    model=TINY_CONFIG.model,
     augment=None,
     optimizer=dataclasses.replace(QUICKSTART.optimizer, batch_size=1),
     loss=dataclasses.replace(QUICKSTART.loss, l1_weight=1.0),
