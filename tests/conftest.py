@@ -34,9 +34,9 @@ jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # a process compiles hundreds of small programs
 
 
-# Most of the time goes to compilation, so programs are compiled without optimisation, except where the last bit
-# decides: whether an exported program is the same, in which cell a point is, and which box owns it.
-_OPTIMISED = ("test_export", "test_projection", "test_assignment")
+# Most of the time goes to compilation, so programs are compiled without optimisation, except where the last bits
+# matter: in exported programs, projection, assignment, overlaps and losses.
+_OPTIMISED = ("test_export", "test_projection", "test_assignment", "test_iou", "test_nms", "test_losses")
 
 
 def _is_quick(path: Path) -> bool:
