@@ -31,16 +31,25 @@ class Progress:
         if done > first and now > began:
             rate = (done - first) / (now - began)
             line += f"  {rate:.2f} {self.unit}/s, {(self.total - done) / rate:.0f} s left"
-        print(line, file=sys.stderr, flush=True)
+        _print(line)
 
 
 _told: set[str] = set()
 
 
-def tell(line: str, *, once: bool = False) -> None:
-    """Print a line to stderr, in the first process only; with ``once``, the same line is not printed again."""
-    if (once and line in _told) or (jax.distributed.is_initialized() and jax.process_index() > 0):
+def tell(line: str, *, once: bool | str = False) -> None:
+    """Print a line to stderr, in the first process only; with ``once``, the same line is not printed again.
+
+    A name as ``once`` stands for all lines with that name.
+    """
+    name = once if isinstance(once, str) else line
+    if (once and name in _told) or (jax.distributed.is_initialized() and jax.process_index() > 0):
         return
     if once:
-        _told.add(line)
-    print(line, file=sys.stderr, flush=True)
+        _told.add(name)
+    _print(line)
+
+
+def _print(line: str) -> None:
+    # In one call: threads would print between the line and its end.
+    print(line + "\n", end="", file=sys.stderr, flush=True)

@@ -36,6 +36,9 @@ def test_a_line_is_told_once_and_only_by_the_first_process(capsys, monkeypatch):
         tell("often")
         tell("told once", once=True)
     assert capsys.readouterr().err == "often\ntold once\noften\n"
+    for number in (1, 2):
+        tell(f"number {number}", once="numbers")
+    assert capsys.readouterr().err == "number 1\n"
     monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(jax, "process_index", lambda: 1)
     tell("by another process")

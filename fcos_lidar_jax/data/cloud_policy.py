@@ -202,8 +202,9 @@ def truncation(number: int, config: Config) -> str | None:
 def tell_truncation(cloud: Cloud, config: Config) -> None:
     """Print a line at the first truncated cloud, once per process; :func:`truncation` counts the points."""
     if cloud.num_truncated:
-        line = f"clouds are truncated: the detector takes at most {config.max_points} points (max_points)"
-        tell(f"{line}; {_ORDER}", once=True)
+        left_out = f"{cloud.num_truncated} of {cloud.num_points} points of the first are left out"
+        limit = f"the detector takes at most {config.max_points} (max_points)"
+        tell(f"clouds are truncated: {left_out}, since {limit}; {_ORDER}", once="truncated")
 
 
 def _limits(sensor: Sensor) -> str:

@@ -236,9 +236,10 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
         cause = f"truncated, or another layout{hint}: name it by columns and dtype"
         raise ValueError(f"{path}: got {size} bytes, not a multiple of {layout}: {cause}")
     if better is not None or _plausible_share(content, columns, dtype) < 0.5:
+        found = hint or f" (x, y, z are about {_magnitudes(content, columns, dtype)})"
         raise ValueError(
-            f"{path}: read with {columns} {dtype} columns most values are not plausible metres{hint}, "
-            "expected a layout named by columns and dtype"
+            f"{path}: read with {columns} {dtype} columns most values are not plausible metres{found}, "
+            "expected metres, or a layout named by columns and dtype"
         )
     return np.frombuffer(content, dtype).reshape(-1, columns)
 
@@ -266,6 +267,11 @@ def _inspected(content: bytes, columns: int, dtype: str) -> np.ndarray:
     number = min(len(content) // np.dtype(dtype).itemsize, _INSPECTED_VALUES)
     with np.errstate(invalid="ignore"):  # misread numbers may be NaNs that signal
         return np.frombuffer(content, dtype, number).astype(np.float64).reshape(-1, columns)
+
+
+def _magnitudes(content: bytes, columns: int, dtype: str) -> str:
+    xyz = np.abs(_inspected(content, columns, dtype)[:, :3])
+    return ", ".join(f"{value:.4g}" for value in np.median(xyz[np.isfinite(xyz).all(axis=1)], axis=0))
 
 
 def _plausible_share(content: bytes, columns: int, dtype: str) -> float:

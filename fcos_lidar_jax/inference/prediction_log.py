@@ -3,7 +3,7 @@
 import contextlib
 import json
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,14 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.config import config_to_json
+from fcos_lidar_jax.data.cloud_policy import no_usable_points, unusable_clouds
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.inference.detector import CloudDetector
 from fcos_lidar_jax.inference.prediction import Prediction, predict_groups
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import Detections
 
@@ -50,11 +51,12 @@ def write_predictions(
         number of points removed by all processes in this run, by reason: ``close``, ``invalid``, ``truncated``.
 
     Raises:
+        ValueError: no frame has usable points.
         ValueError, OSError: the processes have different detectors or frames; another process failed.
         SystemExit: after SIGTERM, in a cluster.
     """
     file = path.with_name(f"{path.stem}.resume_log")
-    removed = [0] * len(_REASONS)
+    removed, unusable = [0] * len(_REASONS), list[str]()
     with contextlib.ExitStack() as held:
         log = None
         with agreed("cannot detect"):
@@ -72,6 +74,7 @@ def write_predictions(
         number = 0
         for number, group in enumerate(groups, 1):
             removed = [sum(counts) for counts in zip(removed, *map(_removed, group), strict=True)]
+            unusable += _unusable(detector, names, group)
             with agreed("cannot write"):
                 if log is not None:
                     for prediction in group:
@@ -80,6 +83,10 @@ def write_predictions(
             _stop_after_sigterm(number)
         _stop_after_sigterm(number + 1)  # if it arrived during the last group
         with agreed("cannot write"):
+            if len(unusable) == len(frames):
+                file.unlink(missing_ok=True)  # the next call must fail, too
+            if line := unusable_clouds(unusable, len(frames)):
+                tell(f"note: {line}")
             if log is not None:
                 write(path, log.entries(names))
                 file.unlink(missing_ok=True)
@@ -93,6 +100,16 @@ def _stop_after_sigterm(number: int) -> None:
     """
     if jax.distributed.is_initialized() and multihost_utils.reached_preemption_sync_point(number):
         raise SystemExit(128 + signal.SIGTERM)
+
+
+def _unusable(detector: CloudDetector, names: Sequence[str], group: Sequence[Prediction]) -> list[str]:
+    """Lines about clouds without usable points that this process has read."""
+    lines = (
+        no_usable_points(names[p.index], p.cloud, int(p.detections.num_dropped), detector.sensor)
+        for p in group
+        if p.cloud is not None
+    )
+    return [*filter(None, lines)]
 
 
 def _removed(prediction: Prediction) -> list[int]:

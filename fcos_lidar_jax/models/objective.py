@@ -19,6 +19,8 @@ from fcos_lidar_jax.locations import ImageLayout, image_layout, locate
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CHANNELS, Batch, Locations, Outputs, RangeImage, Sums, Targets
 
+_REGRESSION = ("l1", "iou", "iou_prediction")  # the paper's losses of the locations that regress a box
+
 
 def location_owners(image: RangeImage, locations: Locations, boxes: Array, box_valid: Array) -> Array:
     """Find the box that owns each location of one sample, -1 for none.
@@ -104,7 +106,8 @@ def make_sums(config: Config, sensor: Sensor) -> Callable[[Outputs, RangeImage, 
         parts = {name: pair[0] for name, pair in pairs.items()}
         parts, counts = jax.tree.map(lambda leaf: leaf.sum(axis=0), (parts, counts))
         by_count = {"positives": {"classification": parts["classification"]}}
-        for name in ("l1", "iou", "iou_prediction"):
+        # The order of the sums decides how they are rounded.
+        for name in (*_REGRESSION, *sorted(parts.keys() - {"classification", *_REGRESSION})):
             by_count.setdefault(config.loss.regress_on, {})[name] = parts[name]
         iou_sum = counts.pop("iou_sum")
         means = {"positives": {"positive_iou": iou_sum}, "owned_boxes": {"mean_k": counts["positives"]}}

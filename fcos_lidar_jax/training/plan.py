@@ -167,11 +167,12 @@ def plan_run(
 
 
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
-    clouds = (frames.frame(index).points for index in spread_indices(len(frames), 5))
-    first = next(clouds)
-    if mismatch := sensor_mismatch(first, frames.sensor, frames.usual_sensor):
-        yield f"{frames.name(0)}: {mismatch}"
-    if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in (first, *clouds)):
+    clouds = {index: frames.frame(index).points for index in spread_indices(len(frames), 5)}
+    for index, points in clouds.items():
+        if mismatch := sensor_mismatch(points, frames.sensor, frames.usual_sensor):
+            yield f"{frames.name(index)}: {mismatch}"
+            break
+    if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in clouds.values()):
         yield (
             f"num_sweeps: got {config.num_sweeps}, but the frames hold one sweep each: expected 1, because "
             f"`stream` would fuse {config.num_sweeps} sweeps, which the detector has not been trained for"

@@ -143,7 +143,6 @@ def test_a_class_map_by_name_trains_on_the_same_frames_as_its_file(tmp_path, mon
 
 
 ORDER = "(max_points); older sweeps go first, then random points"
-TRUNCATED = f"clouds are truncated: the detector takes at most 4096 points {ORDER}"
 COUNTED = f"points left out: the detector takes at most 4096 per cloud {ORDER}"
 
 
@@ -164,13 +163,15 @@ def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):
     command("detect", root / "clouds", "--checkpoint quickstart --out", tmp_path / "boxes.json")
     by_command = json.loads((tmp_path / "boxes.json").read_text())["files"]
     assert by_command[0]["num_truncated"] == by_command[2]["num_truncated"] > 0
+    left_out = f"{by_command[0]['num_truncated']} of {len(dense)} points of the first are left out"
+    truncated = f"clouds are truncated: {left_out}, since the detector takes at most 4096 {ORDER}"
     once, twice = (f"{number * by_command[0]['num_truncated']} {COUNTED}" for number in (1, 2))
-    first, result, *_, last = (line for line in told() if "files " in line or line in (TRUNCATED, once, twice))
-    assert (first, result[:9], last) == (TRUNCATED, "files 1/3", twice)
+    first, result, *_, last = (line for line in told() if "files " in line or line in (truncated, once, twice))
+    assert (first, result[:9], last) == (truncated, "files 1/3", twice)
     command("evaluate", data, "--split train --checkpoint quickstart --no-report --out", tmp_path / "scores")
-    assert [line for line in told() if "at most 4096" in line] == [TRUNCATED, once]
+    assert [line for line in told() if "at most 4096" in line] == [truncated, once]
     command("stream", root / "clouds", "--checkpoint quickstart --out", tmp_path / "boxes.jsonl")
-    assert [line for line in told() if "at most 4096" in line] == [TRUNCATED, twice]
+    assert [line for line in told() if "at most 4096" in line] == [truncated, twice]
     evaluated = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
     detector = fcos.load_detector("quickstart")
     for i, frame in enumerate(evaluated):

@@ -209,6 +209,16 @@ def test_four_and_five_columns_are_distinguished_by_their_values(tmp_path, point
         read_points(four, NUSCENES_HDL32E)
 
 
+def test_millimetres_are_refused_with_their_values(tmp_path, points):
+    path = save(tmp_path / "a.bin", points[:, :4] * np.float32([1000, 1000, 1000, 1]))
+    x, y, z = (
+        f"{value:.4g}" for value in np.median(np.abs(np.fromfile(path, np.float32).reshape(-1, 4)), axis=0)[:3]
+    )
+    assert float(x) > 1000
+    with refused(f"not plausible metres (x, y, z are about {x}, {y}, {z}), expected metres, or a layout", path):
+        read_points(path, NUSCENES_HDL32E, columns=4)
+
+
 def test_with_columns_or_dtype_a_file_of_any_name_is_raw(tmp_path, points):
     rows = points[:, :4].astype(np.float64)
     as_bin = read_points(save(tmp_path / "a.bin", rows), NUSCENES_HDL32E, dtype="float64")

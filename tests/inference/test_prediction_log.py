@@ -1,8 +1,12 @@
 """Counts of removed points; tests/cli/test_evaluate.py tests the results file."""
 
 import numpy as np
+import pytest
+from refusal import refused
+from toy_frames import ToyFrames
 
 from fcos_lidar_jax.data.cloud_policy import Cloud
+from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.inference import prediction_log as results
 from fcos_lidar_jax.inference.prediction import Prediction
 from fcos_lidar_jax.types import Detections
@@ -24,3 +28,37 @@ def test_points_of_a_cloud_that_another_process_has_read_are_not_counted():
     nothing = Detections(*np.zeros((3, 0)), valid=np.zeros(0, bool), num_dropped=np.int32(0))
     assert results._removed(Prediction(0, nothing, None, cloud)) == [1, 2, 3]
     assert results._removed(Prediction(0, nothing, None, None)) == [0, 0, 0]
+
+
+def cloud_and_boxes(num_dropped):
+    cloud = Cloud(np.zeros((9, 5)), np.ones(9, bool), num_points=9, num_close=0, num_invalid=0, num_truncated=0)
+    nothing = np.zeros((0, 9)), *np.zeros((2, 0)), np.zeros(0, bool)
+    return cloud, Detections(*nothing, num_dropped=np.int32(num_dropped))
+
+
+@pytest.mark.parametrize("unusable", [1, 3])
+def test_frames_without_usable_points_are_reported_and_only_such_frames_refused(
+    unusable, monkeypatch, tmp_path, capsys
+):
+    def predict_groups(detector, frames, *, indices, **how):
+        for index in indices:
+            cloud, boxes = cloud_and_boxes(9 if index < unusable else 4)
+            yield [Prediction(index, boxes, None, cloud)]
+
+    monkeypatch.setattr(results, "predict_groups", predict_groups)
+    detector = load_detector("quickstart")
+    frames, out = ToyFrames(size=3), tmp_path / "detections.json"
+
+    def run():
+        how = {"entries": lambda index, boxes: [], "write": lambda path, entries: path.write_text("")}
+        results.write_predictions(detector, frames, out, **how)
+
+    first = f"{frames.name(0)}: none of its 9 points is usable"
+    if unusable == 3:
+        for _ in range(2):
+            with refused(first):
+                run()
+        assert not out.exists()
+        return
+    run()
+    assert f"note: 1 of 3 clouds without usable points, and so without boxes: {first}" in capsys.readouterr().err

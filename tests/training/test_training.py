@@ -1,6 +1,7 @@
 """The training step is finite and compiled once, its schedules are exact, and a short run learns a frame."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,20 +10,22 @@ import oracles
 import pytest
 from tiny_run import TINY_CONFIG, bits
 
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.coding import encode
 from fcos_lidar_jax.config import OptimizerConfig
+from fcos_lidar_jax.data.frame import InMemoryFrames
 from fcos_lidar_jax.evaluation.matching import match_frame
 from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout, locate, location_cells
-from fcos_lidar_jax.models import Detector, build_detector
+from fcos_lidar_jax.models import Detector, build_detector, objective
 from fcos_lidar_jax.models.objective import location_owners, sample_losses
 from fcos_lidar_jax.packing import Packing, pack
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.training import NonFiniteLossError, fit, make_optimizer, make_state, make_train_step
+from fcos_lidar_jax.training import NonFiniteLossError, fit, make_optimizer, make_state, make_train_step, plan
 from fcos_lidar_jax.training.optimizer import learning_rate_schedule, momentum_schedule
 from fcos_lidar_jax.training.step import detection_variables, make_gradient
 from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums
@@ -328,6 +331,34 @@ def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches
         np.testing.assert_allclose(gradient["regression"], regression, rtol=1e-3, atol=1e-8)
         metrics_of.append(metrics)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), metrics_of[0], metrics_of[-1])
+
+
+def test_a_new_loss_is_divided_by_the_locations_of_the_regression(monkeypatch):
+    def with_height(*sample, **options):
+        parts, *rest = sample_losses(*sample, **options)
+        return {**parts, "height": parts["l1"]}, *rest
+
+    def losses(detector, params, batch):
+        images = jax.vmap(detector.prepare)(batch.points, batch.valid)
+        outputs, _ = detector.apply({"params": params}, images, train=True)
+        return detector.sums(outputs, images, batch).losses
+
+    monkeypatch.setattr(objective, "sample_losses", with_height)
+    for regress_on in ("positives", "candidates"):
+        config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, regress_on=regress_on))
+        detector = toy_detector(config)
+        params = detector.init(jax.random.key(0))["params"]
+        found = jax.eval_shape(functools.partial(losses, detector), params, four_frames())
+        assert {"l1", "height"} <= set(found[regress_on])
+
+
+def test_a_warning_names_a_frame_that_does_not_fit_the_sensor():
+    frames = [frame(seed) for seed in range(3)]
+    shifted = frames[1].points * np.float32([1000, 1000, 1000, 1, 1])
+    frames[1] = dataclasses.replace(frames[1], points=shifted)
+    made = InMemoryFrames(tuple(frames), TINY, NUSCENES_CLASSES)
+    [warning] = plan._warnings(made, CONFIG)
+    assert warning.startswith(f"{made.name(1)}: points do not fit")
 
 
 def test_the_target_of_the_score_factor_is_the_iou_or_the_centreness():
