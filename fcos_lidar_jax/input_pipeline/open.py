@@ -158,15 +158,22 @@ def _recognise(root: Path) -> Reader:
         raise ValueError(f"{root}: looks like {names}, expected one format: name it")
     if not matching:
         marks = ", ".join(f"{' or '.join(reader.marks)} ({reader.name})" for reader in READERS if reader.marks)
-        near = (*root.resolve().parents[:2], *sorted(folder for folder in root.glob("*") if folder.is_dir()))
-        found = ((folder, readers[0].name) for folder in near if len(readers := _matching(folder)) == 1)
+        whole = root.resolve()
+        above = [(folder, _matching(folder, part=whole)) for folder in whole.parents[:2]]
+        below = [(folder, _matching(folder)) for folder in sorted(root.glob("*")) if folder.is_dir()]
+        found = ((folder, readers[0].name) for folder, readers in above + below if len(readers) == 1)
         hint = next((f"; found {name} in {folder}" for folder, name in found), "")
         raise ValueError(f"{root}: no known data set, expected one of {marks}{hint}")
     return matching[0]
 
 
-def _matching(root: Path) -> list[Reader]:
-    return [reader for reader in READERS if any(next(root.glob(mark), None) for mark in reader.marks)]
+def _matching(root: Path, *, part: Path | None = None) -> list[Reader]:
+    """Readers whose marks are in a folder; with ``part``, only marks inside it or around it."""
+
+    def counts(mark: Path) -> bool:
+        return part is None or mark.is_relative_to(part) or part.is_relative_to(mark)
+
+    return [reader for reader in READERS if any(counts(path) for mark in reader.marks for path in root.glob(mark))]
 
 
 def _refuse(data: DataSet, **options: object) -> None:

@@ -284,6 +284,10 @@ def test_options_that_do_not_fit_are_refused(roots, tmp_path, case):
 
 def test_the_folder_that_holds_a_data_set_is_named(roots, tmp_path):
     shutil.copytree(roots["kitti"], tmp_path / "kitti")
+    shutil.copytree(roots["folder"], tmp_path / "other")
+    (tmp_path / "other" / "clouds").rename(tmp_path / "other" / "sweeps")
+    with pytest.raises(ValueError, match=r"no known data set, expected one of .* clouds \(folder\)$"):
+        open_frames(tmp_path / "other")
     for near, format, level in (
         (tmp_path, "kitti", tmp_path / "kitti"),
         (tmp_path / "kitti" / "training", "kitti", tmp_path / "kitti"),
