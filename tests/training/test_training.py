@@ -19,7 +19,7 @@ from fcos_lidar_jax.inference import make_detect
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout, locate, location_cells
 from fcos_lidar_jax.models import Detector, build_detector, objective
-from fcos_lidar_jax.models.objective import location_owners, sample_losses
+from fcos_lidar_jax.models.objective import location_owners, make_sums, sample_losses
 from fcos_lidar_jax.packing import Packing, pack
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
@@ -346,7 +346,7 @@ def test_a_new_loss_is_divided_by_the_locations_of_the_regression(monkeypatch):
     monkeypatch.setattr(objective, "sample_losses", with_height)
     for regress_on in ("positives", "candidates"):
         config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, regress_on=regress_on))
-        detector = toy_detector(config)
+        detector = toy_detector(config)._replace(sums=make_sums(config, TINY))
         params = detector.init(jax.random.key(0))["params"]
         found = jax.eval_shape(functools.partial(losses, detector), params, four_frames())
         assert {"l1", "height"} <= set(found[regress_on])
