@@ -233,7 +233,7 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
     size, row = len(content), columns * np.dtype(dtype).itemsize
     if size % row:
         layout = f"{row} ({columns} {dtype} values per point)"
-        cause = f"truncated, or another layout{hint}: name it by columns and dtype"
+        cause = f"truncated, or another layout{hint}: copy it again, or name columns and dtype"
         raise ValueError(f"{path}: got {size} bytes, not a multiple of {layout}: {cause}")
     if better is not None or _plausible_share(content, columns, dtype) < 0.5:
         found = hint or f" (x, y, z are about {_magnitudes(content, columns, dtype)})"
