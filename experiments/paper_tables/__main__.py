@@ -5,8 +5,8 @@
     python -m experiments.paper_tables --tables table8 --scale nuscenes --data-root DIR --test-version V
 
 Each table prints our figures next to the paper's and writes Markdown, JSON and pictures below ``--out``.
-``experiments/README.md`` explains the scales, their cost, and how several processes share the cells. Measure times on an idle machine: once
-all cells are trained, the same command only measures again.
+``experiments/README.md`` explains the scales, their cost, and how several processes share the cells. Measure times
+on an idle machine: once all cells are trained, the same command only measures again.
 """
 
 import dataclasses
