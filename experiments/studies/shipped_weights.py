@@ -9,8 +9,8 @@ trained on simulated streets only, by default each frame on another street. The 
 saves every few minutes; the same command resumes it with bit-identical results.
 
 ``--export`` does not train: it writes the averaged weights of the newest checkpoint into the package as float16,
-scores them on unseen frames, and writes ``experiments/results/NAME.json`` and the model card; a training may run at
-the same time. Without ``--work``, the weights in the package are only scored. If the folder of the run is lost,
+scores them on unseen frames, and writes ``experiments/results/NAME.json`` and the model card; a training may run
+at the same time. Without ``--work``, the weights in the package are only scored. If the folder of the run is lost,
 ``--work NEW --warm-start hdl32e --seed 2`` starts a new one-cycle schedule from the weights in the package, on
 streets from ``seed * frames``; choose a seed whose streets no earlier training used.
 
