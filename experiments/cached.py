@@ -74,6 +74,10 @@ class CachedFrames(WrappedFrames):
 
     labels = FrameSet.labels
 
+    def made(self) -> list[int]:
+        """Indices of the frames in the folder, ascending."""
+        return sorted(int(path.stem) for path in self.folder.glob("[0-9]*.npz"))
+
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
 

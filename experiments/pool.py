@@ -11,7 +11,6 @@ import multiprocessing
 import os
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import jax
 
@@ -34,14 +33,15 @@ class PooledFrames(WrappedFrames):
     least: int = 64  # Number of frames to wait for.
 
     def _source(self, index: int) -> int:
-        while len(ready := self._ready(time.monotonic() // _FRESH_S)) < min(self.least, len(self.frames)):
+        while len(made := _made(self.frames, time.monotonic() // _FRESH_S)) < min(self.least, len(self.frames)):
             time.sleep(_FRESH_S / 10)
-        return ready[index % len(ready)]
+        return made[index % len(made)]
 
-    @functools.lru_cache(maxsize=1)  # noqa: B019  Pools live as long as their processes.
-    def _ready(self, moment: float) -> list[int]:
-        """Indices of the frames in the cache; ``moment`` is a multiple of the time after which to look again."""
-        return sorted(int(path.stem) for path in self.frames.folder.glob("[0-9]*.npz"))
+
+@functools.lru_cache(maxsize=1)
+def _made(frames: CachedFrames, moment: float) -> list[int]:
+    """Indices of the frames in the cache, listed once for each ``moment``."""
+    return frames.made()
 
 
 @contextlib.contextmanager
@@ -66,8 +66,3 @@ def _fill(frames: CachedFrames, first: int, step: int) -> None:
     jax.config.update("jax_platforms", "cpu")
     for index in range(first, len(frames), step):
         frames.truth(index)
-
-
-def count(folder: Path) -> int:
-    """Number of frames in the folder of a cache."""
-    return sum(1 for _ in folder.glob("[0-9]*.npz"))

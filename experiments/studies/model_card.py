@@ -27,7 +27,6 @@ _UNSEEN = {
     "hdl32e": "with class frequencies of cities and half as many objects as in training",
     "quickstart": "of the same kind of streets",
 }
-_MACHINE = {"cpu": "two CPU cores"}
 _AXES = "x right, y forward, z up from the sensor, in metres"
 _WEAK_AP, _WEAK_BOXES = 0.05, 10
 """Classes with less AP are listed as hardly detected, if they have at least this many boxes."""
@@ -87,10 +86,9 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     for leg in (*record["earlier"], trained):
         streets = f"{leg['streets']:,} streets" if "streets" in leg else "as many streets"
         done = f"{leg['frames_seen']:,} frames of {streets}, step {leg['steps']:,} of {leg['steps_planned']:,}"
-        seconds, device = leg["seconds_of_steps"], leg.get("device", "cpu")
+        seconds, machine = leg["seconds_of_steps"], f" on {leg['device']}" if "device" in leg else ""
         time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
-        spent = f"{time} of steps on {_MACHINE.get(device, device)}"
-        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {spent}"
+        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of steps{machine}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."

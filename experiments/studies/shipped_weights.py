@@ -38,7 +38,7 @@ import numpy as np
 from experiments.cached import CachedFrames
 from experiments.changes import change
 from experiments.hardware import hardware
-from experiments.pool import PooledFrames, count, simulating
+from experiments.pool import PooledFrames, simulating
 from experiments.runs import detections, trained
 from experiments.script import Options, compact_json, run_script, save, write_text
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
@@ -138,7 +138,7 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     schedule = Schedule(save_every=args.save_every, keep=_KEPT)
     with simulating(pool, args.simulators):
         trained(work, config, PooledFrames(pool), **run, schedule=schedule)
-    record = {"streets": count(pool.folder), "device": hardware()["device"]}
+    record = {"streets": len(pool.made()), "device": hardware()["device"]}
     write_text(work / _POOLED, compact_json(record) + "\n")
     return training_record(work)
 

@@ -5,7 +5,7 @@ import multiprocessing
 import pytest
 
 from experiments.cached import CachedFrames
-from experiments.pool import PooledFrames, count, simulating
+from experiments.pool import PooledFrames, simulating
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
@@ -24,7 +24,7 @@ def test_frames_that_exist_are_repeated(cache):
     assert len(pool) == len(FRAMES)
     assert [pool.name(index) for index in range(5)] == [FRAMES.name(i) for i in (1, 4, 1, 4, 1)]
     assert (pool.frame(3).points == FRAMES.frame(4).points).all()
-    assert count(cache.folder) == 2
+    assert cache.made() == [1, 4]
 
 
 def test_new_frames_are_found(cache, monkeypatch):
@@ -40,5 +40,5 @@ def test_processes_fill_the_pool_and_end(cache):
     with simulating(cache, 1):
         pool = PooledFrames(cache, least=3)
         assert (pool.frame(0).points == FRAMES.frame(0).points).all()
-        assert count(cache.folder) >= 3
+        assert len(cache.made()) >= 3
     assert not multiprocessing.active_children()
