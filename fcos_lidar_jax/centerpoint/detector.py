@@ -15,6 +15,7 @@ from fcos_lidar_jax.centerpoint.objective import make_sums
 from fcos_lidar_jax.centerpoint.pillars import Grid, make_pillars, pillar_grid
 from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
 from fcos_lidar_jax.models import Detector, Variables
+from fcos_lidar_jax.models.layers import init_variables
 from fcos_lidar_jax.sensors import Sensor
 
 _BEYOND_M = 10.0  # Maximum distance of a box outside the map, and above or below the sensor.
@@ -30,10 +31,9 @@ def build(config: CenterPointConfig, sensor: Sensor) -> Detector:
         return make_pillars(points, valid, grid=grid, sensor=sensor)
 
     def init(key: Any) -> Variables:
-        # Parameters do not depend on the number of points; the forward pass is not computed.
         features, cell = jax.ShapeDtypeStruct((1, 8, 10), jnp.float32), jax.ShapeDtypeStruct((1, 8), jnp.int32)
         pillars = Pillars(features, cell, jax.ShapeDtypeStruct((1,), jnp.int32))  # type: ignore[arg-type]
-        return network.lazy_init(key, pillars, train=False)  # type: ignore[return-value]
+        return init_variables(network, key, pillars)
 
     def apply(variables: Variables, pillars: Pillars, *, train: bool = False) -> tuple[CentreOutputs, Any]:
         outputs, updates = network.apply(variables, pillars, train=train, mutable=["batch_stats"] if train else [])

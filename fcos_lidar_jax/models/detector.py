@@ -1,5 +1,6 @@
 """Detectors as pure functions, and the network of FCOS-LiDAR."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout, image_s
 from fcos_lidar_jax.models.candidates import select_candidates
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
-from fcos_lidar_jax.models.layers import Image, recomputed
+from fcos_lidar_jax.models.layers import Image, init_variables, recomputed
 from fcos_lidar_jax.models.lidar_net import Backbone
 from fcos_lidar_jax.models.local_geometry import LocalGeometry
 from fcos_lidar_jax.models.modality import Stem
@@ -127,9 +128,9 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
             return project_points(points, valid, sensor_of_image, **options)
 
     def init(key: Any) -> Variables:
-        # Parameters do not depend on the image's size; the forward pass is not computed.
         image = jax.ShapeDtypeStruct((1, 32, 32, len(CHANNELS) * projection.num_rounds), jnp.float32)
-        return network.lazy_init(key, image, train=False)  # type: ignore[return-value]
+        plain = Network(dataclasses.replace(config.model, remat=False), len(config.classes))  # the same variables
+        return init_variables(plain, key, image)
 
     def apply(variables: Variables, images: RangeImage, *, train: bool = False) -> tuple[Outputs, Any]:
         # The image takes the parameters' dtype, so that float64 parameters make the whole network float64.

@@ -47,14 +47,20 @@ def make_state(
         step=jnp.zeros((), jnp.int32),
         params=variables["params"],
         batch_stats=variables["batch_stats"],
-        opt_state=optimizer.init(variables["params"]),
+        # Compiled, since each array is a program of its own otherwise.
+        opt_state=jax.jit(optimizer.init)(variables["params"]),
         # A copy, because the step donates its buffers and cannot donate one twice.
-        ema=jax.tree.map(jnp.copy, variables["params"]) if detector.config.optimizer.ema_decay > 0 else None,
+        ema=_copied(variables["params"]) if detector.config.optimizer.ema_decay > 0 else None,
         key=key,
     )
     # A weakly typed leaf would compile the step a second time.
     state = jax.tree.map(lambda x: lax.convert_element_type(x, x.dtype), dataclasses.replace(state, key=None))
     return dataclasses.replace(state, key=key)
+
+
+@jax.jit
+def _copied(params: Any) -> Any:
+    return jax.tree.map(jnp.copy, params)
 
 
 def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, Any, Metrics]]:
