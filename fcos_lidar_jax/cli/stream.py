@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation, unusab
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import recorded_by, with_heading
+from fcos_lidar_jax.data.recorded import recorded_by
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
@@ -30,7 +30,7 @@ from fcos_lidar_jax.inference.stream import SweepDetections, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
 from fcos_lidar_jax.progress import tell
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, in_frame_of
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
@@ -107,8 +107,8 @@ def run(args: Stream) -> None:
     source = args.source or args.data_root or Path()
     paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
     usual = NUSCENES_HDL32E if kind is SCENE else recorded_by(paths[:1])
-    ahead = with_heading(sensor, NUSCENES_HDL32E) if kind is SCENE else sensor
-    aligned = alignment_of(args, sensor, paths, None if ahead == sensor else ahead)
+    scene_sensor = in_frame_of(sensor, NUSCENES_HDL32E) if kind is SCENE else None
+    aligned = alignment_of(args, sensor, paths, scene_sensor)
     drive = _open(args, kind, detector, aligned.data)
     _tell_notes(drive.notes)
     frames: list[PageFrame] = []

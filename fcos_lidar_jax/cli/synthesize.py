@@ -10,7 +10,7 @@ from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.progress import Progress, tell
-from fcos_lidar_jax.sensors import load_sensor
+from fcos_lidar_jax.sensors import NUSCENES_HDL32E, in_frame_of, load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.simulation.streets import STREETS
@@ -50,7 +50,7 @@ def run(args: Synthesize) -> None:
     if args.streets not in STREETS:
         raise ValueError(f"--streets: {unknown_name(args.streets, STREETS)}")
     check_out_folder(args.out)
-    sensor = load_sensor(args.sensor)
+    sensor = in_frame_of(load_sensor(args.sensor), NUSCENES_HDL32E)  # as all readers of this layout expect
     if sensor.row_source == "laser":
         raise ValueError(
             f"--sensor: got {sensor.name}, whose rows come from laser numbers, expected another one: the nuScenes "

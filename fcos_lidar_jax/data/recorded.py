@@ -1,17 +1,17 @@
 """The sensors that recorded the point files of known data sets."""
 
-import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, in_frame_of
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
 
 RECORDED_BY = {
     "training/velodyne/*.bin": KITTI_HDL64E,
     "testing/velodyne/*.bin": KITTI_HDL64E,
     "velodyne_points/data/*.bin": KITTI_HDL64E,
     "sensors/lidar/*.feather": ARGOVERSE2,
+    "LIDAR_TOP/*.pcd.bin": NUSCENES_HDL32E,
 }
 """Ends of paths -> the sensor whose heading, position and intensity scale the files have."""
 
@@ -30,18 +30,6 @@ def recorded_by(paths: Iterable[Path]) -> Sensor | None:
         files = " and ".join(f"{path} of {sensor.name if sensor else 'another'}" for sensor, path in found.items())
         raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")
     return next(iter(found), None)
-
-
-def with_heading(sensor: Sensor, data: Sensor) -> Sensor:
-    """A sensor for points with the heading of another sensor; an unknown heading stays.
-
-    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
-    >>> with_heading(KITTI_HDL64E, NUSCENES_HDL32E).forward_rad == NUSCENES_HDL32E.forward_rad
-    True
-    """
-    if sensor.forward_rad is None or data.forward_rad is None:
-        return sensor
-    return in_frame_of(sensor, dataclasses.replace(sensor, forward_rad=data.forward_rad))
 
 
 def check_scale(intensity_scale: float | None, files: Iterable[Path]) -> None:

@@ -113,8 +113,8 @@ def align(
         data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()), forward_rad=heading(detector, turn))
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
-    if recorded is not None and recorded.num_rows != detector.num_rows:
-        rows = f"{recorded.name} has {recorded.num_rows} rows, and the detector's sensor {detector.num_rows}"
+    if sensor is not None and sensor.num_rows != detector.num_rows:  # a path does not tell the number of rows
+        rows = f"{sensor.name} has {sensor.num_rows} rows, and the detector's sensor {detector.num_rows}"
         tell(f"warning: {rows}: expect poor detections", once=True)
     if sensor is None and recorded is not None and data != detector:
         told = f"recorded by {recorded.name}, as its path says; override with --data-sensor"

@@ -15,7 +15,7 @@ from fcos_lidar_jax.data.nuscenes.index import default_index
 from fcos_lidar_jax.data.nuscenes.names import TO_KITTI
 from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import official_splits
-from fcos_lidar_jax.data.recorded import check_scale, with_heading
+from fcos_lidar_jax.data.recorded import check_scale
 from fcos_lidar_jax.data.splits import own_splits
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.progress import tell
@@ -31,13 +31,11 @@ class Reader:
 
     name: Format
     marks: tuple[str, ...]  # glob patterns of folders in this format; () if the frames are not on disk
-    sensor: Sensor | None  # default sensor; None if the data name it
+    sensor: Sensor | None  # gives heading, position and intensity scale; None if the data name their sensor
     splits: Callable[["DataSet", str | Path | None], list[str]]  # (data set, file of custom splits) -> their names
     open: Callable[..., FrameSet]  # (data set, *, split, sensor, reading, **options) -> frames
     options: tuple[str, ...] = ()  # further options of open_frames that this format takes
     class_maps: Mapping[str, ClassMap] = dataclasses.field(default_factory=dict)  # by the data set they lead to
-    adapt: Callable[[Sensor, Sensor], Sensor] = in_frame_of
-    """(given sensor, ``sensor``) -> the given one with frame and scale, or only the heading, of ``sensor``."""
     result_folders: bool = False  # ``evaluate`` takes folders of KITTI result files
 
     @property
@@ -55,7 +53,6 @@ READERS = (
         lambda data, **how: open_keyframes(data.root, data.version, **how),
         ("version", "index", "splits", "allow_missing_sweeps", "follow_links"),
         class_maps={"kitti": TO_KITTI},
-        adapt=with_heading,
     ),
     Reader(
         "kitti",
@@ -91,7 +88,6 @@ READERS = (
         lambda data, _: list(SIMULATED_SPLITS),
         lambda data, split, **how: simulated_split(split or "train", **how),
         class_maps={"kitti": TO_KITTI},
-        adapt=with_heading,
     ),
 )
 
@@ -227,9 +223,9 @@ def open_frames(
             recognised.
         version: version of nuScenes; may be omitted if there is only one.
         split: name of a split; default: all frames. See also :func:`default_split`.
-        sensor: gives the range image; default: the sensor that recorded the points. KITTI and Argoverse 2 keep
-            the heading, the position and the intensity scale of their own sensors; in nuScenes and simulated
-            frames, y points forward.
+        sensor: gives the range image; default: the sensor that recorded the points. All formats but the folder
+            keep the heading, the position and the intensity scale of their own sensors; in nuScenes and simulated
+            frames, y points forward and the LiDAR is at the origin.
         num_sweeps: maximum number of sweeps to fuse, including the current one; default: ``reading``'s.
         reading: how clouds are read, such as ``config.reading``; default: ``CloudReading()``.
         class_map: name in the data -> name to use instead; None drops objects, other names stay. Or the name of a
@@ -276,10 +272,13 @@ def open_frames(
     options = {name: value for name, value in given.items() if name in data.reader.options}
     recorded = data.reader.sensor
     if sensor is not None and recorded is not None:
-        given_scale, sensor = sensor.intensity_scale, data.reader.adapt(sensor, recorded)
-        if intensity_scale is None and sensor.intensity_scale != given_scale:
-            told = f"{data.root}: intensities are scaled by {sensor.intensity_scale:g}, as for all data of format"
-            tell(f"{told} {data.reader.name}", once=True)
+        given_sensor, sensor, told = sensor, in_frame_of(sensor, recorded), list[str]()
+        if intensity_scale is None and sensor.intensity_scale != given_sensor.intensity_scale:
+            told.append(f"intensities are scaled by {sensor.intensity_scale:g}")
+        if sensor.origin_m != given_sensor.origin_m:
+            told.append(f"the LiDAR is at {sensor.origin_m} m")
+        if told:
+            tell(f"{data.root}: {' and '.join(told)}, as for all data of format {data.reader.name}", once=True)
     open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
     sensor = sensor or recorded
     if intensity_scale is not None:

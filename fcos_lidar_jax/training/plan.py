@@ -223,6 +223,11 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
     if turn := turn_between(detector.sensor, checkpoint.sensor):
         told = f"weights trained on clouds rotated by {math.degrees(turn):g} degrees relative to these"
         tell(f"{folder}: {told}: expect scores to fall at first")
+    was, now = checkpoint.sensor.origin_m, detector.sensor.origin_m
+    if was != now:
+        tell(
+            f"{folder}: weights trained with the LiDAR at {was} m, here at {now} m: expect scores to fall at first"
+        )
     return checkpoint.variables
 
 

@@ -106,7 +106,7 @@ def test_options_are_passed_to_the_readers(roots):
         assert kept < all_of_them
         sensor = dataclasses.replace(open_frames(roots[format]).sensor, origin_m=(1000.0, 0.0, 0.0))
         far = open_frames(roots[format], reading=readings[0], sensor=sensor).frame(0)
-        assert (far.num_close == 0) == (format in ("nuscenes", "folder"))  # the others know where their sensor is
+        assert (far.num_close == 0) == (format == "folder")  # the others know where their sensor is
 
 
 def test_data_keep_their_units_and_axes_with_another_sensor(roots, capsys):
@@ -117,11 +117,23 @@ def test_data_keep_their_units_and_axes_with_another_sensor(roots, capsys):
     assert told.endswith("kitti: intensities are scaled by 255, as for all data of format kitti")
     np.testing.assert_array_equal(frames.frame(0).points, own.frame(0).points)  # intensities times 255 too
     assert (frames.sensor.forward_rad, frames.sensor.intensity_scale, frames.sensor.num_rows) == (0, 255, 32)
-    # In nuScenes and simulated frames y points forward, whatever a detector expects.
+    # In nuScenes and simulated frames y points forward, and the LiDAR is at the origin.
+    elsewhere = {
+        "forward_rad": 0.0,
+        "origin_m": (1.4, 0.0, 1.6),
+        "limit_z_m": (-3.4, 4.6),
+        "intensity_scale": 255.0,
+    }
     for where in ({"root": roots["nuscenes"]}, {"format": "simulated"}):
-        frames = open_frames(**where, sensor=dataclasses.replace(TINY, forward_rad=0.0))
-        assert frames.sensor == TINY
-        assert open_frames(**where, sensor=VLP16).sensor == VLP16  # not known
+        capsys.readouterr()
+        frames, _ = (open_frames(**where, sensor=dataclasses.replace(TINY, **elsewhere)) for _ in range(2))
+        (told,) = capsys.readouterr().err.splitlines()
+        assert "intensities are scaled by 1 and the LiDAR is at (0.0, 0.0, 0.0) m, as for all data of " in told
+        assert dataclasses.replace(frames.sensor, limit_z_m=TINY.limit_z_m) == TINY
+        assert frames.sensor.limit_z_m == pytest.approx(TINY.limit_z_m)
+        expected = open_frames(**where, sensor=TINY).frame(0).points
+        np.testing.assert_array_equal(frames.frame(0).points, expected)
+        assert open_frames(**where, sensor=VLP16).sensor == dataclasses.replace(VLP16, forward_rad=np.pi / 2)
         ahead = open_frames(**where, sensor=sector(dataclasses.replace(TINY, forward_rad=0.0), 0.0, 64)).sensor
         assert ahead.azimuth_limits_rad == pytest.approx((np.pi / 4, 3 * np.pi / 4))
 

@@ -308,8 +308,9 @@ def test_another_specification_in_the_same_folder_is_rejected(made, tmp_path, ca
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
     line = refusal(capsys, made, "--sensor", str(tmp_path / "near.json"))
     assert f"sensor.limit_xy_m: got 9.0, expected {TINY.limit_xy_m} as in the data set begun there" in line
-    (tmp_path / "turned.json").write_text(json.dumps({**sensor_to_json(TINY), "forward_rad": 0.0}))
-    synthesize(made, "--sensor", str(tmp_path / "turned.json"))  # the heading changes no file
+    other = {"forward_rad": 0.0, "origin_m": [1, 0, 2], "limit_z_m": [-3, 5]}  # the layout's own are written
+    (tmp_path / "moved.json").write_text(json.dumps({**sensor_to_json(TINY), **other}))
+    synthesize(made, "--sensor", str(tmp_path / "moved.json"))
     assert contents(made) == before
 
 

@@ -106,12 +106,17 @@ def test_initial_weights_of_another_coding_are_reported(finished, tmp_path, caps
     assert not any(line.startswith("warning: ") for line in lines)
 
 
-def test_initial_weights_for_another_heading_are_reported(finished, capsys):
+def test_initial_weights_for_another_heading_or_place_are_reported(finished, capsys):
     for turn in (0, np.pi / 2):
         sensor = dataclasses.replace(SENSOR, forward_rad=SENSOR.forward_rad - turn)
         plan._initial_weights(build_detector(CONFIG, sensor), finished[0])
     (line,) = capsys.readouterr().err.splitlines()
     assert "weights trained on clouds rotated by 90 degrees relative to these: " in line
+    plan._initial_weights(
+        build_detector(CONFIG, dataclasses.replace(SENSOR, origin_m=(1.4, 0.0, 1.6))), finished[0]
+    )
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "weights trained with the LiDAR at (0.0, 0.0, 0.0) m, here at (1.4, 0.0, 1.6) m: " in line
 
 
 def test_all_documented_metrics_are_recorded(finished):
