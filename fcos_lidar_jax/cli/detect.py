@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +22,7 @@ from fcos_lidar_jax.cli.checks import (
     check_outside,
     check_score,
 )
-from fcos_lidar_jax.cli.options import alignment_of, option, radians
+from fcos_lidar_jax.cli.options import alignment_of, option
 from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
 from fcos_lidar_jax.data.cloud_policy import no_usable_points, truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
@@ -34,7 +35,7 @@ from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
 from fcos_lidar_jax.inference.alignment import Alignment
-from fcos_lidar_jax.inference.prediction import predict
+from fcos_lidar_jax.inference.prediction import predict_groups
 from fcos_lidar_jax.inference.prediction_log import detections_fingerprint
 from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import Sensor, sensor_to_json
@@ -89,14 +90,14 @@ def run(args: Detect) -> None:
     detector = load_detector(args.checkpoint, backend=args.backend)
     place: dict[str, Any] = msgspec.to_builtins(sweeps[0]) if sweeps else {}  # of the current sweep
     check_results(args, detector.classes, posed=bool(sweeps), clouds=parts[:1] or files)
+    aligned = alignment_of(args, detector.sensor, parts or files)
     if len(parts) > (num_sweeps := detector.config.num_sweeps):
         line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
-        tell(f"{args.sweeps}: {line}")
-    aligned = alignment_of(args, detector.sensor, parts or files)
+        aligned = dataclasses.replace(aligned, notes=(*aligned.notes, f"{args.sweeps}: {line}"))
     clouds = _clouds(args, files, detector, aligned.data)
     states = [files_fingerprint(clouds.sources(i), Path("/"), str(file)) for i, file in enumerate(files)]
     with _resume_log(args, detector, aligned) as log:
-        _detect(args, detector, clouds, states, log)
+        _detect(args, detector, aligned, clouds, states, log)
         lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
         if args.output_format == "json":
             write_lines(args.out, b'{"files": [', lines, b"]}\n")
@@ -179,7 +180,12 @@ def _resume_log(args: Detect, detector: CloudDetector, aligned: Alignment) -> It
 
 
 def _detect(
-    args: Detect, detector: CloudDetector, clouds: CloudFiles, states: Sequence[str], log: ResumeLog
+    args: Detect,
+    detector: CloudDetector,
+    aligned: Alignment,
+    clouds: CloudFiles,
+    states: Sequence[str],
+    log: ResumeLog,
 ) -> None:
     """Detect in the files whose present state is not in the log or whose picture is missing."""
     pictures = [
@@ -194,8 +200,9 @@ def _detect(
     progress, num_truncated, unusable = Progress("files", len(clouds)), 0, dict[str, Any]()
     if done := len(states) - len(todo):
         progress.show(done, "detected before")
-    found = predict(detector, clouds, indices=todo, batch_size=args.batch_size, yaw_rad=radians(args.yaw_deg))
-    for number, prediction in enumerate(found, done + 1):
+    how: dict[str, Any] = {"batch_size": args.batch_size, "yaw_rad": aligned.yaw_rad, "notes": aligned.notes}
+    groups = predict_groups(detector, clouds, indices=todo, **how)
+    for number, prediction in enumerate(itertools.chain.from_iterable(groups), done + 1):
         index, detections, cloud = prediction.index, prediction.detections, prediction.cloud
         assert prediction.frame is not None
         assert cloud is not None

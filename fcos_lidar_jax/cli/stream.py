@@ -26,6 +26,7 @@ from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
 from fcos_lidar_jax.inference import CloudDetector, load_detector
+from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.stream import SweepDetections, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
@@ -124,7 +125,7 @@ def run(args: Stream) -> None:
         if not drive.posed:
             how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
         detect = functools.partial(detect_stream, detector=detector, **how)
-        for found in timing.detect(_announcing(drive.sweeps), detect):
+        for found in timing.detect(_announcing(drive.sweeps, aligned), detect):
             points = found.cloud.points[found.cloud.valid]
             if not num_points and (line := sensor_mismatch(points, detector.sensor, usual)):
                 tell(f"warning: {line}")
@@ -177,10 +178,11 @@ def _write_lines(args: Stream, classes: tuple[str, ...]) -> Iterator[Callable[[d
         yield write
 
 
-def _announcing(sweeps: Iterable[Sweep]) -> Iterator[Sweep]:
-    """The sweeps. After reading the first one, say that the detector is compiled."""
+def _announcing(sweeps: Iterable[Sweep], aligned: Alignment) -> Iterator[Sweep]:
+    """The sweeps. After reading the first one, print the notes, and say that the detector is compiled."""
     for number, sweep in enumerate(sweeps):
         if not number:
+            aligned.tell_notes()
             tell("compiling the detector")
         yield sweep
 

@@ -24,6 +24,7 @@ class Alignment:
     data: Sensor  # sensor that recorded the points
     detector: Sensor  # sensor that the detector expects
     yaw_rad: float | None = None  # rotation, counter-clockwise; None for the one between the sensors' headings
+    notes: tuple[str, ...] = ()  # lines for :meth:`tell_notes`
 
     @property
     def turn_rad(self) -> float:
@@ -57,6 +58,11 @@ class Alignment:
         boxes[valid] = to_world(boxes[valid], pose)
         return dataclasses.replace(detections, boxes=boxes)
 
+    def tell_notes(self) -> None:
+        """Print the notes, once per process. Call it after reading points, because an error makes them moot."""
+        for line in self.notes:
+            tell(line, once=True)
+
     def describe(self) -> str:
         """One line about what is done to the clouds; ``""`` for nothing."""
         if (pose := self.pose) is None:
@@ -88,7 +94,7 @@ def align(
     """Make the alignment of points to a detector. Read the points with its ``data``.
 
     Args:
-        sensor: sensor that recorded the points; by default the sensor that the paths name (printed as a note), or
+        sensor: sensor that recorded the points; by default the sensor that the paths name (which a note says), or
             the detector's.
         paths: point files, or recordings in folders.
         yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the angle between
@@ -113,10 +119,11 @@ def align(
         data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()), forward_rad=heading(detector, turn))
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
+    notes = []
     if sensor is not None and sensor.num_rows != detector.num_rows:  # a path does not tell the number of rows
         rows = f"{sensor.name} has {sensor.num_rows} rows, and the detector's sensor {detector.num_rows}"
-        tell(f"warning: {rows}: expect poor detections", once=True)
+        notes.append(f"warning: {rows}: expect poor detections")
     if sensor is None and recorded is not None and data != detector:
         told = f"recorded by {recorded.name}, as its path says; override with --data-sensor"
-        tell(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}", once=True)
-    return Alignment(data, detector, yaw_rad)
+        notes.append(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}")
+    return Alignment(data, detector, yaw_rad, tuple(notes))

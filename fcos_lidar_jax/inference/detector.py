@@ -111,6 +111,7 @@ class CloudDetector(abc.ABC):
             rows, num_close = read_cloud(points, data, reading, full_turn=full_turn)
         else:
             rows, num_close = drop_close(points_from_array(points, data), data, reading)
+        aligned.tell_notes()
         rows = aligned.points(rows)
         if line := sensor_mismatch(rows, self.sensor, recorded_by(paths)):
             warnings.warn(line, stacklevel=2)

@@ -1,8 +1,9 @@
 """Detection in many frames, read ahead and spread over the devices, and its evaluation."""
 
 import dataclasses
+import itertools
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -88,16 +89,16 @@ def predict_groups(
     batch_size: int = 1,
     devices: Sequence[Any] | None = None,
     yaw_rad: float | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Iterator[list[Prediction]]:
     """Like :func:`predict`, in groups of frames that the devices process together.
 
+    ``notes`` are lines to print after the first frames are read, once per process.
     Processes can synchronise between two groups; if another one cannot read its frames, an OSError says so.
     """
     check(batch_size >= 1, "batch_size", batch_size, "at least 1")
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
-    aligned = Alignment(frames.sensor, sensor, yaw_rad)
-    if line := aligned.describe():
-        tell(line)
+    aligned = Alignment(frames.sensor, sensor, yaw_rad, notes)
     program = detector.program(mesh, batch_size)
     todo = list(range(len(frames)) if indices is None else indices)
     size = batch_size * mesh.size
@@ -112,9 +113,6 @@ def predict_groups(
             if row < len(group):
                 frame = frames.frame(group[row])
                 given = aligned.points(frame.points)
-                is_first = group is groups[0] and slot == 0
-                if is_first and (line := sensor_mismatch(given, sensor, frames.usual_sensor)):
-                    tell(f"warning: {line}")
                 cloud = make_cloud(given, config, sensor=sensor, num_close=frame.num_close)
                 tell_truncation(cloud, config)
                 points[slot], valid[slot] = cloud.points, cloud.valid
@@ -135,6 +133,8 @@ def predict_groups(
         for number, group in enumerate(groups):
             with agreed("cannot read its frames"):
                 loaded, clouds = reading.popleft().result()
+            if not number:
+                _tell_notes(aligned, frames, loaded.values())
             if number + _AHEAD < len(groups):
                 reading.append(pool.submit(read, groups[number + _AHEAD]))
             outputs = program(*shard_batch(clouds, mesh))
@@ -143,6 +143,16 @@ def predict_groups(
             running = group, loaded, outputs
         if running is not None:
             yield collect(*running)
+
+
+def _tell_notes(aligned: Alignment, frames: FrameSet, read: Iterable[tuple[Frame, Cloud]]) -> None:
+    """Print lines about the first frames. They were read before, because an error would make the lines moot."""
+    aligned.tell_notes()
+    if line := aligned.describe():
+        tell(line)
+    for frame, _ in itertools.islice(read, 1):
+        if line := sensor_mismatch(aligned.points(frame.points), aligned.detector, frames.usual_sensor):
+            tell(f"warning: {line}")
 
 
 def evaluate(

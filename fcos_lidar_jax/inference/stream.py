@@ -64,8 +64,6 @@ def detect_stream(
     [0, 1]
     """
     reading, aligned = reading or detector.config.reading, align(detector.sensor, sensor, yaw_rad=yaw_rad)
-    if line := aligned.describe():
-        tell(line)
     window: deque[Sweep] = deque(maxlen=reading.num_sweeps)
     before: Sweep | None = None
     for sweep in sweeps:
@@ -74,6 +72,8 @@ def detect_stream(
                 f"{sweep.name}: time: got {sweep.time_us} us, expected more than the {before.time_us} us of the "
                 f"sweep before, {before.name}"
             )
+        if before is None and (line := aligned.describe()):
+            tell(line)
         window.appendleft(sweep)
         before = sweep
         if at_us is not None and sweep.time_us not in at_us:

@@ -143,7 +143,7 @@ def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more
     shutil.move(tmp_path / "away.npy", clouds[3])
     if more:
         next((tmp_path / "pictures").iterdir()).unlink()  # a missing picture is drawn again
-    monkeypatch.setattr(detect_command, "predict", predicted := Mock(wraps=detect_command.predict))
+    monkeypatch.setattr(detect_command, "predict_groups", predicted := Mock(wraps=detect_command.predict_groups))
     command(*words, "--out boxes.json")
     number = done - bool(more)
     assert number == 0 or f"{number}/4  detected before" in capsys.readouterr().err

@@ -21,6 +21,7 @@ from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpo
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
 from fcos_lidar_jax.evaluation.records import cloud_record
+from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, sensor_to_json
 
@@ -172,6 +173,22 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
         assert page_content(tmp_path / "drive.html")["forward_rad"] == KITTI_HDL64E.forward_rad
         told = capsys.readouterr().err
         assert told.count("clouds rotated by 90 degrees") == 1
+
+
+def test_an_error_comes_without_notes_that_it_makes_moot(kitti, tmp_path, capsys):
+    good, damaged = kitti / "training" / "velodyne", tmp_path / "training" / "velodyne"
+    damaged.mkdir(parents=True)
+    (damaged / "000000.bin").write_bytes(b"damaged")
+    for command_name, clouds, out, message in (
+        ("detect", good, "used.json", "used.json: in use"),
+        ("detect", damaged, "boxes.json", "000000.bin: "),
+        ("stream", damaged, "boxes.jsonl", "000000.bin: "),
+    ):
+        with file_lock(tmp_path / ".used.json.resume_log"):
+            assert cli.main([command_name, str(clouds), *SMALL.split(), str(tmp_path / out)]) == 1
+        *others, error = capsys.readouterr().err.splitlines()
+        assert message in error
+        assert not re.search("rotated|recorded by|rows", "".join(others))
 
 
 def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):

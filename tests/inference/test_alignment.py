@@ -46,11 +46,13 @@ def test_one_line_says_what_is_done():
 
 
 def test_a_sensor_with_another_number_of_rows_gives_a_warning(capsys):
-    align(NUSCENES_HDL32E, VLP16)
+    aligned = align(NUSCENES_HDL32E, VLP16)
+    assert capsys.readouterr().err == ""
+    for _ in range(2):
+        aligned.tell_notes()
     expected = "vlp16 has 16 rows, and the detector's sensor 32: expect poor detections"
     assert capsys.readouterr().err == f"warning: {expected}\n"
-    align(NUSCENES_HDL32E, dataclasses.replace(NUSCENES_HDL32E, forward_rad=0.0))
-    assert capsys.readouterr().err == ""
+    assert align(NUSCENES_HDL32E, dataclasses.replace(NUSCENES_HDL32E, forward_rad=0.0)).notes == ()
 
 
 def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(capsys):
