@@ -69,8 +69,8 @@ class Train:
     steps: Annotated[int | None, option("N", default="--optimizer.epochs passes over the frames")] = None
     """Training steps."""
     seed: int = 0  # Seed of weights, frame order, pasted objects and augmentation.
-    evaluate_every: Annotated[int | None, option("N", default="a tenth of the run")] = None
-    """Steps between two evaluations."""
+    evaluate_every: Annotated[int | None, option("N", default="a tenth of the run, but at least 100")] = None
+    """Steps between two evaluations; the last step is always evaluated."""
     save_every: Annotated[int | None, option("N", default="a fiftieth of the run")] = None
     """Steps between two checkpoints."""
     keep: int = 2  # Number of newest checkpoints to keep, in addition to the best one.

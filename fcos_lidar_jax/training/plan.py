@@ -34,6 +34,8 @@ from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.step import make_state
 
 NUM_SEEDS = 2**32  # JAX uses 32 bits of a seed, so larger seeds would repeat smaller ones
+_MIN_EVALUATE_EVERY = 100
+"""An evaluation of a whole split can take longer than so few steps, which hardly change the scores."""
 RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 
 
@@ -47,7 +49,8 @@ class Schedule:
 
     save_every: int | None = None  # steps between checkpoints; by default a fiftieth of the run
     evaluate_every: int | None = None
-    """Steps between evaluations, each of which also saves a checkpoint; by default a tenth of the run."""
+    """Steps between evaluations, each of which also saves a checkpoint; by default a tenth of the run, but at
+    least 100. The last step is always evaluated."""
     keep: int = 2  # number of newest checkpoints to keep, in addition to the best
 
     def __post_init__(self) -> None:
@@ -85,7 +88,7 @@ class Run:
         return Checkpoints(self.folder / CHECKPOINTS, keep=self.schedule.keep)
 
     def evaluates_at(self, step: int) -> bool:
-        every = self.schedule.evaluate_every or -(-self.num_steps // 10)
+        every = self.schedule.evaluate_every or max(-(-self.num_steps // 10), _MIN_EVALUATE_EVERY)
         return self.tests is not None and (step % every == 0 or step == self.num_steps)
 
     def saves_at(self, step: int) -> bool:

@@ -12,6 +12,7 @@ import shutil
 import signal
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -534,3 +535,17 @@ def test_invalid_arguments_are_refused_before_the_run_starts(tmp_path, options, 
 def test_a_schedule_refuses_invalid_numbers():
     with pytest.raises(ValueError, match=r"schedule\.keep: got 0, expected an integer of at least 1"):
         runs.Schedule(keep=0)
+
+
+@pytest.mark.parametrize(
+    ("steps", "every", "expected"),
+    [
+        (20, None, [20]),
+        (250, None, [100, 200, 250]),
+        (2001, None, [201, 402, 603, 804, 1005, 1206, 1407, 1608, 1809, 2001]),
+        (20, 8, [8, 16, 20]),
+    ],
+)
+def test_short_runs_evaluate_rarely_by_default(steps, every, expected):
+    run = Mock(num_steps=steps, schedule=runs.Schedule(evaluate_every=every))
+    assert [step for step in range(1, steps + 1) if plan.Run.evaluates_at(run, step)] == expected
