@@ -33,7 +33,7 @@ from fcos_lidar_jax.evaluation.kitti_results import KITTI_SUMMARY, score_kitti, 
 from fcos_lidar_jax.evaluation.truth import read_truth, split_truth
 from fcos_lidar_jax.files import atomic_write, folder_lock
 from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.alignment import heading
+from fcos_lidar_jax.inference.alignment import heading, other_rows
 from fcos_lidar_jax.presets import NUSCENES_SINGLE
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import load_sensor
@@ -215,7 +215,9 @@ def _open(args: Evaluate) -> Task:
         own = frames.sensor  # the report's range images are in the frame of the data
         if data.reader.sensor is None and (turn := radians(args.yaw_deg)) is not None:
             own = dataclasses.replace(own, forward_rad=heading(sensor, turn))
-        return Task(name, compare_by_distance(frames, config.ranges_m), own, detector, frames)
+        # Only own data tell the number of rows: the frames of other formats have the rows of the detector's.
+        notes = () if data.reader.sensor else other_rows(frames.sensor, sensor)
+        return Task(name, compare_by_distance(frames, config.ranges_m), own, detector, frames, notes)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
     assert isinstance(frames, NuScenesFrames)
     if args.samples is not None:

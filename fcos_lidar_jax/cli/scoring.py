@@ -39,6 +39,7 @@ class Task:
     sensor: Sensor
     detector: CloudDetector | None = None
     frames: FrameSet | None = None  # None if the report has no points
+    notes: tuple[str, ...] = ()  # lines to print when the detection begins
 
 
 def run_detector(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float | None = None) -> None:
@@ -54,6 +55,7 @@ def run_detector(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float |
         write=comparison.write,
         batch_size=batch_size,
         yaw_rad=yaw_rad,
+        notes=task.notes,
     )
     if line := truncation(removed["truncated"], task.detector.config):
         tell(line)

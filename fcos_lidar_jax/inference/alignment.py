@@ -119,11 +119,16 @@ def align(
         data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()), forward_rad=heading(detector, turn))
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
-    notes = []
-    if sensor is not None and sensor.num_rows != detector.num_rows:  # a path does not tell the number of rows
-        rows = f"{sensor.name} has {sensor.num_rows} rows, and the detector's sensor {detector.num_rows}"
-        notes.append(f"warning: {rows}: expect poor detections")
+    notes = () if sensor is None else other_rows(sensor, detector)  # a path does not tell the number of rows
     if sensor is None and recorded is not None and data != detector:
         told = f"recorded by {recorded.name}, as its path says; override with --data-sensor"
-        notes.append(f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}")
-    return Alignment(data, detector, yaw_rad, tuple(notes))
+        notes += (f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}",)
+    return Alignment(data, detector, yaw_rad, notes)
+
+
+def other_rows(recorded: Sensor, detector: Sensor) -> tuple[str, ...]:
+    """A warning if the sensor that recorded the points has another number of rows than the detector's."""
+    if recorded.num_rows == detector.num_rows:
+        return ()
+    rows = f"{recorded.name} has {recorded.num_rows} rows, and the detector's sensor {detector.num_rows}"
+    return (f"warning: {rows}: expect poor detections",)

@@ -35,6 +35,7 @@ def write_predictions(
     write: Callable[[Path, Iterator[tuple[str, bytes]]], None],
     batch_size: int = 1,
     yaw_rad: float | None = None,
+    notes: tuple[str, ...] = (),
 ) -> dict[str, int]:
     """Detect boxes in all frames, whose names are unique, and write a results file.
 
@@ -45,7 +46,7 @@ def write_predictions(
     Args:
         entries: converts the index of a frame and its detections to the entries of the file.
         write: writes the file from names of frames with entries as JSON.
-        batch_size, yaw_rad: see :func:`fcos_lidar_jax.inference.prediction.predict`.
+        batch_size, yaw_rad, notes: see :func:`fcos_lidar_jax.inference.prediction.predict_groups`.
 
     Returns:
         number of points removed by all processes in this run, by reason: ``close``, ``invalid``, ``truncated``.
@@ -69,7 +70,7 @@ def write_predictions(
         progress = Progress("frames", len(frames))
         if log is not None:
             progress.show(len(log))
-        how: dict[str, Any] = {"batch_size": batch_size, "yaw_rad": yaw_rad}
+        how: dict[str, Any] = {"batch_size": batch_size, "yaw_rad": yaw_rad, "notes": notes}
         groups = predict_groups(detector, frames, indices=np.flatnonzero(~done).tolist(), **how)
         number = 0
         for number, group in enumerate(groups, 1):

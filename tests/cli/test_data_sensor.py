@@ -23,7 +23,7 @@ from fcos_lidar_jax.data.kitti import TO_NUSCENES
 from fcos_lidar_jax.evaluation.records import cloud_record
 from fcos_lidar_jax.files import file_lock
 from fcos_lidar_jax.presets import PRESETS
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, sensor_to_json
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, TINY, sensor_to_json
 
 SMALL = "--checkpoint small --out"
 
@@ -173,6 +173,18 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
         assert page_content(tmp_path / "drive.html")["forward_rad"] == KITTI_HDL64E.forward_rad
         told = capsys.readouterr().err
         assert told.count("clouds rotated by 90 degrees") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["evaluate --data-root DATA --class-map MAP --no-report", "detect DATA/clouds --data-sensor DATA/sensor.json"],
+)
+def test_a_sensor_with_other_rows_gives_a_warning(tmp_path, capsys, words):
+    data = make_folder(tmp_path / "data", sensor=TINY, train=0, val=1)
+    (tmp_path / "map.json").write_text(json.dumps({"vehicle": "car"}))
+    command(words.replace("DATA", str(data)).replace("MAP", f"{tmp_path}/map.json"), SMALL, tmp_path / "out")
+    line = "warning: tiny has 16 rows, and the detector's sensor 32: expect poor detections\n"
+    assert capsys.readouterr().err.count(line) == 1
 
 
 def test_an_error_comes_without_notes_that_it_makes_moot(kitti, tmp_path, capsys):
