@@ -58,7 +58,7 @@ class Evaluate:
     The command writes metrics_summary.json, curves.json, report.html, frames.html (the worst and the best frames),
     and the detections: results_nusc.json for nuScenes, otherwise detections.json. For KITTI, it also writes
     metrics_kitti.json and result files in results_kitti. After Ctrl-C or a kill, the same command resumes and
-    repeats at most one batch.
+    repeats at most one batch, and clouds without usable points.
     """
 
     data: tyro.conf.OmitArgPrefixes[DataOptions]  # The data set.

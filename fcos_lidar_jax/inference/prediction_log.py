@@ -39,9 +39,9 @@ def write_predictions(
 ) -> dict[str, int]:
     """Detect boxes in all frames, whose names are unique, and write a results file.
 
-    A resume log next to the file keeps the detections of finished frames until the file is written. Several
-    processes share the frames, and the first writes; the path is the same for all. A SIGTERM to any process stops
-    all after the same frames.
+    A resume log next to the file keeps the detections of finished frames until the file is written, except for
+    frames without usable points: a resumed run reads and counts them again. Several processes share the frames,
+    and the first writes; the path is the same for all. A SIGTERM to any process stops all after the same frames.
 
     Args:
         entries: converts the index of a frame and its detections to the entries of the file.
@@ -57,7 +57,7 @@ def write_predictions(
         SystemExit: after SIGTERM, in a cluster.
     """
     file = path.with_name(f"{path.stem}.resume_log")
-    removed, unusable = [0] * len(_REASONS), list[str]()
+    removed, unusable = [0] * len(_REASONS), dict[str, tuple[str, Any]]()
     with contextlib.ExitStack() as held:
         log = None
         with agreed("cannot detect"):
@@ -75,21 +75,24 @@ def write_predictions(
         number = 0
         for number, group in enumerate(groups, 1):
             removed = [sum(counts) for counts in zip(removed, *map(_removed, group), strict=True)]
-            unusable += _unusable(detector, names, group)
             with agreed("cannot write"):
                 if log is not None:
                     for prediction in group:
-                        log.add(names[prediction.index], entries(prediction.index, prediction.detections))
-                        progress.show(len(log))
+                        name, found = names[prediction.index], entries(prediction.index, prediction.detections)
+                        if line := _unusable(detector, name, prediction):
+                            unusable[name] = line, found
+                        else:
+                            log.add(name, found)
+                        progress.show(len(log) + len(unusable))
             _stop_after_sigterm(number)
         _stop_after_sigterm(number + 1)  # if it arrived during the last group
         with agreed("cannot write"):
-            if len(unusable) == len(frames):
-                file.unlink(missing_ok=True)  # the next call must fail, too
-            if line := unusable_clouds(unusable, len(frames)):
-                tell(f"note: {line}")
             if log is not None:
-                write(path, log.entries(names))
+                if len(unusable) == len(frames):
+                    file.unlink(missing_ok=True)
+                if line := unusable_clouds([line for line, _ in unusable.values()], len(frames)):
+                    tell(f"note: {line}")
+                write(path, _in_order(names, log, {name: found for name, (_, found) in unusable.items()}))
                 file.unlink(missing_ok=True)
     return dict(zip(_REASONS, _sum_over_processes(removed), strict=True))
 
@@ -103,14 +106,20 @@ def _stop_after_sigterm(number: int) -> None:
         raise SystemExit(128 + signal.SIGTERM)
 
 
-def _unusable(detector: CloudDetector, names: Sequence[str], group: Sequence[Prediction]) -> list[str]:
-    """Lines about clouds without usable points that this process has read."""
-    lines = (
-        no_usable_points(names[p.index], p.cloud, int(p.detections.num_dropped), detector.sensor)
-        for p in group
-        if p.cloud is not None
-    )
-    return [*filter(None, lines)]
+def _unusable(detector: CloudDetector, name: str, prediction: Prediction) -> str | None:
+    """A line about a cloud without usable points that this process has read, or None."""
+    if prediction.cloud is None:
+        return None
+    return no_usable_points(name, prediction.cloud, int(prediction.detections.num_dropped), detector.sensor)
+
+
+def _in_order(names: Sequence[str], log: ResumeLog, others: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
+    """Names with entries as JSON, from the log and from the ``others``, which are not in it."""
+    for name in names:
+        if name in others:
+            yield name, json.dumps(others[name]).encode()
+        else:
+            yield from log.entries([name])
 
 
 def _removed(prediction: Prediction) -> list[int]:

@@ -62,3 +62,32 @@ def test_frames_without_usable_points_are_reported_and_only_such_frames_refused(
         return
     run()
     assert f"note: 1 of 3 clouds without usable points, and so without boxes: {first}" in capsys.readouterr().err
+
+
+def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_before(
+    monkeypatch, tmp_path, capsys
+):
+    detected, written = [], []
+
+    def predict_groups(detector, frames, *, indices, **how):
+        for index in indices:
+            if len(detected) == 2:
+                detected.append("interrupted")
+                raise KeyboardInterrupt
+            cloud, boxes = cloud_and_boxes(9 if index in (0, 3) else 4)
+            detected.append(index)
+            yield [Prediction(index, boxes, None, cloud)]
+
+    def run():
+        how = {"entries": lambda index, _: [{"index": index}], "write": lambda _, found: written.extend(found)}
+        results.write_predictions(load_detector("quickstart"), ToyFrames(size=4), tmp_path / "x.json", **how)
+
+    monkeypatch.setattr(results, "predict_groups", predict_groups)
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    run()
+    assert detected == [0, 1, "interrupted", 0, 2, 3]
+    assert written == [(f"toy {i}", b'[{"index": %d}]' % i) for i in range(4)]
+    told = capsys.readouterr().err
+    assert "note: 2 of 4 clouds without usable points" in told
+    assert "frames 4/4" in told
