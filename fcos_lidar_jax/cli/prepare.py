@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import tyro
 
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
@@ -52,6 +53,7 @@ def run(args: Prepare) -> None:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
     folder = args.data.index or data.index
     check_out_folder(folder, "--index")
+    jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
     with folder_lock(folder, "preparing"):
         record = _prepare(args, data, folder)
     record["seconds"] = round(time.monotonic() - began, 1)

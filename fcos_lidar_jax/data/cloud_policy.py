@@ -21,6 +21,7 @@ MAX_TIME_LAG_S = 60.0  # far above any fusion; larger values, like negative ones
 
 _SEED = 0  # of the random choice of truncated rows
 _ORDER = "older sweeps go first, then random points"
+_BLOCK = 4096  # rows that are projected together
 _MIN_ROWS = 500  # too few rows say nothing about the sensor
 _MAX_COORDINATE_M = 1000.0  # a larger median is no distance in metres
 _NEAR_M = 2.0  # points on the ego vehicle say nothing about the sensor
@@ -171,7 +172,25 @@ def no_usable_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: S
     )
 
 
-def unusable_clouds(lines: Sequence[str], number: int) -> str | None:
+def unusable_cloud(
+    name: str | Path, points: np.ndarray, valid: np.ndarray, num_close: int, sensor: Sensor
+) -> str | None:
+    """The line of :func:`no_usable_points` about f32[n, c] of a reader that removed ``num_close`` points.
+
+    ``valid`` is the result of :func:`usable_rows`. Later rows are only projected if none of the first rows is in
+    the range image, which is rare.
+    """
+    num_cells, num_valid = sensor.num_rows * sensor.num_columns, int(valid.sum())
+    for start in range(0, len(points), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        if (_cells(points[rows], valid[rows], sensor, _BLOCK) < num_cells).any():
+            return None
+    num_invalid = len(points) - num_valid
+    cloud = Cloud(points, valid, len(points) + num_close, num_close, num_invalid, num_truncated=0)
+    return no_usable_points(name, cloud, num_valid, sensor)
+
+
+def unusable_clouds(lines: Sequence[str], number: int, without: str = "boxes") -> str | None:
     """A line about the clouds of :func:`no_usable_points` among a number of clouds, or None.
 
     Raises:
@@ -185,7 +204,7 @@ def unusable_clouds(lines: Sequence[str], number: int) -> str | None:
     if len(lines) == number:
         raise ValueError(lines[0])
     first = "" if len(lines) == 1 else "the first is "
-    return f"{len(lines)} of {number} clouds without usable points, and so without boxes: {first}{lines[0]}"
+    return f"{len(lines)} of {number} clouds without usable points, and so without {without}: {first}{lines[0]}"
 
 
 def truncation(number: int, config: Config) -> str | None:
@@ -275,10 +294,8 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
         if within.sum() < _MIN_ROWS:
             return
     # Padded to a power of two, so that clouds of any length need few compilations.
-    padding = (0, (1 << (len(points) - 1).bit_length()) - len(points))
-    valid = np.pad(within, padding)
-    cell = np.asarray(image_cells(np.pad(points, (padding, (0, 0))), valid, sensor)[0])
-    cells = np.bincount(cell[valid], minlength=sensor.num_rows * sensor.num_columns + 1)
+    cell = _cells(points, within, sensor, 1 << (len(points) - 1).bit_length())
+    cells = np.bincount(cell[within], minlength=sensor.num_rows * sensor.num_columns + 1)
     outside = cells[-1] / within.sum()
     if outside > _MAX_OUTSIDE:
         yield f"{outside:.0%} of the points lie outside its vertical field of view"
@@ -293,3 +310,10 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     for share, what in ((beside, "column"), (below, "row")):
         if share < _MIN_NEIGHBOURS:
             yield f"{share:.0%} of the points have a neighbour in the next {what}, expected most"
+
+
+def _cells(points: np.ndarray, valid: np.ndarray, sensor: Sensor, size: int) -> np.ndarray:
+    """:func:`~fcos_lidar_jax.projection.image_cells` i32[n], compiled once for up to ``size`` points."""
+    padding = (0, size - len(points))
+    cells, _ = image_cells(np.pad(points, (padding, (0, 0))), np.pad(valid, padding), sensor)
+    return np.asarray(cells)[: len(points)]

@@ -17,21 +17,23 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import msgspec
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import check_boxes, points_in_boxes
-from fcos_lidar_jax.data.cloud_policy import usable_rows
+from fcos_lidar_jax.data.cloud_policy import unusable_cloud, unusable_clouds, usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.npy_files import parse_npz
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write, checksum, read_json
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.workers import end_with_parent
 
 MAX_SWEEPS = 20  # number of sweeps for which an object's points are counted
 
-_FORMAT, _VERSION = "fcos_lidar_jax objects", 3
+_FORMAT, _VERSION = "fcos_lidar_jax objects", 4
 _REBUILD = "rebuild it with fcos-lidar prepare"
 _MANIFEST = "manifest.json"
 _ROW = np.dtype(
@@ -79,6 +81,7 @@ class _Table(NamedTuple):
     recipe: str  # checksum of everything that determines the shard's bytes
     blake2b: str  # checksum of the file
     num_points: int  # of all objects
+    unusable: list[str]  # a line about each cloud without usable points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,7 +197,7 @@ def prepare_database(
             shard.
 
     Raises:
-        ValueError: a frame has other columns than its sensor, or an implausible box.
+        ValueError: a frame has other columns than its sensor, or an implausible box; no frame has usable points.
         OSError: an error of the file system, or a worker died.
     """
     folder = Path(folder)
@@ -224,6 +227,9 @@ def prepare_database(
         done += count
         report(done, len(frames))
     tables = {name: _read_shard(folder, name, columns) for name in shards}
+    unusable = [line for table in tables.values() for line in table.unusable]
+    if line := unusable_clouds(unusable, len(frames), without="objects"):
+        tell(f"note: {line}")
     entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
     manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, num_sweeps, columns, entries)
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
@@ -270,13 +276,17 @@ def _finished(job: _Job) -> bool:
 def _cut_shard(frames: FrameSet, job: _Job) -> int:
     rows: list[tuple] = []
     parts: list[np.ndarray] = []
+    unusable: list[str] = []
     start = 0
     for index in job.indices:
         frame = frames.frame(index)
         columns = frame.points.shape[1]
         check(columns == job.columns, f"frame {index}: point columns", columns, f"{job.columns} of the sensor")
         check_boxes(frame.boxes, lambda box, index=index: f"frame {frames.name(index)!r}: box {box}")
-        cloud = frame.points[usable_rows(frame.points)]
+        usable = np.asarray(usable_rows(frame.points))
+        if line := unusable_cloud(frames.name(index), frame.points, usable, frame.num_close, frames.sensor):
+            unusable.append(line)
+        cloud = frame.points[usable]
         lags = np.unique(np.append(cloud[:, 4], np.float32(0)))[:MAX_SWEEPS]
         for box, label, inside in zip(frame.boxes, frame.labels, points_in_boxes(cloud, frame.boxes), strict=True):
             if len(inside) < job.min_points:
@@ -288,7 +298,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
             rows.append((box, label, index, start, len(points), newest, zlib.crc32(points.data)))
             parts.append(points)
             start += len(points)
-    table = {"rows": np.array(rows, _ROW), "recipe": np.array(job.recipe)}
+    table = {"rows": np.array(rows, _ROW), "recipe": np.array(job.recipe), "unusable": np.array(unusable, str)}
     points = np.concatenate([np.zeros((0, job.columns), "<f4"), *parts])
     points_file, table_file = _files(job.folder, job.name)
     atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # errors of tofile lack their errno
@@ -320,6 +330,7 @@ _worker_frames: FrameSet | None = None
 def _begin_worker(frames: FrameSet) -> None:
     global _worker_frames
     _worker_frames = frames
+    jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
     end_with_parent()
 
 
@@ -339,8 +350,8 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
     if expected is not None and digest != expected:
         raise ValueError(f"{file}: checksum differs from the manifest's; {_REBUILD}")
     try:
-        arrays = parse_npz(data, ["rows", "recipe"])
-        rows, recipe = arrays["rows"], str(arrays["recipe"])
+        arrays = parse_npz(data, ["rows", "recipe", "unusable"])
+        rows, recipe, unusable = arrays["rows"], str(arrays["recipe"]), arrays["unusable"]
     except ValueError as error:
         raise ValueError(f"{file}: not a table of objects: {error}") from None
     if rows.dtype != _ROW or rows.ndim != 1:
@@ -350,7 +361,7 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
     placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)
     if not (placed & (newest >= 0).all(axis=1) & (newest <= rows["count"][:, None]).all(axis=1)).all():
         raise ValueError(f"{file}: got objects with points outside the shard; {_REBUILD}")
-    table = _Table(rows, recipe, digest, int(ends[-1]) if len(ends) else 0)
+    table = _Table(rows, recipe, digest, int(ends[-1]) if len(ends) else 0, [*map(str, unusable.flat)])
     size = 4 * columns * table.num_points
     found = f"{points_file.stat().st_size} bytes" if points_file.is_file() else "no file"
     if found != f"{size} bytes":

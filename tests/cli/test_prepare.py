@@ -105,6 +105,22 @@ def test_objects_are_cut_again_from_changed_clouds(root, tmp_path):
     assert open_database(objects).fingerprint() != before
 
 
+def test_clouds_without_usable_points_are_reported_once_and_no_others_refused(root, tmp_path, capsys):
+    copy = shutil.copytree(root, tmp_path / "copy")
+
+    def place_all_points(scene, x):
+        for file in copy.glob(f"s*/*/{scene}-*"):
+            np.array([[x, 9, 0, 9, 0]], np.float32).tofile(file)
+
+    place_all_points("*", 9)
+    place_all_points("0", 1e4)
+    command(*prepare(copy, tmp_path / "i"))
+    note = "note: 4 of 24 clouds without usable points, and so without objects: the first is "
+    assert capsys.readouterr().err.count(note) == 1
+    place_all_points("*", 1e4)
+    assert_one_line_error(capsys, prepare(copy, tmp_path / "i"), "points is usable")
+
+
 @pytest.mark.parametrize(
     ("damage", "expected"),
     [

@@ -15,7 +15,9 @@ from fcos_lidar_jax.data.cloud_policy import (
     make_cloud,
     no_usable_points,
     sensor_mismatch,
+    unusable_cloud,
     unusable_clouds,
+    usable_rows,
 )
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.presets import QUICKSTART
@@ -160,6 +162,18 @@ def test_a_line_tells_a_cloud_without_usable_points_with_the_counts():
     points[:, 0] = 1.533e9  # the time, as the first column
     line = no_usable_points("a.bin", cloud_of(points), 130, TINY)
     assert "of tiny; the values of x are about 1.533e+09, expected metres in the columns x, y" in line
+
+
+def test_a_cloud_of_a_reader_is_usable_with_one_point_in_the_range_image():
+    points = np.tile(np.float32([1e3, 0, 0, 50, 0]), (10_000, 1))
+    points[:7, 3] = np.nan
+    line = unusable_cloud("a.bin", points, np.asarray(usable_rows(points)), 5, TINY)
+    expected = "none of its 10005 points is usable (7 not finite or beyond physical limits, 5 on the ego vehicle, "
+    assert line.startswith(f"a.bin: {expected}")
+    points[9_000, 0] = 9
+    assert unusable_cloud("a.bin", points, np.asarray(usable_rows(points)), 5, TINY) is None
+    line = unusable_cloud("a.bin", points[:0], np.zeros(0, bool), 0, TINY)
+    assert line == "a.bin: no points in it, expected at least one"
 
 
 def test_one_line_tells_all_unusable_clouds_and_none_usable_is_refused():

@@ -80,6 +80,22 @@ def test_points_beyond_physical_limits_are_not_cut(tmp_path):
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_clouds_without_usable_points_are_counted_also_if_they_were_read_before(tmp_path, capsys, workers):
+    frames = [toy_frame(seed) for seed in range(3)]
+    for frame in frames[:2]:
+        frame.points[:, :3] *= 1000  # millimetres
+    scenes = (("s", (0, 1)), ("t", (2,)))
+    for _ in range(2):
+        build(tmp_path / "a", ListedFrames(tuple(frames)), scenes=scenes, workers=workers)
+        told = capsys.readouterr().err
+        note = "note: 2 of 3 clouds without usable points, and so without objects: the first is frame 0: none of"
+        assert told.count("note: ") == told.count(note) == 1
+        with refused("frame 0: none of its 1500 points is usable"):
+            build(tmp_path / "b", ListedFrames(tuple(frames[:2])), scenes=scenes[:1], workers=workers)
+        assert "manifest.json" not in contents(tmp_path / "b")
+
+
 def test_a_split_name_cannot_lead_out_of_the_index():
     for name in ("../elsewhere", "..", "a/b", "/tmp"):
         with refused("expected a name that a folder can have"):
@@ -284,8 +300,8 @@ MANIFEST, TABLE, POINTS = "manifest.json", "scene-b.objects.npz", "scene-c.point
 DAMAGE = {
     "no manifest": (MANIFEST, Path.unlink, "no such file, expected a finished"),
     "truncated manifest": (MANIFEST, lambda f: cut(f, 100), "not JSON"),
-    "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 3; rebuild it with"),
-    "other format": (MANIFEST, lambda f: edit(f, format="x"), "got 'x' version 3"),
+    "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 4; rebuild it with"),
+    "other format": (MANIFEST, lambda f: edit(f, format="x"), "got 'x' version 4"),
     "no shards": (MANIFEST, lambda f: edit(f, shards=3), "$.shards: got 3, expected array"),
     "empty shard": (MANIFEST, lambda f: edit(f, shards=[{}]), "$.shards[0]: Object missing required field `name`"),
     "path": (MANIFEST, lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]), "shards: name: got '/etc/x', exp"),
