@@ -62,7 +62,8 @@ from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.devices.mesh import make_mesh, pmap_step
 from fcos_lidar_jax.training import make_state, make_train_step
 def stacked(tree, n): return jax.tree.map(lambda leaf: leaf.reshape(n, -1, *leaf.shape[1:]), tree)
-def double(tree): return jax.tree.map(lambda leaf: np.float64(leaf) if leaf.dtype == np.float32 else leaf, tree)
+def double(tree):
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64 if leaf.dtype == np.float32 else None), tree)
 def copies(tree, n): return jax.tree.map(lambda leaf: jax.numpy.stack([leaf] * n), tree)
 def steps(config, n):
     batch = make_batch(frames, max_points=config.max_points, max_boxes=config.max_boxes)

@@ -30,7 +30,7 @@ from fcos_lidar_jax.training.optimizer import learning_rate_schedule, momentum_s
 from fcos_lidar_jax.training.step import detection_variables, make_gradient
 from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums
 
-STEPS = 60
+STEPS = 75
 CONFIG = dataclasses.replace(
     QUICKSTART,
     model=TINY_CONFIG.model,
