@@ -163,7 +163,7 @@ def index_of(boxes: Sequence[msgspec.Struct], field: str, known: Mapping[str, in
 def expect(
     good: np.ndarray | np.bool, boxes: Sequence[msgspec.Struct], field: str, where: str, expected: str
 ) -> None:
-    """Raise a ValueError for the first box whose field is not good."""
+    """Raise a ValueError that names the first box with a wrong value in a field."""
     if not good.all():
         box = int(np.argmin(good))
         got = list(value) if isinstance(value := getattr(boxes[box], field), tuple) else value
