@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import points_in_box
 from fcos_lidar_jax.namespaces import own_names
-from fcos_lidar_jax.types import Targets
+from fcos_lidar_jax.types import Targets, check_rows
 
 __dir__ = own_names(__name__)
 
@@ -41,11 +41,18 @@ def owners(
     Returns:
         box index, or -1 where no box contains the point; the lower index wins among equal volumes.
 
+    Raises:
+        ValueError: at trace time, if ``present`` or ``box_valid`` has another length than its array.
+
     >>> boxes = jnp.array([[0, 0, 0, 4, 4, 4, 0], [0, 0, 0, 2, 2, 2, 0]], jnp.float32)
     >>> points = jnp.array([[0.5, 0, 0], [1.5, 0, 0], [9, 0, 0]])
     >>> owners(points, jnp.ones(3, bool), boxes, jnp.ones(2, bool)).tolist()
     [1, 0, -1]
     """
+    check_rows(len(points), present=present)
+    check_rows(len(boxes), box_valid=box_valid)
+    if not len(boxes):
+        return jnp.full(len(points), -1, jnp.int32)
     points, present, box_valid = jnp.asarray(points), jnp.asarray(present), jnp.asarray(box_valid)
     boxes = jnp.where(box_valid[:, None], boxes, 0.0)
     forms = {"loop": _owners_by_box, "reduction": _owners_by_rank}
@@ -103,6 +110,8 @@ def dynamic_k(
     >>> dynamic_k(jnp.array([0, 0, 0, -1]), jnp.array([0.9, 0.6, 0, 0]), num_boxes=2, top_q=20).tolist()
     [2, 0]
     """
+    if not len(owner):
+        return jnp.zeros(num_boxes, jnp.int32)
     group, negative_iou, _ = _by_owner(owner, -iou, num_boxes)
     edges = _edges(group, num_boxes)
     first, end = edges[:-1, None], edges[1:, None]
@@ -148,10 +157,14 @@ def assign(
         iou: IoU of the decoded box with the owner; arbitrary where there is no owner.
         num_boxes, top_q: m and Q (static).
 
+    Raises:
+        ValueError: at trace time, if the arrays have different lengths.
+
     >>> owner = jnp.array([0, 0, -1])
     >>> assign(owner, jnp.array([1.0, 2.0, 0.0]), jnp.array([0.2, 0.3, 0.0]), num_boxes=1).positive.tolist()
     [True, False, False]
     """
+    check_rows(len(owner), owner=owner, classification_cost=classification_cost, iou=iou)
     owned = owner >= 0
     iou = jnp.where(owned, lax.stop_gradient(iou), 0.0)
     cost = jnp.where(owned, lax.stop_gradient(classification_cost) + 1 - iou, jnp.inf)

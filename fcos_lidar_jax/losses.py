@@ -1,5 +1,7 @@
 """Losses of one sample (paper, section 3.4), each as (sum, count).
 
+Arrays of different lengths raise a ValueError when the loss is traced.
+
 Each sum is divided once, over the global batch. A mean per sample or per device would give more weight to the
 positives of samples with few positives.
 """
@@ -14,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 from fcos_lidar_jax.config import LossConfig
 from fcos_lidar_jax.iou import oriented_overlap
 from fcos_lidar_jax.namespaces import own_names
-from fcos_lidar_jax.types import ORIENTED, check_columns
+from fcos_lidar_jax.types import ORIENTED, check_columns, check_rows
 
 __dir__ = own_names(__name__)
 
@@ -31,6 +33,7 @@ def cross_entropy(logits: Float32[Array, "l c"], labels: Int32[Array, "l"]) -> F
     >>> round(float(cross_entropy(jnp.zeros((1, 2)), jnp.array([0]))[0]), 4)
     0.6931
     """
+    check_rows(len(logits), labels=labels)
     return -jnp.take_along_axis(jax.nn.log_softmax(logits), labels[:, None], axis=1)[:, 0]
 
 
@@ -45,6 +48,7 @@ def classification_loss(
     >>> round(float(total), 4), int(count)
     (0.6931, 1)
     """
+    check_rows(len(logits), mask=mask)
     # Replace masked logits, which may be NaN: 0 * NaN is NaN in the gradient.
     return _masked(cross_entropy(jnp.where(mask[:, None], logits, 0.0), labels), mask)
 
@@ -68,6 +72,8 @@ def l1_loss(
     >>> round(float(total), 4)
     8.4
     """
+    check_rows(len(prediction), axes=2, target=target)
+    check_rows(len(prediction), mask=mask)
     known = ~jnp.isnan(target)
     difference = jnp.where(known & mask[:, None], prediction - jnp.where(known, target, 0.0), 0.0)
     weights = jnp.array([1.0] * 8 + [velocity_weight] * 2, prediction.dtype)
@@ -94,6 +100,8 @@ def iou_loss(
     """
     for name, boxes in (("prediction", prediction), ("target", target)):
         check_columns(name, boxes, ORIENTED)
+    check_rows(len(prediction), axes=2, target=target)
+    check_rows(len(prediction), mask=mask)
     # Replace masked boxes before they can overflow: 0 * inf is NaN in the gradient.
     unit = jnp.array([0, 0, 0, 1, 1, 1, 1, 0], prediction.dtype)
     prediction = jnp.where(mask[:, None], prediction, unit)
@@ -152,6 +160,7 @@ def iou_prediction_loss(logits: Float32[Array, "l"], iou: Float32[Array, "l"], m
     >>> round(float(total), 4)
     0.6931
     """
+    check_rows(len(logits), logits=logits, iou=iou, mask=mask)
     iou = lax.stop_gradient(iou)
     logits = jnp.where(mask, logits, 0.0)  # masked logits may be NaN, as above
     return _masked(jax.nn.softplus(logits) - iou * logits, mask)

@@ -15,6 +15,7 @@ from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
 from fcos_lidar_jax.namespaces import own_names
+from fcos_lidar_jax.types import check_rows
 
 __dir__ = own_names(__name__)
 
@@ -53,7 +54,7 @@ def rotated_nms(
         indices of the kept boxes by decreasing score, 0 in unused slots, and a mask of the used slots.
 
     Raises:
-        ValueError: at trace time, if ``max_outputs`` is below 1.
+        ValueError: at trace time, if ``max_outputs`` is below 1 or the arrays have different lengths.
 
     >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0], [9, 0, 0, 4, 2, 1, 0]])
     >>> scores, valid = jnp.array([0.5, 0.9, 0.1]), jnp.ones(3, bool)
@@ -65,11 +66,12 @@ def rotated_nms(
     [1, 2, 0]
     """
     check(max_outputs >= 1, "max_outputs", max_outputs, "at least 1")
+    labels = jnp.zeros(len(boxes), jnp.int32) if labels is None else jnp.asarray(labels)
+    check_rows(len(boxes), scores=scores, valid=valid, labels=labels)
     if not len(scores):
         return jnp.zeros(max_outputs, jnp.int32), jnp.zeros(max_outputs, bool)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     scores = jnp.where(usable, scores, -jnp.inf)
-    labels = jnp.zeros(scores.shape, jnp.int32) if labels is None else jnp.asarray(labels)
     options = {"threshold": iou_threshold, "max_outputs": max_outputs, "vertical": _is_vertical(overlap)}
     rows, matrix = (functools.partial(suppress, **options) for suppress in (_by_rows, _by_matrix))
     candidates = oriented(boxes), scores, usable, labels
@@ -104,16 +106,20 @@ def merge_boxes(
     Returns:
         merged boxes, zero in unused slots.
 
+    Raises:
+        ValueError: at trace time, if the arrays have different lengths.
+
     >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0]])
     >>> valid, best = jnp.ones(2, bool), (jnp.array([0]), jnp.array([True]))
     >>> merge_boxes(boxes, jnp.array([0.8, 0.4]), valid, *best, iou_threshold=0.3)[0, 0].round(3).tolist()
     0.10000000149011612
     """
+    labels = jnp.zeros(len(boxes), jnp.int32) if labels is None else jnp.asarray(labels)
+    check_rows(len(boxes), scores=scores, valid=valid, labels=labels)
     if not len(scores):
         return jnp.zeros((*kept.shape, boxes.shape[1]), jnp.float32)
     usable = jnp.asarray(valid) & ~jnp.isnan(scores)
     weights = jnp.where(usable, scores, 0.0) ** 2
-    labels = jnp.zeros(weights.shape, jnp.int32) if labels is None else jnp.asarray(labels)
     mean = functools.partial(_weighted_mean, threshold=iou_threshold, vertical=_is_vertical(overlap))
     arrays = jnp.asarray(boxes, jnp.float32), weights, labels, usable, kept, used
     rows, matrix = (functools.partial(merge, mean) for merge in (_merged_by_rows, _merged_by_matrix))

@@ -45,6 +45,22 @@ def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:
         raise ValueError(f"{name}: got shape {array.shape}, expected columns {columns}")
 
 
+def check_rows(number: int, *, axes: int = 1, **arrays: Any) -> None:
+    """Refuse arrays of another length, which JAX would broadcast or clamp to wrong results without an error.
+
+    Raises:
+        ValueError: an array has another length than ``number``, or another number of ``axes``.
+
+    >>> check_rows(2, scores=np.zeros((2, 1)))
+    Traceback (most recent call last):
+    ValueError: scores: got shape (2, 1), expected (2,)
+    """
+    for name, array in arrays.items():
+        shape = np.shape(array)
+        if len(shape) != axes or shape[0] != number:
+            raise ValueError(f"{name}: got shape {shape}, expected ({number},{' ...' * (axes - 1)})")
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RangeImage:

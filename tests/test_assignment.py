@@ -104,6 +104,15 @@ def test_without_candidates_and_with_one_candidate():
     assert one.num_positive.tolist() == [0, 1]
 
 
+def test_without_boxes_or_locations():
+    points, boxes = jnp.zeros((3, 3)), jnp.zeros((0, 7))
+    for form in (None, "loop", "reduction"):
+        assert owners(points, jnp.ones(3, bool), boxes, jnp.ones(0, bool), form=form).tolist() == [-1] * 3
+    targets = assign(i32([]), f32([]), f32([]), num_boxes=2)
+    assert targets.num_positive.tolist() == [0, 0]
+    assert targets.positive.shape == (0,)
+
+
 def test_a_diverged_prediction_ranks_last():
     targets = compute(i32([0, 0, 0]), f32([np.nan, 5, np.inf]), f32([0.0, 0.0, 0.0]), num_boxes=1)
     assert targets.positive.tolist() == [False, True, False]

@@ -9,6 +9,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.point_files import check_time_lags
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.projection import remove_close
 from fcos_lidar_jax.sensors import Sensor
@@ -103,6 +105,9 @@ class FrameSet(Protocol):
 class InMemoryFrames(FrameSet):
     """Frames in memory.
 
+    Raises:
+        ValueError: a label is not the index of a class, or the fifth column of the points is a ring.
+
     >>> from fcos_lidar_jax.sensors import TINY
     >>> nothing = Frame(np.zeros((0, 5)), np.zeros((0, 9)), np.zeros(0, int), np.zeros(0, int))
     >>> len(InMemoryFrames((nothing,), TINY, ("car",)))
@@ -112,6 +117,13 @@ class InMemoryFrames(FrameSet):
     frames: tuple[Frame, ...]
     sensor: Sensor
     classes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        for index, frame in enumerate(self.frames):
+            known = (frame.labels >= 0) & (frame.labels < len(self.classes))
+            expected = f"indices of the {len(self.classes)} classes"
+            check(bool(known.all()), f"frame {index}: labels", frame.labels[~known].tolist(), expected)
+            check_time_lags(frame.points, f"frame {index}: points")
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -8,6 +8,7 @@ import numpy as np
 from fcos_lidar_jax.data.box_geometry import check_boxes
 from fcos_lidar_jax.data.cloud_policy import usable_rows, write_points
 from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.data.point_files import check_time_lags
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.types import Batch
 
@@ -109,6 +110,7 @@ def _check_frame(where: str, frame: Frame, columns: int) -> None:
     fits = frame.points.ndim == 2 and columns in (5, 6) and frame.points.shape[1] == columns
     expected = "[n, 5], or [n, 6] with laser numbers, as the other frames"
     check(fits, f"{where}: points: shape", frame.points.shape, expected)
+    check_time_lags(frame.points, f"{where}: points")
     check_boxes(frame.boxes, lambda box: f"{where}: box {box}")
     least = int(frame.labels.min(initial=0))
     check(least >= 0, f"{where}: labels", least, "indices of classes, from 0")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 import jax
 import numpy as np
 
-from fcos_lidar_jax.progress import Progress
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.training.step import TrainStep
 from fcos_lidar_jax.types import HostBatch, TrainState
 
@@ -75,6 +75,9 @@ def fit(
         record: Record = {name: np.asarray(value).tolist() for name, value in metrics.items()}
         now = time.monotonic()
         record |= {"seconds": now - before, "waiting_seconds": waited, **host.counts}
+        if lost := host.counts.get("truncated_boxes"):
+            told = f"step {number}: {lost} boxes left out, since samples have more than max_boxes"
+            tell(f"note: {told}; the metrics of each step count them as truncated_boxes", once="truncated_boxes")
         before = now
         _check_finite(number, record, host.names)
         iou = f"  IoU {record['positive_iou']:.2f}" if "positive_iou" in record else ""

@@ -99,7 +99,14 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
             micros = jax.tree.map(lambda leaf: leaf.reshape(-1, num_micro, *leaf.shape[1:]).swapaxes(0, 1), batch)
             shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
             zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-            (batch_stats, (grads, sums)), _ = lax.scan(add, (batch_stats, zeros), micros)
+            # XLA runs convolutions in a loop several times slower on CPUs.
+            accumulated, _ = lax.platform_dependent(
+                (batch_stats, zeros),
+                micros,
+                cpu=functools.partial(lax.scan, add, unroll=True),
+                default=functools.partial(lax.scan, add),
+            )
+            batch_stats, (grads, sums) = accumulated
 
         grads, sums = sum_over_devices((grads, sums))
 

@@ -28,7 +28,7 @@ from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training import NonFiniteLossError, fit, make_optimizer, make_state, make_train_step, plan
 from fcos_lidar_jax.training.optimizer import learning_rate_schedule, momentum_schedule
 from fcos_lidar_jax.training.step import detection_variables, make_gradient
-from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums
+from fcos_lidar_jax.types import Batch, HostBatch, Outputs, Sums, TrainState
 
 STEPS = 75
 CONFIG = dataclasses.replace(
@@ -447,6 +447,18 @@ def test_the_running_mean_of_the_weights_matches_a_loop(squares):
     plain = make_state(make(), optimizer, jax.random.key(0), variables=ZERO)
     assert plain.ema is None
     assert detection_variables(plain) == {"params": plain.params, "batch_stats": {}}
+
+
+def test_boxes_that_are_left_out_are_reported_once(capsys):
+    def step(state, _):
+        return state, {"loss/total": 1.0}
+
+    state = TrainState(np.int32(0), {}, {}, (), None, jax.random.key(0))
+    counts = ({}, {"truncated_boxes": 0}, {"truncated_boxes": 2}, {"truncated_boxes": 7})
+    fit(step, state, [HostBatch(None, found, ("a",)) for found in counts], num_steps=4)
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+    assert len(lines) == 1
+    assert lines[0].startswith("note: step 3: 2 boxes left out")
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_before_a_pause(squares):
