@@ -39,10 +39,14 @@ def check_out_folder(out: Path, option: str = "--out") -> None:
 
 
 def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
-    """Reject an output that is one of the files to ``keep``, is not a regular file, or cannot be written."""
+    """Reject an output that is one of the files to ``keep`` or of own data, no regular file, or not writable."""
     for other in keep:
         if out.resolve() == other.resolve() or (out.exists() and other.exists() and out.samefile(other)):
             raise ValueError(f"{option}: {out}: the same file as {other}, expected another one")
+    folder = out.absolute().parent
+    described = out.name in ("classes.json", "sensor.json", "splits.json") and (folder / "clouds").is_dir()
+    if described or (folder.name == "boxes" and (folder.parent / "clouds").is_dir()):
+        raise ValueError(f"{option}: {out}: the place of a file of own data, expected another one")
     check_writable(out)
 
 

@@ -37,6 +37,7 @@ FORMATS: dict[Format, ResultFormat] = {
     "kitti": ResultFormat(calibrated=True),
     "openlabel": ResultFormat(),
 }
+_LABEL_COLUMNS = 15  # Results have a score after them.
 _TYPES = kitti_types(TO_NUSCENES) | kitti_types()
 
 
@@ -48,6 +49,9 @@ def check_result_files(args: Any, keep: Sequence[Path]) -> None:
     if calibrated:
         check_outside("--out", args.out, args.checkpoint)
         check_out_folder(args.out)
+        for file in sorted(args.out.glob("*.txt")):
+            if any(len(line.split()) == _LABEL_COLUMNS for line in file.read_text(errors="replace").splitlines()):
+                raise ValueError(f"--out: {file}: found labels, which have no score, expected results or nothing")
     else:
         check_outputs(args.checkpoint, keep, out=args.out)
 

@@ -22,6 +22,7 @@ MAX_TIME_LAG_S = 60.0  # far above any fusion; larger values, like negative ones
 _SEED = 0  # of the random choice of truncated rows
 _ORDER = "older sweeps go first, then random points"
 _BLOCK = 4096  # rows that are projected together
+_MAX_INTENSITY_READ = 255  # of all detectors
 _MIN_ROWS = 500  # too few rows say nothing about the sensor
 _MAX_COORDINATE_M = 1000.0  # a larger median is no distance in metres
 _NEAR_M = 2.0  # points on the ego vehicle say nothing about the sensor
@@ -286,6 +287,8 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     """All findings, except for those that too few points within the sensor's limits cannot show."""
     if (most := points[:, 3].max()) <= 1:
         yield "no intensity is above 1, expected 0 to 255" + (": multiply them by 255" if most > 0 else "")
+    if np.median(points[:, 3]) > _MAX_INTENSITY_READ:
+        yield f"most intensities are above {_MAX_INTENSITY_READ}, expected 0 to {_MAX_INTENSITY_READ}"
     low, high = sensor.limit_z_m
     within = (np.abs(points[:, :2]) < sensor.limit_xy_m).all(axis=1) & (points[:, 2] > low) & (points[:, 2] < high)
     beyond = 1 - within.mean()

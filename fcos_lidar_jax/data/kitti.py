@@ -187,9 +187,17 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
 
 
 def camera_calibration(file: Path) -> Path | None:
-    """The calibration by which :func:`in_camera` crops a file, or None."""
+    """The calibration by which :func:`in_camera` crops a file, or None.
+
+    Raises:
+        ValueError: the calibrations of other files are there; a mixture of crops and full turns would be scored.
+    """
     calibration = file.absolute().parent.parent / "calib" / f"{file.stem}.txt"
-    return calibration if calibration.is_file() and recorded_by([file]) == KITTI_HDL64E else None
+    if recorded_by([file]) != KITTI_HDL64E or not calibration.parent.is_dir():
+        return None
+    if not calibration.is_file():
+        raise ValueError(f"{calibration}: found nothing, expected the calibration of {file} (or --full-turn)")
+    return calibration
 
 
 def read_labels(file: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -75,9 +75,10 @@ def fit(
         record: Record = {name: np.asarray(value).tolist() for name, value in metrics.items()}
         now = time.monotonic()
         record |= {"seconds": now - before, "waiting_seconds": waited, **host.counts}
-        if lost := host.counts.get("truncated_boxes"):
-            told = f"step {number}: {lost} boxes left out, since samples have more than max_boxes"
-            tell(f"note: {told}; the metrics of each step count them as truncated_boxes", once="truncated_boxes")
+        for what in ("points", "boxes"):
+            if lost := host.counts.get(count := f"truncated_{what}"):
+                told = f"step {number}: {lost} {what} left out, since samples have more than max_{what}"
+                tell(f"note: {told}; the metrics of each step count them as {count}", once=count)
         before = now
         _check_finite(number, record, host.names)
         iou = f"  IoU {record['positive_iou']:.2f}" if "positive_iou" in record else ""

@@ -251,6 +251,20 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monk
     assert left_out in told
 
 
+def test_labels_and_files_of_own_data_are_not_overwritten(home, tmp_path, capsys):
+    call = ["detect", str(home / "training" / "velodyne"), "--checkpoint", str(home / "checkpoint"), "--out"]
+    label = tmp_path / "label_2" / "000000.txt"
+    label.parent.mkdir()
+    label.write_text("Car 0.00 0 0.1 10 20 30 40 1.5 1.6 3.9 1 2 9 0.2\n")
+    message = "000000.txt: found labels, which have no score"
+    assert_one_line_error(capsys, [*call, str(label.parent), "--output-format", "kitti"], message)
+    assert label.read_text().startswith("Car 0.00 0 0.1")
+    (tmp_path / "clouds").mkdir()
+    for out in (tmp_path / "boxes" / "000.json", tmp_path / "splits.json"):
+        assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
+        assert not out.exists()
+
+
 MISTAKES = [
     ("--output-format kitti --calibration HOME/nowhere", "nowhere: no such file"),
     ("--output-format kitti --calibration HOME", r"kitti: .*000000.txt: no such file, expected --calibration"),

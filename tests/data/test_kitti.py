@@ -56,7 +56,13 @@ def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, c
     assert capsys.readouterr().err.count("points outside the camera image are left out") == 1
     monkeypatch.chdir(file.parent)
     np.testing.assert_array_equal(in_camera(Path(file.name), points), cropped)
-    (root / "training" / "calib" / "000003.txt").unlink()
+    calibration = root / "training" / "calib" / "000003.txt"
+    calibration.unlink()
+    with pytest.raises(
+        ValueError, match=r"calib/000003\.txt: found nothing, expected the calibration of .*000003"
+    ):
+        in_camera(file.with_name("000003.bin"), points)
+    calibration.parent.rename(root / "elsewhere")
     for other in (file.with_name("000003.bin"), root / "000007.bin"):
         np.testing.assert_array_equal(in_camera(other, points), points)
 

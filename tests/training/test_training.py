@@ -449,16 +449,17 @@ def test_the_running_mean_of_the_weights_matches_a_loop(squares):
     assert detection_variables(plain) == {"params": plain.params, "batch_stats": {}}
 
 
-def test_boxes_that_are_left_out_are_reported_once(capsys):
+def test_boxes_and_points_that_are_left_out_are_reported_once(capsys):
     def step(state, _):
         return state, {"loss/total": 1.0}
 
     state = TrainState(np.int32(0), {}, {}, (), None, jax.random.key(0))
-    counts = ({}, {"truncated_boxes": 0}, {"truncated_boxes": 2}, {"truncated_boxes": 7})
-    fit(step, state, [HostBatch(None, found, ("a",)) for found in counts], num_steps=4)
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
-    assert len(lines) == 1
-    assert lines[0].startswith("note: step 3: 2 boxes left out")
+    counts = ({}, {"truncated_boxes": 0, "truncated_points": 0}, {"truncated_boxes": 2}, {"truncated_boxes": 7})
+    counts += ({"truncated_points": 9}, {"truncated_points": 9})
+    fit(step, state, [HostBatch(None, found, ("a",)) for found in counts], num_steps=6)
+    boxes, points = (line for line in capsys.readouterr().err.splitlines() if line.startswith("note: "))
+    assert boxes.startswith("note: step 3: 2 boxes left out, since samples have more than max_boxes;")
+    assert points.startswith("note: step 5: 9 points left out, since samples have more than max_points;")
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_before_a_pause(squares):
