@@ -18,7 +18,9 @@ def make(labels=LABELS) -> InMemoryFrames:
     for i, own in enumerate(labels):
         boxes = np.arange(len(own) * 9, dtype=np.float32).reshape(-1, 9) + 100 * i
         counts = np.arange(len(own), dtype=np.int32) + 10 * i
-        frames.append(Frame(np.full((4, 5), i, np.float32), boxes, np.array(own, np.int32), counts, num_close=i))
+        frames.append(
+            Frame(np.full((4, 5), i / 10, np.float32), boxes, np.array(own, np.int32), counts, num_close=i)
+        )
     return InMemoryFrames(tuple(frames), TINY, OWN)
 
 

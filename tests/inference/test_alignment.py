@@ -61,7 +61,7 @@ def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(capsys):
     points = np.column_stack([frame.points[:, 1], -frame.points[:, 0], frame.points[:, 2:]])
     ahead = dataclasses.replace(detector.sensor, forward_rad=0.0)
     [expected], [found] = (
-        list(predict(detector, InMemoryFrames((dataclasses.replace(frame, points=p),), sensor, ("car",))))
+        list(predict(detector, InMemoryFrames((dataclasses.replace(frame, points=p),), sensor, detector.classes)))
         for p, sensor in ((frame.points, detector.sensor), (points, ahead))
     )
     assert capsys.readouterr().err.count("clouds rotated by 90 degrees") == 1
