@@ -60,7 +60,7 @@ def init_variables(network: nn.Module, key: Any, inputs: Any) -> Any:
         return network.init(key, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), inputs), train=False)
 
     program, shapes = jax.make_jaxpr(init, return_shape=True)(key)
-    needed, kept = set(program.jaxpr.outvars), []
+    needed, kept = {x for x in program.jaxpr.outvars if not isinstance(x, Literal)}, []
     for operation in reversed(program.jaxpr.eqns):
         if needed.intersection(operation.outvars):
             kept.insert(0, operation)
