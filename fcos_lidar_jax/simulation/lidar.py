@@ -21,6 +21,8 @@ _SECTORS = 10  # number of parts of a sweep with separate times, with rolling sh
 _TILT_RAD = 0.1  # upper bound of the sensor's tilt
 _FARTHEST_M = 105.0
 _RANGE_STEP_M = 0.002
+_AHEAD_LOSS = 0.15  # share of the gloss that acts at perpendicular incidence
+_MOST_LOST = 0.95
 _LOST = 0.015  # share of strong returns that are lost
 _NO_RETURN_NOISE_M = 0.02
 _NO_RETURN_INTENSITY = 12.0  # mean intensity noise of rays without a return
@@ -161,9 +163,14 @@ def _scan_sector(
         struck = np.flatnonzero(hits.solid >= 0)
         x, y, z = eye[:, None] + towards[:, struck] * range_m[struck]
         albedo[struck] *= np.exp(world.ground.shading.at(x + z, y + z))
+    away = np.float32(0)
+    if streets.gloss:
+        gloss = np.append(solids["gloss"], 0.0).astype(np.float32)[hits.solid]
+        away = np.minimum(gloss * (_AHEAD_LOSS + (1 - _AHEAD_LOSS) * (1 - hits.cosine)), np.float32(_MOST_LOST))
+        albedo *= 1 - away
     # Nearly all strong rays return, but only some faint ones (far away or at a grazing angle).
     strength = albedo * hits.cosine / np.maximum(range_m / 100, np.float32(1e-3)) ** 2
-    chance = (1 - _LOST) * -np.expm1(-strength / rings.faint)
+    chance = (1 - away) * (1 - _LOST) * -np.expm1(-strength / rings.faint)
     returned = (rng.random(len(range_m), np.float32) < chance) & (range_m < farthest)
 
     range_m += np.tile(rings.range_m, fan.num_columns)

@@ -11,6 +11,9 @@ from fcos_lidar_jax.simulation.solids import BALL, BOX, DRUM, WHEEL, make_solids
 
 _MARGIN_M = 0.04  # gap between solids and their annotated box on each side, as in manual annotations
 _KINDS = {"box": BOX, "drum": DRUM, "ball": BALL, "wheel": WHEEL}
+_GLOSSY = ("vehicle.car", "vehicle.truck", "vehicle.bus", "vehicle.trailer", "vehicle.construction")
+_GLOSS_DEVIATION = 0.2  # of the vehicles of a world
+_GLASS_GLOSS = 2.5  # gloss of glass relative to paint
 _FULL = 0.96  # parts that reach this share of the box determine its extent
 _MATERIALS = {  # albedo (None for the object's paint) and density
     "paint": (None, np.inf),
@@ -121,6 +124,20 @@ def object_solids(model: ObjectModel, size_m: np.ndarray, paint: float) -> np.nd
     solids["lean"] *= scale[0] / scale[2]
     solids["albedo"][model.painted] = paint
     return solids
+
+
+def polish(rng: np.random.Generator, model: ObjectModel, solids: np.ndarray, gloss: float) -> None:
+    """Make the paint and the glass of a vehicle glossy in place, around a mean gloss; other objects stay matt.
+
+    Args:
+        solids: [s], of the model.
+        gloss: share of the grazing rays that paint reflects away, 0 to 1; glass loses more.
+    """
+    if not model.category.startswith(_GLOSSY):
+        return
+    own = np.clip(gloss + _GLOSS_DEVIATION * rng.standard_normal(), 0, 1)
+    glass = np.isclose(solids["density"], _MATERIALS["glass"][1])
+    solids["gloss"] = own * np.where(glass, _GLASS_GLOSS, model.painted)
 
 
 def vary_shape(rng: np.random.Generator, solids: np.ndarray, size_m: np.ndarray, deviation: float) -> None:

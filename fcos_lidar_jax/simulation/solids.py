@@ -20,6 +20,7 @@ SOLID = np.dtype(
         ("taper", np.float64, 2),  # ratio of top to base along x and y; drums use the first
         ("albedo", np.float64),  # 0-1
         ("density", np.float64),  # stopped rays per metre inside, inf for opaque solids
+        ("gloss", np.float64),  # share of grazing rays that are reflected away, above 1 for glass
         ("owner", np.int32),  # index of the object, -1 for scenery, -2 for the ego vehicle
     ]
 )
@@ -37,7 +38,15 @@ def make_solids(kind: int, center: object, half: object, **fields: object) -> np
     """
     center = np.atleast_2d(np.asarray(center, np.float64))
     solids = np.zeros(len(center), SOLID)
-    values = {"lean": 0.0, "taper": 1.0, "albedo": 0.3, "density": np.inf, "owner": SCENERY, **fields}
+    values = {
+        "lean": 0.0,
+        "taper": 1.0,
+        "albedo": 0.3,
+        "density": np.inf,
+        "gloss": 0.0,
+        "owner": SCENERY,
+        **fields,
+    }
     for name, value in {"kind": kind, "center": center, "half": half, **values}.items():
         solids[name] = value
     return solids

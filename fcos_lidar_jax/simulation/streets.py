@@ -47,6 +47,8 @@ class Streets:
     groups: float = 0.0  # share of pedestrians next to another pedestrian
     shape: float = 0.0  # deviation of the sizes of object parts
     sizes: float = 1.0  # factor of the deviations of box sizes
+    gloss: float = 0.0  # maximum share of grazing rays that the paint of vehicles reflects away, uniform per world
+    patchwork: float = 0.0  # deviation of the log albedo per part of an object
 
 
 PLAIN = Streets()

@@ -8,7 +8,7 @@ from numpy.random import Generator
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.simulation.ground import LANE_M, Ground
 from fcos_lidar_jax.simulation.motion import make_motion, pose_at
-from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, sample_paint, vary_shape
+from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, polish, sample_paint, vary_shape
 from fcos_lidar_jax.simulation.relief import sample_relief
 from fcos_lidar_jax.simulation.scenery import sample_scenery
 from fcos_lidar_jax.simulation.solids import SOLID, place_solids
@@ -97,11 +97,16 @@ def sample_world(
         fast_traffic=fast_traffic,
         streets=streets,
     )
-    parts = [np.zeros(0, SOLID)]
+    parts, surfaces = [np.zeros(0, SOLID)], shapes.spawn(1)[0]
+    gloss = streets.gloss * surfaces.random()
     for index, (model, size) in enumerate(zip(traffic.models, traffic.sizes, strict=True)):
         parts.append(object_solids(model, size, sample_paint(rng, model)))
         if streets.shape:
             vary_shape(shapes, parts[-1], size, streets.shape)
+        if streets.gloss:
+            polish(surfaces, model, parts[-1], gloss)
+        if streets.patchwork:
+            parts[-1]["albedo"] *= np.exp(streets.patchwork * surfaces.standard_normal(len(parts[-1])))
         parts[-1]["owner"] = index
     return World(ground, scenery, traffic, np.concatenate(parts), ego, streets, int(unit.integers(2**63)))
 

@@ -13,7 +13,14 @@ from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.simulation.ground import Ground
 from fcos_lidar_jax.simulation.lidar import SWEEP_S, Scan, sample_mount, scan
 from fcos_lidar_jax.simulation.motion import MOTION, make_motion
-from fcos_lidar_jax.simulation.objects import CLUTTER_MODELS, OBJECT_MODELS, object_solids, sample_size, vary_shape
+from fcos_lidar_jax.simulation.objects import (
+    CLUTTER_MODELS,
+    OBJECT_MODELS,
+    object_solids,
+    polish,
+    sample_size,
+    vary_shape,
+)
 from fcos_lidar_jax.simulation.relief import Relief, sample_relief
 from fcos_lidar_jax.simulation.solids import BOX, SOLID, WHEEL, corners, make_solids
 from fcos_lidar_jax.simulation.streets import CITY, PLAIN
@@ -167,6 +174,54 @@ def test_ring_gains_and_offsets_are_constant_within_a_drive():
     again = of_rings(ringed, 5, 1)
     np.testing.assert_allclose(again[0], units[0, 0], rtol=0.05)
     np.testing.assert_allclose(again[1], units[0, 1], atol=0.002)
+
+
+def test_glossy_surfaces_lose_grazing_rays():
+    """Walls at 19 m on both sides, whose rays hit at the angle of their azimuth from the normal."""
+    albedo, gloss = 0.1, 0.8
+    walls = make_solids(BOX, [[0, 20, 3], [0, -20, 3]], [90, 1, 9], albedo=albedo, gloss=gloss)
+    plain = changed(speckle=0.0, range_noise_m=0.0)
+    share, brightness = {}, {}
+    for streets in (plain, dataclasses.replace(plain, gloss=1.0)):
+        sweep = scan_of(empty_world(streets, scenery=walls))
+        points, returned = by_laser(sweep.points.astype(float)), by_laser(sweep.returned)
+        rows = slice(23, 26)  # nearly level rays
+        angle = np.arctan2(np.abs(points[..., 1]), np.abs(points[..., 0]))
+        column = np.ma.median(np.ma.array(angle, mask=~returned), axis=1).data  # of all rays of a column
+        for degrees in (10, 40, 65):
+            near = np.abs(np.degrees(column) - degrees) < 4
+            share[streets.gloss, degrees] = returned[near, rows].mean()
+            brightness[streets.gloss, degrees] = points[near, rows, 3][returned[near, rows]].mean()
+    for degrees in (10, 40, 65):
+        cosine = np.cos(np.radians(degrees))
+        lost = gloss * (0.15 + 0.85 * (1 - cosine))
+        strength = albedo * (1 - lost) * cosine / (0.19 / cosine) ** 2
+        expected = (1 - lost) * (1 - 0.015) * (1 - np.exp(-strength / plain.faint))
+        assert share[1.0, degrees] == pytest.approx(expected, abs=0.06)
+        assert brightness[1.0, degrees] == pytest.approx((1 - lost) * brightness[0.0, degrees], rel=0.1)
+    assert share[0.0, 65] > 0.9
+
+
+def test_only_paint_and_glass_of_vehicles_are_glossy():
+    vehicles = ("car", "truck", "bus", "trailer", "construction_vehicle")
+    for name, models in OBJECT_MODELS.items():
+        for model in models:
+            solids = model.solids.copy()
+            polish(default_rng(0), model, solids, 0.5)
+            glass = solids["density"] == 0.5
+            paint = solids["gloss"][model.painted].max(initial=0)
+            assert (0 < paint <= 1) == (name in vehicles)
+            np.testing.assert_allclose(solids["gloss"], paint * np.where(glass, 2.5, model.painted))
+
+
+def test_parts_of_an_object_differ_in_albedo():
+    options = {"reach_m": 40, "beyond_m": 60, "duration_s": 0.0, "labels": np.zeros(40, int)}
+    streets = changed(patchwork=0.4)
+    even, patched = (sample_world(default_rng(2), **options, streets=s).parts for s in (PLAIN, streets))
+    log_ratio = np.log(patched["albedo"] / even["albedo"])
+    assert log_ratio.std() == pytest.approx(0.4, rel=0.15)
+    assert log_ratio.mean() == pytest.approx(0, abs=0.1)
+    np.testing.assert_array_equal(patched["center"], even["center"])
 
 
 @pytest.mark.parametrize("name", OBJECT_MODELS)
