@@ -198,7 +198,7 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
             raise ValueError(f"{saved[-1]}: found a checkpoint without {RUN_SPEC}, expected another folder")
         return
     if not resume:
-        raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
+        raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
     recorded = read_json(file, dict[str, Any], what="the specification of a run")
     if spec is None:
         return
