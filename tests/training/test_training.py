@@ -124,6 +124,24 @@ def test_a_step_is_finite_without_boxes_and_points(trainer, num_points, with_box
     assert (int(metrics["positives"]) > 0) == (with_box and num_points == 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [
+        ("labels", (1, 6), r"labels: got shape \(6,\), expected \(32,\)"),
+        ("box_valid", (1, 6), r"box_valid: got shape \(6,\), expected \(32,\)"),
+        ("boxes", (2, 32, 9), r"boxes: got shape \(2, 32, 9\), expected \(1, ... ...\)"),
+        ("labels", (32,), r"labels: got shape \(32,\), expected \(1, ...\)"),
+    ],
+)
+def test_a_step_refuses_a_batch_whose_arrays_do_not_fit_each_other(trainer, name, shape, message):
+    detector, state, _, _ = trainer
+    step = make_train_step(detector, make_optimizer(CONFIG.optimizer, STEPS))
+    batch = empty_batch(1)
+    batch = dataclasses.replace(batch, **{name: np.zeros(shape, getattr(batch, name).dtype)})
+    with pytest.raises(ValueError, match=f"^{message}"):
+        jax.eval_shape(step, state, batch)
+
+
 def test_a_step_on_a_packed_batch_is_bit_identical():
     """To a step on a plain batch with its valid rows in front; in any order, the metrics are bit-identical.
 
