@@ -12,6 +12,7 @@ from jax import lax
 
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.packing import unpack
 from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
@@ -42,6 +43,7 @@ def make_state(
     >>> sorted(state.params)
     ['backbone', 'fpn', 'heads', 'stem']
     """
+    check(not isinstance(key, int), "key", key, f"a random key, such as jax.random.key({key})")
     variables = detector.init(key) if variables is None else variables
     state = TrainState(
         step=jnp.zeros((), jnp.int32),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -187,6 +188,12 @@ def test_a_step_keeps_the_types_of_the_state_and_none_is_weak(trainer):
 
     assert kinds(state) == kinds(after)
     assert not any(getattr(kind, "weak_type", False) for kind in kinds(state))
+
+
+def test_a_seed_is_no_key(trainer):
+    unchecked = inspect.unwrap(make_state)  # without the types that the tests check in signatures
+    with pytest.raises(ValueError, match=r"^key: got 7, expected a random key, such as jax.random.key\(7\)$"):
+        unchecked(trainer[0], make_optimizer(CONFIG.optimizer, STEPS), 7)
 
 
 def test_schedules_have_the_end_points_of_the_paper():
