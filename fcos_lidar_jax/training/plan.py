@@ -43,15 +43,19 @@ RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 class Schedule:
     """Steps of a run at which it saves checkpoints and evaluates.
 
+    Attributes:
+        save_every: steps between checkpoints; by default a fiftieth of the run.
+        evaluate_every: steps between evaluations, each of which also saves a checkpoint; by default a tenth of the
+            run, but at least 100. The last step is always evaluated.
+        keep: number of newest checkpoints to keep, in addition to the best.
+
     >>> Schedule(save_every=100).keep
     2
     """
 
-    save_every: int | None = None  # steps between checkpoints; by default a fiftieth of the run
+    save_every: int | None = None
     evaluate_every: int | None = None
-    """Steps between evaluations, each of which also saves a checkpoint; by default a tenth of the run, but at
-    least 100. The last step is always evaluated."""
-    keep: int = 2  # number of newest checkpoints to keep, in addition to the best
+    keep: int = 2
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
