@@ -88,7 +88,9 @@ def _short_arrays(text: str) -> str:
 
 def _whole_comment(app, what, name, obj, options, lines):
     """A colon in the comment of a field is no end of a type, which napoleon takes it for in the first line."""
-    if what in ("attribute", "data", "property"):
+    if lines and lines[0].startswith("Alias for field number"):  # Python's text for fields of named tuples
+        lines.clear()
+    elif what in ("attribute", "data", "property"):
         lines.insert(0, "\\")
 
 

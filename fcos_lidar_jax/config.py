@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
-from fcos_lidar_jax.fields import check, check_least, check_types, from_json
+from fcos_lidar_jax.fields import check, check_least, check_per_class, check_types, from_json
 from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
 
@@ -344,9 +344,7 @@ class Config:
         enough = stem.group_rounds or stem.channels_per_type >= rounds
         expected = f"at least the {rounds} rounds, which are convolved separately"
         check(enough, "model.stem.channels_per_type", stem.channels_per_type, expected)
-        targets = self.copy_paste.targets if self.copy_paste else ()
-        for field, values in (("class_ranges_m", self.class_ranges_m), ("copy_paste.targets", targets)):
-            check(len(values) in (0, len(names)), field, values, f"{len(names)} values, one per class, or none")
+        check_per_class("class_ranges_m", self.class_ranges_m, names)
         check(all(v > 0 for v in self.class_ranges_m), "class_ranges_m", self.class_ranges_m, "values above 0")
         for axis in self.inference.flips if self.inference.flips != "none" else "":
             trained = self.augment is not None and getattr(self.augment, f"flip_{axis}_probability") > 0
@@ -374,9 +372,15 @@ class Config:
 
     @property
     def paste_targets(self) -> tuple[int, ...]:
-        """Number of boxes per class up to which copy-paste fills a frame; zeros without copy-paste."""
+        """Number of boxes per class up to which copy-paste fills a frame; zeros without copy-paste.
+
+        Raises:
+            ValueError: the number of targets is not the number of classes. Not refused at construction, because
+                the targets of a preset do not matter to ``train --classes ... --no-copy-paste``.
+        """
         if self.copy_paste is None:
             return (0,) * len(self.classes)
+        check_per_class("copy_paste.targets", self.copy_paste.targets, self.classes)
         by_name = tuple(PASTE_TARGETS.get(name, DEFAULT_PASTE_TARGET) for name in self.classes)
         return self.copy_paste.targets or by_name
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 
@@ -21,6 +21,12 @@ def check_least(record: Any, least: int, *fields: str) -> None:
     """Check that fields of a dataclass are not below a number."""
     for field in fields:
         check(getattr(record, field) >= least, field, getattr(record, field), f"at least {least}")
+
+
+def check_per_class(field: str, values: Collection[object], classes: Collection[str]) -> None:
+    """Check that a field has one value per class, or no values, which stand for the usual ones."""
+    expected = f"{len(classes)} values, one per class, or no values for the usual ones"
+    check(len(values) in (0, len(classes)), field, values, expected)
 
 
 def check_types(record: Any) -> None:

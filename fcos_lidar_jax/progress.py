@@ -10,10 +10,11 @@ class Progress:
     """Prints progress lines to stderr, identical on a terminal and in a pipe.
 
     The rate excludes the work before the first call, which often includes compilation. ``unit`` names the counted
-    items, in the plural. Lines are at least ``every_s`` seconds apart; the last item always prints one.
+    items, in the plural. Lines are at least ``every_s`` seconds apart; the last item always prints one. Without
+    ``total``, lines have no time left.
     """
 
-    def __init__(self, unit: str, total: int, *, every_s: float = 10.0) -> None:
+    def __init__(self, unit: str, total: int | None, *, every_s: float = 10.0) -> None:
         self.unit, self.total, self.every_s = unit, total, every_s
         self._began: tuple[float, int] | None = None
         self._next = 0.0
@@ -23,14 +24,16 @@ class Progress:
         now = time.monotonic()
         if self._began is None:
             self._began = now, done
-        if now < self._next and done < self.total:
+        if now < self._next and done != self.total:
             return
         self._next = now + self.every_s
         began, first = self._began
-        line = f"{self.unit} {done}/{self.total}" + (f"  {text}" if text else "")
+        line = f"{self.unit} {done}" + ("" if self.total is None else f"/{self.total}")
+        line += f"  {text}" if text else ""
         if done > first and now > began:
             rate = (done - first) / (now - began)
-            line += f"  {rate:.2f} {self.unit}/s, {(self.total - done) / rate:.0f} s left"
+            line += f"  {rate:.2f} {self.unit}/s"
+            line += "" if self.total is None else f", {(self.total - done) / rate:.0f} s left"
         _print(line)
 
 

@@ -83,6 +83,14 @@ class RangeImage:
 class Batch:
     """One training batch: raw points and padded ground truth.
 
+    Attributes:
+        points: f32[b, n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser
+            number as a sixth column for sensors with ``row_source="laser"``; arbitrary where invalid.
+        valid: bool[b, n]: False for padding.
+        boxes: f32[b, m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN velocity where unknown; arbitrary where invalid.
+        labels: i32[b, m]: class index.
+        box_valid: bool[b, m]: False for padding.
+
     >>> clouds = np.zeros((2, 4096, 5)), np.zeros((2, 4096), bool)
     >>> batch = Batch(*clouds, np.zeros((2, 32, 9)), np.zeros((2, 32), int), np.zeros((2, 32), bool))
     >>> jax.tree.map(lambda leaf: leaf[0], batch).boxes.shape  # of the first sample
@@ -90,12 +98,10 @@ class Batch:
     """
 
     points: Float32[Array, "b n c"]
-    """x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a sixth column
-    for sensors with ``row_source="laser"``; arbitrary where invalid."""
-    valid: Bool[Array, "b n"]  # False for padding.
-    boxes: Float32[Array, "b m 9"]  # Boxes, see the module docstring; arbitrary where invalid.
-    labels: Int32[Array, "b m"]  # Class index.
-    box_valid: Bool[Array, "b m"]  # False for padding.
+    valid: Bool[Array, "b n"]
+    boxes: Float32[Array, "b m 9"]
+    labels: Int32[Array, "b m"]
+    box_valid: Bool[Array, "b m"]
 
 
 @jax.tree_util.register_dataclass

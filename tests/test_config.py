@@ -180,7 +180,7 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: Config(classes=["crate"]),  # type: ignore[arg-type]
         lambda: Config(augment=AugmentConfig(scale_range=[0.9, 1.1])),  # type: ignore[arg-type]
         lambda: Config(class_ranges_m=(50.0,)),
-        lambda: Config(copy_paste=CopyPasteConfig(targets=(2, 2))),
+        lambda: Config(copy_paste=CopyPasteConfig(targets=(2, 2))).paste_targets,
     ],
 )
 def test_nonsense_is_refused_at_construction(make):

@@ -21,11 +21,15 @@ import fcos_lidar_jax
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import demo
 from fcos_lidar_jax.cli.commands import parse
+from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.evaluation.kitti_results import kitti_types
 from fcos_lidar_jax.input_pipeline.open import READERS
+from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import SHORT_RANGE, Sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.training import Schedule
+from fcos_lidar_jax.types import Batch
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -91,6 +95,13 @@ def test_every_public_function_and_class_has_an_example():
     missing = [name for name, value in listed.items() if ">>>" not in (value.__doc__ or "")]
     assert len(listed) > 100
     assert missing == []
+
+
+@pytest.mark.parametrize("kind", [Frame, Batch, Detector, Schedule])
+def test_help_describes_the_fields(kind):
+    _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
+    described = re.findall(r"^    (\w+): ", section, re.MULTILINE)
+    assert described == list(inspect.signature(kind).parameters)
 
 
 def belongs_to(module, value) -> bool:

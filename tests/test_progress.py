@@ -20,6 +20,16 @@ def test_the_first_and_last_item_print_a_line(capsys):
     assert 10 < float(rate[1]) <= 50
 
 
+def test_without_a_total_lines_have_a_rate_and_no_time_left(capsys):
+    progress = Progress("sweeps", None, every_s=0.05)
+    for done in (1, 2, 3):
+        progress.show(done)
+        time.sleep(0.03)
+    first, last = capsys.readouterr().err.splitlines()
+    assert first == "sweeps 1"
+    assert re.fullmatch(r"sweeps 3  \d+\.\d\d sweeps/s", last)
+
+
 def test_the_rate_of_resumed_work_counts_only_new_items(capsys):
     progress = Progress("steps", 100, every_s=0)
     progress.show(90)

@@ -249,6 +249,17 @@ def test_batches_and_masks_of_other_lengths_are_rejected(points, valid):
         unchecked(np.zeros(points, np.float32), np.zeros(valid, bool), SMALL)
 
 
+def test_names_of_sensors_and_lists_are_rejected():
+    unchecked, mask = inspect.unwrap(project_points), np.ones(400, bool)
+    for points, valid, sensor, message in (
+        (cloud(0), mask, "tiny", r"sensor: got 'tiny', expected a Sensor, such as load_sensor\(NAME\)"),
+        (cloud(0).tolist(), mask, SMALL, "points: got 'list', expected an array"),
+        (cloud(0), [True] * 400, SMALL, "valid: got 'list', expected an array"),
+    ):
+        with pytest.raises(ValueError, match=f"^{message}$"):
+            unchecked(points, valid, sensor)
+
+
 def bits(image):
     return [np.asarray(image.features).view(np.uint32), np.asarray(image.point_index)]
 

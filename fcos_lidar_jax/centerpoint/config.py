@@ -5,7 +5,7 @@ import math
 from typing import Any, Literal
 
 from fcos_lidar_jax.config import Config, LossConfig, ModelConfig
-from fcos_lidar_jax.fields import check, check_least, check_types
+from fcos_lidar_jax.fields import check, check_least, check_per_class, check_types
 from fcos_lidar_jax.sensors import Sensor
 
 _RANGE_VIEW_LOSSES = (
@@ -70,9 +70,7 @@ class CenterPointConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        groups, names = self.pillars.groups, self.classes
-        expected = f"{len(names)} values, one per class, or none"
-        check(len(groups) in (0, len(names)), "pillars.groups", groups, expected)
+        check_per_class("pillars.groups", self.pillars.groups, self.classes)
         check(self.model == ModelConfig(), "model", "changes", "the default: pillars takes its place")
         for name in _RANGE_VIEW_LOSSES:
             own, default = getattr(self.loss, name), getattr(LossConfig(), name)

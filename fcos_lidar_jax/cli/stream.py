@@ -30,7 +30,7 @@ from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.stream import SweepDetections, detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
-from fcos_lidar_jax.progress import tell
+from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, in_frame_of
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
@@ -55,7 +55,7 @@ class Stream:
     """
 
     checkpoint: options.Detector
-    out: Annotated[Path, option("FILE.jsonl")]  # File to write.
+    out: Annotated[Path, option("FILE.jsonl")]  # File to write; an earlier file is replaced.
     output_format: options.OutputFormat = "json"
     calibration: options.Calibration = None
     source: tyro.conf.Positional[Annotated[Path | None, option("SOURCE")]] = None
@@ -114,7 +114,7 @@ def run(args: Stream) -> None:
     _tell_notes(drive.notes)
     frames: list[PageFrame] = []
     tracks, before_us, num_truncated, num_points = Tracks(), None, 0, 0
-    unusable = list[str | None]()
+    unusable, progress = list[str | None](), Progress("sweeps", None)
     shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
     with (
         rerun_recording(args.rrd, detector.classes, min_score=shown_score) as record_rerun,
@@ -149,6 +149,7 @@ def run(args: Stream) -> None:
             if args.page is not None:
                 frames.append(page_frame(points, (boxes, labels, scores), **details))
             before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
+            progress.show(len(unusable), f"{found.sweep.name}: {len(boxes)} boxes")
         if line := unusable_clouds([*filter(None, unusable)], len(unusable)):
             drive.notes.append(line)
     _tell_notes(drive.notes)

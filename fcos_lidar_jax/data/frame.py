@@ -20,18 +20,24 @@ from fcos_lidar_jax.sensors import Sensor
 class Frame:
     """Points and boxes of one keyframe in its LiDAR frame, unpadded.
 
+    Attributes:
+        points: f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number
+            as a sixth column for sensors whose rows come from it.
+        boxes: f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN velocity where unknown.
+        labels: i32[m]: index into the ``classes`` of the frame set.
+        num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box.
+        num_close: number of points on the ego vehicle that the reader removed, see :func:`drop_close`.
+
     >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
     >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
     [4.0, 2.0, 2.0]
     """
 
     points: np.ndarray
-    """f32[n, c]: x, y, z, intensity (0-255), time lag (s, 0 for the current sweep), and the laser number as a
-    sixth column for sensors whose rows come from it."""
-    boxes: np.ndarray  # f32[m, 9]: ``x, y, z, l, w, h, yaw, vx, vy``; NaN velocity where unknown.
-    labels: np.ndarray  # i32[m]: index into the ``classes`` of the frame set.
-    num_points: np.ndarray  # i32[m]: annotated number of LiDAR points of the current sweep in each box.
-    num_close: int = 0  # Points on the ego vehicle that the reader removed, see :func:`drop_close`.
+    boxes: np.ndarray
+    labels: np.ndarray
+    num_points: np.ndarray
+    num_close: int = 0
 
 
 @runtime_checkable

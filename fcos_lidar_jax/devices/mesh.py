@@ -53,11 +53,21 @@ def replicate(tree: Tree, mesh: Mesh) -> Tree:
 def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
     """Split a batch along its first axis; each process passes its own rows of the global batch, in order.
 
+    Raises:
+        ValueError: the devices of this process cannot share the rows evenly.
+
     >>> shard_batch(np.zeros((4, 3)), make_mesh(jax.devices()[:1])).shape
     (4, 3)
     """
-    sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
-    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), batch)
+    sharding, number = NamedSharding(mesh, PartitionSpec(_AXIS)), len(mesh.local_devices)
+
+    def place(leaf: Any) -> jax.Array:
+        rows = np.asarray(leaf)
+        if number and len(rows) % number:
+            raise ValueError(f"batch: got {len(rows)} rows, expected a multiple of the {number} devices")
+        return jax.make_array_from_process_local_data(sharding, rows)
+
+    return jax.tree.map(place, batch)
 
 
 def check_batch_size(batch_size: int, mesh: Mesh) -> None:

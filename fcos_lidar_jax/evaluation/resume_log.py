@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fcos_lidar_jax.files import naming
+from fcos_lidar_jax.progress import tell
 
 
 class ResumeLog:
@@ -65,6 +66,8 @@ class ResumeLog:
     def __enter__(self) -> "ResumeLog":
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind in (KeyboardInterrupt, SystemExit) and len(self):
+            tell("the same command resumes")
         with naming(self.path):
             self._stream.close()

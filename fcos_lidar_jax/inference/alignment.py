@@ -60,8 +60,25 @@ class Alignment:
 
     def tell_notes(self) -> None:
         """Print the notes, once per process. Call it after reading points, because an error makes them moot."""
-        for line in self.notes:
+        for line in (*self.notes, *self._unknown_heading()):
             tell(line, once=True)
+
+    def _unknown_heading(self) -> tuple[str, ...]:
+        """A line if clouds are not rotated because only one of the headings is known."""
+        unknown = [sensor.forward_rad is None for sensor in (self.data, self.detector)]
+        if self.yaw_rad is not None or all(unknown) or not any(unknown):
+            return ()
+        whose = "their sensor" if unknown[0] else "the detector's sensor"
+        why = f"since the heading of {whose} is unknown (forward_rad){self._expected_axis}"
+        return (f"note: clouds are not rotated, {why}; --yaw-deg rotates them",)
+
+    @property
+    def _expected_axis(self) -> str:
+        """The end of a line: the axis that points forward for the detector, if it is one."""
+        ahead = self.detector.forward_rad
+        axes = {0.0: "x", 90.0: "y", 180.0: "-x", -180.0: "-x", -90.0: "-y"}
+        axis = None if ahead is None else axes.get(round(math.degrees(ahead), 2))
+        return f": the detector expects {axis} ahead" if axis else ""
 
     def describe(self) -> str:
         """One line about what is done to the clouds; ``""`` for nothing."""
@@ -71,11 +88,7 @@ class Alignment:
         steps = [f"rotated by {turn:g} degrees"] if turn else []
         if (shift := pose[:3, 3]).any():
             steps.append(f"shifted by ({', '.join(f'{v:.2f}' for v in shift)}) m")
-        ahead = self.detector.forward_rad
-        axes = {0.0: "x", 90.0: "y", 180.0: "-x", -180.0: "-x", -90.0: "-y"}
-        axis = None if ahead is None else axes.get(round(math.degrees(ahead), 2))
-        why = f": the detector expects {axis} ahead" if turn and axis else ""
-        return f"clouds {' and '.join(steps)}, and boxes transformed back{why}"
+        return f"clouds {' and '.join(steps)}, and boxes transformed back{self._expected_axis if turn else ''}"
 
 
 def heading(detector: Sensor, turn_rad: float) -> float | None:

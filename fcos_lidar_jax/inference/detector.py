@@ -88,8 +88,9 @@ class CloudDetector(abc.ABC):
 
         Args:
             points: a point file, see :func:`~fcos_lidar_jax.data.point_files.read_points`; or [n, 3 to 6]: x, y, z
-                in metres, intensity, time lag in seconds, laser number, as in an array file. Under ``jax.jit``,
-                call the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
+                in metres, intensity, time lag in seconds, laser number, as in an array file. The sensor scales
+                intensities unless most would exceed 255, as in points of frames, which are already scaled. Under
+                ``jax.jit``, call the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
             sensor: sensor that recorded the points, or its name or JSON file; gives their heading, position and
                 intensity scale. By default the detector's or, for files in the folders of KITTI and Argoverse 2,
                 theirs.
@@ -110,7 +111,7 @@ class CloudDetector(abc.ABC):
         if is_file:
             rows, num_close = read_cloud(points, data, reading, full_turn=full_turn)
         else:
-            rows, num_close = drop_close(points_from_array(points, data), data, reading)
+            rows, num_close = drop_close(_scaled_once(points, data), data, reading)
         aligned.tell_notes()
         rows = aligned.points(rows)
         if line := sensor_mismatch(rows, self.sensor, recorded_by(paths)):
@@ -136,6 +137,14 @@ class CloudDetector(abc.ABC):
         mesh = make_mesh(jax.local_devices()[:1])
         found = self.program(mesh)(*shard_batch((cloud.points[None], cloud.valid[None]), mesh))
         return jax.tree.map(lambda leaf: leaf[0], jax.device_get(found))
+
+
+def _scaled_once(points: Rows, sensor: Sensor) -> np.ndarray:
+    """An array in the columns of a sensor; its intensities are scaled unless they were before."""
+    rows = points_from_array(points, sensor)
+    if (rows[:, 3] > 255).mean() > 0.5:
+        return points_from_array(points, dataclasses.replace(sensor, intensity_scale=1.0))
+    return rows
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)

@@ -75,12 +75,14 @@ def write_predictions(
         number = 0
         for number, group in enumerate(groups, 1):
             removed = [sum(counts) for counts in zip(removed, *map(_removed, group), strict=True)]
+            lines = [_unusable(detector, names[prediction.index], prediction) for prediction in group]
+            without = _in_any_process([line is not None for line in lines])
             with agreed("cannot write"):
                 if log is not None:
-                    for prediction in group:
+                    for prediction, line, is_unusable in zip(group, lines, without, strict=True):
                         name, found = names[prediction.index], entries(prediction.index, prediction.detections)
-                        if line := _unusable(detector, name, prediction):
-                            unusable[name] = line, found
+                        if is_unusable:
+                            unusable[name] = line or f"{name}: no usable points", found
                         else:
                             log.add(name, found)
                         progress.show(len(log) + len(unusable))
@@ -111,6 +113,11 @@ def _unusable(detector: CloudDetector, name: str, prediction: Prediction) -> str
     if prediction.cloud is None:
         return None
     return no_usable_points(name, prediction.cloud, int(prediction.detections.num_dropped), detector.sensor)
+
+
+def _in_any_process(flags: list[bool]) -> list[bool]:
+    """Whether each flag is set in any process."""
+    return multihost_utils.process_allgather(np.array(flags)[None], tiled=True).any(axis=0).tolist()
 
 
 def _in_order(names: Sequence[str], log: ResumeLog, others: dict[str, Any]) -> Iterator[tuple[str, bytes]]:

@@ -88,6 +88,8 @@ def make_batch(frames: Sequence[Frame], *, max_points: int, max_boxes: int) -> B
     ... ]
     ((2, 4096, 5), (2, 64, 9), True)
     """
+    if isinstance(frames, Frame):
+        raise ValueError("frames: got a Frame, expected a list of frames")
     if not frames:
         raise ValueError("frames: got none, expected at least one")
     columns = frames[0].points.shape[-1]

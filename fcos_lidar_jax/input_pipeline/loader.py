@@ -256,6 +256,7 @@ def check_loader_options(config: Config, *, threads: int | None, workers: int, n
     """Check the options of :func:`make_batches` before a run begins."""
     for name, value in (("threads", threads), ("workers", workers)):
         check(value is None or value >= 0, name, value, "at least 0")
+    _ = config.paste_targets  # refuses
     if workers:
         _check_shared_memory(config, workers, num_processes)
 

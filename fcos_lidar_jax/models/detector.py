@@ -31,6 +31,20 @@ Variables = dict[str, Any]  # ``params`` and ``batch_stats``, plain dicts of arr
 class Detector(NamedTuple):
     """A detector as pure functions, with its configuration and sensor.
 
+    Attributes:
+        prepare: ``(points f32[n, c], valid bool[n]) -> input`` converts one cloud to the network's input: a pytree
+            with ``num_dropped`` i32[], the number of excluded valid points. FCOS-LiDAR's is a
+            :class:`~fcos_lidar_jax.types.RangeImage`.
+        init: ``key -> variables``.
+        apply: ``(variables, inputs, train=False) -> (outputs, batch_stats)`` for a batch of inputs. The batch
+            statistics are unchanged unless training. FCOS-LiDAR's outputs are
+            :class:`~fcos_lidar_jax.types.Outputs`.
+        sums: ``(outputs, inputs, batch) -> Sums``, the losses of a batch.
+        candidates: ``(outputs, input) -> (boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c])`` for one
+            cloud, before NMS.
+        config: the configuration.
+        sensor: the sensor whose clouds it takes.
+
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
     >>> detector = build_detector(QUICKSTART, SHORT_RANGE)
@@ -43,17 +57,10 @@ class Detector(NamedTuple):
     """
 
     prepare: Callable[..., Any]
-    """``(points f32[n, c], valid bool[n]) -> input`` converts one cloud to the network's input: a pytree with
-    ``num_dropped`` i32[], the number of excluded valid points. FCOS-LiDAR's is a
-    :class:`~fcos_lidar_jax.types.RangeImage`."""
-    init: Callable[[Any], Variables]  # ``key -> variables``.
+    init: Callable[[Any], Variables]
     apply: Callable[..., tuple[Any, Any]]
-    """``(variables, inputs, train=False) -> (outputs, batch_stats)`` for a batch of inputs. The batch statistics
-    are unchanged unless training. FCOS-LiDAR's outputs are :class:`~fcos_lidar_jax.types.Outputs`."""
-    sums: Callable[[Any, Any, Batch], Sums]  # ``(outputs, inputs, batch) -> Sums``, the losses of a batch.
+    sums: Callable[[Any, Any, Batch], Sums]
     candidates: Callable[[Any, Any], tuple[Array, Array, Array, Array]]
-    """``(outputs, input) -> (boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c])`` for one cloud, before
-    NMS."""
     config: Config
     sensor: Sensor
 

@@ -43,15 +43,19 @@ RUN_SPEC = "run.json"  # file with the specification of a run in its folder
 class Schedule:
     """Steps of a run at which it saves checkpoints and evaluates.
 
+    Attributes:
+        save_every: steps between checkpoints; by default a fiftieth of the run.
+        evaluate_every: steps between evaluations, each of which also saves a checkpoint; by default a tenth of the
+            run, but at least 100. The last step is always evaluated.
+        keep: number of newest checkpoints to keep, in addition to the best.
+
     >>> Schedule(save_every=100).keep
     2
     """
 
-    save_every: int | None = None  # steps between checkpoints; by default a fiftieth of the run
+    save_every: int | None = None
     evaluate_every: int | None = None
-    """Steps between evaluations, each of which also saves a checkpoint; by default a tenth of the run, but at
-    least 100. The last step is always evaluated."""
-    keep: int = 2  # number of newest checkpoints to keep, in addition to the best
+    keep: int = 2
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -198,7 +202,7 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
             raise ValueError(f"{saved[-1]}: found a checkpoint without {RUN_SPEC}, expected another folder")
         return
     if not resume:
-        raise ValueError(f"{folder}: holds a run, expected --resume or another folder")
+        raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
     recorded = read_json(file, dict[str, Any], what="the specification of a run")
     if spec is None:
         return

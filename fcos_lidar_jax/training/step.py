@@ -12,11 +12,12 @@ from jax import lax
 
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.packing import unpack
 from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
-from fcos_lidar_jax.types import Batch, PackedBatch, Sums, TrainState
+from fcos_lidar_jax.types import Batch, PackedBatch, Sums, TrainState, check_rows
 
 TrainStep = Callable[[TrainState, Batch | PackedBatch], tuple[TrainState, Metrics]]
 
@@ -42,6 +43,7 @@ def make_state(
     >>> sorted(state.params)
     ['backbone', 'fpn', 'heads', 'stem']
     """
+    check(not isinstance(key, int), "key", key, f"a random key, such as jax.random.key({key})")
     variables = detector.init(key) if variables is None else variables
     state = TrainState(
         step=jnp.zeros((), jnp.int32),
@@ -125,7 +127,8 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
 
     Returns:
         pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. A packed batch is unpacked first.
-        Metrics are scalars except ``positives_per_level`` i32[6].
+        Metrics are scalars except ``positives_per_level`` i32[6]. Raises a ValueError at trace time if the arrays
+        of the batch have different numbers of samples or boxes.
 
     >>> from fcos_lidar_jax.inference import load_trained
     >>> from fcos_lidar_jax.training import make_optimizer
@@ -153,7 +156,9 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         return dataclasses.replace(batch, points=points, boxes=boxes)
 
     def step(state: TrainState, batch: Batch | PackedBatch) -> tuple[TrainState, Metrics]:
-        batch = augmented(state, unpack(batch))
+        batch = unpack(batch)
+        _check_batch(batch)
+        batch = augmented(state, batch)
         grads, batch_stats, metrics = gradient(state.params, state.batch_stats, batch)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
@@ -167,6 +172,14 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         return TrainState(state.step + 1, params, batch_stats, opt_state, ema, state.key), metrics
 
     return step
+
+
+def _check_batch(batch: Batch) -> None:
+    """Refuse arrays of different numbers of samples, or of boxes per sample."""
+    size = len(batch.points)
+    check_rows(size, axes=3, boxes=batch.boxes)
+    check_rows(size, axes=2, valid=batch.valid, labels=batch.labels, box_valid=batch.box_valid)
+    check_rows(batch.boxes.shape[1], labels=batch.labels[0], box_valid=batch.box_valid[0])
 
 
 def detection_variables(state: TrainState) -> dict[str, Any]:

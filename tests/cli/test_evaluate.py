@@ -157,6 +157,7 @@ def test_a_checkpoint_is_evaluated_and_an_interrupted_evaluation_resumes(home, t
     monkeypatch.setattr(comparison, "result_entries", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(args)
+    assert capsys.readouterr().err.endswith("the same command resumes\n")
     assert {path.name for path in cut.iterdir()} == {"results_nusc.resume_log", ".lock"}
     run(args)
     assert len(done) == 5 + 2

@@ -59,6 +59,15 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     )
 
 
+def test_the_number_of_targets_of_copy_paste_matters_only_with_copy_paste(tmp_path, capsys):
+    args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
+    args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--val-split", "none", "--evaluate-every", "4"]
+    assert_one_line_error(capsys, [*args, "--no-copy-paste"], "--evaluate-every: got 4 with --val-split none")
+    args = args[:-4]
+    expected = "expected 3 values, one per class, or no values for the usual ones$"
+    assert_one_line_error(capsys, args, rf"copy_paste.targets: got \(.*\), {expected}")
+
+
 def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_path, capsys):
     args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
     args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--steps", "4"]

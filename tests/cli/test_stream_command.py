@@ -131,7 +131,9 @@ def test_keyframes_option_skips_the_boxes_of_other_sweeps(home, tmp_path, capsys
     command("stream", data, "--out", tmp_path / "all.jsonl")
     capsys.readouterr()
     command("stream", data, "--keyframes --out", tmp_path / "some.jsonl")
-    assert "3 sweeps: " in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "3 sweeps: " in told
+    assert re.search(r"^sweeps 1  \S+: \d+ boxes$", told, re.MULTILINE)
     every, some = (tmp_path / f"{name}.jsonl" for name in ("all", "some"))
     lines = some.read_text().splitlines()
     assert len(lines) == 3

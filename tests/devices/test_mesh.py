@@ -78,6 +78,8 @@ def check_odd_batch(mesh) -> None:
     check_batch_size(4, mesh)
     with pytest.raises(ValueError, match=r"^batch_size: got 3, expected a multiple of the 2 devices$"):
         check_batch_size(3, mesh)
+    with pytest.raises(ValueError, match=r"^batch: got 3 rows, expected a multiple of the 2 devices$"):
+        shard_batch({"x": np.zeros((3, 1))}, mesh)
 
 
 def test_two_devices_share_a_batch_in_both_forms():

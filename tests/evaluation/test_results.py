@@ -224,6 +224,24 @@ def test_entries_are_the_best_500_boxes():
     assert result_entries(found(5, 0), "a", np.eye(4)) == []
 
 
+def test_an_interrupted_command_says_that_it_resumes_if_something_is_in_the_log(tmp_path, capsys):
+    def fail(resume_log, error, *tokens):
+        for token in tokens:
+            resume_log.add(token, [])
+        raise error
+
+    said = "the same command resumes\n"
+    for error, tokens, expected in (
+        (KeyboardInterrupt, "", ""),
+        (ValueError, "a", ""),
+        (KeyboardInterrupt, "b", said),
+        (SystemExit, "", said),
+    ):
+        with pytest.raises(error), ResumeLog(tmp_path / "resume_log", "x") as resume_log:
+            fail(resume_log, error, *tokens)
+        assert capsys.readouterr().err == expected
+
+
 def test_a_resume_log_survives_interruptions(tmp_path):
     file = tmp_path / "resume_log"
     with ResumeLog(file, "one") as resume_log:

@@ -50,9 +50,27 @@ def test_a_sensor_with_another_number_of_rows_gives_a_warning(capsys):
     assert capsys.readouterr().err == ""
     for _ in range(2):
         aligned.tell_notes()
-    expected = "vlp16 has 16 rows, and the detector's sensor 32: expect poor detections"
-    assert capsys.readouterr().err == f"warning: {expected}\n"
+    expected = "warning: vlp16 has 16 rows, and the detector's sensor 32: expect poor detections"
+    assert capsys.readouterr().err.count(expected) == 1
     assert align(NUSCENES_HDL32E, dataclasses.replace(NUSCENES_HDL32E, forward_rad=0.0)).notes == ()
+
+
+def test_a_note_says_if_only_one_heading_is_known(capsys):
+    why = "since the heading of their sensor is unknown (forward_rad): the detector expects y ahead"
+    unknown = dataclasses.replace(TINY, forward_rad=None)
+    for aligned, expected in (
+        (align(TINY, unknown), f"note: clouds are not rotated, {why}; --yaw-deg rotates them\n"),
+        (Alignment(unknown, TINY, yaw_rad=0.0), ""),
+        (align(unknown), ""),
+        (Alignment(TINY, TINY), ""),
+        (
+            Alignment(TINY, unknown),
+            "note: clouds are not rotated, since the heading of the detector's sensor is unknown (forward_rad); "
+            "--yaw-deg rotates them\n",
+        ),
+    ):
+        aligned.tell_notes()
+        assert capsys.readouterr().err == expected
 
 
 def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(capsys):

@@ -64,6 +64,24 @@ def test_frames_without_usable_points_are_reported_and_only_such_frames_refused(
     assert f"note: 1 of 3 clouds without usable points, and so without boxes: {first}" in capsys.readouterr().err
 
 
+def test_frames_without_usable_points_of_other_processes_are_counted(monkeypatch, tmp_path, capsys):
+    def predict_groups(detector, frames, *, indices, **how):
+        cloud, boxes = cloud_and_boxes(9)
+        yield [Prediction(index, boxes, None, cloud if index == 2 else None) for index in range(3)]
+
+    def of_two(own, tiled):
+        return np.concatenate([own, [[True, False, False]]]) if own.dtype == bool else own
+
+    assert results._in_any_process([True, False]) == [True, False]
+    monkeypatch.setattr(results, "predict_groups", predict_groups)
+    monkeypatch.setattr(results.multihost_utils, "process_allgather", of_two)
+    how = {"entries": lambda index, boxes: [], "write": lambda path, entries: [*entries]}
+    results.write_predictions(load_detector("quickstart"), ToyFrames(size=3), tmp_path / "x.json", **how)
+    told = capsys.readouterr().err
+    assert "note: 2 of 3 clouds without usable points" in told
+    assert "the first is toy 0: no usable points\n" in told
+
+
 def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_before(
     monkeypatch, tmp_path, capsys
 ):

@@ -430,7 +430,7 @@ def test_a_different_ground_truth_database_of_the_same_frames_is_refused(begun, 
 
 
 def test_a_folder_with_another_run_or_none_is_refused(begun, tmp_path):
-    with pytest.raises(ValueError, match="holds a run, expected --resume or another folder"):
+    with pytest.raises(ValueError, match=r"holds a run, expected another folder or --resume, in Python resume=T"):
         train_tiny(begun)
     with pytest.raises(ValueError, match=r"run.json: found nothing, expected the run to resume"):
         train_tiny(tmp_path / "nothing", resume=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -124,6 +125,24 @@ def test_a_step_is_finite_without_boxes_and_points(trainer, num_points, with_box
     assert (int(metrics["positives"]) > 0) == (with_box and num_points == 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [
+        ("labels", (1, 6), r"labels: got shape \(6,\), expected \(32,\)"),
+        ("box_valid", (1, 6), r"box_valid: got shape \(6,\), expected \(32,\)"),
+        ("boxes", (2, 32, 9), r"boxes: got shape \(2, 32, 9\), expected \(1, ... ...\)"),
+        ("labels", (32,), r"labels: got shape \(32,\), expected \(1, ...\)"),
+    ],
+)
+def test_a_step_refuses_a_batch_whose_arrays_do_not_fit_each_other(trainer, name, shape, message):
+    detector, state, _, _ = trainer
+    step = make_train_step(detector, make_optimizer(CONFIG.optimizer, STEPS))
+    batch = empty_batch(1)
+    batch = dataclasses.replace(batch, **{name: np.zeros(shape, getattr(batch, name).dtype)})
+    with pytest.raises(ValueError, match=f"^{message}"):
+        jax.eval_shape(step, state, batch)
+
+
 def test_a_step_on_a_packed_batch_is_bit_identical():
     """To a step on a plain batch with its valid rows in front; in any order, the metrics are bit-identical.
 
@@ -169,6 +188,12 @@ def test_a_step_keeps_the_types_of_the_state_and_none_is_weak(trainer):
 
     assert kinds(state) == kinds(after)
     assert not any(getattr(kind, "weak_type", False) for kind in kinds(state))
+
+
+def test_a_seed_is_no_key(trainer):
+    unchecked = inspect.unwrap(make_state)  # without the types that the tests check in signatures
+    with pytest.raises(ValueError, match=r"^key: got 7, expected a random key, such as jax.random.key\(7\)$"):
+        unchecked(trainer[0], make_optimizer(CONFIG.optimizer, STEPS), 7)
 
 
 def test_schedules_have_the_end_points_of_the_paper():
@@ -331,6 +356,15 @@ def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches
         np.testing.assert_allclose(gradient["regression"], regression, rtol=1e-3, atol=1e-8)
         metrics_of.append(metrics)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), metrics_of[0], metrics_of[-1])
+
+
+def test_every_weight_of_the_configuration_has_a_loss(trainer):
+    detector, state, _, _ = trainer
+    step = make_train_step(detector, make_optimizer(CONFIG.optimizer, STEPS))
+    _, metrics = jax.eval_shape(step, state, empty_batch(1))
+    found = {f"{name.removeprefix('loss/')}_weight" for name in metrics if name.startswith("loss/")}
+    named = {field.name for field in dataclasses.fields(CONFIG.loss) if field.name.endswith("_weight")}
+    assert found - {"total_weight"} == named - {"velocity_weight"}  # which is a weight within the L1 loss
 
 
 def test_a_new_loss_is_divided_by_the_locations_of_the_regression(monkeypatch):
