@@ -25,6 +25,7 @@ from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
 from fcos_lidar_jax.models import Detector, Variables, build_detector
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.types import Detections
 
@@ -143,6 +144,10 @@ def _scaled_once(points: Rows, sensor: Sensor) -> np.ndarray:
     """An array in the columns of a sensor; its intensities are scaled unless they were before."""
     rows = points_from_array(points, sensor)
     if (rows[:, 3] > 255).mean() > 0.5:
+        tell(
+            "note: intensities are not scaled, since most would exceed 255: they seem to be scaled already",
+            once=True,
+        )
         return points_from_array(points, dataclasses.replace(sensor, intensity_scale=1.0))
     return rows
 
