@@ -86,7 +86,7 @@ class FolderFrames(FrameSet):
             raise ValueError(f"{self._clouds[name]}: no {root / 'boxes' / name}.json, expected {expected}")
         self.names = tuple(sorted(self._clouds))
         """Names of the frames: file names without extension."""
-        self.sensor = _read_sensor(root, self._inside) if sensor is None else sensor
+        self.sensor = read_sensor(root, self._inside) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
             self.names = _read_split(root, splits, split, self._clouds)
@@ -216,7 +216,8 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
         point_files.check_inside(file, inside, where)
 
 
-def _read_sensor(root: Path, inside: Path | None) -> Sensor:
+def read_sensor(root: Path, inside: Path | None = None) -> Sensor:
+    """Read ``sensor.json`` of a folder, which no link may lead out of the folder ``inside``."""
     file = root / "sensor.json"
     _expect_file(file, inside, str(file))
     record = read_json(file, str | dict[str, Any])

@@ -9,7 +9,7 @@ from fcos_lidar_jax.data.box_geometry import check_boxes, count_inside
 from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.data.recorded import recorded_by
+from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
 from fcos_lidar_jax.progress import tell
@@ -193,7 +193,7 @@ def camera_calibration(file: Path) -> Path | None:
         ValueError: the calibrations of other files are there; a mixture of crops and full turns would be scored.
     """
     calibration = file.absolute().parent.parent / "calib" / f"{file.stem}.txt"
-    if recorded_by([file]) != KITTI_HDL64E or not calibration.parent.is_dir():
+    if usual_sensor(file) != KITTI_HDL64E or not calibration.parent.is_dir():
         return None
     if not calibration.is_file():
         raise ValueError(f"{calibration}: found nothing, expected the calibration of {file} (or --full-turn)")

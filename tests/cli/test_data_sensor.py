@@ -177,7 +177,12 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 
 @pytest.mark.parametrize(
     "words",
-    ["evaluate --data-root DATA --class-map MAP --no-report", "detect DATA/clouds --data-sensor DATA/sensor.json"],
+    [
+        "evaluate --data-root DATA --class-map MAP --no-report",
+        "detect DATA/clouds --data-sensor DATA/sensor.json",
+        "detect DATA/clouds",
+        "stream DATA/clouds",
+    ],
 )
 def test_a_sensor_with_other_rows_gives_a_warning(tmp_path, capsys, words):
     data = make_folder(tmp_path / "data", sensor=TINY, train=0, val=1)
@@ -301,6 +306,28 @@ def test_evaluates_own_data_of_other_axes_and_units(tmp_path):
     assert page_content(out / "frames.html")["forward_rad"] == 0
     assert scores[1] == pytest.approx(scores[0], abs=1e-6)
     assert scores[0] > 0.01
+
+
+def test_the_sensor_of_own_data_is_used_for_their_files(tmp_path, capsys):
+    sensor = dataclasses.replace(NUSCENES_HDL32E, num_columns=128)
+    data = make_folder(tmp_path / "data", sensor=sensor, train=0, val=1)
+    described = {**sensor_to_json(sensor), "name": "mine", "forward_rad": 0.0, "intensity_scale": 4.0}
+    (data / "sensor.json").write_text(json.dumps(described))
+    (data / "older").mkdir()
+    copy, older = (shutil.copy(data / "clouds" / "000.npy", tmp_path / name) for name in ("a.npy", "data/older"))
+    out = tmp_path / "boxes.json"
+    expected = detect(out, copy, "--yaw-deg 90 --intensity-scale 4")
+    assert expected != detect(out, copy)
+    capsys.readouterr()
+    assert detect(out, data / "clouds") == detect(out, older) == expected
+    told = "recorded by mine, as its sensor.json says; override with --data-sensor: intensities times 4"
+    assert f"{data}/clouds: {told}" in capsys.readouterr().err
+    assert stream(out, data / "clouds") == expected
+    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
+    command(f"evaluate --data-root {data} --class-map {tmp_path}/map.json --no-report", SMALL, tmp_path / "scores")
+    [evaluated] = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
+    assert evaluated["boxes"] == expected
+    assert fcos.load_detector("small")(data / "clouds" / "000.npy").to_dict()["boxes"] == expected
 
 
 def test_what_cannot_be_meant_is_refused_in_one_line(kitti, tmp_path, capsys):
