@@ -42,7 +42,7 @@ class CloudFiles(FrameSet):
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
-            how = {"full_turn": self.full_turn, "allow_empty": True, **layout}
+            how = {"full_turn": self.full_turn, **layout}
             points, num_close = read_cloud(file, self.sensor, self.reading, **how)
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 

@@ -59,6 +59,22 @@ def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, 
     )
 
 
+def test_clouds_without_points_are_counted(tmp_path, capsys):
+    data, run = make_folder(tmp_path / "data"), tmp_path / "run"
+    for name in ("000", "004"):  # one of four to train on, and one of two to evaluate
+        np.save(data / "clouds" / f"{name}.npy", np.zeros((0, 4)))
+    command("prepare --data-root", data)
+    line = (
+        "note: 1 of {} clouds without usable points, and so without {}: {}: no points in it, expected at least one"
+    )
+    assert line.format(4, "objects", "000") in capsys.readouterr().err
+    train = f"train quickstart --data-root {data} --out {run} --classes", *CLASSES, "--copy-paste.targets 2 2 2"
+    with linear_network():
+        command(*train, *NETWORK_OPTIONS, "--optimizer.batch-size 4 --steps 1")
+        command(f"evaluate --data-root {data} --checkpoint {run} --out {tmp_path}/scores")
+    assert line.format(2, "boxes", "004") in capsys.readouterr().err
+
+
 def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_path, capsys):
     args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
     args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--steps", "4"]

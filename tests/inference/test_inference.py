@@ -96,6 +96,8 @@ def test_a_detector_warns_about_a_cloud_without_usable_points():
     detector = TrainedDetector(build_detector(TINY_CONFIG, TINY), untrained(TINY_CONFIG, TINY))
     with pytest.warns(UserWarning, match="points: none of its 9 points is usable"):
         assert not len(detector(np.full((9, 4), np.nan)))
+    with pytest.warns(UserWarning, match="points: no points in it, expected at least one"):
+        assert not len(detector(np.zeros((0, 4))))
 
 
 def test_a_detector_under_jit_names_its_pure_function():
