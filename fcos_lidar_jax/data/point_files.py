@@ -21,6 +21,7 @@ MAX_POINTS = 10_000_000  # default limit of a cloud, far above any LiDAR's
 BYTES_PER_POINT = 64  # limit of a cloud's size, as a file and unpacked
 _HEADER_BYTES = 2**20
 _RAW_DTYPES = ("float16", "float32", "float64")
+_OTHER_LAYOUTS = "only detect, stream and project read other layouts, by --columns and --dtype"
 
 # Criteria for whether a raw file is read in the layout in which it was written.
 _REACH_M = 300.0  # no supported LiDAR sees farther
@@ -228,13 +229,13 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
     size, row = len(content), columns * np.dtype(dtype).itemsize
     if size % row:
         layout = f"{row} ({columns} {dtype} values per point)"
-        cause = f"truncated, or another layout{hint}: copy it again, or name columns and dtype"
+        cause = f"truncated, or another layout{hint}: copy it again, or convert it; {_OTHER_LAYOUTS}"
         raise ValueError(f"{path}: got {size} bytes, not a multiple of {layout}: {cause}")
     if better is not None or _plausible_share(content, columns, dtype) < 0.5:
         found = hint or f" (x, y, z are about {_magnitudes(content, columns, dtype)})"
         raise ValueError(
             f"{path}: read with {columns} {dtype} columns most values are not plausible metres{found}, "
-            "expected metres, or a layout named by columns and dtype"
+            f"expected metres; {_OTHER_LAYOUTS}"
         )
     return np.frombuffer(content, dtype).reshape(-1, columns)
 

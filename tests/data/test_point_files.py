@@ -215,7 +215,7 @@ def test_millimetres_are_refused_with_their_values(tmp_path, points):
         f"{value:.4g}" for value in np.median(np.abs(np.fromfile(path, np.float32).reshape(-1, 4)), axis=0)[:3]
     )
     assert float(x) > 1000
-    with refused(f"not plausible metres (x, y, z are about {x}, {y}, {z}), expected metres, or a layout", path):
+    with refused(f"not plausible metres (x, y, z are about {x}, {y}, {z}), expected metres; only detect", path):
         read_points(path, NUSCENES_HDL32E, columns=4)
 
 
@@ -249,7 +249,8 @@ def test_a_wrong_dtype_is_refused_and_the_right_one_named(tmp_path, points, stor
             "a.bin",
             999,
             {},
-            "not a multiple of 16 (4 float32 values per point): truncated, or another layout, 5 columns",
+            "16 (4 float32 values per point): truncated, or another layout, 5 columns would fit: copy it again, "
+            "or convert it; only detect, stream and project read other layouts, by --columns and --dtype",
         ),
         ("a.bin", 8, {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
         ("a.bin", 8, {"dtype": "int16"}, "dtype: got 'int16', expected float16"),

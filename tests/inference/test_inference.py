@@ -139,7 +139,7 @@ def test_a_detector_accepts_files_and_warns_about_clouds_of_another_sensor(tmp_p
     )
     with (
         pytest.warns(UserWarning, match=r"^points do not fit sensor 'tiny' .*; expect poor detections$"),
-        pytest.warns(UserWarning, match=r"^19674 points left out: the detector takes at most "),
+        pytest.warns(UserWarning, match=r"^19674 points left out in total: the detector takes at most "),
     ):
         detector(make_frame(0, NUSCENES_HDL32E).points)
 
