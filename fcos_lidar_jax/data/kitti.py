@@ -182,8 +182,13 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
     if calibration is None:
         return points
     matrices = read_calibration(calibration)
-    tell(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them", once=True)
+    tell(cropped(file.parent), once=True)
     return points[in_image(points, matrices["P2"] @ matrices["velo_to_rect"], IMAGE_SIZE)]
+
+
+def cropped(folder: Path) -> str:
+    """A line about the points of a folder that :func:`in_camera` or :class:`KittiFrames` leaves out."""
+    return f"{folder}: points outside the camera image are left out; --full-turn keeps them"
 
 
 def camera_calibration(file: Path) -> Path | None:

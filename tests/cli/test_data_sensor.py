@@ -16,7 +16,7 @@ from made_kitti import make_kitti
 from tiny_run import CONFIG, NETWORK_OPTIONS, untrained
 
 import fcos_lidar_jax as fcos
-from fcos_lidar_jax import cli
+from fcos_lidar_jax import cli, progress
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
@@ -145,7 +145,9 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 
     data = f"--data-root {kitti} --format kitti --split train --class-map {kitti}/map.json --no-report"
     for more, expected in (("", cropped), ("--full-turn", boxes)):
+        progress._told.clear()  # commands of one test print notes again
         command("evaluate", data, more, SMALL, tmp_path / f"scores{more}")
+        assert (f"{folder}: points outside the camera image are left" in capsys.readouterr().err) == (not more)
         [evaluated] = json.loads((tmp_path / f"scores{more}" / "detections.json").read_text())["frames"]
         assert evaluated["boxes"] == expected
     assert 0 < len(cropped) < len(boxes)
@@ -336,6 +338,10 @@ def test_what_cannot_be_meant_is_refused_in_one_line(kitti, tmp_path, capsys):
     for words, message in (
         (f"detect {inside} {copy}", "got .*bin of .* and .*bin of .*, expected files of one sensor"),
         (f"detect {copy} --data-sensor sonar", "sonar: no such sensor file"),
+        (
+            f"detect {copy} --full-turn",
+            "--full-turn: expected none for .*cloud.bin: only files of KITTI are cropped",
+        ),
         (f"detect {copy} --intensity-scale -1", "intensity_scale: got -1.*, expected a positive number"),
         (
             f"detect {tmp_path}/cloud.pcd.bin --intensity-scale 9",
