@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fcos_lidar_jax.data.folder import read_sensor
+from fcos_lidar_jax.data.folder import read_sensor, sensor_file
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
 
 RECORDED_BY = {
@@ -25,12 +25,6 @@ def usual_sensor(path: Path) -> Sensor | None:
     """
     path = Path(os.path.abspath(path))
     return next((sensor for end, sensor in RECORDED_BY.items() if path.match(end) or any(path.glob(end))), None)
-
-
-def sensor_file(path: Path) -> Path | None:
-    """The ``sensor.json`` of the own data (``docs/own_data.md``) in one of whose folders a file is, or None."""
-    root = Path(os.path.abspath(path)).parent.parent
-    return file if (file := root / "sensor.json").is_file() and (root / "clouds").is_dir() else None
 
 
 def recorded_by(paths: Iterable[Path]) -> Sensor | None:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fcos_lidar_jax.data.recorded import check_scale, recorded_by, sensor_file
+from fcos_lidar_jax.data.folder import sensor_file
+from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
 from fcos_lidar_jax.inference.tracks import to_world
 from fcos_lidar_jax.progress import tell

@@ -260,9 +260,14 @@ def test_labels_and_files_of_own_data_are_not_overwritten(home, tmp_path, capsys
     assert_one_line_error(capsys, [*call, str(label.parent), "--output-format", "kitti"], message)
     assert label.read_text().startswith("Car 0.00 0 0.1")
     (tmp_path / "clouds").mkdir()
-    for out in (tmp_path / "boxes" / "000.json", tmp_path / "splits.json"):
+    places = ["boxes/000.json", "sweeps/000.json", "splits.json"]
+    for out in map(tmp_path.joinpath, places):
         assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
         assert not out.exists()
+    out = tmp_path / "clouds" / "a.npy"
+    command(*call, out)  # not own data yet: any folder may be called clouds
+    (tmp_path / "boxes").mkdir()
+    assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
 
 
 MISTAKES = [
