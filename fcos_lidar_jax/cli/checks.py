@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
+from fcos_lidar_jax.data.folder import belongs_to_own_data
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import check_writable
 
@@ -43,9 +44,7 @@ def check_out_file(option: str, out: Path, keep: Iterable[Path]) -> None:
     for other in keep:
         if out.resolve() == other.resolve() or (out.exists() and other.exists() and out.samefile(other)):
             raise ValueError(f"{option}: {out}: the same file as {other}, expected another one")
-    folder = out.absolute().parent
-    described = out.name in ("classes.json", "sensor.json", "splits.json") and (folder / "clouds").is_dir()
-    if described or (folder.name == "boxes" and (folder.parent / "clouds").is_dir()):
+    if belongs_to_own_data(out):
         raise ValueError(f"{option}: {out}: the place of a file of own data, expected another one")
     check_writable(out)
 

@@ -65,7 +65,7 @@ class DataOptions:
         samples: str | None = None,
         sensor: Sensor | None = None,
         option: str = "--samples",
-    ) -> FrameSet:
+    ) -> MappedFrames:
         """Open frames whose labels index the classes of a configuration.
 
         Boxes of other classes are left out and counted on standard error. ``samples``, from ``option``, are ranges

@@ -28,6 +28,7 @@ from fcos_lidar_jax.data.cloud_policy import no_usable_points, truncation, unusa
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
 from fcos_lidar_jax.data.frame import files_fingerprint
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
+from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
 from fcos_lidar_jax.evaluation.json_io import write_lines
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, read_boxes, select
@@ -38,7 +39,7 @@ from fcos_lidar_jax.inference.alignment import Alignment
 from fcos_lidar_jax.inference.prediction import predict_groups
 from fcos_lidar_jax.inference.prediction_log import detections_fingerprint
 from fcos_lidar_jax.progress import Progress, tell
-from fcos_lidar_jax.sensors import Sensor, sensor_to_json
+from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor, sensor_to_json
 from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
@@ -120,7 +121,10 @@ def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
     if args.sweeps is None:
-        return tuple(dict.fromkeys(find_clouds(args.files))), []
+        files = tuple(dict.fromkeys(find_clouds(args.files)))
+        if args.full_turn and not any(usual_sensor(file) == KITTI_HDL64E for file in files):
+            raise ValueError(f"--full-turn: expected none for {files[0]}: only files of KITTI are cropped")
+        return files, []
     if args.sweeps.suffix != ".json":
         raise ValueError(f"--sweeps: {args.sweeps}: expected a file that ends in .json")
     folder, sweeps = args.sweeps.parent, read_list(args.sweeps)

@@ -24,7 +24,7 @@ from fcos_lidar_jax.cli.options import DETECTOR_TEXT, option, radians
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
 from fcos_lidar_jax.cli.scoring import Task, run_detector, write_recording, write_reports, write_scores
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.kitti import KittiFrames
+from fcos_lidar_jax.data.kitti import KittiFrames, cropped
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.evaluation.comparison import RESULT_FILES, compare_by_benchmark, compare_by_distance
@@ -217,6 +217,8 @@ def _open(args: Evaluate) -> Task:
             own = dataclasses.replace(own, forward_rad=heading(sensor, turn))
         # Only own data tell the number of rows: the frames of other formats have the rows of the detector's.
         notes = () if data.reader.sensor else other_rows(frames.sensor, sensor)
+        if "full_turn" in data.reader.options and not args.data.full_turn:
+            notes += (cropped(data.root / "training" / "velodyne"),)
         return Task(name, compare_by_distance(frames, config.ranges_m), own, detector, frames, notes)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
     assert isinstance(frames, NuScenesFrames)

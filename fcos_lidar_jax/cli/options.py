@@ -103,7 +103,8 @@ DataSensor = Annotated[
     str | None,
     option(
         "SENSOR",
-        default="KITTI's or Argoverse 2's for files in their folders, else the detector's",
+        default="KITTI's, Argoverse 2's or the sensor.json of own data for files in their folders, else the "
+        "detector's",
         text="Sensor of the data, a preset or a sensor file; gives heading, position and intensity scale.",
     ),
 ]

@@ -64,7 +64,7 @@ def check_results(args: Any, classes: Sequence[str], *, posed: bool, clouds: Seq
     option, row = f"--output-format {args.output_format}", FORMATS[args.output_format]
     if row.in_world:
         if others := [name for name in classes if name not in NUSCENES_CLASSES]:
-            raise ValueError(f"{option}: got the class {others[0]!r}, expected only classes of nuScenes")
+            raise ValueError(f"{option}: got the classes {', '.join(others)}, expected only classes of nuScenes")
         if not posed:
             raise ValueError(f"{option}: found no poses, expected some: the boxes are in the global frame")
     if row.calibrated:

@@ -21,7 +21,7 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation, unusab
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import recorded_by
+from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
@@ -107,7 +107,7 @@ def run(args: Stream) -> None:
     detector = load_detector(args.checkpoint, backend=args.backend)
     source = args.source or args.data_root or Path()
     paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
-    usual = NUSCENES_HDL32E if kind is SCENE else recorded_by(paths[:1])
+    usual = NUSCENES_HDL32E if kind is SCENE else usual_sensor(paths[0])
     scene_sensor = in_frame_of(sensor, NUSCENES_HDL32E) if kind is SCENE else None
     aligned = alignment_of(args, sensor, paths, scene_sensor)
     drive = _open(args, kind, detector, aligned.data)

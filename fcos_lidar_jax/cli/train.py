@@ -158,6 +158,9 @@ def _open(args: Train) -> _Task:
     split = args.train_split or args.data.split("train")
     frames = args.data.open(config, split=split, samples=args.samples)
     _check_sensor(config, data, frames)
+    if absent := [name for name in config.classes if name not in frames.frames.classes]:
+        known = ", ".join(frames.frames.classes)
+        tell(f"warning: --classes: the data have no example of {', '.join(absent)}, only of {known}")
     tests = _open_tests(args, config, data.root)
     if split is None and args.samples is None and tests is None:
         tell(f"{data.root}: no splits: training on all {len(frames)} frames, with no evaluation")
@@ -232,8 +235,9 @@ def _objects(args: Train, task: _Task) -> database.GroundTruthDatabase | None:
     objects = database.open_database(folder)
     reading = database.cut_reading(objects.manifest.num_sweeps)
     if objects.manifest.source != args.data.open_whole(split, reading, report_missing=False).fingerprint():
+        of = "all frames" if split is None else f"split {split!r}"
         raise ValueError(
-            f"{folder}: cut from other frames than split {split!r}, or with another --class-map: run fcos-lidar "
-            "prepare again, with the same data options"
+            f"{folder}: cut from other frames than {of}, or with other options, such as --class-map or "
+            "--full-turn, expected the same: run fcos-lidar prepare again"
         )
     return objects

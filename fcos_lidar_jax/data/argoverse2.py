@@ -144,7 +144,7 @@ def argoverse2_drive(log: Path, sensor: Sensor, *, max_points: int = MAX_POINTS)
     def read() -> Iterator[Sweep]:
         for stamp in stamps:
             file = log / _SWEEPS / f"{stamp}.feather"
-            points = read_points(file, sensor, allow_empty=True, max_points=max_points)
+            points = read_points(file, sensor, max_points=max_points)
             yield Sweep(points, poses.at(stamp), stamp // 1000, str(file))
 
     return Drive(read())

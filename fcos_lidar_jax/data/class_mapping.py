@@ -22,9 +22,8 @@ def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None 
     [1, 1, -1]
     """
     class_map = class_map or {}
-    for name in class_map:
-        if name not in of:
-            raise ValueError(f"class map: {unknown_name(name, of)}")
+    if unknown := [name for name in class_map if name not in of]:
+        raise ValueError(f"class map: got {', '.join(unknown)}, expected classes of the data: {', '.join(of)}")
     place = {name: i for i, name in enumerate(to)}
     names = (class_map.get(name, name) for name in of)
     return np.array([-1 if name is None else place.get(name, -1) for name in names], np.int32)

@@ -209,20 +209,21 @@ def unusable_clouds(lines: Sequence[str], number: int, without: str = "boxes") -
 
 
 def truncation(number: int, config: Config) -> str | None:
-    """A line about truncated points, or None.
+    """A line about the truncated points of all clouds, or None.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> truncation(7, QUICKSTART)
-    '7 points left out: the detector takes at most 4096 per cloud (max_points); older sweeps go first, ...'
+    '7 points left out in total: the detector takes at most 4096 per cloud (max_points); older sweeps go first...'
     """
-    how = f"left out: the detector takes at most {config.max_points} per cloud (max_points)"
+    how = f"left out in total: the detector takes at most {config.max_points} per cloud (max_points)"
     return f"{number} points {how}; {_ORDER}" if number else None
 
 
 def tell_truncation(cloud: Cloud, config: Config) -> None:
     """Print a line at the first truncated cloud, once per process; :func:`truncation` counts the points."""
     if cloud.num_truncated:
-        left_out = f"{cloud.num_truncated} of {cloud.num_points} points of the first are left out"
+        usable = cloud.num_points - cloud.num_close - cloud.num_invalid
+        left_out = f"{cloud.num_truncated} of {usable} usable points of the first are left out"
         limit = f"the detector takes at most {config.max_points} (max_points)"
         tell(f"clouds are truncated: {left_out}, since {limit}; {_ORDER}", once="truncated")
 
@@ -286,7 +287,9 @@ def _fitting(sensor: Sensor, usual: Sensor | None) -> str:
 def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     """All findings, except for those that too few points within the sensor's limits cannot show."""
     if (most := points[:, 3].max()) <= 1:
-        yield "no intensity is above 1, expected 0 to 255" + (": multiply them by 255" if most > 0 else "")
+        yield "no intensity is above 1, expected 0 to 255" + (
+            ": multiply them by 255 (--intensity-scale 255)" if most > 0 else ""
+        )
     if np.median(points[:, 3]) > _MAX_INTENSITY_READ:
         yield f"most intensities are above {_MAX_INTENSITY_READ}, expected 0 to {_MAX_INTENSITY_READ}"
     low, high = sensor.limit_z_m

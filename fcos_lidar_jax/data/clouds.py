@@ -11,7 +11,7 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points
 from fcos_lidar_jax.data.kitti import camera_calibration, in_camera
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
-from fcos_lidar_jax.data.recorded import recorded_by
+from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import read_list, read_sweeps
 from fcos_lidar_jax.sensors import Sensor
 
@@ -31,7 +31,7 @@ class CloudFiles(FrameSet):
 
     @property
     def usual_sensor(self) -> Sensor | None:  # type: ignore[override]
-        return recorded_by(self.files[:1])
+        return usual_sensor(self.files[0]) if self.files else None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -42,7 +42,7 @@ class CloudFiles(FrameSet):
         if file.suffix == ".json":
             points, num_close = read_sweeps(file, self.sensor, self.reading, **layout)
         else:
-            how = {"full_turn": self.full_turn, "allow_empty": True, **layout}
+            how = {"full_turn": self.full_turn, **layout}
             points, num_close = read_cloud(file, self.sensor, self.reading, **how)
         return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
 

@@ -112,7 +112,7 @@ def folder_drive(folder: Path, sensor: Sensor, poses: Path | None = None, **layo
 
     def read() -> Iterator[Sweep]:
         for file, time_us, matrix in zip(files, times, matrices, strict=True):
-            yield Sweep(read_points(file, sensor, allow_empty=True, **layout), matrix, time_us, str(file))
+            yield Sweep(read_points(file, sensor, **layout), matrix, time_us, str(file))
 
     return Drive(read(), posed=poses is not None, timed=poses is not None)
 

@@ -24,8 +24,11 @@ from fcos_lidar_jax.data.splits import SPLITS, distinct_names, own_splits
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
+from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import PRESETS, Sensor, sensor_from_json
 
+_SENSOR, _CLASSES = "sensor.json", "classes.json"
+_CLOUDS, _BOXES, _SWEEPS = "clouds", "boxes", "sweeps"
 _MAX_LAGS = 100  # far more sweeps than anybody fuses
 _Speed = Annotated[float, msgspec.Meta(ge=-LIMITS["vx"], le=LIMITS["vx"])]  # no NaN: unknown speeds are null
 
@@ -72,21 +75,21 @@ class FolderFrames(FrameSet):
         self.root = root = Path(root)
         self._inside = None if follow_links else root
         self.reading = reading
-        self._clouds = _list_files(root, "clouds", point_files.ENDINGS, self._inside)
-        self._boxes = _list_files(root, "boxes", (".json",), self._inside)
-        listed = (root / "sweeps").exists()
-        self._sweeps = _list_files(root, "sweeps", (".json",), self._inside) if listed else {}
+        self._clouds = _list_files(root, _CLOUDS, point_files.ENDINGS, self._inside)
+        self._boxes = _list_files(root, _BOXES, (".json",), self._inside)
+        listed = (root / _SWEEPS).exists()
+        self._sweeps = _list_files(root, _SWEEPS, (".json",), self._inside) if listed else {}
         if not self._clouds:
-            raise ValueError(f"{root / 'clouds'}: no point file in it, expected at least one")
+            raise ValueError(f"{root / _CLOUDS}: no point file in it, expected at least one")
         for files in (self._boxes, self._sweeps):
             for name in sorted(files.keys() - self._clouds.keys()):
-                raise ValueError(f"{files[name]}: no cloud named {name} in {root / 'clouds'}, expected one")
+                raise ValueError(f"{files[name]}: no cloud named {name} in {root / _CLOUDS}, expected one")
         for name in sorted(self._clouds.keys() - self._boxes.keys()):
             expected = 'one for every cloud, {"boxes": []} where there is no object'
-            raise ValueError(f"{self._clouds[name]}: no {root / 'boxes' / name}.json, expected {expected}")
+            raise ValueError(f"{self._clouds[name]}: no {root / _BOXES / name}.json, expected {expected}")
         self.names = tuple(sorted(self._clouds))
         """Names of the frames: file names without extension."""
-        self.sensor = _read_sensor(root, self._inside) if sensor is None else sensor
+        self.sensor = read_sensor(root, self._inside) if sensor is None else sensor
         self.classes, self._translation = self._read_classes()
         if split is not None:
             self.names = _read_split(root, splits, split, self._clouds)
@@ -121,7 +124,7 @@ class FolderFrames(FrameSet):
         clouds = {os.path.normpath(file) for file in self._clouds.values()}
         older = {Path(path) for path in map(os.path.normpath, listed) if path not in clouds}
         files = [*self._clouds.values(), *self._boxes.values(), *self._sweeps.values(), *older]
-        files += [file for name in ("sensor.json", "classes.json") if (file := self.root / name).exists()]
+        files += [file for name in (_SENSOR, _CLASSES) if (file := self.root / name).exists()]
         reading = self.names, self.sensor, *dataclasses.astuple(self.reading)
         return files_fingerprint(files, self.root, reading)
 
@@ -153,6 +156,9 @@ class FolderFrames(FrameSet):
         records = read_json(file, _Annotation).boxes
         boxes = np.array([record.box for record in records], np.float64).reshape(-1, 9)  # null becomes NaN
         check_boxes(boxes, lambda i: f"{file}: $.boxes[{i}].box")
+        if len(large := np.flatnonzero(np.abs(boxes[:, 6]) > 2 * np.pi)):
+            found = f"{file}: $.boxes[{large[0]}].box: yaw: got {boxes[large[0], 6]:g}"
+            tell(f"warning: {found}, expected radians: are these degrees?", once="yaw")
         kept, labels = [], []
         for i, record in enumerate(records):
             label = self._translation.get(record.label, record.label)
@@ -167,7 +173,7 @@ class FolderFrames(FrameSet):
 
     def _read_classes(self) -> tuple[tuple[str, ...], dict[str, str | None]]:
         """The classes, and what labels in the files become, None for boxes to leave out."""
-        file = self.root / "classes.json"
+        file = self.root / _CLASSES
         classes: list[str] | dict[str, str | None] = {}
         if os.path.lexists(file):
             _expect_file(file, self._inside, str(file))
@@ -179,6 +185,21 @@ class FolderFrames(FrameSet):
         records = (record for file in self._boxes.values() for record in read_json(file, _Annotation).boxes)
         labels = {classes.get(record.label, record.label) for record in records}
         return tuple(sorted(label for label in labels if label is not None)), classes
+
+
+def sensor_file(path: Path) -> Path | None:
+    """The ``sensor.json`` of the folder of own data in one of whose folders a file is, or None."""
+    root = Path(os.path.abspath(path)).parent.parent
+    return file if (file := root / _SENSOR).is_file() and (root / _CLOUDS).is_dir() else None
+
+
+def belongs_to_own_data(path: Path) -> bool:
+    """Whether a path is the place of a description, or of a file in ``clouds/``, ``boxes/`` or ``sweeps/``."""
+    folder = path.absolute().parent
+    if path.name in (_SENSOR, _CLASSES, SPLITS):
+        return (folder / _CLOUDS).is_dir()
+    beside = {_CLOUDS: _BOXES, _BOXES: _CLOUDS, _SWEEPS: _CLOUDS}.get(folder.name)
+    return beside is not None and (folder.parent / beside).is_dir()
 
 
 def _expect_sweeps(lags: np.ndarray, cloud: Path) -> None:
@@ -216,8 +237,9 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
         point_files.check_inside(file, inside, where)
 
 
-def _read_sensor(root: Path, inside: Path | None) -> Sensor:
-    file = root / "sensor.json"
+def read_sensor(root: Path, inside: Path | None = None) -> Sensor:
+    """Read ``sensor.json`` of a folder, which no link may lead out of the folder ``inside``."""
+    file = root / _SENSOR
     _expect_file(file, inside, str(file))
     record = read_json(file, str | dict[str, Any])
     if isinstance(record, dict):

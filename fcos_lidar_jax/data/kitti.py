@@ -9,7 +9,7 @@ from fcos_lidar_jax.data.box_geometry import check_boxes, count_inside
 from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
-from fcos_lidar_jax.data.recorded import recorded_by
+from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
 from fcos_lidar_jax.progress import tell
@@ -182,8 +182,13 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
     if calibration is None:
         return points
     matrices = read_calibration(calibration)
-    tell(f"{file.parent}: points outside the camera image are left out; --full-turn keeps them", once=True)
+    tell(cropped(file.parent), once=True)
     return points[in_image(points, matrices["P2"] @ matrices["velo_to_rect"], IMAGE_SIZE)]
+
+
+def cropped(folder: Path) -> str:
+    """A line about the points of a folder that :func:`in_camera` or :class:`KittiFrames` leaves out."""
+    return f"{folder}: points outside the camera image are left out; --full-turn keeps them"
 
 
 def camera_calibration(file: Path) -> Path | None:
@@ -193,7 +198,7 @@ def camera_calibration(file: Path) -> Path | None:
         ValueError: the calibrations of other files are there; a mixture of crops and full turns would be scored.
     """
     calibration = file.absolute().parent.parent / "calib" / f"{file.stem}.txt"
-    if recorded_by([file]) != KITTI_HDL64E or not calibration.parent.is_dir():
+    if usual_sensor(file) != KITTI_HDL64E or not calibration.parent.is_dir():
         return None
     if not calibration.is_file():
         raise ValueError(f"{calibration}: found nothing, expected the calibration of {file} (or --full-turn)")

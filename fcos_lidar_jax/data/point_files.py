@@ -21,6 +21,7 @@ MAX_POINTS = 10_000_000  # default limit of a cloud, far above any LiDAR's
 BYTES_PER_POINT = 64  # limit of a cloud's size, as a file and unpacked
 _HEADER_BYTES = 2**20
 _RAW_DTYPES = ("float16", "float32", "float64")
+_OTHER_LAYOUTS = "only detect, stream and project read other layouts, by --columns and --dtype"
 
 # Criteria for whether a raw file is read in the layout in which it was written.
 _REACH_M = 300.0  # no supported LiDAR sees farther
@@ -37,7 +38,6 @@ def read_points(
     *,
     columns: int | None = None,
     dtype: str | None = None,
-    allow_empty: bool = False,
     max_points: int = MAX_POINTS,
 ) -> np.ndarray:
     """Read the points of a file.
@@ -54,13 +54,13 @@ def read_points(
         sensor: scales the intensity, except in ``.pcd.bin``, and determines whether laser numbers are needed.
         columns: values per point in a raw file, 3 to 6.
         dtype: ``float16``, ``float32`` or ``float64``, of a raw file.
-        allow_empty: accept files that say that they have no points; files of 0 bytes are always refused.
         max_points: larger clouds are refused by their header or size, before they take memory.
 
     Returns:
         f32[n, c]: x, y, z (metres, the file's frame), intensity (0-255), time lag (seconds), and the laser number
         for sensors whose rows come from it. Missing intensity and lag are 0. The row order is the file's;
-        non-finite values are kept, and dropped and counted by the projection.
+        non-finite values are kept, and dropped and counted by the projection. A file may say that it has no
+        points, but files of 0 bytes are refused.
 
     Raises:
         ValueError: with the file, the field, the found and the expected value.
@@ -81,18 +81,16 @@ def read_points(
     if kind == ".feather":
         names = ("x", "y", "z", "intensity", "laser_number")
         table = read_feather(path, dict.fromkeys(names, "fiu"), max_rows=max_points)
-        return assemble_points(path, sensor, {**table, "laser": table["laser_number"]}, allow_empty=allow_empty)
+        return assemble_points(path, sensor, {**table, "laser": table["laser_number"]})
     content = _read_whole(path, max_points)
     if kind == ".pcd":
         try:
             table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_PER_POINT)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        return assemble_points(path, sensor, table, allow_empty=allow_empty)
+        return assemble_points(path, sensor, table)
     if kind in (".npy", ".npz"):
-        return points_from_array(
-            _read_numpy(path, content, kind, max_points), sensor, str(path), allow_empty=allow_empty
-        )
+        return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
     if not kind.endswith(".bin"):
         raise NotImplementedError(f"{kind} is in ENDINGS, but read_points does not read it")
     columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
@@ -105,14 +103,12 @@ def read_points(
     return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
-def points_from_array(
-    array: ArrayLike, sensor: Sensor, where: str = "points", *, allow_empty: bool = False
-) -> np.ndarray:
+def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -> np.ndarray:
     """Convert an array, which ``where`` names in messages, to the columns that :func:`read_points` returns.
 
     Args:
         array: [n, 3 to 6], of NumPy or JAX, or a list: x, y, z, intensity, time lag, laser number.
-        sensor, allow_empty: as in :func:`read_points`.
+        sensor: as in :func:`read_points`.
 
     Raises:
         ValueError: wrong shape or type, or a fifth column of whole numbers above 1, which is a ring.
@@ -133,7 +129,7 @@ def points_from_array(
     check(fits, f"{where}: shape", array.shape, "N x 3, 4, 5 or 6")
     check_time_lags(array, where)
     names = ("x", "y", "z", "intensity", "time_lag", "laser")
-    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)), allow_empty=allow_empty)
+    return assemble_points(where, sensor, dict(zip(names, array.T, strict=False)))
 
 
 def check_time_lags(points: np.ndarray, where: str = "points") -> None:
@@ -233,13 +229,13 @@ def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarra
     size, row = len(content), columns * np.dtype(dtype).itemsize
     if size % row:
         layout = f"{row} ({columns} {dtype} values per point)"
-        cause = f"truncated, or another layout{hint}: copy it again, or name columns and dtype"
+        cause = f"truncated, or another layout{hint}: copy it again, or convert it; {_OTHER_LAYOUTS}"
         raise ValueError(f"{path}: got {size} bytes, not a multiple of {layout}: {cause}")
     if better is not None or _plausible_share(content, columns, dtype) < 0.5:
         found = hint or f" (x, y, z are about {_magnitudes(content, columns, dtype)})"
         raise ValueError(
             f"{path}: read with {columns} {dtype} columns most values are not plausible metres{found}, "
-            "expected metres, or a layout named by columns and dtype"
+            f"expected metres; {_OTHER_LAYOUTS}"
         )
     return np.frombuffer(content, dtype).reshape(-1, columns)
 
@@ -318,17 +314,12 @@ def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.nd
         raise ValueError(f"{path}: not a readable {kind} file: {error}") from None
 
 
-def assemble_points(
-    where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray], *, allow_empty: bool = False
-) -> np.ndarray:
+def assemble_points(where: Path | str, sensor: Sensor, table: Mapping[str, np.ndarray]) -> np.ndarray:
     """Combine the columns x, y, z, intensity, time_lag and laser to the array that :func:`read_points` returns.
 
-    Refuses a cloud without points unless allowed, negative lags, and missing or invalid laser numbers.
+    Refuses negative lags, and missing or invalid laser numbers.
     """
-    number = len(table["x"])
-    if number == 0 and not allow_empty:
-        raise ValueError(f"{where}: no points in it, expected at least one")
-    points = np.zeros((number, sensor.point_columns), np.float32)
+    points = np.zeros((len(table["x"]), sensor.point_columns), np.float32)
     # Values too large for float32 become infinite, and are dropped with other non-finite values.
     with np.errstate(over="ignore", invalid="ignore"):
         for i, name in enumerate(("x", "y", "z", "intensity", "time_lag")):

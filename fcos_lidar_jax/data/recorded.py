@@ -1,9 +1,10 @@
-"""The sensors that recorded the point files of known data sets."""
+"""The sensors that recorded point files, by their paths."""
 
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from fcos_lidar_jax.data.folder import read_sensor, sensor_file
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor
 
 RECORDED_BY = {
@@ -16,16 +17,23 @@ RECORDED_BY = {
 """Ends of paths -> the sensor whose heading, position and intensity scale the files have."""
 
 
-def recorded_by(paths: Iterable[Path]) -> Sensor | None:
-    """The one sensor that recorded point files, or recordings in folders, if their paths name it.
+def usual_sensor(path: Path) -> Sensor | None:
+    """The sensor of a point file, or of a recording in a folder, of a known data set.
 
-    >>> recorded_by([Path("KITTI/training/velodyne/000000.bin")]).name, recorded_by([Path("000000.bin")])
+    >>> usual_sensor(Path("KITTI/training/velodyne/000000.bin")).name, usual_sensor(Path("000000.bin"))
     ('kitti_hdl64e', None)
     """
+    path = Path(os.path.abspath(path))
+    return next((sensor for end, sensor in RECORDED_BY.items() if path.match(end) or any(path.glob(end))), None)
+
+
+def recorded_by(paths: Iterable[Path]) -> Sensor | None:
+    """The one sensor that recorded point files, or recordings in folders: by own data's ``sensor.json``, or by
+    :func:`usual_sensor`."""
     found: dict[Sensor | None, Path] = {}
     for path in {(path.parent, path.suffix): Path(os.path.abspath(path)) for path in paths}.values():
-        known = (sensor for end, sensor in RECORDED_BY.items() if path.match(end) or any(path.glob(end)))
-        found[next(known, None)] = path
+        file = sensor_file(path)
+        found[usual_sensor(path) if file is None else read_sensor(file.parent)] = path
     if len(found) > 1:
         files = " and ".join(f"{path} of {sensor.name if sensor else 'another'}" for sensor, path in found.items())
         raise ValueError(f"sensor: got {files}, expected files of one sensor, or --data-sensor for all")

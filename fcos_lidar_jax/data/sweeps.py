@@ -81,18 +81,20 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
 def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any) -> tuple[np.ndarray, int]:
     """Fuse the sweeps of a JSON list, at most ``reading.num_sweeps``; returns the result of :func:`fuse_sweeps`.
 
+    Without points in the current sweep, older sweeps are left out: as in ``stream``, there is nothing to detect.
     ``layout`` are options of :func:`~fcos_lidar_jax.data.point_files.read_points`, for each file of the list.
     """
 
     def read(index: int, each: ListedSweep) -> Sweep:
         try:
-            points = read_points(path.parent / each.file, sensor, allow_empty=index > 0, **layout)
+            points = read_points(path.parent / each.file, sensor, **layout)
         except ValueError as error:
             raise ValueError(f"{path}: $[{index}].file: {error}") from None
         return Sweep(points, np.array(each.sensor_to_world), each.timestamp_us)
 
     sweeps = (read(index, each) for index, each in enumerate(read_list(path)[: reading.num_sweeps]))
-    return fuse_sweeps(sweeps, sensor, reading)
+    current = next(sweeps)
+    return fuse_sweeps(itertools.chain([current], sweeps if len(current.points) else ()), sensor, reading)
 
 
 def read_list(path: Path) -> list[ListedSweep]:

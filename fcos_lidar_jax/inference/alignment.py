@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fcos_lidar_jax.data.folder import sensor_file
 from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
 from fcos_lidar_jax.inference.tracks import to_world
@@ -107,8 +108,8 @@ def align(
     """Make the alignment of points to a detector. Read the points with its ``data``.
 
     Args:
-        sensor: sensor that recorded the points; by default the sensor that the paths name (which a note says), or
-            the detector's.
+        sensor: sensor that recorded the points; by default the sensor of the paths, by :func:`recorded_by` (which
+            a note says), or the detector's.
         paths: point files, or recordings in folders.
         yaw_rad: rotation from the points to the detector, counter-clockwise, instead of the angle between
             headings.
@@ -125,6 +126,8 @@ def align(
     check_scale(intensity_scale, paths)
     recorded = recorded_by(paths) if sensor is None else sensor
     if recorded is not None:
+        if recorded.forward_rad is None and yaw_rad is not None:
+            recorded = dataclasses.replace(recorded, forward_rad=heading(detector, yaw_rad))
         data = in_frame_of(detector, recorded)
     else:  # the same place on the ego vehicle, in the axes of the points
         turn = yaw_rad or 0.0
@@ -132,10 +135,15 @@ def align(
         data = dataclasses.replace(detector, origin_m=tuple(origin.tolist()), forward_rad=heading(detector, turn))
     if intensity_scale is not None:
         data = dataclasses.replace(data, intensity_scale=intensity_scale)
-    notes = () if sensor is None else other_rows(sensor, detector)  # a path does not tell the number of rows
-    if sensor is None and recorded is not None and data != detector:
-        told = f"recorded by {recorded.name}, as its path says; override with --data-sensor"
-        notes += (f"{next(iter(paths)).parent}: {told}: intensities times {data.intensity_scale:g}",)
+    first = next(iter(paths), None) if sensor is None else None
+    file = first and sensor_file(first)
+    notes: tuple[str, ...] = ()
+    if recorded is not None and (first is None or file is not None):  # a path does not tell the number of rows
+        notes = other_rows(recorded, detector)
+    if first is not None and recorded is not None and data != detector:
+        told = f"recorded by {recorded.name}, as its {file.name if file else 'path'} says"
+        scaled = f"intensities times {data.intensity_scale:g}"
+        notes += (f"{first.parent}: {told}; override with --data-sensor: {scaled}",)
     return Alignment(data, detector, yaw_rad, notes)
 
 

@@ -18,7 +18,7 @@ from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, no_usable_points
 from fcos_lidar_jax.data.clouds import read_cloud
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import points_from_array
-from fcos_lidar_jax.data.recorded import recorded_by
+from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
 from fcos_lidar_jax.inference.alignment import align
@@ -93,8 +93,8 @@ class CloudDetector(abc.ABC):
                 intensities unless most would exceed 255, as in points of frames, which are already scaled. Under
                 ``jax.jit``, call the function of :func:`~fcos_lidar_jax.inference.make_detect` instead.
             sensor: sensor that recorded the points, or its name or JSON file; gives their heading, position and
-                intensity scale. By default the detector's or, for files in the folders of KITTI and Argoverse 2,
-                theirs.
+                intensity scale. By default the detector's or, for files in the folders of KITTI, Argoverse 2 and
+                own data with ``sensor.json``, theirs.
             full_turn: keep the points of KITTI's files outside the camera image, see
                 :func:`~fcos_lidar_jax.data.kitti.in_camera`.
 
@@ -115,7 +115,8 @@ class CloudDetector(abc.ABC):
             rows, num_close = drop_close(_scaled_once(points, data), data, reading)
         aligned.tell_notes()
         rows = aligned.points(rows)
-        if line := sensor_mismatch(rows, self.sensor, recorded_by(paths)):
+        usual = usual_sensor(paths[0]) if paths else None
+        if line := sensor_mismatch(rows, self.sensor, usual):
             warnings.warn(line, stacklevel=2)
         cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
         if line := truncation(cloud.num_truncated, self.config):

@@ -33,7 +33,7 @@ from fcos_lidar_jax.workers import end_with_parent
 
 MAX_SWEEPS = 20  # number of sweeps for which an object's points are counted
 
-_FORMAT, _VERSION = "fcos_lidar_jax objects", 4
+_FORMAT, _VERSION = "fcos_lidar_jax objects", 5
 _REBUILD = "rebuild it with fcos-lidar prepare"
 _MANIFEST = "manifest.json"
 _ROW = np.dtype(
@@ -82,6 +82,7 @@ class _Table(NamedTuple):
     blake2b: str  # checksum of the file
     num_points: int  # of all objects
     unusable: list[str]  # a line about each cloud without usable points
+    boxes: np.ndarray  # i64[2]: number of boxes, and of boxes without a point
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,6 +231,11 @@ def prepare_database(
     unusable = [line for table in tables.values() for line in table.unusable]
     if line := unusable_clouds(unusable, len(frames), without="objects"):
         tell(f"note: {line}")
+    num_boxes, num_empty = sum((table.boxes for table in tables.values()), np.zeros(2, np.int64))
+    tell(f"{num_boxes} boxes, {sum(len(t.rows) for t in tables.values())} with at least {min_points} points")
+    if num_empty > num_boxes / 2:
+        found = f"{num_empty} of {num_boxes} boxes contain no point, expected few"
+        tell(f"warning: {found}: are points and boxes in the same frame?")
     entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
     manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, num_sweeps, columns, entries)
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
@@ -277,7 +283,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
     rows: list[tuple] = []
     parts: list[np.ndarray] = []
     unusable: list[str] = []
-    start = 0
+    num_boxes, start = np.zeros(2, np.int64), 0
     for index in job.indices:
         frame = frames.frame(index)
         columns = frame.points.shape[1]
@@ -289,6 +295,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
         cloud = frame.points[usable]
         lags = np.unique(np.append(cloud[:, 4], np.float32(0)))[:MAX_SWEEPS]
         for box, label, inside in zip(frame.boxes, frame.labels, points_in_boxes(cloud, frame.boxes), strict=True):
+            num_boxes += 1, not len(inside)
             if len(inside) < job.min_points:
                 continue
             points = cloud[inside]
@@ -299,6 +306,7 @@ def _cut_shard(frames: FrameSet, job: _Job) -> int:
             parts.append(points)
             start += len(points)
     table = {"rows": np.array(rows, _ROW), "recipe": np.array(job.recipe), "unusable": np.array(unusable, str)}
+    table["boxes"] = num_boxes
     points = np.concatenate([np.zeros((0, job.columns), "<f4"), *parts])
     points_file, table_file = _files(job.folder, job.name)
     atomic_write(points_file, lambda path: path.write_bytes(points.tobytes()))  # errors of tofile lack their errno
@@ -350,18 +358,20 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
     if expected is not None and digest != expected:
         raise ValueError(f"{file}: checksum differs from the manifest's; {_REBUILD}")
     try:
-        arrays = parse_npz(data, ["rows", "recipe", "unusable"])
-        rows, recipe, unusable = arrays["rows"], str(arrays["recipe"]), arrays["unusable"]
+        arrays = parse_npz(data, ["rows", "recipe", "unusable", "boxes"])
+        rows, recipe, unusable, boxes = arrays["rows"], str(arrays["recipe"]), arrays["unusable"], arrays["boxes"]
     except ValueError as error:
         raise ValueError(f"{file}: not a table of objects: {error}") from None
     if rows.dtype != _ROW or rows.ndim != 1:
         raise ValueError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; {_REBUILD}")
+    if boxes.dtype != np.int64 or boxes.shape != (2,):
+        raise ValueError(f"{file}: boxes: got {boxes.dtype} {boxes.shape}, expected two numbers; {_REBUILD}")
     ends = rows["count"].cumsum(dtype=np.int64)
     newest = rows["newest"]
     placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)
     if not (placed & (newest >= 0).all(axis=1) & (newest <= rows["count"][:, None]).all(axis=1)).all():
         raise ValueError(f"{file}: got objects with points outside the shard; {_REBUILD}")
-    table = _Table(rows, recipe, digest, int(ends[-1]) if len(ends) else 0, [*map(str, unusable.flat)])
+    table = _Table(rows, recipe, digest, int(ends[-1]) if len(ends) else 0, [*map(str, unusable.flat)], boxes)
     size = 4 * columns * table.num_points
     found = f"{points_file.stat().st_size} bytes" if points_file.is_file() else "no file"
     if found != f"{size} bytes":

@@ -16,7 +16,7 @@ from made_kitti import make_kitti
 from tiny_run import CONFIG, NETWORK_OPTIONS, untrained
 
 import fcos_lidar_jax as fcos
-from fcos_lidar_jax import cli
+from fcos_lidar_jax import cli, progress
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
@@ -145,7 +145,9 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 
     data = f"--data-root {kitti} --format kitti --split train --class-map {kitti}/map.json --no-report"
     for more, expected in (("", cropped), ("--full-turn", boxes)):
+        progress._told.clear()  # commands of one test print notes again
         command("evaluate", data, more, SMALL, tmp_path / f"scores{more}")
+        assert (f"{folder}: points outside the camera image are left" in capsys.readouterr().err) == (not more)
         [evaluated] = json.loads((tmp_path / f"scores{more}" / "detections.json").read_text())["frames"]
         assert evaluated["boxes"] == expected
     assert 0 < len(cropped) < len(boxes)
@@ -180,7 +182,12 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
 
 @pytest.mark.parametrize(
     "words",
-    ["evaluate --data-root DATA --class-map MAP --no-report", "detect DATA/clouds --data-sensor DATA/sensor.json"],
+    [
+        "evaluate --data-root DATA --class-map MAP --no-report",
+        "detect DATA/clouds --data-sensor DATA/sensor.json",
+        "detect DATA/clouds",
+        "stream DATA/clouds",
+    ],
 )
 def test_a_sensor_with_other_rows_gives_a_warning(tmp_path, capsys, words):
     data = make_folder(tmp_path / "data", sensor=TINY, train=0, val=1)
@@ -306,12 +313,38 @@ def test_evaluates_own_data_of_other_axes_and_units(tmp_path):
     assert scores[0] > 0.01
 
 
+def test_the_sensor_of_own_data_is_used_for_their_files(tmp_path, capsys):
+    sensor = dataclasses.replace(NUSCENES_HDL32E, num_columns=128)
+    data = make_folder(tmp_path / "data", sensor=sensor, train=0, val=1)
+    described = {**sensor_to_json(sensor), "name": "mine", "forward_rad": 0.0, "intensity_scale": 4.0}
+    (data / "sensor.json").write_text(json.dumps(described))
+    (data / "older").mkdir()
+    copy, older = (shutil.copy(data / "clouds" / "000.npy", tmp_path / name) for name in ("a.npy", "data/older"))
+    out = tmp_path / "boxes.json"
+    expected = detect(out, copy, "--yaw-deg 90 --intensity-scale 4")
+    assert expected != detect(out, copy)
+    capsys.readouterr()
+    assert detect(out, data / "clouds") == detect(out, older) == expected
+    told = "recorded by mine, as its sensor.json says; override with --data-sensor: intensities times 4"
+    assert f"{data}/clouds: {told}" in capsys.readouterr().err
+    assert stream(out, data / "clouds") == expected
+    (tmp_path / "map.json").write_text(json.dumps({"person": "pedestrian", "post": "barrier", "vehicle": "car"}))
+    command(f"evaluate --data-root {data} --class-map {tmp_path}/map.json --no-report", SMALL, tmp_path / "scores")
+    [evaluated] = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
+    assert evaluated["boxes"] == expected
+    assert fcos.load_detector("small")(data / "clouds" / "000.npy").to_dict()["boxes"] == expected
+
+
 def test_what_cannot_be_meant_is_refused_in_one_line(kitti, tmp_path, capsys):
     inside, copy = kitti / "training" / "velodyne" / "000000.bin", kitti / "elsewhere" / "cloud.bin"
     np.zeros((9, 5), np.float32).tofile(tmp_path / "cloud.pcd.bin")
     for words, message in (
         (f"detect {inside} {copy}", "got .*bin of .* and .*bin of .*, expected files of one sensor"),
         (f"detect {copy} --data-sensor sonar", "sonar: no such sensor file"),
+        (
+            f"detect {copy} --full-turn",
+            "--full-turn: expected none for .*cloud.bin: only files of KITTI are cropped",
+        ),
         (f"detect {copy} --intensity-scale -1", "intensity_scale: got -1.*, expected a positive number"),
         (
             f"detect {tmp_path}/cloud.pcd.bin --intensity-scale 9",

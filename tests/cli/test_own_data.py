@@ -11,6 +11,7 @@ from linear_network import linear_network
 from made_folder import CLASSES, make_folder
 from tiny_run import NETWORK_OPTIONS
 
+from fcos_lidar_jax.cli import main
 from fcos_lidar_jax.data.folder import FolderFrames
 
 PAGE = (Path(__file__).parents[2] / "docs" / "own_data.md").read_text()
@@ -68,6 +69,22 @@ def test_the_number_of_targets_of_copy_paste_matters_only_with_copy_paste(tmp_pa
     assert_one_line_error(capsys, args, rf"copy_paste.targets: got \(.*\), {expected}")
 
 
+def test_clouds_without_points_are_counted(tmp_path, capsys):
+    data, run = make_folder(tmp_path / "data"), tmp_path / "run"
+    for name in ("000", "004"):  # one of four to train on, and one of two to evaluate
+        np.save(data / "clouds" / f"{name}.npy", np.zeros((0, 4)))
+    command("prepare --data-root", data)
+    line = (
+        "note: 1 of {} clouds without usable points, and so without {}: {}: no points in it, expected at least one"
+    )
+    assert line.format(4, "objects", "000") in capsys.readouterr().err
+    train = f"train quickstart --data-root {data} --out {run} --classes", *CLASSES, "--copy-paste.targets 2 2 2"
+    with linear_network():
+        command(*train, *NETWORK_OPTIONS, "--optimizer.batch-size 4 --steps 1")
+        command(f"evaluate --data-root {data} --checkpoint {run} --out {tmp_path}/scores")
+    assert line.format(2, "boxes", "004") in capsys.readouterr().err
+
+
 def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_path, capsys):
     args = ["train", "quickstart", "--data-root", str(make_folder(tmp_path / "data", train=2, val=1))]
     args += ["--out", str(tmp_path / "out"), "--classes", *CLASSES, "--steps", "4"]
@@ -84,3 +101,24 @@ def test_own_data_define_the_sensor_whatever_the_name_of_the_configuration(tmp_p
     message = "--evaluate-every: got 4, expected --val-split or --val-samples too: .*data has no split to evaluate"
     assert_one_line_error(capsys, [*args, "--evaluate-every", "4"], message)
     assert not (tmp_path / "out").exists()
+
+
+def test_objects_of_changed_frames_without_splits_are_refused(tmp_path, capsys):
+    data = make_folder(tmp_path / "data", train=1, val=0)
+    (data / "splits.json").unlink()
+    command("prepare --data-root", data)
+    np.save(data / "clouds" / "000.npy", np.load(data / "clouds" / "000.npy")[1:])
+    train = (
+        f"train quickstart --data-root {data} --out {tmp_path}/out --copy-paste.targets 2 2 2 --steps 1 --classes"
+    )
+    message = "all_frames: cut from other frames than all frames, or with other options, .* or --full-turn"
+    assert_one_line_error(capsys, [*train.split(), *CLASSES], message)
+
+
+def test_classes_that_the_data_do_not_have_are_named_in_a_warning(tmp_path, capsys):
+    data = make_folder(tmp_path / "data", train=1, val=0)
+    for name, warned in (("vehicel", True), ("vehicle", False)):
+        train = f"train quickstart --data-root {data} --out {tmp_path}/out --classes person {name} post"
+        assert main(f"{train} --copy-paste.targets 2 2 2 --steps 1".split()) == 1  # without prepare
+        line = f"warning: --classes: the data have no example of {name}, only of person, post, vehicle\n"
+        assert (line in capsys.readouterr().err) == warned

@@ -46,7 +46,7 @@ def home(tmp_path_factory):
         head[name] *= 0  # so that it finds boxes of two classes
     regression["size_kernel"] *= 0.05
     save_checkpoint(home / "checkpoint", Checkpoint(CONFIG, TINY, variables, 7))
-    other = dataclasses.replace(CONFIG, classes=(*CLASSES, "hovercraft"))
+    other = dataclasses.replace(CONFIG, classes=(*CLASSES[1:], "hovercraft", "tractor"))
     save_checkpoint(home / "other", Checkpoint(other, TINY, variables, 7))
     (home / "training" / "velodyne").mkdir(parents=True)
     (home / "training" / "calib").mkdir()
@@ -260,9 +260,14 @@ def test_labels_and_files_of_own_data_are_not_overwritten(home, tmp_path, capsys
     assert_one_line_error(capsys, [*call, str(label.parent), "--output-format", "kitti"], message)
     assert label.read_text().startswith("Car 0.00 0 0.1")
     (tmp_path / "clouds").mkdir()
-    for out in (tmp_path / "boxes" / "000.json", tmp_path / "splits.json"):
+    places = ["boxes/000.json", "sweeps/000.json", "splits.json"]
+    for out in map(tmp_path.joinpath, places):
         assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
         assert not out.exists()
+    out = tmp_path / "clouds" / "a.npy"
+    command(*call, out)  # not own data yet: any folder may be called clouds
+    (tmp_path / "boxes").mkdir()
+    assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
 
 
 MISTAKES = [
@@ -285,7 +290,9 @@ def test_wrong_combinations_get_one_line(home, tmp_path, capsys, name, words, me
 def test_other_classes_are_not_of_nuscenes(home, tmp_path, capsys):
     words = ["--checkpoint", str(home / "other"), "--out", str(tmp_path / "out"), "--output-format", "nuscenes"]
     source = ["stream", str(home / "training" / "velodyne"), "--poses", str(home / "poses.json")]
-    assert_one_line_error(capsys, [*source, *words], "nuscenes: got the class 'hovercraft', expected only")
+    assert_one_line_error(
+        capsys, [*source, *words], "nuscenes: got the classes hovercraft, tractor, expected only"
+    )
 
 
 @pytest.mark.parametrize(

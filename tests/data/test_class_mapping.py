@@ -53,8 +53,8 @@ def test_disjoint_classes_and_unknown_names_are_refused():
         MappedFrames(make(), ("car", "bus"))
     with refused("expected a name in both"):
         MappedFrames(make(), ("ant",), {"ant": None})
-    with refused("class map: got 'zebra', expected ant, bee"):
-        map_labels(("ant", "bee"), ("ant",), {"zebra": "ant"})
+    with refused("class map: got yak, zebra, expected classes of the data: ant, bee"):
+        map_labels(("ant", "bee"), ("ant",), {"yak": "ant", "bee": "ant", "zebra": None})
 
 
 def test_the_fingerprint_depends_on_the_mapping_unless_it_changes_nothing():

@@ -108,7 +108,7 @@ def expect(condition: object, what: str) -> None:
 
 def check_points(points: np.ndarray, sensor: Sensor) -> None:
     shape = (len(points), sensor.point_columns)
-    expect(points.dtype == np.float32 and points.shape == shape and len(points), f"{points.dtype} {points.shape}")
+    expect(points.dtype == np.float32 and points.shape == shape, f"{points.dtype} {points.shape}")
     kept, num_close = drop_close(points, sensor, CONFIG.reading)
     cloud = make_cloud(kept, CONFIG, sensor=sensor, num_close=num_close)
     expect(np.isfinite(cloud.points[cloud.valid]).all(), "points that are not finite")
@@ -116,8 +116,7 @@ def check_points(points: np.ndarray, sensor: Sensor) -> None:
 
 
 def check_frame(frame: Frame, frames: FrameSet) -> None:
-    if len(frame.points):
-        check_points(frame.points, frames.sensor)
+    check_points(frame.points, frames.sensor)
     check_boxes(frame.boxes, "box {}".format)
     expect(frame.boxes.dtype == np.float32, "boxes that are not float32")
     for column in (frame.labels, frame.num_points):

@@ -116,4 +116,4 @@ def test_truncated_points_are_reported():
     points = unseen_frames(detector.sensor, 1).frame(0).points
     with pytest.warns(UserWarning, match="point") as told:
         detector(np.concatenate([points] * 2))
-    assert "points left out: the detector takes at most 4096 per cloud" in str(told[-1].message)
+    assert "points left out in total: the detector takes at most 4096 per cloud" in str(told[-1].message)

@@ -96,6 +96,8 @@ def test_a_detector_warns_about_a_cloud_without_usable_points():
     detector = TrainedDetector(build_detector(TINY_CONFIG, TINY), untrained(TINY_CONFIG, TINY))
     with pytest.warns(UserWarning, match="points: none of its 9 points is usable"):
         assert not len(detector(np.full((9, 4), np.nan)))
+    with pytest.warns(UserWarning, match="points: no points in it, expected at least one"):
+        assert not len(detector(np.zeros((0, 4))))
 
 
 def test_a_detector_under_jit_names_its_pure_function():
@@ -137,7 +139,7 @@ def test_a_detector_accepts_files_and_warns_about_clouds_of_another_sensor(tmp_p
     )
     with (
         pytest.warns(UserWarning, match=r"^points do not fit sensor 'tiny' .*; expect poor detections$"),
-        pytest.warns(UserWarning, match=r"^19674 points left out: the detector takes at most "),
+        pytest.warns(UserWarning, match=r"^19674 points left out in total: the detector takes at most "),
     ):
         detector(make_frame(0, NUSCENES_HDL32E).points)
 

@@ -96,6 +96,22 @@ def test_clouds_without_usable_points_are_counted_also_if_they_were_read_before(
         assert "manifest.json" not in contents(tmp_path / "b")
 
 
+def test_boxes_are_counted_and_most_of_them_without_points_give_a_warning(tmp_path, capsys):
+    frame = toy_frame(0)
+    away = dataclasses.replace(frame, boxes=frame.boxes + np.float32([0, 0, 90, 0, 0, 0, 0, 0, 0]))
+    number = len(frame.boxes)
+    for frames, empty in (((frame,), 0), ((frame, away, away), 2 * number)):
+        for _ in range(2):  # the second time from the tables
+            objects = build(
+                tmp_path, ListedFrames(frames), scenes=(("s", tuple(range(len(frames)))),), min_points=1
+            )
+            told = capsys.readouterr().err
+            boxes = number * len(frames)
+            assert f"{boxes} boxes, {len(objects)} with at least 1 points\n" in told
+            line = f"warning: {empty} of {boxes} boxes contain no point, expected few: are points and boxes in"
+            assert (line in told) == bool(empty)
+
+
 def test_a_split_name_cannot_lead_out_of_the_index():
     for name in ("../elsewhere", "..", "a/b", "/tmp"):
         with refused("expected a name that a folder can have"):
@@ -300,8 +316,8 @@ MANIFEST, TABLE, POINTS = "manifest.json", "scene-b.objects.npz", "scene-c.point
 DAMAGE = {
     "no manifest": (MANIFEST, Path.unlink, "no such file, expected a finished"),
     "truncated manifest": (MANIFEST, lambda f: cut(f, 100), "not JSON"),
-    "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 4; rebuild it with"),
-    "other format": (MANIFEST, lambda f: edit(f, format="x"), "got 'x' version 4"),
+    "older version": (MANIFEST, lambda f: edit(f, version=2), "version 2, expected", "version 5; rebuild it with"),
+    "other format": (MANIFEST, lambda f: edit(f, format="x"), "got 'x' version 5"),
     "no shards": (MANIFEST, lambda f: edit(f, shards=3), "$.shards: got 3, expected array"),
     "empty shard": (MANIFEST, lambda f: edit(f, shards=[{}]), "$.shards[0]: Object missing required field `name`"),
     "path": (MANIFEST, lambda f: edit(f, shards=[SHARD | {"name": "/etc/x"}]), "shards: name: got '/etc/x', exp"),

@@ -276,7 +276,10 @@ BAD = {
     "scale": ({"root": "nuscenes", "intensity_scale": 2.0}, "intensity_scale: got 2.0, expected none"),
     "no scale": ({"root": "folder", "intensity_scale": -2.0}, "intensity_scale: got -2.0, expected a positive"),
     "sweeps": ({"root": "kitti", "num_sweeps": 0}, "num_sweeps: got 0, expected at least 1"),
-    "class map": ({"root": "kitti", "class_map": {"Lorry": "truck"}}, "class map: got 'Lorry', expected Car"),
+    "class map": (
+        {"root": "kitti", "class_map": {"Lorry": "truck"}},
+        "class map: got Lorry, expected classes of the data: Car, Van, ",
+    ),
     "map of a folder": (
         {"root": "folder", "class_map": "nuscenes"},
         "class map: got 'nuscenes', expected one of the class maps of format folder: (none)",
