@@ -23,7 +23,12 @@ _LIMIT = 2**15 - 1  # int16, for points up to 655 m
 
 @dataclasses.dataclass(frozen=True)
 class PageFrame:
-    """A cloud with its boxes, encoded for the page. Optional fields are None if unknown."""
+    """A cloud with its boxes, encoded for the page by :func:`page_frame`. Optional fields are None if unknown.
+
+    >>> found = np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)
+    >>> page_frame(np.array([[0, 8.0, 0, 50]]), found, name="street").pose is None
+    True
+    """
 
     name: str
     time_us: int | None
