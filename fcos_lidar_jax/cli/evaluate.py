@@ -217,8 +217,9 @@ def _open(args: Evaluate) -> Task:
             own = dataclasses.replace(own, forward_rad=heading(sensor, turn))
         # Only own data tell the number of rows: the frames of other formats have the rows of the detector's.
         notes = () if data.reader.sensor else other_rows(frames.sensor, sensor)
-        if "full_turn" in data.reader.options and not args.data.full_turn:
-            notes += (cropped(data.root / "training" / "velodyne"),)
+        if "full_turn" in data.reader.options:
+            unlabelled = "detections outside the camera image, where KITTI has no labels, lower mAP by distance"
+            notes += (unlabelled if args.data.full_turn else cropped(data.root / "training" / "velodyne"),)
         return Task(name, compare_by_distance(frames, config.ranges_m), own, detector, frames, notes)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
     assert isinstance(frames, NuScenesFrames)

@@ -219,11 +219,11 @@ def truncation(number: int, config: Config) -> str | None:
     return f"{number} points {how}; {_ORDER}" if number else None
 
 
-def tell_truncation(cloud: Cloud, config: Config) -> None:
-    """Print a line at the first truncated cloud, once per process; :func:`truncation` counts the points."""
+def tell_truncation(name: str, cloud: Cloud, config: Config) -> None:
+    """Print a line about the first truncated cloud, once per process; :func:`truncation` counts the points."""
     if cloud.num_truncated:
         usable = cloud.num_points - cloud.num_close - cloud.num_invalid
-        left_out = f"{cloud.num_truncated} of {usable} usable points of the first are left out"
+        left_out = f"{cloud.num_truncated} of {usable} usable points of {name} are left out"
         limit = f"the detector takes at most {config.max_points} (max_points)"
         tell(f"clouds are truncated: {left_out}, since {limit}; {_ORDER}", once="truncated")
 
@@ -288,7 +288,9 @@ def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:
     """All findings, except for those that too few points within the sensor's limits cannot show."""
     if (most := points[:, 3].max()) <= 1:
         yield "no intensity is above 1, expected 0 to 255" + (
-            ": multiply them by 255 (--intensity-scale 255)" if most > 0 else ""
+            ": multiply them by 255 (--intensity-scale 255, or intensity_scale of the data's sensor)"
+            if most > 0
+            else ""
         )
     if np.median(points[:, 3]) > _MAX_INTENSITY_READ:
         yield f"most intensities are above {_MAX_INTENSITY_READ}, expected 0 to {_MAX_INTENSITY_READ}"

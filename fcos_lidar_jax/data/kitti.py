@@ -188,7 +188,8 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
 
 def cropped(folder: Path) -> str:
     """A line about the points of a folder that :func:`in_camera` or :class:`KittiFrames` leaves out."""
-    return f"{folder}: points outside the camera image are left out; --full-turn keeps them"
+    kept = "--full-turn keeps them, which detectors of full turns, such as hdl32e, need"
+    return f"{folder}: points outside the camera image are left out; {kept}"
 
 
 def camera_calibration(file: Path) -> Path | None:

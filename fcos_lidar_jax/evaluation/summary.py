@@ -121,8 +121,8 @@ def _class_table(summary: Mapping[str, Any]) -> list[str]:
 def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None = None) -> list[str]:
     """Warnings about missing truth and missing detections, which affect the meaning of the scores.
 
-    ``num_found`` and ``truth`` are the detections and the truth before filtering; with the truth, boxes beyond
-    their class range are counted, unless in the benchmark.
+    ``num_found`` and ``truth`` are the detections and the truth before filtering; with the truth, boxes without
+    points and boxes beyond their class range are counted, unless in the benchmark.
     """
     benchmark, lines = evaluation.metric.benchmark, []
     rankings = zip(evaluation.metric.classes, evaluation.rankings, strict=True)
@@ -134,12 +134,20 @@ def warnings(evaluation: Evaluation, num_found: int, truth: GroundTruth | None =
         rule = "AP 0 and errors 1, as in the benchmark" if benchmark else "excluded from the means"
         lines.append(f"no ground truth is evaluated for {', '.join(absent)}: {rule}")
     if truth is not None and not benchmark:
-        lines += _beyond_range(truth, evaluation.metric)
+        lines += [*_without_points(truth), *_beyond_range(truth, evaluation.metric)]
     if not num_found:
         lines.append("the results contain no boxes: every AP is 0 and every error 1")
     elif not len(evaluation.predictions):
         lines.append("no box of the results is within the range of its class: every AP is 0")
     return lines
+
+
+def _without_points(truth: GroundTruth) -> list[str]:
+    empty, number = int((truth.boxes.num_points == 0).sum()), len(truth.boxes.label)
+    if not empty:
+        return []
+    cause = ": are points and boxes in the same frame?" if empty > number / 2 else ""
+    return [f"{empty} of {number} boxes of the truth contain no point and are not evaluated{cause}"]
 
 
 def _beyond_range(truth: GroundTruth, metric: Metric) -> list[str]:

@@ -114,7 +114,7 @@ def predict_groups(
                 frame = frames.frame(group[row])
                 given = aligned.points(frame.points)
                 cloud = make_cloud(given, config, sensor=sensor, num_close=frame.num_close)
-                tell_truncation(cloud, config)
+                tell_truncation(frames.name(group[row]), cloud, config)
                 points[slot], valid[slot] = cloud.points, cloud.valid
                 loaded[row] = frame, cloud
         return loaded, (points, valid)

@@ -81,7 +81,7 @@ def detect_stream(
         points, num_close = fuse_sweeps(window, aligned.data, reading)
         points = aligned.points(points)
         cloud = make_cloud(points, detector.config, sensor=detector.sensor, num_close=num_close)
-        tell_truncation(cloud, detector.config)
+        tell_truncation(sweep.name, cloud, detector.config)
         detections = detector.detect(cloud)
         line = no_usable_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
         if line is None and cloud.points[cloud.valid, 4].min() > 0:

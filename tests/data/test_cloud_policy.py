@@ -240,7 +240,7 @@ def test_the_warning_describes_the_mismatch(clouds):
             r"the values of [xy] are about \d+, expected metres in the columns x, y, z",
         ),
         (timed, "nuscenes_hdl32e", r"the values of x are about 1.533e\+09, expected metres in the columns x, y"),
-        (shares, "nuscenes_hdl32e", r"expected 0 to 255: multiply them by 255 \(--intensity-scale 255\);"),
+        (shares, "nuscenes_hdl32e", r"expected 0 to 255: multiply them by 255 \(--intensity-scale 255, or "),
         (hdl32e[:, :3], "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255;"),
         (hdl32e * np.array([1, 1, 1, 255, 1]), "nuscenes_hdl32e", "most intensities are above 255, expected 0 to"),
     ):

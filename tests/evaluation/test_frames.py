@@ -135,6 +135,22 @@ def test_truth_beyond_the_range_is_reported():
     assert len(counted[near].truth) + far == len(counted[unlimited].truth)
 
 
+def test_truth_without_points_is_reported():
+    found, truths = made(OWN, [0, 1])
+    metric = metric_of(OWN, (1000.0,) * len(OWN))
+    for lost, cause in ((1, ""), (None, ": are points and boxes in the same frame?")):
+        counts = [np.ones(len(frame.boxes), int) for frame in truths]
+        counts[0][0] = 0
+        if lost is None:
+            counts = [0 * each for each in counts]
+        frames = [dataclasses.replace(f, num_points=n) for f, n in zip(truths, counts, strict=True)]
+        predictions, truth = frame_columns(found, frames, [f"frame {i}" for i in range(len(frames))])
+        lines = warnings(evaluate(predictions, truth, metric), 9, truth)
+        number = sum(map(len, counts))
+        expected = f"{lost or number} of {number} boxes of the truth contain no point and are not evaluated{cause}"
+        assert [line for line in lines if "no point" in line] == [expected]
+
+
 def test_the_benchmark_on_frames_includes_absent_classes_and_attributes():
     """Studies on simulated frames report these scores in addition to the centre-distance metric."""
     classes = NUSCENES_METRIC.classes
