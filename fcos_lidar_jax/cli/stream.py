@@ -127,7 +127,7 @@ def run(args: Stream) -> None:
         detect = functools.partial(detect_stream, detector=detector, **how)
         for found in timing.detect(_announcing(drive.sweeps, aligned), detect):
             points = found.cloud.points[found.cloud.valid]
-            if not num_points and (line := sensor_mismatch(points, detector.sensor, usual)):
+            if not num_points and (line := sensor_mismatch(_whole(found.sweep, aligned), detector.sensor, usual)):
                 tell(f"warning: {line}")
             num_points += len(points)
             unusable.append(found.unusable)
@@ -177,6 +177,13 @@ def _write_lines(args: Stream, classes: tuple[str, ...]) -> Iterator[Callable[[d
             opened[0](json.dumps(record).encode())
 
         yield write
+
+
+def _whole(sweep: Sweep, aligned: Alignment) -> np.ndarray:
+    """Points of a sweep in the detector's frame, before the truncation, which would hide a denser sensor."""
+    points = sweep.points.copy()
+    points[:, 4] = 0
+    return aligned.points(points)
 
 
 def _announcing(sweeps: Iterable[Sweep], aligned: Alignment) -> Iterator[Sweep]:

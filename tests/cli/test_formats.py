@@ -171,12 +171,16 @@ def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):
     left_out = f"{by_command[0]['num_truncated']} of {usable} usable points of NAME are left out"
     truncated = f"clouds are truncated: {left_out}, since the detector takes at most 4096 {ORDER}"
     once, twice = (f"{number * by_command[0]['num_truncated']} {COUNTED}" for number in (1, 2))
-    first, result, *_, last = (line for line in told() if "files " in line or line in (truncated, once, twice))
+    lines = told()
+    [dense_line] = (line for line in lines if "points per cell, expected about 1" in line)
+    first, result, *_, last = (line for line in lines if "files " in line or line in (truncated, once, twice))
     assert (first, result[:9], last) == (truncated, "files 1/3", twice)
     command("evaluate", data, "--split train --checkpoint quickstart --no-report --out", tmp_path / "scores")
     assert [line for line in told() if "at most 4096" in line] == [truncated, once]
     command("stream", root / "clouds", "--checkpoint quickstart --out", tmp_path / "boxes.jsonl")
-    assert [line for line in told() if "at most 4096" in line] == [truncated, twice]
+    lines = told()
+    assert [line for line in lines if "at most 4096" in line] == [truncated, twice]
+    assert dense_line in lines  # counted before the truncation
     evaluated = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
     detector = fcos.load_detector("quickstart")
     for i, frame in enumerate(evaluated):
