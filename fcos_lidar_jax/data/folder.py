@@ -240,6 +240,9 @@ def _expect_file(file: Path, inside: Path | None, where: str) -> None:
 def read_sensor(root: Path, inside: Path | None = None) -> Sensor:
     """Read ``sensor.json`` of a folder, which no link may lead out of the folder ``inside``."""
     file = root / _SENSOR
+    if not os.path.lexists(file):
+        names = ", ".join(f'"{name}"' for name in PRESETS)
+        raise ValueError(f"{file}: no such file, expected the fields of the LiDAR, or its name in quotes: {names}")
     _expect_file(file, inside, str(file))
     record = read_json(file, str | dict[str, Any])
     if isinstance(record, dict):

@@ -230,7 +230,11 @@ BAD = {
         "sensor.json",
         "sensor.json: inclinations_deg, inclinations_rad: missing, expected one of them",
     ),
-    "no sensor": (lambda r: (r / "sensor.json").unlink(), "sensor.json", "no such file"),
+    "no sensor": (
+        lambda r: (r / "sensor.json").unlink(),
+        "sensor.json",
+        'no such file, expected the fields of the LiDAR, or its name in quotes: "',
+    ),
     "preset": (lambda r: write(r / "sensor.json", '"tinny"'), "sensor.json", "got 'tinny', expected tiny"),
     "class": (lambda r: write(r / "classes.json", ["carr"]), B, "$.boxes[0].label: got 'car', expected carr"),
     "class twice": (lambda r: write(r / "classes.json", ["car", "car"]), "classes.json", "2 names, expected at"),
