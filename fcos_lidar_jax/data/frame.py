@@ -154,6 +154,8 @@ class WrappedFrames(FrameSet):
     sensor: Sensor = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
+        are_frames = hasattr(self.frames, "classes")
+        check(are_frames, "frames", type(self.frames).__name__, "a set of frames, as open_frames returns")
         object.__setattr__(self, "classes", self.frames.classes)
         object.__setattr__(self, "sensor", self.frames.sensor)
 

@@ -25,6 +25,7 @@ from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, replicate
+from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write, checksum, folder_lock, local_path
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.inference.prediction import evaluate, predict
@@ -99,6 +100,8 @@ def train(
     Traceback (most recent call last):
     ValueError: ...
     """
+    check(isinstance(config, Config), "config", config, "a Config, such as presets.COMPACT")
+    check(isinstance(schedule, Schedule), "schedule", schedule, "a Schedule")
     mesh = make_mesh(devices)
     is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
     with agreed("cannot train"):
