@@ -219,7 +219,7 @@ def _open(args: Evaluate) -> Task:
         notes = () if data.reader.sensor else other_rows(frames.sensor, sensor)
         if "full_turn" in data.reader.options:
             unlabelled = "detections outside the camera image, where KITTI has no labels, lower mAP by distance"
-            notes += (unlabelled if args.data.full_turn else cropped(data.root / "training" / "velodyne"),)
+            notes += (unlabelled if args.data.full_turn else cropped(data.root),)
         return Task(name, compare_by_distance(frames, config.ranges_m), own, detector, frames, notes)
     frames = args.data.open_whole(split, config.reading, sensor, report_missing=detector is not None)
     assert isinstance(frames, NuScenesFrames)

@@ -127,7 +127,9 @@ def run(args: Stream) -> None:
         detect = functools.partial(detect_stream, detector=detector, **how)
         for found in timing.detect(_announcing(drive.sweeps, aligned), detect):
             points = found.cloud.points[found.cloud.valid]
-            if not num_points and (line := sensor_mismatch(_whole(found.sweep, aligned), detector.sensor, usual)):
+            if not num_points and (
+                line := sensor_mismatch(_untruncated(found.sweep, aligned), detector.sensor, usual)
+            ):
                 tell(f"warning: {line}")
             num_points += len(points)
             unusable.append(found.unusable)
@@ -179,7 +181,7 @@ def _write_lines(args: Stream, classes: tuple[str, ...]) -> Iterator[Callable[[d
         yield write
 
 
-def _whole(sweep: Sweep, aligned: Alignment) -> np.ndarray:
+def _untruncated(sweep: Sweep, aligned: Alignment) -> np.ndarray:
     """Points of a sweep in the detector's frame, before the truncation, which would hide a denser sensor."""
     points = sweep.points.copy()
     points[:, 4] = 0

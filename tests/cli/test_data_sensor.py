@@ -147,7 +147,9 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
     for more, expected in (("", cropped), ("--full-turn", boxes)):
         progress._told.clear()  # commands of one test print notes again
         command("evaluate", data, more, SMALL, tmp_path / f"scores{more}")
-        assert (f"{folder}: points outside the camera image are left" in capsys.readouterr().err) == (not more)
+        told = capsys.readouterr().err
+        assert (f"{kitti}: points outside the camera image are left" in told) == (not more)
+        assert ("detections outside the camera image, where KITTI has no labels" in told) == bool(more)
         [evaluated] = json.loads((tmp_path / f"scores{more}" / "detections.json").read_text())["frames"]
         assert evaluated["boxes"] == expected
     assert 0 < len(cropped) < len(boxes)
