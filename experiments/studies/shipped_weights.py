@@ -71,7 +71,7 @@ CONFIGS = {
     )(_FRESH(COMPACT)),
 }
 TRAINING_CITY = dataclasses.replace(
-    CITY, name="city, more even and glossy", city_classes=0.25, gloss=1.0, patchwork=0.4
+    CITY, name="city, more even and glossy", city_classes=0.25, gloss=1.0, patchwork=0.4, walls=0.35, bends=0.03
 )
 """At the frequencies of a city, most classes would hardly occur; here each has at least a tenth of the mean.
 

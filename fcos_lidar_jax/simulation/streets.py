@@ -39,12 +39,14 @@ class Streets:
     clutter: float = 0.0  # unannotated things per metre of street side
     facades: bool = False  # buildings with entrances, columns, bays and balconies
     setting: bool = False  # built-up, green, empty and crowded surroundings
+    walls: float = 0.0  # share of street sides with long walls or fences, and independently with long buildings
     # The objects.
     city_classes: float = 0.0  # class frequencies: 1 as in cities, 0 all equal
     class_mix: float = 0.0  # deviation of the log class frequencies per frame
     spread: float = 1.0  # distances are uniform numbers to this power; 0.5 is uniform over an area
     round_cars: bool = False  # most cars have rounded ends
     groups: float = 0.0  # share of pedestrians next to another pedestrian
+    bends: float = 0.0  # deviation of the curvature of rows of cones and barriers, 1/m
     shape: float = 0.0  # deviation of the sizes of object parts
     sizes: float = 1.0  # factor of the deviations of box sizes
     gloss: float = 0.0  # maximum share of grazing rays that the paint of vehicles reflects away, uniform per world

@@ -21,6 +21,11 @@ from fcos_lidar_jax.simulation.streets import Streets
 _STOREY_M = 3.2
 _VARIED = 0.08  # deviation of the sides of clutter parts
 _GROUPS = (1, 1, 1, 2, 3, 5)  # sizes of groups of equal things
+_LONG_M = (8, 60)  # length of walls and long buildings
+_PIECE_M = 3.0
+_FOUNDATION_M = 0.4  # depth of walls below the ground
+_WALLS = ((0.2, np.inf, 0.1), (0.3, np.inf, 0.25), (0.06, 25.0, 0.15), (0.9, 3.0, 0.2))
+"""Thickness in metres, density and albedo of two walls, a fence and a hedge."""
 _SETTINGS = {"city": 0.4, "suburb": 0.3, "works": 0.15, "open": 0.15}
 # By setting: share of the street side with buildings, setback of their fronts in metres, trees per metre of street
 # side, and factor of the clutter.
@@ -85,10 +90,15 @@ class Side:
 def sample_surroundings(rng: Generator, side: Side, streets: Streets, setting: str) -> np.ndarray:
     """Sample everything along one side of a street, as solids [s] in the street frame."""
     built, cluttered = rng.spawn(2)
+    walled = built.spawn(1)[0]
     parts = [np.zeros(0, SOLID)]
     setback = float(built.uniform(*_SETBACK_M[setting]))
     if streets.facades:
         parts += _buildings(built, side, setback, _BUILT[setting])
+    if walled.random() < streets.walls:
+        parts += _walls(walled, side)
+    if walled.random() < streets.walls:
+        parts += _long_buildings(walled, side, setback)
     if streets.clutter:
         dense = streets.clutter * _DENSITY[setting] * np.exp(0.5 * cluttered.standard_normal())
         parts += _trees(cluttered, side, _TREES[setting] * np.exp(0.5 * cluttered.standard_normal()))
@@ -115,6 +125,35 @@ def _buildings(rng: Generator, side: Side, setback: float, built: float) -> list
         for position in center:  # at most one
             building = _building(rng, width, depth, storeys * _STOREY_M)
             parts.append(place_solids(building, np.append(position, side.facing)))
+    return parts
+
+
+def _long_buildings(rng: Generator, side: Side, setback: float) -> list[np.ndarray]:
+    """Sample long buildings parallel to the street, which may be as close to it as its pavement."""
+    parts, s = [], side.span[0]
+    while s < side.span[1]:
+        width, s = rng.uniform(*_LONG_M), s + rng.uniform(0, 60)
+        building = _building(rng, width, rng.uniform(7, 15), rng.uniform(3, 12))
+        ends = s + width / 2 * np.array([0, -1, 1])
+        center, free = side.positions(ends, side.back_m + setback, 1.0)
+        if len(free) == len(ends):
+            parts.append(place_solids(building, np.append(center[0], side.facing)))
+        s += width
+    return parts
+
+
+def _walls(rng: Generator, side: Side) -> list[np.ndarray]:
+    """Sample walls, fences or hedges of the same kind and height behind the pavement, with gaps between them."""
+    thickness, density, albedo = _WALLS[rng.integers(len(_WALLS))]
+    height, away, s, parts = rng.uniform(0.5, 2.8), side.back_m + rng.uniform(0.1, 2.5), side.span[0], []
+    while s < side.span[1]:
+        length, s = rng.uniform(*_LONG_M), s + rng.uniform(1.5, 40)
+        pieces = s + np.arange(_PIECE_M / 2, length, _PIECE_M)  # short pieces, which follow the ground
+        center, _ = side.positions(pieces, away, _PIECE_M / 2)
+        center[:, 2] += height / 2 - _FOUNDATION_M / 2
+        half = [thickness / 2, _PIECE_M / 2, height / 2 + _FOUNDATION_M / 2]
+        parts.append(make_solids(BOX, center, half, yaw=side.facing, albedo=albedo, density=density))
+        s += length
     return parts
 
 

@@ -79,8 +79,8 @@ def sample_traffic(
     vehicle = pose_at(ego, times)
     vehicle[:, :2] += EGO_MIDDLE_M * np.stack([np.cos(vehicle[:, 2]), np.sin(vehicle[:, 2])], axis=1)
     occupancy.add(vehicle, EGO_SIZE_M)
-    places = _Places(rng, ground, ego, reach_m, fast_traffic, streets.spread)
     groups, pedestrian = rng.spawn(1)[0], None
+    places = _Places(rng, ground, ego, reach_m, fast_traffic, streets, groups.spawn(1)[0])
     objects: list[tuple[int, ObjectModel, np.ndarray, np.ndarray, bool]] = []
     for label in labels:
         name = NUSCENES_CLASSES[label]
@@ -160,11 +160,14 @@ class _Row:
 
     along: int  # 0 main street, 1 crossing street
     end: float  # end of the last object, metres along the street
-    beside: float  # metres to the left of the middle of the street
+    side: int  # 1 to the left of the street, -1 to the right
+    beside: float  # the same end, metres to the left of the middle of the street
     gap: float  # gap between objects, metres
     left: int  # number of objects still to place
     across: bool  # objects face the street, as barriers do; otherwise they face along it
     model: ObjectModel  # model of the cones or barriers
+    curvature: float = 0.0  # 1/m, positive to the left
+    angle: float = 0.0  # direction at the end of the row, relative to the street
 
 
 @dataclasses.dataclass
@@ -174,7 +177,8 @@ class _Places:
     ego: np.ndarray
     reach_m: float  # maximum distance from the ego vehicle
     fast_traffic: bool  # all lanes flow fast and steadily, and few objects stand
-    spread: float  # see streets.Streets
+    streets: Streets
+    bends: Generator  # random source of the curvatures of rows
     # The unfinished row of each class.
     rows: dict[str, _Row] = dataclasses.field(default_factory=dict)
     # Speed and acceleration by (street, side, lane). Vehicles of a lane share them, which keeps their gaps.
@@ -199,11 +203,14 @@ class _Places:
     def next_in_row(self, row: _Row, size: np.ndarray) -> np.ndarray:
         """Motion at the next place of a row, [1] of ``motion.MOTION``."""
         extent = size[1] if row.across else size[0]
-        s = row.end + row.gap + extent / 2
-        row.end, row.left = s + extent / 2, row.left - 1
-        turn = np.pi / 2 * np.sign(row.beside) if row.across else np.pi * (row.beside > 0)
+        ahead, aside = np.cos(row.angle), np.sin(row.angle)
+        s, beside = row.end + row.gap * ahead + extent / 2 * ahead, row.beside + (row.gap + extent / 2) * aside
+        turn = np.pi / 2 * row.side if row.across else np.pi * (row.side > 0)
         noise = self.rng.normal(0, (0.06, 0.03))
-        return self._motion(row.along, s, row.beside + noise[0], turn + noise[1])
+        motion = self._motion(row.along, s, beside + noise[0], turn + row.angle + noise[1])
+        row.end, row.beside, row.left = s + extent / 2 * ahead, beside + extent / 2 * aside, row.left - 1
+        row.angle += row.curvature * (row.gap + extent)
+        return motion
 
     def sample_motion(self, place: str, moment: float, model: ObjectModel, size: np.ndarray) -> np.ndarray | None:
         """Sample a motion that is at a place at a moment, [1] of ``motion.MOTION``; None on failure."""
@@ -265,20 +272,22 @@ class _Places:
         rng, pavement = self.rng, self.ground.pavement
         along, s = self._sample_station(moment)
         half, side = self._half(along), rng.choice([-1, 1])
-        left, across, gap = int(rng.integers(2, _ROW_LENGTH[name] + 1)), True, 0.25
+        left, across, gap, curvature = int(rng.integers(2, _ROW_LENGTH[name] + 1)), True, 0.25, 0.0
         if name in ("traffic_cone", "barrier"):
             beside = half - rng.uniform(0.6, 2.6)
             gap = rng.uniform(1.0, 3.5) if name == "traffic_cone" or rng.random() < 0.3 else gap
+            if self.streets.bends:
+                curvature = float(self.bends.normal(0, self.streets.bends))
         elif name == "trailer" or rng.random() < 0.6:  # side by side, off the street
             beside, gap = half + pavement + size[0] / 2 + rng.uniform(1.5, 14), rng.uniform(0.5, 1.2)
         else:  # in line, at the kerb
             beside, gap, across = half - size[1] / 2 - rng.uniform(0.1, 0.4), rng.uniform(0.5, 2.5), False
-        return _Row(along, s, side * beside, gap, left, across, model)
+        return _Row(along, s, side, side * beside, gap, left, across, model, curvature)
 
     def _sample_station(self, moment: float) -> tuple[int, float]:
         """Sample a street (0 main, 1 crossing) and a position along it, by distance from the ego vehicle."""
         x, y, _ = pose_at(self.ego, moment)[0]
-        distance = self.reach_m * self.rng.uniform(0.05, 1) ** self.spread
+        distance = self.reach_m * self.rng.uniform(0.05, 1) ** self.streets.spread
         stations = []
         for along, (position, offset) in enumerate(((x, y), (y, x - self.ground.crossing_x))):
             if distance > abs(offset):
