@@ -88,11 +88,18 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
         done = f"{leg['frames_seen']:,} frames of {streets}, step {leg['steps']:,} of {leg['steps_planned']:,}"
         seconds, machine = leg["seconds_of_steps"], f" on {leg['device']}" if "device" in leg else ""
         time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
-        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of steps{machine}"
+        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of steps{machine}{_average(leg)}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
+
+
+def _average(leg: Mapping[str, Any]) -> str:
+    if "averaged_with" not in leg:
+        return ""
+    share, other = (leg["averaged_with"][key] for key in ("share", "hash"))
+    return f"; averaged with earlier weights (share {share}, hash {other[:12]})"
 
 
 def _curve(legs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -121,9 +128,10 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
         if isinstance(part, dict) and "all" in part:
             yield from _part(name, part)
     if found := record.get("fine_tuning"):
-        ours, other = (found[start]["all"]["mAP"] for start in ("from the checkpoint", "from scratch"))
+        starts = {"from the checkpoint": "from these weights", "from scratch": "from random ones"}
+        scores = [f"{found[start]['all']['mAP']:.3f} {text}" for start, text in starts.items() if start in found]
         yield f"\n### Fine-tuned on {found['keyframes']} real keyframes, {found['steps']} steps\n"
-        yield f"mAP on other keyframes of the scene: {ours:.3f} from these weights, {other:.3f} from random ones."
+        yield f"mAP on other keyframes of the scene: {', '.join(scores)}."
 
 
 def _part(name: str, part: Mapping[str, Any]) -> Iterator[str]:

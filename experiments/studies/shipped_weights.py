@@ -17,6 +17,9 @@ streets from ``seed * frames``; choose a seed whose streets no earlier training 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --steps 8000 --seed 7 \
         --batch-size 4 --learning-rate 4e-3 --simulators 12 --workers 3  # on a GPU
 
+``--average CHECKPOINT`` exports the average with the weights of an earlier training, such as those that this one
+started from: a training on other streets loses some of what the earlier one had learned.
+
 With ``--simulators``, that many processes simulate streets, from ``seed * 100,000`` on, and the steps repeat the
 streets that there are. Such a run resumes, but not bit for bit. It does not pause for evaluations; ``--export``
 scores its checkpoints instead.
@@ -44,7 +47,7 @@ from experiments.script import Options, compact_json, run_script, save, write_te
 from experiments.studies.model_card import RESULTS, SHIPPED, write_card
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints import load_checkpoint, save_checkpoint
-from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints
+from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, read_description
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
@@ -75,7 +78,8 @@ TRAINING_CITY = dataclasses.replace(
 )
 """At the frequencies of a city, most classes would hardly occur; here each has at least a tenth of the mean.
 
-Real cars have fewer points than a city's matt cars (``experiments/README.md``), so the gloss differs per street.
+Real cars have fewer points than a city's matt cars, so the gloss differs per street. Real streets have longer
+walls and buildings (``experiments/README.md``).
 """
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20
@@ -103,12 +107,14 @@ class Args(Options):
     warm_start: Path | None = None  # Checkpoint or shipped weights to start from; default: random weights.
     save_every: int = 150  # Steps between two checkpoints.
     export: bool = False  # Write the current weights into the package instead of training.
+    average: Path | None = None  # Checkpoint of an earlier training to average the exported weights with.
+    average_share: float = 0.3  # Share of that checkpoint, above 0 and below 1.
     test_frames: int = 200  # Unseen frames for the scores.
 
 
 _TRAINING_OPTIONS = (
     *("steps", "seed", "batch_size", "learning_rate", "simulators", "workers", "warm_start", "save_every"),
-    "export",
+    *("export", "average", "average_share"),
 )
 """Options that require ``work``."""
 
@@ -203,6 +209,19 @@ def half_precision(checkpoint: Checkpoint) -> Checkpoint:
     return dataclasses.replace(checkpoint, variables=halved)
 
 
+def averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpoint:
+    """Average the weights of two checkpoints, with a share of the other one.
+
+    After training on other streets, the average of old and new weights is often better on both (Wortsman et al.,
+    "Robust fine-tuning of zero-shot models", CVPR 2022). The second training must start from the first one.
+    """
+
+    def mean(own: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return (1 - share) * np.asarray(own, np.float32) + np.float32(share) * np.asarray(others, np.float32)
+
+    return dataclasses.replace(checkpoint, variables=jax.tree.map(mean, checkpoint.variables, other.variables))
+
+
 def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
     """Replace a checkpoint's post-processing, which training does not depend on, by the preset's current one."""
     config = dataclasses.replace(checkpoint.config, inference=CONFIGS[name].inference)
@@ -232,6 +251,10 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     training["curve"] = training["curve"] or curve_of(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
+    if args.average is not None:
+        other = find_checkpoint(args.average)
+        checkpoint = averaged(checkpoint, load_checkpoint(other), args.average_share)
+        training["averaged_with"] = {"hash": read_description(other)["hash"], "share": args.average_share}
     save_checkpoint(folder, half_precision(checkpoint))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     if size > _MAX_BYTES:
@@ -243,6 +266,10 @@ def export(args: Args, work: Path) -> dict[str, Any]:
 
 def main(args: Args) -> None:
     """Score, train or export; the next export reads the record of this one."""
+    if not 0 < args.average_share < 1:
+        raise ValueError(f"--average-share: got {args.average_share}, expected above 0 and below 1")
+    if args.average is not None and not args.export:
+        raise ValueError("--average: only for --export")
     if args.work is None:
         if changed := [name for name in _TRAINING_OPTIONS if getattr(args, name) != getattr(Args, name)]:
             raise ValueError(

@@ -12,11 +12,13 @@ import pytest
 from refusal import refused
 from tiny_run import TINY_CONFIG, untrained
 
+from experiments.changes import change
 from experiments.real_frames import SPANS_M, scores_by_range, within
 from experiments.studies import model_card, shipped_weights, transfer
 from experiments.studies.shipped_weights import earlier_trainings, half_precision
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.checkpoints.storage import CheckpointError
+from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -214,7 +216,7 @@ def test_a_card_of_other_weights_is_refused(shipped, tmp_path):
         model_card.write_card("hdl32e", tmp_path)
 
 
-def test_fine_tuning_trains_the_network_of_its_checkpoint(tmp_path, monkeypatch):
+def test_fine_tuning_trains_the_network_and_keeps_the_augmentation_of_its_checkpoint(tmp_path, monkeypatch):
     """Other weights of the same name are another run."""
     runs = []
     monkeypatch.setattr(transfer, "real_data", lambda *_: tmp_path)
@@ -224,13 +226,16 @@ def test_fine_tuning_trains_the_network_of_its_checkpoint(tmp_path, monkeypatch)
     )
     monkeypatch.setattr(transfer, "measured", lambda *_: {})
     weights = tmp_path / "weights"
+    given = change(augment=AugmentConfig(flip_y_probability=0.0))(CONFIG)
     for value in (0.0, 1.0):
         variables = jax.tree.map(lambda leaf, v=value: leaf + np.float32(v), untrained(CONFIG, TINY))
         shutil.rmtree(weights, ignore_errors=True)
-        save_checkpoint(weights, Checkpoint(CONFIG, TINY, variables, 3))
-        transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=weights, work=tmp_path))
+        save_checkpoint(weights, Checkpoint(given, TINY, variables, 3))
+        records = list(transfer.fine_tuning(transfer.Args(data=tmp_path, checkpoint=weights, work=tmp_path)))
+        assert len(records) == 2
     assert len({folder for folder, _, _ in runs}) == 4
-    assert all(config.model == CONFIG.model for _, config, _ in runs)
+    assert all(config.model == given.model for _, config, _ in runs)
+    assert all(config.augment == given.augment for _, config, _ in runs)
     assert [options["weights"] for _, _, options in runs] == [weights, None] * 2
     rates = [config.optimizer.peak_learning_rate for _, config, _ in runs]
     assert rates[0] == rates[1] / 3

@@ -269,6 +269,53 @@ def test_surroundings_are_beside_their_street_and_off_both_carriageways(along, s
     assert (np.sign(beside) == side).all()
 
 
+@pytest.mark.parametrize(("along", "side"), [(0, -1), (0, 1), (1, -1), (1, 1)])
+def test_walls_and_long_buildings_line_the_street(along, side):
+    """They follow the pavement for most of the street, and nothing of them stands on a carriageway."""
+    ground = Ground(np.array([[0.02, 0, -1.8]]), 7, 30, 6, 0.13, 3, (0.1, 0.1, 0.1))
+    here, walled = Side(ground, along, side, (-60.0, 80.0)), changed(walls=1.0)
+    lengths = {"wall": [], "building": []}
+    for seed in range(12):
+        found = sample_surroundings(default_rng(seed), here, walled, "city")
+        x, y = found["center"][:, :2].T
+        beside, half = (y, 7) if along == 0 else (x - 30, 6)
+        away = np.abs(beside) - half - 3  # behind the pavement
+        wall = np.isclose(found["half"][:, 1], 1.5) & (found["half"][:, 0] < 0.5)
+        ends = np.abs(beside) - found["half"][:, 0]
+        assert (np.sign(beside) == side).all()
+        assert (ends[wall] > half + 2.5).all()
+        assert (away[wall] < 2.7).all()
+        assert np.ptp(away[wall]) < 1e-6  # in line
+        top = (found["center"][:, 2] + found["half"][:, 2] - ground.height(x, y))[wall]
+        assert np.ptp(top) < 1e-6
+        assert 0.5 < top[0] < 2.8
+        bodies = found[(found["half"][:, 0] > 3) & (found["half"][:, 1] > 3)]
+        edges = corners(bodies)[..., :2].reshape(-1, 2)
+        assert not ground.on_road(*edges.T).any()
+        lengths["wall"].append(3.0 * wall.sum())
+        lengths["building"].append(2 * bodies["half"][:, 1].sum())
+    assert all(30 < np.mean(each) < 120 for each in lengths.values())
+    assert len(sample_surroundings(default_rng(0), here, PLAIN, "city")) == 0
+
+
+def test_rows_of_barriers_bend():
+    """The direction of a row turns by its curvature times the distance from barrier to barrier."""
+    options = {"reach_m": 50, "beyond_m": 20, "duration_s": 0.0, "labels": np.full(14, 9), "level": True}
+    turns = {}
+    for bends in (0.0, 0.05):
+        turns[bends] = []
+        for seed in range(40):
+            world = sample_world(default_rng(seed), **options, streets=changed(bends=bends))
+            motions = world.traffic.motions
+            step = np.hypot(np.diff(motions["x"]), np.diff(motions["y"]))
+            turn = (np.diff(motions["yaw"]) + np.pi / 2) % np.pi - np.pi / 2
+            turns[bends] += [np.mean((turn / step)[step < 5])] if (step < 5).sum() > 3 else []
+        assert len(turns[bends]) > 20
+    assert np.std(turns[0.0]) < 0.01
+    assert np.std(turns[0.05]) == pytest.approx(0.05, rel=0.35)
+    assert np.mean(turns[0.05]) == pytest.approx(0, abs=0.025)
+
+
 def test_fronts_of_buildings_have_depth():
     """Parts extend beyond the plane of a front by decimetres to metres."""
     ground = Ground(np.zeros((1, 3)), 7, 900, 6, 0.13, 3, (0.1, 0.1, 0.1))
