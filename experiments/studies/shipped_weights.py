@@ -217,6 +217,8 @@ def averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpo
     """
 
     def mean(own: np.ndarray, others: np.ndarray) -> np.ndarray:
+        if own.shape != others.shape:
+            raise ValueError(f"got arrays of shapes {own.shape} and {others.shape}, expected equal shapes")
         return (1 - share) * np.asarray(own, np.float32) + np.float32(share) * np.asarray(others, np.float32)
 
     return dataclasses.replace(checkpoint, variables=jax.tree.map(mean, checkpoint.variables, other.variables))
@@ -253,7 +255,10 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     if args.average is not None:
         other = find_checkpoint(args.average)
-        checkpoint = averaged(checkpoint, load_checkpoint(other), args.average_share)
+        try:
+            checkpoint = averaged(checkpoint, load_checkpoint(other), args.average_share)
+        except ValueError:
+            raise ValueError(f"--average: got another network in {other}, expected that of {work}") from None
         training["averaged_with"] = {"hash": read_description(other)["hash"], "share": args.average_share}
     save_checkpoint(folder, half_precision(checkpoint))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -146,6 +146,36 @@ def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
     assert training["seconds_of_steps"] == 6
 
 
+def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path):
+    package, _ = shipped
+    run = load_checkpoint(tmp_path / "run/checkpoints/00000003")
+    other = jax.tree.map(lambda leaf: np.asarray(leaf) + np.float32(1), run.variables)
+    earlier = save_and_hash(tmp_path / "earlier", dataclasses.replace(run, variables=other))
+    args = shipped_weights.Args(name="hdl32e", work=tmp_path / "run", export=True, test_frames=2)
+    args = dataclasses.replace(args, average=tmp_path / "earlier", average_share=0.25)
+    shipped_weights.main(args)
+    both = (load_checkpoint(package / "hdl32e").variables, run.variables)
+    for a, b in zip(*map(jax.tree.leaves, both), strict=True):
+        np.testing.assert_allclose(a, np.asarray(b, np.float32) + 0.25, rtol=1e-3, atol=1e-4)
+    record = json.loads((tmp_path / "results/hdl32e.json").read_text())
+    assert record["training"]["averaged_with"] == {"hash": earlier, "share": 0.25}
+    card = (package / "hdl32e/README.md").read_text()
+    assert f"averaged with earlier weights (share 0.25, hash {earlier[:12]})" in card
+    wrong = {
+        "--average-share: got 1.5": {"average_share": 1.5},
+        "--average: only for --export": {"export": False},
+        "--average: got another network": {"average": Path("hdl32e")},
+    }
+    for message, change_of in wrong.items():
+        with pytest.raises(ValueError, match=message):
+            shipped_weights.main(dataclasses.replace(args, **change_of))
+
+
+def save_and_hash(folder: Path, checkpoint: Checkpoint) -> str:
+    save_checkpoint(folder, checkpoint)
+    return json.loads((folder / "checkpoint.json").read_text())["hash"]
+
+
 def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     package, record = shipped
     before = {file: file.read_bytes() for file in package.rglob("*") if file.is_file()}
