@@ -255,8 +255,9 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     if args.average is not None:
         other = find_checkpoint(args.average)
+        earlier_weights = load_checkpoint(other)
         try:
-            checkpoint = averaged(checkpoint, load_checkpoint(other), args.average_share)
+            checkpoint = averaged(checkpoint, earlier_weights, args.average_share)
         except ValueError:
             raise ValueError(f"--average: got another network in {other}, expected that of {work}") from None
         training["averaged_with"] = {"hash": read_description(other)["hash"], "share": args.average_share}
@@ -275,6 +276,8 @@ def main(args: Args) -> None:
         raise ValueError(f"--average-share: got {args.average_share}, expected above 0 and below 1")
     if args.average is not None and not args.export:
         raise ValueError("--average: only for --export")
+    if args.average is None and args.average_share != Args.average_share:
+        raise ValueError("--average-share: only with --average")
     if args.work is None:
         if changed := [name for name in _TRAINING_OPTIONS if getattr(args, name) != getattr(Args, name)]:
             raise ValueError(

@@ -134,9 +134,9 @@ def _long_buildings(rng: Generator, side: Side, setback: float) -> list[np.ndarr
     while s < side.span[1]:
         width, s = rng.uniform(*_LONG_M), s + rng.uniform(0, 60)
         building = _building(rng, width, rng.uniform(7, 15), rng.uniform(3, 12))
-        ends = s + width / 2 * np.array([0, -1, 1])
-        center, free = side.positions(ends, side.back_m + setback, 1.0)
-        if len(free) == len(ends):
+        places = s + width * np.array([0.5, 0, 1])  # the middle and both ends
+        center, free = side.positions(places, side.back_m + setback, 1.0)
+        if len(free) == len(places):
             parts.append(place_solids(building, np.append(center[0], side.facing)))
         s += width
     return parts

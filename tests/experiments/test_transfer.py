@@ -164,6 +164,7 @@ def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path):
     wrong = {
         "--average-share: got 1.5": {"average_share": 1.5},
         "--average: only for --export": {"export": False},
+        "--average-share: only with --average": {"average": None},
         "--average: got another network": {"average": Path("hdl32e")},
     }
     for message, change_of in wrong.items():

@@ -271,7 +271,7 @@ def test_surroundings_are_beside_their_street_and_off_both_carriageways(along, s
 
 @pytest.mark.parametrize(("along", "side"), [(0, -1), (0, 1), (1, -1), (1, 1)])
 def test_walls_and_long_buildings_line_the_street(along, side):
-    """They follow the pavement for most of the street, and nothing of them stands on a carriageway."""
+    """They stand behind the pavement, and no part of them stands on a carriageway."""
     ground = Ground(np.array([[0.02, 0, -1.8]]), 7, 30, 6, 0.13, 3, (0.1, 0.1, 0.1))
     here, walled = Side(ground, along, side, (-60.0, 80.0)), changed(walls=1.0)
     lengths = {"wall": [], "building": []}
