@@ -74,12 +74,19 @@ CONFIGS = {
     )(_FRESH(COMPACT)),
 }
 TRAINING_CITY = dataclasses.replace(
-    CITY, name="city, more even and glossy", city_classes=0.25, gloss=1.0, patchwork=0.4, walls=0.35, bends=0.03
+    CITY,
+    name="city, more even and glossy",
+    city_classes=0.25,
+    gloss=1.0,
+    patchwork=0.4,
+    walls=0.35,
+    bends=0.03,
+    depots=0.5,
 )
 """At the frequencies of a city, most classes would hardly occur; here each has at least a tenth of the mean.
 
 Real cars have fewer points than a city's matt cars, so the gloss differs per street. Real streets have longer
-walls and buildings (``experiments/README.md``).
+walls and buildings, and closer rows of trailers (``experiments/README.md``).
 """
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20

@@ -47,6 +47,7 @@ class Streets:
     round_cars: bool = False  # most cars have rounded ends
     groups: float = 0.0  # share of pedestrians next to another pedestrian
     bends: float = 0.0  # deviation of the curvature of rows of cones and barriers, 1/m
+    depots: float = 0.0  # share of the rows of trailers that are long and close, with trailers of one model
     shape: float = 0.0  # deviation of the sizes of object parts
     sizes: float = 1.0  # factor of the deviations of box sizes
     gloss: float = 0.0  # maximum share of grazing rays that the paint of vehicles reflects away, uniform per world

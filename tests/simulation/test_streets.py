@@ -1,6 +1,7 @@
 """Check each randomisation of varied streets, and that plain streets are unchanged."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -314,6 +315,27 @@ def test_rows_of_barriers_bend():
     assert np.std(turns[0.0]) < 0.01
     assert np.std(turns[0.05]) == pytest.approx(0.05, rel=0.35)
     assert np.mean(turns[0.05]) == pytest.approx(0, abs=0.025)
+
+
+def test_trailers_in_depots_stand_close():
+    """Gaps are at least 0.08 m and mostly below 0.5 m, headings and models of a depot are alike."""
+    options = {"reach_m": 50, "beyond_m": 20, "duration_s": 0.0, "labels": np.full(12, 3), "level": True}
+    gaps, lengths, turns = [], [], []
+    for seed in range(40):
+        traffic = sample_world(default_rng(seed), **options, streets=changed(depots=1.0)).traffic
+        motions, sizes = traffic.motions, traffic.sizes
+        step = np.hypot(np.diff(motions["x"]), np.diff(motions["y"]))
+        gap = step - (sizes[1:, 1] + sizes[:-1, 1]) / 2
+        together = gap < 0.6
+        same = np.array([a is b for a, b in itertools.pairwise(traffic.models)], bool)
+        assert same[together].all()
+        turn = (np.diff(motions["yaw"]) + np.pi / 2) % np.pi - np.pi / 2
+        gaps, turns = [*gaps, *gap[together]], [*turns, *turn[together]]
+        lengths.append(together.sum())
+    assert min(gaps) > 0.08
+    assert np.median(gaps) < 0.4
+    assert np.std(turns) < 0.02
+    assert np.mean(lengths) > 4
 
 
 def test_fronts_of_buildings_have_depth():
