@@ -30,7 +30,7 @@ _PARKED = ("row", "kerb", "yard")
 _ROW_LENGTH = {"car": 8, "trailer": 5, "traffic_cone": 8, "barrier": 14}  # maximum number of objects in a row
 _DEPOT_LENGTH = 12  # of trailers in a depot
 _DEPOT_GAP_M = (0.12, 0.5)
-_DEPOT_ORDER = 0.2  # factor of the deviations of places and headings in a depot
+_DEPOT_DISORDER = 0.2  # factor of the deviations of places and headings in a depot
 _FAST = 0.7  # share of the objects in fast traffic that use the first place of their class
 _FLOWING = {0: 0.8, 1: 0.4}  # probability that a lane moves, in the main street and the crossing street
 _CLEARANCE_M = 0.35  # minimum gap between objects at all times
@@ -170,7 +170,7 @@ class _Row:
     across: bool  # objects face the street, as barriers do; otherwise they face along it
     model: ObjectModel  # model of the first object
     equal: bool  # all objects have this model
-    order: float = 1.0  # factor of the deviations of places and headings
+    disorder: float = 1.0  # factor of the deviations of places and headings
     curvature: float = 0.0  # 1/m, positive to the left
     angle: float = 0.0  # direction at the end of the row, relative to the street
 
@@ -211,7 +211,7 @@ class _Places:
         ahead, aside = np.cos(row.angle), np.sin(row.angle)
         s, beside = row.end + row.gap * ahead + extent / 2 * ahead, row.beside + (row.gap + extent / 2) * aside
         turn = np.pi / 2 * row.side if row.across else np.pi * (row.side > 0)
-        noise = row.order * self.rng.normal(0, (0.06, 0.03))
+        noise = row.disorder * self.rng.normal(0, (0.06, 0.03))
         motion = self._motion(row.along, s, beside + noise[0], turn + row.angle + noise[1])
         row.end, row.beside, row.left = s + extent / 2 * ahead, beside + extent / 2 * aside, row.left - 1
         row.angle += row.curvature * (row.gap + extent)
@@ -277,7 +277,7 @@ class _Places:
         rng, pavement = self.rng, self.ground.pavement
         along, s = self._sample_station(moment)
         half, side = self._half(along), rng.choice([-1, 1])
-        left, across, gap, order, curvature = int(rng.integers(2, _ROW_LENGTH[name] + 1)), True, 0.25, 1.0, 0.0
+        left, across, gap, disorder, curvature = int(rng.integers(2, _ROW_LENGTH[name] + 1)), True, 0.25, 1.0, 0.0
         equal = name in ("traffic_cone", "barrier")
         if equal:
             beside = half - rng.uniform(0.6, 2.6)
@@ -290,8 +290,8 @@ class _Places:
             beside, gap, across = half - size[1] / 2 - rng.uniform(0.1, 0.4), rng.uniform(0.5, 2.5), False
         if name == "trailer" and self.streets.depots and self.shapes.random() < self.streets.depots:
             left, gap = int(self.shapes.integers(4, _DEPOT_LENGTH + 1)), self.shapes.uniform(*_DEPOT_GAP_M)
-            equal, order = True, _DEPOT_ORDER
-        return _Row(along, s, side, side * beside, gap, left, across, model, equal, order, curvature)
+            equal, disorder = True, _DEPOT_DISORDER
+        return _Row(along, s, side, side * beside, gap, left, across, model, equal, disorder, curvature)
 
     def _sample_station(self, moment: float) -> tuple[int, float]:
         """Sample a street (0 main, 1 crossing) and a position along it, by distance from the ego vehicle."""
