@@ -7,7 +7,8 @@ The cells of tables 1, 2 and 7 are of a network that learns slowly, because the 
 geometry, unlike ``compact``. These rows have it, and each takes one part away from five rounds of ten sweeps with
 priority. The paper's figures for the same changes are -2.06 (one round), -3.66 (one sweep) and -2.79 (without
 priority) points of mAP. The heads see the local geometry of the first round only. An epoch of ``sector`` has 4,000
-samples. Cost: ``experiments/README.md`` estimates the hours. No cell has been trained.
+samples. Cost: ``experiments/README.md`` estimates the hours. Only the cell of one round with seed 0 has been
+trained.
 """
 
 import dataclasses
