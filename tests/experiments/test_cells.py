@@ -25,7 +25,8 @@ def test_the_tables_of_today_find_every_committed_cell(tmp_path):
     rows = [row for table in (*TABLES.values(), *study_tables()) for row in table.rows]
     known = {changes_of(row.change(scale.base), scale.base) for row in rows}
     cells = read_cells(SECTOR, scale)
-    assert len(cells) == 20
+    lines = (SECTOR / "cells.csv").read_text().splitlines()
+    assert len(cells) == len(lines) - 1 > 20
     assert {changes for changes, _ in cells} <= known
 
 
