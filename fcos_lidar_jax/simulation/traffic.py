@@ -28,8 +28,8 @@ _PLACES: dict[str, tuple[tuple[str, float], ...]] = {
 }
 _PARKED = ("row", "kerb", "yard")
 _ROW_LENGTH = {"car": 8, "trailer": 5, "traffic_cone": 8, "barrier": 14}  # maximum number of objects in a row
-_DEPOT_LENGTH = 12  # of trailers in a depot
-_DEPOT_GAP_M = (0.12, 0.5)
+_DEPOT_LENGTH = (4, 12)  # minimum and maximum number of trailers in a depot
+_DEPOT_GAP_M = (0.12, 0.5)  # gap between trailers of a depot
 _DEPOT_DISORDER = 0.2  # factor of the deviations of places and headings in a depot
 _FAST = 0.7  # share of the objects in fast traffic that use the first place of their class
 _FLOWING = {0: 0.8, 1: 0.4}  # probability that a lane moves, in the main street and the crossing street
@@ -183,7 +183,7 @@ class _Places:
     reach_m: float  # maximum distance from the ego vehicle
     fast_traffic: bool  # all lanes flow fast and steadily, and few objects stand
     streets: Streets
-    shapes: Generator  # random source of the curvatures of rows, and of depots
+    shapes: Generator  # random source of curved rows and depots
     # The unfinished row of each class.
     rows: dict[str, _Row] = dataclasses.field(default_factory=dict)
     # Speed and acceleration by (street, side, lane). Vehicles of a lane share them, which keeps their gaps.
@@ -289,7 +289,8 @@ class _Places:
         else:  # in line, at the kerb
             beside, gap, across = half - size[1] / 2 - rng.uniform(0.1, 0.4), rng.uniform(0.5, 2.5), False
         if name == "trailer" and self.streets.depots and self.shapes.random() < self.streets.depots:
-            left, gap = int(self.shapes.integers(4, _DEPOT_LENGTH + 1)), self.shapes.uniform(*_DEPOT_GAP_M)
+            left = int(self.shapes.integers(*_DEPOT_LENGTH, endpoint=True))
+            gap = self.shapes.uniform(*_DEPOT_GAP_M)
             equal, disorder = True, _DEPOT_DISORDER
         return _Row(along, s, side, side * beside, gap, left, across, model, equal, disorder, curvature)
 
