@@ -29,3 +29,13 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
     first, *rest = path
     inner = _replaced(getattr(config, first), rest, value) if rest else value
     return dataclasses.replace(config, **{first: inner})
+
+
+SLIM = change(
+    model__stem__out_channels=16,
+    model__backbone_blocks=(2, 3, 3, 2),
+    model__backbone_widths=(16, 48, 64, 64),
+    model__fpn_channels=48,
+    model__head_channels=32,
+)
+"""Former sizes of ``compact``. The ladder and the scale ``sector`` keep them, so that all trials are comparable."""

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from experiments.cached import CachedFrames
-from experiments.changes import change
+from experiments.changes import SLIM, change
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemConfig
@@ -341,7 +341,7 @@ _SECTOR = change(
     projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
     model__circular_width=False,
     model__local_geometry=False,
-    # Wider than compact, for the 45 inputs of five rounds.
+    # Wider than in compact, for the 45 inputs of five rounds.
     model__stem__channels_per_type=8,
     model__stem__out_channels=24,
     # Larger rotations leave the sector, and a mirrored street would face backwards.
@@ -349,7 +349,7 @@ _SECTOR = change(
     augment__max_rotation_rad=math.radians(5),
     optimizer__ema_decay=0.998,
     optimizer__epochs=2,
-)(COMPACT)
+)(SLIM(COMPACT))
 
 
 def quarter(cache: Path) -> Simulated:

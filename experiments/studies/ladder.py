@@ -3,10 +3,11 @@
     python -m experiments.studies.ladder --trials base CenterPoint
     python -m experiments.studies.ladder --trials base "local geometry" --seeds 0 1 2
 
-Each trial is a change of ``compact``, trained on a quarter of the view of nuScenes' HDL-32E (32 x 272 pixels) with
-one sweep and one round: 4,000 frames of varied simulated streets, 3,000 steps of one frame, one one-cycle
-schedule. The score is nuScenes' mAP on 200 unseen frames, and on 60 of them after each quarter of the training.
-The same command resumes a trial. Trials that are already in the file of ``--out`` are not repeated: with
+Each trial is a change of ``compact`` with its former, smaller sizes, trained on a quarter of the view of nuScenes'
+HDL-32E (32 x 272 pixels) with one sweep and one round: 4,000 frames of varied simulated streets, 3,000 steps of
+one frame, one one-cycle schedule. The score is nuScenes' mAP on 200 unseen frames, and on 60 of them after each
+quarter of the training. The same command resumes a trial. Trials that are already in
+the file of ``--out`` are not repeated: with
 ``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has
 one line per trial. Cost: half an hour of one core per trial, and some minutes once for the frames.
 """
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.cached import CachedFrames
-from experiments.changes import Change, change
+from experiments.changes import SLIM, Change, change
 from experiments.hardware import hardware
 from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
@@ -109,7 +110,7 @@ def measure(args: Args) -> None:
     for seed in args.seeds:
         for name in args.trials:
             if not any((r["trial"], r["steps"], r["seed"]) == (name, args.steps, seed) for r in rows):
-                rows.append(trial(name, TRIALS[name](BASE(COMPACT)), seed, args))
+                rows.append(trial(name, TRIALS[name](BASE(SLIM(COMPACT))), seed, args))
                 save({"rows": rows}, out, json.dumps(rows[-1]))
     print(table(rows))
 

@@ -41,6 +41,7 @@ import numpy as np
 from experiments.cached import CachedFrames
 from experiments.changes import change
 from experiments.hardware import hardware
+from experiments.mixed import MixedFrames
 from experiments.pool import PooledFrames, simulating
 from experiments.runs import detections, trained
 from experiments.script import Options, compact_json, run_script, save, write_text
@@ -73,21 +74,21 @@ CONFIGS = {
         optimizer__warmup_fraction=0.2,
     )(_FRESH(COMPACT)),
 }
+EVEN_CITY = dataclasses.replace(CITY, name="city, more even", city_classes=0.25)
+"""At the frequencies of a city, most classes would hardly occur; here each has at least a tenth of the mean."""
 TRAINING_CITY = dataclasses.replace(
-    CITY,
+    EVEN_CITY,
     name="city, more even and glossy",
-    city_classes=0.25,
     gloss=1.0,
     patchwork=0.4,
     walls=0.35,
     bends=0.03,
     depots=0.5,
 )
-"""At the frequencies of a city, most classes would hardly occur; here each has at least a tenth of the mean.
-
-Real cars have fewer points than a city's matt cars, so the gloss differs per street. Real streets have longer
+"""Real cars have fewer points than a city's matt cars, so the gloss differs per street. Real streets have longer
 walls and buildings, and closer rows of trailers (``experiments/README.md``).
 """
+_MATT = 3  # Every third street has matt cars, as the simulated drives of the tests have.
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
@@ -126,15 +127,16 @@ _TRAINING_OPTIONS = (
 """Options that require ``work``."""
 
 
-def streets(config: Config, *, steps: int, seed: int) -> tuple[SimulatedFrames, FrameSet]:
+def streets(config: Config, *, steps: int, seed: int) -> tuple[FrameSet, FrameSet]:
     """Create training frames that are all different, and unseen test frames."""
     unseen = open_frames(format="simulated", split="val", sensor=load_sensor(config.sensor))
     assert isinstance(unseen, SimulatedFrames)
     fresh = fresh_streets(config, steps=steps, seed=seed)[1]
     shown = dataclasses.replace(unseen, number=fresh.number, first_seed=fresh.first_seed)
-    if unseen.streets == CITY:
-        shown = dataclasses.replace(shown, num_objects=_MORE_OBJECTS, streets=TRAINING_CITY)
-    return shown, unseen
+    if unseen.streets != CITY:
+        return shown, unseen
+    matt = dataclasses.replace(shown, num_objects=_MORE_OBJECTS, streets=EVEN_CITY)
+    return MixedFrames(dataclasses.replace(matt, streets=TRAINING_CITY), matt, _MATT), unseen
 
 
 def train(args: Args, work: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import pytest
 import tiny_run
 from linear_network import linear_network
 
+from experiments.changes import SLIM
 from experiments.studies import ladder
 from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, measure
 from fcos_lidar_jax.models import build_detector, count_parameters
@@ -18,11 +19,11 @@ PARAMETERS = {"base": 1_265_726, "CenterPoint": 739_796, "local geometry": 1_288
 
 @pytest.mark.parametrize("name", TRIALS)
 def test_every_trial_is_a_network_for_the_sector(name):
-    config = TRIALS[name](BASE(COMPACT))
+    config = TRIALS[name](BASE(SLIM(COMPACT)))
     detector = build_detector(config, SENSOR)
     parameters = count_parameters(jax.eval_shape(detector.init, jax.random.key(0))["params"])["total"]
     assert parameters == PARAMETERS[name]
-    assert (config == BASE(COMPACT)) == (name == "local geometry")
+    assert (config == BASE(SLIM(COMPACT))) == (name == "local geometry")
     assert config.optimizer == COMPACT.optimizer
 
 
@@ -52,7 +53,7 @@ def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys)
     assert (row["trial"], row["seed"], len(row["curve"])) == ("local geometry", 0, 4)
     assert 0 <= row["mAP"] <= 1
     assert row["step_s"] > 0
-    shapes = jax.eval_shape(build_detector(BASE(ladder.COMPACT), SENSOR).init, jax.random.key(0))
+    shapes = jax.eval_shape(build_detector(BASE(SLIM(ladder.COMPACT)), SENSOR).init, jax.random.key(0))
     assert row["parameters"] == sum(leaf.size for leaf in jax.tree.leaves(shapes["params"]))
     assert '"trial": "local geometry"' in capsys.readouterr().out
     monkeypatch.setattr(ladder, "trial", None)  # nothing is trained again
