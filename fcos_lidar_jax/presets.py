@@ -117,10 +117,11 @@ COMPACT = dataclasses.replace(
     augment=AugmentConfig(max_rotation_rad=math.pi / 8),
     optimizer=OptimizerConfig(peak_learning_rate=3e-3, batch_size=1, ema_decay=0.998),
 )
-"""One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with an eighth of its parameters.
+"""One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with a fifth of its parameters.
 
-The sizes follow from measured times (``experiments/LOG.md``, 2026-11-22). Layers at stride 1 cost most, so they
-are narrow; the later stages of the backbone cost least, so they are deep. Doubled rows contain the same points.
+Layers at stride 1 cost most, and the later stages of the backbone least, so the former are narrow and the latter
+deep (``experiments/LOG.md``, 2026-11-22). The first stage, the pyramid and the heads were widened when more training
+no longer helped (2026-11-27). Doubled rows contain the same points.
 The image wraps around, so there is no seam behind the vehicle. NMS at 0.1, weighted NMS and the IoU exponent are
 not in the paper; ``python -m experiments.studies.post_processing`` measures what each adds. The regression axes
 are not in the paper either; ``experiments/LOG.md`` compares them with the paper's.
@@ -165,7 +166,7 @@ CENTERPOINT_COMPACT = CenterPointConfig.of(
     ),
 )
 """CenterPoint for comparison with ``compact``: the same sweep, augmentation, optimizer and post-processing, with
-pillars of 0.4 m and half the parameters. All classes are one group: rare classes share features with frequent
+pillars of 0.4 m and 0.4 times the parameters. All classes are one group: rare classes share features with frequent
 ones."""
 
 PRESETS: dict[str, Config] = {

@@ -1,0 +1,32 @@
+"""Frames of two sets in turn."""
+
+import dataclasses
+
+from experiments.cached import CachedFrames
+from experiments.mixed import MixedFrames
+from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+
+FIRST = SimulatedFrames(TINY, 6)
+OTHER = dataclasses.replace(FIRST, num_objects=3)
+MIXED = MixedFrames(FIRST, OTHER, 3)
+
+
+def test_every_third_frame_is_of_the_other_set():
+    for index in range(6):
+        expected = (OTHER if index in (0, 3) else FIRST).frame(index)
+        assert (MIXED.frame(index).points == expected.points).all()
+        assert (MIXED.truth(index).boxes == expected.boxes).all()
+        assert MIXED.labels(index).tolist() == expected.labels.tolist()
+    assert (len(MIXED), MIXED.sensor, MIXED.name(3)) == (6, TINY, FIRST.name(3))
+
+
+def test_the_fingerprint_depends_on_both_sets_and_the_period():
+    others = (dataclasses.replace(MIXED, other=FIRST), dataclasses.replace(MIXED, period=2))
+    assert len({MIXED.fingerprint(), *(other.fingerprint() for other in others)}) == 3
+
+
+def test_a_cache_keeps_them_apart(tmp_path):
+    cache = CachedFrames(MIXED, tmp_path)
+    assert (cache.frame(3).points == OTHER.frame(3).points).all()
+    assert (CachedFrames(MIXED, tmp_path).frame(3).points == OTHER.frame(3).points).all()
