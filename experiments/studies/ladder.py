@@ -2,6 +2,7 @@
 
     python -m experiments.studies.ladder --trials base CenterPoint
     python -m experiments.studies.ladder --trials base "local geometry" --seeds 0 1 2
+    python -m experiments.studies.ladder --trials "local geometry" larger  # the sizes of compact today
 
 Each trial is a change of ``compact`` with its former, smaller sizes, trained on a quarter of the view of nuScenes'
 HDL-32E (32 x 272 pixels) with one sweep and one round: 4,000 frames of varied simulated streets, 3,000 steps of
@@ -40,6 +41,7 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
+_SIZES = ("stem", "backbone_blocks", "backbone_widths", "fpn_channels", "head_channels")
 
 BASE: Change = change(
     name="ladder",
@@ -57,6 +59,7 @@ TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
     "local geometry": change(),
+    "larger": change(**{f"model__{name}": getattr(COMPACT.model, name) for name in _SIZES}),
 }
 
 

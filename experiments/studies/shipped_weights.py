@@ -57,10 +57,12 @@ from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import metric_of
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.inference import load_trained
+from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames, fresh_streets
 from fcos_lidar_jax.simulation.streets import CITY
+from fcos_lidar_jax.simulation.world import class_shares
 from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
@@ -88,6 +90,7 @@ TRAINING_CITY = dataclasses.replace(
 """Real cars have fewer points than a city's matt cars, so the gloss differs per street. Real streets have longer
 walls and buildings, and closer rows of trailers (``experiments/README.md``).
 """
+_CITY_SHARE = {"hdl32e": 0.5}  # See at_city_frequencies; chosen from 0, 0.5 and 1 on drives of another seed.
 _MATT = 3  # Every third street has matt cars, as the simulated drives of the tests have.
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20
@@ -188,6 +191,7 @@ def training_record(run: Path) -> dict[str, Any]:
     pooled = run / _POOLED
     return {
         "preset": config.name,
+        "parameters": count_parameters(checkpoint.variables["params"])["total"],
         "seed": spec["seed"],
         "begun_with": spec["weights"] or "random weights",
         "steps": done,
@@ -233,6 +237,23 @@ def averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpo
     return dataclasses.replace(checkpoint, variables=jax.tree.map(mean, checkpoint.variables, other.variables))
 
 
+def at_city_frequencies(checkpoint: Checkpoint, share: float) -> Checkpoint:
+    """Adapt the scores to class frequencies between those of ``EVEN_CITY``, 0, and of cities, 1.
+
+    The training shows rare classes more often than cities do, so a detector of cities should take them for less
+    probable. The logarithm of the ratio of the frequencies is added to the logits (Menon et al., "Long-tail
+    learning via logit adjustment", ICLR 2021).
+    """
+    seen, usual = class_shares(EVEN_CITY.city_classes), class_shares(1.0)
+    added = np.append(share * np.log(usual / seen), 0.0).astype(np.float32)  # nothing for the background
+
+    def adapt(path: tuple[Any, ...], leaf: np.ndarray) -> np.ndarray:
+        return leaf + added if path[-1].key == "logits_bias" else leaf
+
+    adapted = jax.tree_util.tree_map_with_path(adapt, checkpoint.variables)
+    return dataclasses.replace(checkpoint, variables=adapted)
+
+
 def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
     """Replace a checkpoint's post-processing, which training does not depend on, by the preset's current one."""
     config = dataclasses.replace(checkpoint.config, inference=CONFIGS[name].inference)
@@ -262,6 +283,8 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     training["curve"] = training["curve"] or curve_of(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
+    if share := _CITY_SHARE.get(args.name):
+        checkpoint = at_city_frequencies(checkpoint, share)
     if args.average is not None:
         other = find_checkpoint(args.average)
         earlier_weights = load_checkpoint(other)

@@ -14,7 +14,7 @@ from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, measure
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import COMPACT
 
-PARAMETERS = {"base": 1_265_726, "CenterPoint": 739_796, "local geometry": 1_288_574}
+PARAMETERS = {"base": 1_265_726, "CenterPoint": 739_796, "local geometry": 1_288_574, "larger": 1_929_694}
 
 
 @pytest.mark.parametrize("name", TRIALS)
