@@ -38,4 +38,4 @@ SLIM = change(
     model__fpn_channels=48,
     model__head_channels=32,
 )
-"""Former sizes of ``compact``. The ladder and the scale ``sector`` keep them, so that all trials are comparable."""
+"""Former sizes of ``compact``, which the ladder and the scale ``sector`` keep, so that trials stay comparable."""

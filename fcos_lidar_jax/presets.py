@@ -120,11 +120,11 @@ COMPACT = dataclasses.replace(
 """One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with a fifth of its parameters.
 
 Layers at stride 1 cost most, and the later stages of the backbone least, so the former are narrow and the latter
-deep (``experiments/LOG.md``, 2026-11-22). The first stage, the pyramid and the heads were widened when more training
-no longer helped (2026-11-27). Doubled rows contain the same points.
-The image wraps around, so there is no seam behind the vehicle. NMS at 0.1, weighted NMS and the IoU exponent are
-not in the paper; ``python -m experiments.studies.post_processing`` measures what each adds. The regression axes
-are not in the paper either; ``experiments/LOG.md`` compares them with the paper's.
+deep (``experiments/LOG.md``, 2026-11-22). First stage, pyramid and heads were widened when more training no longer
+helped (2026-11-27). Doubled rows contain the same points. The image wraps around, so there is no seam behind the
+vehicle. NMS at 0.1, weighted NMS and the IoU exponent are not in the paper;
+``python -m experiments.studies.post_processing`` measures what each adds. The regression axes are not in the paper
+either; ``experiments/LOG.md`` compares them with the paper's.
 """
 
 KITTI_COMPACT = dataclasses.replace(

@@ -88,8 +88,8 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
         done = f"{leg['frames_seen']:,} frames of {streets}, step {leg['steps']:,} of {leg['steps_planned']:,}"
         seconds, machine = leg["seconds_of_steps"], f" on {leg['device']}" if "device" in leg else ""
         time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
-        size = f", {leg['parameters']:,} parameters" if "parameters" in leg else ""
-        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of steps{machine}{size}{_average(leg)}"
+        more = (f", {leg['parameters']:,} parameters" if "parameters" in leg else "") + _average(leg)
+        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of steps{machine}{more}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it, which"
         yield "`experiments.studies.widened_weights` had enlarged if the preset had become larger."

@@ -2,10 +2,10 @@
 
     python -m experiments.studies.widened_weights --name hdl32e
 
-Training can then go on in the larger network from what the smaller one has learned, instead of from random weights
-(Chen et al., "Net2Net", ICLR 2016). Old channels keep their weights and ignore the new ones. New channels have random
-weights, and new blocks of the backbone add zero, so both learn from the first step on. The command replaces the
-weights in the package; run it after the sizes of the preset have been changed.
+Training can then continue in the larger network with what the smaller one has learned, instead of from random
+weights (Chen et al., "Net2Net", ICLR 2016). Old channels keep their weights and ignore the new channels, whose
+weights are random. New blocks of the backbone add zero. The command replaces the weights in the package; run it
+after the sizes of the preset have been changed.
 """
 
 import dataclasses

@@ -77,5 +77,5 @@ def test_a_smaller_network_is_refused(both):
         widened(
             {"linear1": old["params"]["local_geometry"]["linear1"]}, {"linear1": np.zeros((32, 4), np.float32)}
         )
-    with pytest.raises(ValueError, match="'more'.*not in the larger network"):
+    with pytest.raises(ValueError, match=r"'more'.*not in the larger network"):
         widened({"more": np.zeros(2)}, {"other": np.zeros(2)})
