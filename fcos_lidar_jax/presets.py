@@ -119,9 +119,9 @@ COMPACT = dataclasses.replace(
 )
 """One sweep of nuScenes' sensor on two CPU cores: the paper's architecture with a fifth of its parameters.
 
-Layers at stride 1 cost most, and the later stages of the backbone least, so the former are narrow and the latter
-deep (``experiments/LOG.md``, 2026-11-22). First stage, pyramid and heads were widened when more training no longer
-helped (2026-11-27). Doubled rows contain the same points. The image wraps around, so there is no seam behind the
+Layers at stride 1 cost most, so they are narrower than the later ones (``experiments/LOG.md``, 2026-11-22). When
+more training no longer helped, stem, first stage, pyramid and heads were widened, and the first stage got a third
+block (2026-11-27). Doubled rows contain the same points. The image wraps around, so there is no seam behind the
 vehicle. NMS at 0.1, weighted NMS and the IoU exponent are not in the paper;
 ``python -m experiments.studies.post_processing`` measures what each adds. The regression axes are not in the paper
 either; ``experiments/LOG.md`` compares them with the paper's.
@@ -188,6 +188,6 @@ ABOUT = {
     "kitti_compact": "the network of compact for KITTI, without trained weights",
     "quickstart": "smaller still, for a short-range sensor and tests",
     "centerpoint_pillars": "CenterPoint on ten sweeps, for comparison",
-    "centerpoint_compact": "CenterPoint on one sweep, at about the cost of compact",
+    "centerpoint_compact": "CenterPoint on one sweep, for comparison with compact",
 }
 """Descriptions of the presets, for ``fcos-lidar train --help``."""

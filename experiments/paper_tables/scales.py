@@ -2,7 +2,7 @@
 
 - ``smoke``: a toy network and a few steps on a few simulated frames, to check in minutes that everything runs. Its
   scores mean nothing.
-- ``sector``: the compact network on ten sweeps in a quarter of the view of nuScenes' sensor, at full resolution
+- ``sector``: the former, smaller network of compact on ten sweeps in a quarter of the view of nuScenes' sensor, at full resolution
   and range, of varied simulated streets. Half an hour of one CPU core per cell.
 - ``nuscenes``: the paper's detector on a data set in the nuScenes layout, prepared by ``fcos-lidar prepare``.
 """
@@ -341,7 +341,7 @@ _SECTOR = change(
     projection=dataclasses.replace(NUSCENES.projection, remove_close="all", close_m=_BONNET_M),
     model__circular_width=False,
     model__local_geometry=False,
-    # Wider than in compact, for the 45 inputs of five rounds.
+    # Wider than SLIM, for the 45 inputs of five rounds.
     model__stem__channels_per_type=8,
     model__stem__out_channels=24,
     # Larger rotations leave the sector, and a mirrored street would face backwards.

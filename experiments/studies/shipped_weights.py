@@ -10,7 +10,7 @@ saves every few minutes; the same command resumes it with bit-identical results.
 
 ``--export`` does not train: it writes the averaged weights of the newest checkpoint into the package as float16,
 scores them on unseen frames, and writes ``experiments/results/NAME.json`` and the model card; a training may run
-at the same time. The scores of ``hdl32e`` are then adapted to the class frequencies of cities. Without ``--work``,
+at the same time. The scores of ``hdl32e`` are adapted to the class frequencies of nuScenes. Without ``--work``,
 the weights in the package are only scored. If the folder of the run is lost, ``--work NEW --warm-start hdl32e
 --seed 2`` starts a new one-cycle schedule from the weights in the package, on streets from ``seed * frames``;
 choose a seed whose streets no earlier training used.
@@ -19,7 +19,8 @@ choose a seed whose streets no earlier training used.
         --batch-size 4 --learning-rate 4e-3 --simulators 12 --workers 3  # on a GPU
 
 ``--average CHECKPOINT`` exports the average with the weights of an earlier training, such as those that this one
-started from: a training on other streets loses some of what the earlier one had learned.
+started from: a training on other streets loses some of what the earlier one had learned. Weights in the package
+are adapted to class frequencies already; checkpoints of a run are not.
 
 With ``--simulators``, that many processes simulate streets, from ``seed * 100,000`` on, and the steps repeat the
 streets that there are. Such a run resumes, but not bit for bit. It does not pause for evaluations; ``--export``
@@ -91,8 +92,10 @@ TRAINING_CITY = dataclasses.replace(
 """Real cars have fewer points than a city's matt cars, so the gloss differs per street. Real streets have longer
 walls and buildings, and closer rows of trailers (``experiments/README.md``).
 """
-_CITY_SHARE = {"hdl32e": 0.5}  # See at_city_frequencies; chosen from 0, 0.5 and 1 on drives of another seed.
-_MATT = 3  # Every third street has matt cars, as the simulated drives of the tests have.
+_CITY_SHARE = {"hdl32e": 0.5}  # See at_city_frequencies and ``experiments/LOG.md``, 2026-11-27.
+_MATT_PERIOD = 3
+"""Every third street has matt cars, like the simulated drives of the tests; with ``--simulators`` about every third,
+since each process simulates streets of one kind and some are faster."""
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
@@ -140,7 +143,7 @@ def streets(config: Config, *, steps: int, seed: int) -> tuple[FrameSet, FrameSe
     if unseen.streets != CITY:
         return shown, unseen
     matt = dataclasses.replace(shown, num_objects=_MORE_OBJECTS, streets=EVEN_CITY)
-    return MixedFrames(dataclasses.replace(matt, streets=TRAINING_CITY), matt, _MATT), unseen
+    return MixedFrames(dataclasses.replace(matt, streets=TRAINING_CITY), matt, _MATT_PERIOD), unseen
 
 
 def train(args: Args, work: Path) -> dict[str, Any]:
@@ -239,10 +242,10 @@ def averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpo
 
 
 def at_city_frequencies(checkpoint: Checkpoint, share: float) -> Checkpoint:
-    """Adapt the scores to class frequencies between those of ``EVEN_CITY``, 0, and of cities, 1.
+    """Adapt the scores to class frequencies between those of ``EVEN_CITY``, 0, and those of nuScenes, 1.
 
-    The training shows rare classes more often than cities do, so a detector of cities should take them for less
-    probable. The logarithm of the ratio of the frequencies is added to the logits (Menon et al., "Long-tail
+    The training shows rare classes more often than nuScenes does, so their scores are too high beside those of
+    frequent classes. The logarithm of the ratio of the frequencies is added to the logits (Menon et al., "Long-tail
     learning via logit adjustment", ICLR 2021).
     """
     seen, usual = class_shares(EVEN_CITY.city_classes), class_shares(1.0)
@@ -286,6 +289,7 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
     if share := _CITY_SHARE.get(args.name):
         checkpoint = at_city_frequencies(checkpoint, share)
+        training["city_share"] = share
     if args.average is not None:
         other = find_checkpoint(args.average)
         earlier_weights = load_checkpoint(other)

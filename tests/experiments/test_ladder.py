@@ -1,11 +1,9 @@
 """The learning ladder: its trials are possible networks, and differ from the base in what they say."""
 
-import dataclasses
 import json
 
 import jax
 import pytest
-import tiny_run
 from linear_network import linear_network
 
 from experiments.changes import SLIM
@@ -41,9 +39,7 @@ def _linear():
 
 @pytest.mark.usefixtures("_linear")
 def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys):
-    """Four steps on four frames with a tiny network: that everything is there, not what it is."""
-    model = dataclasses.replace(tiny_run.CONFIG.model, local_geometry=True)
-    monkeypatch.setattr(ladder, "COMPACT", dataclasses.replace(COMPACT, model=model))
+    """Four steps on four frames with a linear network: that everything is there, not what it is."""
     for name, value in (("TRAIN_FRAMES", 4), ("TEST_FRAMES", 3), ("CURVE_FRAMES", 2)):
         monkeypatch.setattr(ladder, name, value)
     out = tmp_path / "ladder.json"
@@ -53,7 +49,7 @@ def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys)
     assert (row["trial"], row["seed"], len(row["curve"])) == ("local geometry", 0, 4)
     assert 0 <= row["mAP"] <= 1
     assert row["step_s"] > 0
-    shapes = jax.eval_shape(build_detector(BASE(SLIM(ladder.COMPACT)), SENSOR).init, jax.random.key(0))
+    shapes = jax.eval_shape(build_detector(BASE(SLIM(COMPACT)), SENSOR).init, jax.random.key(0))
     assert row["parameters"] == sum(leaf.size for leaf in jax.tree.leaves(shapes["params"]))
     assert '"trial": "local geometry"' in capsys.readouterr().out
     monkeypatch.setattr(ladder, "trial", None)  # nothing is trained again

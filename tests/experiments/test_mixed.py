@@ -2,9 +2,11 @@
 
 import dataclasses
 
+import pytest
+
 from experiments.cached import CachedFrames
 from experiments.mixed import MixedFrames
-from fcos_lidar_jax.sensors import TINY
+from fcos_lidar_jax.sensors import KITTI_HDL64E, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 
 FIRST = SimulatedFrames(TINY, 6)
@@ -24,6 +26,18 @@ def test_every_third_frame_is_of_the_other_set():
 def test_the_fingerprint_depends_on_both_sets_and_the_period():
     others = (dataclasses.replace(MIXED, other=FIRST), dataclasses.replace(MIXED, period=2))
     assert len({MIXED.fingerprint(), *(other.fingerprint() for other in others)}) == 3
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"number": 5}, "other: length: got 5, expected that of the frames, 6"),
+        ({"sensor": KITTI_HDL64E}, "sensor"),
+    ],
+)
+def test_sets_that_do_not_fit_are_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        MixedFrames(FIRST, dataclasses.replace(FIRST, **changed), 3)
 
 
 def test_a_cache_keeps_them_apart(tmp_path):

@@ -147,6 +147,12 @@ def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
     assert training["seconds_of_steps"] == 6
 
 
+def test_every_third_training_street_has_matt_cars_like_the_tests():
+    shown, unseen = shipped_weights.streets(shipped_weights.CONFIGS["hdl32e"], steps=6, seed=2)
+    assert (len(shown), shown.name(0), shown.period) == (6, "seed 12", 3)
+    assert [frames.streets.gloss for frames in (shown.frames, shown.other, unseen)] == [1, 0, 0]
+
+
 def test_scores_are_adapted_to_the_class_frequencies_of_cities():
     """Closed form: the training's frequencies are nuScenes' to the power of 0.25, up to a constant factor."""
     before = Checkpoint(CONFIG, TINY, untrained(CONFIG, TINY), 1)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from tiny_run import CONFIG, SENSOR, images_of
 
+from experiments.studies import widened_weights
 from experiments.studies.widened_weights import widened
+from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.models import build_detector
 
 MODEL = dataclasses.replace(CONFIG.model, local_geometry=True, backbone_widths=(4, 4, 4, 4))
@@ -52,23 +54,55 @@ def test_the_larger_network_predicts_the_same(both, images):
         np.testing.assert_allclose(own, other, rtol=1e-3, atol=1e-3 * np.abs(own).max())
 
 
-def test_every_new_array_changes_the_larger_network_or_learns(both, images):
-    """New channels are ignored at first by weights of zero, which have a gradient."""
-    _, variables = both
+def test_the_weights_that_ignore_new_channels_have_gradients(both, images):
+    """Otherwise no new channel could ever be used."""
+    old, variables = both
 
     def total(params):
         outputs, _ = LARGE.apply({**variables, "params": params}, images, train=True)
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(outputs))
 
     gradients = jax.jit(jax.grad(total))(variables["params"])
-    ignored = {
-        jax.tree_util.keystr(path)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(gradients)
-        if not np.any(np.abs(leaf) > 0)
-    }
-    # The new block adds zero, so what it computes gets a gradient once its last scale has changed.
-    assert all("stage0_block1" in name for name in ignored), ignored
-    assert np.any(gradients["backbone"]["stage0_block1"]["expand"]["norm"]["scale"])
+    shapes = {path: leaf.shape for path, leaf in jax.tree_util.tree_leaves_with_path(old["params"])}
+    checked = 0
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradients):
+        if path not in shapes or leaf.ndim < 2 or leaf.shape[-2] == shapes[path][-2]:
+            continue
+        inputs, outputs = shapes[path][-2:]
+        name = jax.tree_util.keystr(path)
+        assert not np.any(variables_at(variables["params"], path)[..., inputs:, :outputs]), name
+        assert np.all(np.any(leaf[..., inputs:, :outputs], axis=tuple(range(leaf.ndim - 2)))), name
+        checked += 1
+    assert checked > 20
+    # The new block adds zero to the old channels.
+    assert np.all(
+        gradients["backbone"]["stage0_block1"]["expand"]["norm"]["scale"][: 4 * MODEL.backbone_widths[0]]
+    )
+
+
+def variables_at(tree, path):
+    for key in path:
+        tree = tree[key.key]
+    return np.asarray(tree)
+
+
+def test_the_command_replaces_the_weights_only_if_they_predict_the_same(tmp_path, monkeypatch, capsys):
+    config = dataclasses.replace(CONFIG, model=MODEL)
+    before = Checkpoint(config, SENSOR, jax.tree.map(np.float16, drawn(SMALL, 3)), 5)
+    save_checkpoint(tmp_path / "hdl32e", before)
+    monkeypatch.setattr(widened_weights, "SHIPPED", tmp_path)
+    wrong = dataclasses.replace(LARGER, stem=dataclasses.replace(LARGER.stem, channels_per_type=4))
+    files = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for model in (wrong, LARGER):
+        assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == files
+        monkeypatch.setitem(widened_weights.CONFIGS, "hdl32e", dataclasses.replace(config, model=model))
+        if model == wrong:
+            with pytest.raises(ValueError, match="hdl32e: the larger network predicts otherwise, by"):
+                widened_weights.main(widened_weights.Args(name="hdl32e"))
+    widened_weights.main(widened_weights.Args(name="hdl32e"))
+    after = load_checkpoint(tmp_path / "hdl32e")
+    assert (after.step, after.config.model) == (5, LARGER)
+    assert "parameters became" in capsys.readouterr().err
 
 
 def test_a_smaller_network_is_refused(both):
