@@ -91,11 +91,11 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
         more = (f", {leg['parameters']:,} parameters" if "parameters" in leg else "") + _average(leg)
         yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of steps{machine}{more}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
-        yield f"\nA run from {name} started from the weights of the run before it. If the preset had become larger,"
-        yield "`experiments.studies.widened_weights` enlarged them first."
+        yield f"\nA run from {name} started from the weights of the run before it. If the preset had become"
+        yield "larger, `experiments.studies.widened_weights` enlarged them first."
     if share := trained.get("city_share"):
-        yield f"\nFor the scores above, the logits of the classes were shifted by {share} of the logarithm of the ratio"
-        yield "between the class frequencies of nuScenes and of the training."
+        yield f"\nThe logits of the classes were then shifted by {share} of the logarithm of the ratio between the"
+        yield "class frequencies of nuScenes and of the training."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
 

@@ -94,8 +94,8 @@ walls and buildings, and closer rows of trailers (``experiments/README.md``).
 """
 _CITY_SHARE = {"hdl32e": 0.5}  # See at_city_frequencies and ``experiments/LOG.md``, 2026-11-27.
 _MATT_PERIOD = 3
-"""Every third street has matt cars, like the simulated drives of the tests; with ``--simulators`` about every third,
-since each process simulates streets of one kind and some are faster."""
+"""Every third street has matt cars, like the simulated drives of the tests. With ``--simulators`` it is about every
+third, since each process simulates streets of one kind, and some are faster."""
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
@@ -245,8 +245,8 @@ def at_city_frequencies(checkpoint: Checkpoint, share: float) -> Checkpoint:
     """Adapt the scores to class frequencies between those of ``EVEN_CITY``, 0, and those of nuScenes, 1.
 
     The training shows rare classes more often than nuScenes does, so their scores are too high beside those of
-    frequent classes. The logarithm of the ratio of the frequencies is added to the logits (Menon et al., "Long-tail
-    learning via logit adjustment", ICLR 2021).
+    frequent classes. The logarithm of the ratio of the frequencies is added to the logits (Menon et al.,
+    "Long-tail learning via logit adjustment", ICLR 2021).
     """
     seen, usual = class_shares(EVEN_CITY.city_classes), class_shares(1.0)
     added = np.append(share * np.log(usual / seen), 0.0).astype(np.float32)  # nothing for the background

@@ -5,9 +5,9 @@
 Training can then continue in the larger network with what the smaller one has learned, instead of from random
 weights (Chen et al., "Net2Net", ICLR 2016). Old channels keep their weights and ignore the new channels, whose
 weights are random. New blocks of the backbone add zero. Run it after one of these sizes of the preset has grown:
-``stem.out_channels``, ``backbone_blocks``, ``backbone_widths``, ``fpn_channels`` and ``head_channels``, the latter to
-even numbers up to 64. The command replaces the weights in the package, unless the larger network predicts otherwise
-on a simulated frame.
+``stem.out_channels``, ``backbone_blocks``, ``backbone_widths``, ``fpn_channels`` and ``head_channels``, the latter
+to even numbers up to 64. The command replaces the weights in the package, unless the larger network predicts
+otherwise on a simulated frame.
 """
 
 import dataclasses
@@ -96,8 +96,8 @@ def main(args: Args) -> None:
     larger = dataclasses.replace(checkpoint, variables=variables, config=kept)
     if (most := difference((checkpoint, larger))) > _TOLERANCE:
         raise ValueError(
-            f"{folder}: the larger network predicts otherwise, by {most:.2g} of the largest output, expected a change"
-            " of the sizes that `--help` lists"
+            f"{folder}: the larger network predicts otherwise, by {most:.2g} of the largest output, expected"
+            " larger sizes of those that `--help` lists"
         )
     save_checkpoint(folder, half_precision(larger))
     tell(f"{args.name}: {before} parameters became {after}")
