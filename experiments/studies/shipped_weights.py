@@ -94,8 +94,8 @@ walls and buildings, and closer rows of trailers (``experiments/README.md``).
 """
 _CITY_SHARE = {"hdl32e": 0.5}  # See at_city_frequencies and ``experiments/LOG.md``, 2026-11-27.
 _MATT_PERIOD = 3
-"""Every third street has matt cars, like the simulated drives of the tests. With ``--simulators`` it is about every
-third, since each process simulates streets of one kind, and some are faster."""
+"""Every third street has matt cars, like the simulated drives of the tests. With ``--simulators`` it is about
+every third, since each process simulates streets of one kind, and some are faster."""
 _MORE_OBJECTS = 120  # Instead of 60: the time of a step hardly depends on the number of objects.
 _MAX_BYTES = 8 * 2**20
 _NICE = 10
