@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.script import Options, run_script
+from experiments.script import run_script
 from experiments.studies.model_card import SHIPPED
 from experiments.studies.shipped_weights import CONFIGS, half_precision
 from fcos_lidar_jax import open_frames
@@ -33,7 +33,7 @@ _TOLERANCE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Args(Options):
+class Args:
     """Options of the widening."""
 
     name: Literal["quickstart", "hdl32e"]  # Weights in the package.
