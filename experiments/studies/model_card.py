@@ -93,9 +93,9 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it. If the preset had become"
         yield "larger, `experiments.studies.widened_weights` enlarged them first."
-    if share := trained.get("city_share"):
-        yield f"\nThe logits of the classes were then shifted by {share} of the logarithm of the ratio between the"
-        yield "class frequencies of nuScenes and of the training."
+    if share := trained.get("logit_adjustment"):
+        yield f"\nThe export added {share} times the log ratio of the class frequencies of nuScenes and of the"
+        yield "training to the class logits (logit adjustment)."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
 

@@ -10,17 +10,17 @@ saves every few minutes; the same command resumes it with bit-identical results.
 
 ``--export`` does not train: it writes the averaged weights of the newest checkpoint into the package as float16,
 scores them on unseen frames, and writes ``experiments/results/NAME.json`` and the model card; a training may run
-at the same time. The scores of ``hdl32e`` are adapted to the class frequencies of nuScenes. Without ``--work``,
-the weights in the package are only scored. If the folder of the run is lost, ``--work NEW --warm-start hdl32e
---seed 2`` starts a new one-cycle schedule from the weights in the package, on streets from ``seed * frames``;
+at the same time. The class logits of ``hdl32e`` are adjusted for the class frequencies of nuScenes. Without
+``--work``, the weights in the package are only scored. If the folder of the run is lost,
+``--work NEW --warm-start hdl32e --seed 2`` starts a new one-cycle schedule from the weights in the package, on streets from ``seed * frames``;
 choose a seed whose streets no earlier training used.
 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --steps 15000 --seed 1 \
         --batch-size 4 --learning-rate 4e-3 --simulators 12 --workers 3  # on a GPU
 
 ``--average CHECKPOINT`` exports the average with the weights of an earlier training, such as those that this one
-started from: a training on other streets loses some of what the earlier one had learned. Weights in the package
-are adapted to class frequencies already; checkpoints of a run are not.
+started from: a training on other streets loses some of what the earlier one had learned. The logits
+of weights in the package are adjusted already; those of a run's checkpoints are not.
 
 With ``--simulators``, that many processes simulate streets, from ``seed * 100,000`` on, and the steps repeat the
 streets that there are. Such a run resumes, but not bit for bit. It does not pause for evaluations; ``--export``
@@ -92,7 +92,7 @@ TRAINING_CITY = dataclasses.replace(
 """Real cars have fewer points than a city's matt cars, so the gloss differs per street. Real streets have longer
 walls and buildings, and closer rows of trailers (``experiments/README.md``).
 """
-_CITY_SHARE = {"hdl32e": 0.5}  # See at_city_frequencies and ``experiments/LOG.md``, 2026-11-27.
+_LOGIT_ADJUSTMENT = {"hdl32e": 0.5}  # See with_adjusted_logits and ``experiments/LOG.md``, 2026-11-27.
 _MATT_PERIOD = 3
 """Every third street has matt cars, like the simulated drives of the tests. With ``--simulators`` it is about
 every third, since each process simulates streets of one kind, and some are faster."""
@@ -241,12 +241,11 @@ def averaged(checkpoint: Checkpoint, other: Checkpoint, share: float) -> Checkpo
     return dataclasses.replace(checkpoint, variables=jax.tree.map(mean, checkpoint.variables, other.variables))
 
 
-def at_city_frequencies(checkpoint: Checkpoint, share: float) -> Checkpoint:
-    """Adapt the scores to class frequencies between those of ``EVEN_CITY``, 0, and those of nuScenes, 1.
+def with_adjusted_logits(checkpoint: Checkpoint, share: float) -> Checkpoint:
+    """Add a share of the log ratio of the class frequencies of nuScenes and of ``EVEN_CITY`` to the class logits.
 
-    The training shows rare classes more often than nuScenes does, so their scores are too high beside those of
-    frequent classes. The logarithm of the ratio of the frequencies is added to the logits (Menon et al.,
-    "Long-tail learning via logit adjustment", ICLR 2021).
+    The training shows rare classes more often than nuScenes does, so their scores are too high relative to those
+    of frequent classes (Menon et al., "Long-tail learning via logit adjustment", ICLR 2021).
     """
     seen, usual = class_shares(EVEN_CITY.city_classes), class_shares(1.0)
     added = np.append(share * np.log(usual / seen), 0.0).astype(np.float32)  # nothing for the background
@@ -287,9 +286,9 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     training["curve"] = training["curve"] or curve_of(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
-    if share := _CITY_SHARE.get(args.name):
-        checkpoint = at_city_frequencies(checkpoint, share)
-        training["city_share"] = share
+    if share := _LOGIT_ADJUSTMENT.get(args.name):
+        checkpoint = with_adjusted_logits(checkpoint, share)
+        training["logit_adjustment"] = share
     if args.average is not None:
         other = find_checkpoint(args.average)
         earlier_weights = load_checkpoint(other)

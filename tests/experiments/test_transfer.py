@@ -15,7 +15,7 @@ from tiny_run import TINY_CONFIG, untrained
 from experiments.changes import change
 from experiments.real_frames import SPANS_M, scores_by_range, within
 from experiments.studies import model_card, shipped_weights, transfer
-from experiments.studies.shipped_weights import at_city_frequencies, earlier_trainings, half_precision
+from experiments.studies.shipped_weights import earlier_trainings, half_precision, with_adjusted_logits
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.checkpoints.storage import CheckpointError
 from fcos_lidar_jax.config import AugmentConfig
@@ -138,7 +138,7 @@ def shipped(exported, tmp_path, monkeypatch):
 def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
     package, record = shipped
     exported, run = (load_checkpoint(p) for p in (package / "hdl32e", tmp_path / "run/checkpoints/00000003"))
-    run = at_city_frequencies(run, 0.5)
+    run = with_adjusted_logits(run, 0.5)
     for a, b in zip(*(jax.tree.leaves(c.variables) for c in (exported, run)), strict=True):
         assert a.dtype == np.float32
         np.testing.assert_array_equal(a, np.asarray(b).astype(np.float16).astype(np.float32))
@@ -153,10 +153,10 @@ def test_every_third_training_street_has_matt_cars_like_the_tests():
     assert [frames.streets.gloss for frames in (shown.frames, shown.other, unseen)] == [1, 0, 0]
 
 
-def test_scores_are_adapted_to_the_class_frequencies_of_cities():
+def test_logits_are_adjusted_for_the_class_frequencies_of_nuscenes():
     """Closed form: the training's frequencies are nuScenes' to the power of 0.25, up to a constant factor."""
     before = Checkpoint(CONFIG, TINY, untrained(CONFIG, TINY), 1)
-    after = at_city_frequencies(before, 0.4)
+    after = with_adjusted_logits(before, 0.4)
     old, new = (dict(jax.tree_util.tree_leaves_with_path(c.variables)) for c in (before, after))
     changed = {path: new[path] - old[path] for path in old if not np.array_equal(old[path], new[path])}
     assert [path[-1].key for path in changed] == ["logits_bias"]  # the tiny network has one head for all levels
@@ -177,7 +177,7 @@ def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path):
     args = shipped_weights.Args(name="hdl32e", work=tmp_path / "run", export=True, test_frames=2)
     args = dataclasses.replace(args, average=tmp_path / "earlier", average_share=0.25)
     shipped_weights.main(args)
-    both = (load_checkpoint(package / "hdl32e").variables, at_city_frequencies(run, 0.75 * 0.5).variables)
+    both = (load_checkpoint(package / "hdl32e").variables, with_adjusted_logits(run, 0.75 * 0.5).variables)
     for a, b in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_allclose(a, np.asarray(b, np.float32) + 0.25, rtol=1e-3, atol=1e-4)
     record = json.loads((tmp_path / "results/hdl32e.json").read_text())

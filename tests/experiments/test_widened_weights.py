@@ -1,4 +1,4 @@
-"""Weights for a larger network: it detects the same, and all of its parameters learn."""
+"""Weights for a larger network: it detects the same, and can learn to use its new channels."""
 
 import dataclasses
 
@@ -93,12 +93,11 @@ def test_the_command_replaces_the_weights_only_if_they_predict_the_same(tmp_path
     monkeypatch.setattr(widened_weights, "SHIPPED", tmp_path)
     wrong = dataclasses.replace(LARGER, stem=dataclasses.replace(LARGER.stem, channels_per_type=4))
     files = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
-    for model in (wrong, LARGER):
-        assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == files
-        monkeypatch.setitem(widened_weights.CONFIGS, "hdl32e", dataclasses.replace(config, model=model))
-        if model == wrong:
-            with pytest.raises(ValueError, match="hdl32e: the larger network predicts otherwise, by"):
-                widened_weights.main(widened_weights.Args(name="hdl32e"))
+    monkeypatch.setitem(widened_weights.CONFIGS, "hdl32e", dataclasses.replace(config, model=wrong))
+    with pytest.raises(ValueError, match="hdl32e: the larger network predicts otherwise, by"):
+        widened_weights.main(widened_weights.Args(name="hdl32e"))
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == files
+    monkeypatch.setitem(widened_weights.CONFIGS, "hdl32e", dataclasses.replace(config, model=LARGER))
     widened_weights.main(widened_weights.Args(name="hdl32e"))
     after = load_checkpoint(tmp_path / "hdl32e")
     assert (after.step, after.config.model) == (5, LARGER)
