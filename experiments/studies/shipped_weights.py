@@ -12,8 +12,8 @@ saves every few minutes; the same command resumes it with bit-identical results.
 scores them on unseen frames, and writes ``experiments/results/NAME.json`` and the model card; a training may run
 at the same time. The class logits of ``hdl32e`` are adjusted for the class frequencies of nuScenes. Without
 ``--work``, the weights in the package are only scored. If the folder of the run is lost,
-``--work NEW --warm-start hdl32e --seed 2`` starts a new one-cycle schedule from the weights in the package, on streets from ``seed * frames``;
-choose a seed whose streets no earlier training used.
+``--work NEW --warm-start hdl32e --seed 2`` starts a new one-cycle schedule from the weights in the package, on
+streets from ``seed * frames``; choose a seed whose streets no earlier training used.
 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --steps 15000 --seed 1 \
         --batch-size 4 --learning-rate 4e-3 --simulators 12 --workers 3  # on a GPU
