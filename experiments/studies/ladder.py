@@ -42,6 +42,7 @@ SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
 _SIZES = ("stem", "backbone_blocks", "backbone_widths", "fpn_channels", "head_channels")
+_LARGER = {f"model__{name}": getattr(COMPACT.model, name) for name in _SIZES}
 
 BASE: Change = change(
     name="ladder",
@@ -59,7 +60,8 @@ TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
     "local geometry": change(),
-    "larger": change(**{f"model__{name}": getattr(COMPACT.model, name) for name in _SIZES}),
+    "larger": change(**_LARGER),
+    "larger, without local geometry": change(**_LARGER, model__local_geometry=False),
 }
 
 

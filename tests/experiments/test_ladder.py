@@ -12,7 +12,13 @@ from experiments.studies.ladder import BASE, SENSOR, TRIALS, Args, measure
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import COMPACT
 
-PARAMETERS = {"base": 1_265_726, "CenterPoint": 739_796, "local geometry": 1_288_574, "larger": 1_929_694}
+PARAMETERS = {
+    "base": 1_265_726,
+    "CenterPoint": 739_796,
+    "local geometry": 1_288_574,
+    "larger": 1_929_694,
+    "larger, without local geometry": 1_887_870,
+}
 
 
 @pytest.mark.parametrize("name", TRIALS)
