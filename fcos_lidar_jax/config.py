@@ -125,6 +125,9 @@ class ModelConfig:
     local_geometry: bool = False
     """Not in the paper: the offsets from each location's point to the points of the neighbouring pixels are an
     additional input of the heads, see ``fcos_lidar_jax.models.local_geometry``."""
+    round_offsets: bool = False
+    """Not in the paper: with local geometry, also the offsets from each location's point to the points of the
+    later rounds in its pixel."""
     background_prior: float = 0.99  # Our choice: initial background probability.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Our choice: means subtracted from the nine channels in preprocessing."""
@@ -137,6 +140,8 @@ class ModelConfig:
         for name in ("backbone_blocks", "backbone_widths"):
             stages = getattr(self, name)
             check(len(stages) == 4 and min(stages) >= 1, name, stages, "four stages of at least 1")
+        with_local = self.local_geometry or not self.round_offsets
+        check(with_local, "round_offsets", self.round_offsets, "False without local_geometry")
         groups = max(1, min(32, self.head_channels // 2))  # Groups of the group norms, see models.layers.
         check(self.head_channels % groups == 0, "head_channels", self.head_channels, f"a multiple of {groups}")
         prior = self.background_prior

@@ -136,7 +136,9 @@ class Simulated:
             return database.prepare_database(self.frames("train", num_sweeps), folder)
 
     def score(self, config: Config, seed: int, folder: Path) -> dict[str, Any]:
-        """Train in a folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}}``.
+        """Train in a folder and evaluate: ``{"mAP", "NDS", "AP": {class: AP}, "errors"}``.
+
+        ``errors`` are nuScenes' errors of true positives: means over the classes, and of cars.
 
         With ``evaluations`` also ``curve``, [[samples, mAP]], ``ranges``, scores by distance, and
         ``seconds_of_steps``.
@@ -300,7 +302,12 @@ def write_submission(detector: CloudDetector, frames: NuScenesFrames, file: Path
 
 def _scores(summary: dict[str, Any]) -> dict[str, Any]:
     aps = {name: round(ap, 5) for name, ap in summary["mean_dist_aps"].items()}
-    return {"mAP": round(summary["mean_ap"], 5), "NDS": round(summary["nd_score"], 5), "AP": aps}
+    errors = {"mean": summary["tp_errors"], "car": summary["label_tp_errors"].get("car", {})}
+    shown = {
+        kind: {name: round(value, 4) for name, value in own.items() if math.isfinite(value)}
+        for kind, own in errors.items()
+    }
+    return {"mAP": round(summary["mean_ap"], 5), "NDS": round(summary["nd_score"], 5), "AP": aps, "errors": shown}
 
 
 small_network = change(

@@ -158,11 +158,13 @@ def make_record(
     table: Table, scale_name: str, scale: Scale | None, cells: dict[str, list[Cell]], figures: dict[str, Any]
 ) -> dict[str, Any]:
     """Combine the cells of a table's rows with the figures that need no training."""
+    reference = next(row for row in table.rows if row.label == table.reference)
+    trained = {} if scale is None else {**scale.describe(), "base": config_to_json(reference.change(scale.base))}
     return {
         "table": table.name,
         "scale": scale_name,
         "seeds": [cell["seed"] for cell in next(iter(cells.values()), [])],
-        "trained_on": None if scale is None else {**scale.describe(), "base": config_to_json(scale.base)},
+        "trained_on": trained or None,
         "rows": [_row_record(table, row, cells) for row in table.rows],
         "figures": figures,
         "cells_of": sorted({f"{cell['git']} on {cell['device']}" for row in cells.values() for cell in row}),
@@ -187,10 +189,11 @@ def _cells(table: Table, scale: Scale, seeds: tuple[int, ...], results: Path, ar
     if isinstance(scale, Simulated):
         for config in configs.values():
             scale.check(config)
-    pairs = [(config, seed) for config in configs.values() for seed in seeds]
-    labels = [f"{label}, seed {seed}" for label in configs for seed in seeds]
-    cells = iter(run_cells(pairs, scale, results=results, runs=args.runs / args.scale, labels=labels))
-    return {label: [next(cells) for _ in seeds] for label in configs}
+    # Seed by seed, so that an interrupted table has whole seeds.
+    pairs = [(config, seed) for seed in seeds for config in configs.values()]
+    labels = [f"{label}, seed {seed}" for seed in seeds for label in configs]
+    cells = run_cells(pairs, scale, results=results, runs=args.runs / args.scale, labels=labels)
+    return {label: cells[row :: len(configs)] for row, label in enumerate(configs)}
 
 
 def _row_record(table: Table, row: Row, cells: dict[str, list[Cell]]) -> dict[str, Any]:

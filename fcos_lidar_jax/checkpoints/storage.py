@@ -29,7 +29,7 @@ from fcos_lidar_jax.types import TrainState
 
 _FORMAT = 3
 LATER_FIELDS = {
-    "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False},
+    "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False, "round_offsets": False},
     "loss": {"quality": "iou", "centreness_m": 0.75},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none", "nms_across_classes": False},
 }
@@ -292,7 +292,7 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     """Add the fields that a configuration of an earlier version lacks, and drop removed fields.
 
     >>> with_later_fields({"model": {"remat": True, "meta_kernel": False}})["model"]
-    {'remat': True, 'regression_axes': 'lidar', 'local_geometry': False}
+    {'remat': True, 'regression_axes': 'lidar', 'local_geometry': False, 'round_offsets': False}
     """
     later = dict[str, Any]()
     for section, fields in LATER_FIELDS.items():

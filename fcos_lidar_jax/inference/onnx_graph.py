@@ -232,25 +232,39 @@ _FAST_WIDTH = 16
 
 def _local_geometry(network: _Network, image: str, rounds: int, model: ModelConfig) -> str:
     """See :class:`fcos_lidar_jax.models.local_geometry.LocalGeometry`."""
-    points = network("Gather", image, [0, rounds, 2 * rounds], axis=1)
-    points = network("Mul", points, np.array(model.channel_scale[:3])[:, None, None])
-    filled = network("Greater", network("Gather", image, [7 * rounds], axis=1), 0.0)
-    exists = network("Where", filled, 1.0, 0.0)
+
+    def points_of(r: int) -> tuple[str, str]:
+        points = network("Gather", image, [r, rounds + r, 2 * rounds + r], axis=1)
+        filled = network("Greater", network("Gather", image, [7 * rounds + r], axis=1), 0.0)
+        points = network("Mul", points, np.array(model.channel_scale[:3])[:, None, None])
+        return points, network("Where", filled, 1.0, 0.0)
+
+    points, exists = points_of(0)
     azimuth = network("Mul", network("Gather", image, [4 * rounds], axis=1), model.channel_scale[4])
     azimuth = network("Add", azimuth, model.channel_mean[4])
     cos, sin = network("Cos", azimuth), network("Sin", azimuth)
+
+    def offsets_to(others: str) -> str:
+        offset = network("Sub", others, points)
+        dx, dy, dz = (network("Slice", offset, [axis], [axis + 1], [1]) for axis in range(3))
+        radial = network("Add", network("Mul", cos, dx), network("Mul", sin, dy))
+        tangential = network("Sub", network("Mul", cos, dy), network("Mul", sin, dx))
+        return network("Asinh", network("Div", network("Concat", radial, tangential, dz, axis=1), UNIT_M))
+
     padded_points, padded_exists = (network.padded(x, ROWS, COLUMNS) for x in (points, exists))
     channels = []
     for row, column in window():
-        offset = network("Sub", network.cut(padded_points, row, column, ROWS, COLUMNS), points)
-        dx, dy, dz = (network("Slice", offset, [axis], [axis + 1], [1]) for axis in range(3))
         both = network("Mul", network.cut(padded_exists, row, column, ROWS, COLUMNS), exists)
-        radial = network("Add", network("Mul", cos, dx), network("Mul", sin, dy))
-        tangential = network("Sub", network("Mul", cos, dy), network("Mul", sin, dx))
-        turned = network("Concat", radial, tangential, dz, axis=1)
-        channels += [network("Mul", network("Asinh", network("Div", turned, UNIT_M)), both), both]
-    own = network("Gather", image, [rounds * channel for channel in OWN], axis=1)
-    x = network("Concat", *channels, own, axis=1)
+        offsets = offsets_to(network.cut(padded_points, row, column, ROWS, COLUMNS))
+        channels += [network("Mul", offsets, both), both]
+    channels.append(network("Gather", image, [rounds * channel for channel in OWN], axis=1))
+    for r in range(1, rounds if model.round_offsets else 1):
+        others, filled = points_of(r)
+        both = network("Mul", filled, exists)
+        times = (network("Gather", image, [8 * rounds + k], axis=1) for k in (r, 0))
+        later = network("Concat", offsets_to(others), network("Sub", *times), axis=1)
+        channels += [network("Mul", later, both), both]
+    x = network("Concat", *channels, axis=1)
     for layer in range(2):
         gain, shift = network.batch_norm(f"local_geometry/norm{layer}")
         kernel = network.parameter(f"local_geometry/linear{layer}") * gain

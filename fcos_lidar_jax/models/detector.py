@@ -75,7 +75,10 @@ class Network(nn.Module):
         c = self.config  # The attributes' names are the top level of the parameters.
         self.stem = Stem(c.stem, c.circular_width, c.precision)
         if c.local_geometry:
-            self.local_geometry = LocalGeometry(c.fpn_channels, c.channel_mean, c.channel_scale, c.circular_width)
+            normalisation = c.channel_mean, c.channel_scale
+            self.local_geometry = LocalGeometry(
+                c.fpn_channels, *normalisation, c.circular_width, later_rounds=c.round_offsets
+            )
         self.backbone = Backbone(c.backbone_blocks, c.backbone_widths, c.circular_width, c.remat)
         self.fpn = FeaturePyramid(c.fpn_channels, c.circular_width)
         self.heads = Heads(

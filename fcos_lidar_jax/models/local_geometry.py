@@ -5,6 +5,7 @@ apart, so the heads see little of a single pixel. Local geometry is an additiona
 pixel."""
 
 import itertools
+from collections.abc import Callable
 
 import flax.linen as nn
 import jax
@@ -54,12 +55,8 @@ def local_offsets(
     [88.0, 0.0, 0.0, 100.0]
     """
     first = image[..., :: image.shape[-1] // 9]
-    exists = (first[..., 7] > 0).astype(image.dtype)
-    points = [
-        first[..., i] * scale[i] for i in range(3)
-    ]  # Still shifted by the means, which cancel in the offsets.
-    azimuth = first[..., 4] * scale[4] + mean[4]
-    cos, sin = jnp.cos(azimuth), jnp.sin(azimuth)
+    points, exists = _points(first, scale)
+    turned = _turning(first[..., 4] * scale[4] + mean[4])
     height, width = image.shape[1:3]
 
     def padded(x: jax.Array) -> jax.Array:
@@ -70,11 +67,56 @@ def local_offsets(
     channels = []
     for row, column in window():
         cut = (slice(None), slice(row, row + height), slice(column, column + width))
-        dx, dy, dz = (other[cut] - own for other, own in zip(neighbours, points, strict=True))
         both = neighbour_exists[cut] * exists
-        offsets = cos * dx + sin * dy, cos * dy - sin * dx, dz
-        channels += [*(jnp.arcsinh(offset / UNIT_M) * both for offset in offsets), both]
+        offsets = turned(*(other[cut] - own for other, own in zip(neighbours, points, strict=True)))
+        channels += [*(offset * both for offset in offsets), both]
     return jnp.stack(channels, axis=-1)
+
+
+def round_offsets(image: Image, *, mean: tuple[float, ...], scale: tuple[float, ...]) -> Image:
+    """Compute the offsets from the first-round point of each pixel to its points of the later rounds.
+
+    Args:
+        image: the network's normalised input with ``9 r`` channels, ordered by type.
+        mean, scale: normalisation of the nine channels.
+
+    Returns:
+        f[b, h, w, 5 (r - 1)]: for each later round the radial, tangential and vertical offset as in
+        :func:`local_offsets`, the difference of the normalised times, and 1. All five are 0 if one of the points
+        is missing.
+
+    >>> nine = (0.0,) * 9, (1.0,) * 9
+    >>> two = jnp.zeros((1, 1, 1, 9, 2)).at[..., 0, :].set(jnp.array([5.0, 5.2])).at[..., 7:, :].set(1.0)
+    >>> offsets = round_offsets(two.reshape(1, 1, 1, 18), mean=nine[0], scale=nine[1])
+    >>> (100 * offsets[0, 0, 0]).round().tolist()
+    [88.0, 0.0, 0.0, 0.0, 100.0]
+    """
+    rounds = image.shape[-1] // 9
+    first = image[..., ::rounds]
+    points, exists = _points(first, scale)
+    turned, channels = _turning(first[..., 4] * scale[4] + mean[4]), []
+    for r in range(1, rounds):
+        later = image[..., r::rounds]
+        others, filled = _points(later, scale)
+        both = filled * exists
+        offsets = turned(*(other - own for other, own in zip(others, points, strict=True)))
+        channels += [*(x * both for x in (*offsets, later[..., 8] - first[..., 8])), both]
+    return jnp.stack(channels, axis=-1) if channels else first[..., :0]
+
+
+def _points(channels: Image, scale: tuple[float, ...]) -> tuple[list[jax.Array], jax.Array]:
+    """Coordinates of points, still shifted by the means, which cancel in offsets; 1 where there is a point."""
+    return [channels[..., i] * scale[i] for i in range(3)], (channels[..., 7] > 0).astype(channels.dtype)
+
+
+def _turning(azimuth: jax.Array) -> Callable[..., tuple[jax.Array, ...]]:
+    """Make a function that turns offsets to an azimuth and compresses them."""
+    cos, sin = jnp.cos(azimuth), jnp.sin(azimuth)
+
+    def turned(dx: jax.Array, dy: jax.Array, dz: jax.Array) -> tuple[jax.Array, ...]:
+        return tuple(jnp.arcsinh(x / UNIT_M) for x in (cos * dx + sin * dy, cos * dy - sin * dx, dz))
+
+    return turned
 
 
 def own_numbers(image: Image) -> Image:
@@ -95,11 +137,15 @@ class LocalGeometry(nn.Module):
     mean: tuple[float, ...]
     scale: tuple[float, ...]
     circular: bool = False
+    later_rounds: bool = False  # Also use :func:`round_offsets`.
 
     @nn.compact
     def __call__(self, image: Image, *, train: bool) -> Image:
         offsets = local_offsets(image, mean=self.mean, scale=self.scale, circular=self.circular)
-        x = jnp.concatenate([offsets, own_numbers(image)], axis=-1)
+        parts = [offsets, own_numbers(image)]
+        if self.later_rounds:
+            parts.append(round_offsets(image, mean=self.mean, scale=self.scale))
+        x = jnp.concatenate(parts, axis=-1)
         for layer, width in enumerate((HIDDEN, self.features)):
             kernel = self.param(f"linear{layer}", kernel_init, (x.shape[-1], width))
             (x,) = BatchNorm(name=f"norm{layer}")([pointwise(x, kernel)], train=train)

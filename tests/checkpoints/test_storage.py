@@ -100,7 +100,7 @@ def test_values_that_are_not_finite_are_never_saved(copy, checkpoint, value):
 
 def test_a_checkpoint_of_an_older_version_is_converted(copy, written):
     later = {
-        "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False},
+        "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False, "round_offsets": False},
         "loss": {"quality": "iou", "centreness_m": 0.75},
         "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none", "nms_across_classes": False},
     }

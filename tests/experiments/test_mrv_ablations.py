@@ -7,28 +7,53 @@ import jax
 import pytest
 from pretended import Pretended
 
+from experiments.changes import change
 from experiments.paper_tables import tables
 from experiments.paper_tables.cells import changes_of
-from experiments.paper_tables.scales import quarter
+from experiments.paper_tables.scales import quarter, smoke
 from experiments.script import run_script
 from experiments.studies import mrv_ablations
 from experiments.studies.mrv_ablations import AblationArgs, make_table
 from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.presets import COMPACT
+
+WHOLE = "five rounds of ten sweeps"
+CHANGED = {
+    "one round of ten sweeps": "projection.num_rounds=1",
+    "without priority": "projection.prioritize_current=false",
+    "five rounds of one sweep": "num_sweeps=1",
+    "one round of one sweep": "num_sweeps=1, projection.num_rounds=1",
+    "with round offsets": "model.round_offsets=true",
+    "without local geometry": "model.local_geometry=false",
+}
 
 
-def test_every_row_takes_one_part_away_from_the_network_with_local_geometry(tmp_path):
-    scale = quarter(tmp_path)
-    whole, *others = (row.change(scale.base) for row in make_table().rows)
-    assert not scale.base.model.local_geometry
-    assert whole == dataclasses.replace(
-        scale.base, model=dataclasses.replace(scale.base.model, local_geometry=True)
-    )
+@pytest.mark.parametrize("make_scale", [quarter, smoke])
+def test_every_row_changes_the_named_part_only(tmp_path, make_scale):
+    scale = make_scale(tmp_path)
+    configs = {row.label: row.change(scale.base) for row in make_table().rows}
+    whole = configs.pop(WHOLE)
+    ten, one = configs.pop("CenterPoint, ten sweeps"), configs.pop("CenterPoint, one sweep")
     assert (whole.num_sweeps, whole.projection.num_rounds, whole.projection.prioritize_current) == (10, 5, True)
-    changed = ["projection.num_rounds=1", "num_sweeps=1", "projection.prioritize_current=false"]
-    assert [changes_of(config, whole) for config in others] == changed
-    for config in (whole, *others):
+    assert {label: changes_of(config, whole) for label, config in configs.items()} == CHANGED
+    assert (ten.num_sweeps, changes_of(one, ten)) == (10, "num_sweeps=1")
+    for config in (whole, ten, one, *configs.values()):
+        assert config.optimizer == whole.optimizer
         detector = build_detector(config, scale.sensor)
         assert jax.eval_shape(detector.init, jax.random.key(0))["params"]
+
+
+def test_at_scale_sector_the_network_has_the_sizes_of_compact_and_larger_batches(tmp_path):
+    scale = quarter(tmp_path)
+    whole, base = make_table().rows[0].change(scale.base), scale.base
+    sizes = "backbone_blocks", "backbone_widths", "fpn_channels", "head_channels"
+    stem = dataclasses.replace(base.model.stem, out_channels=COMPACT.model.stem.out_channels)
+    model = {name: getattr(COMPACT.model, name) for name in sizes} | {"stem": stem, "local_geometry": True}
+    assert whole.model == dataclasses.replace(base.model, **model)
+    assert (whole.optimizer.batch_size, whole.optimizer.epochs) == (4, 4)
+    assert whole.optimizer.ema_decay == pytest.approx(base.optimizer.ema_decay**4, abs=1e-4)
+    small = smoke(tmp_path).base
+    assert make_table().rows[0].change(small) == change(model__local_geometry=True)(small)
 
 
 def test_the_number_of_samples_is_an_option(tmp_path, monkeypatch, capsys):

@@ -58,6 +58,12 @@ CASES = {
         ),
         ODD,
     ),
+    "local geometry with the offsets of the later rounds": (
+        with_model(
+            with_stem(), local_geometry=True, round_offsets=True, channel_scale=(12.0, 11.5, 0.9, *[2.0] * 6)
+        ),
+        ODD,
+    ),
     "local geometry, circular, doubled rows": (
         with_model(CONFIG, local_geometry=True, circular_width=True, row_upscale=2),
         SENSOR,

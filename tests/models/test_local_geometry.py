@@ -20,6 +20,7 @@ from fcos_lidar_jax.models.local_geometry import (
     UNIT_M,
     LocalGeometry,
     local_offsets,
+    round_offsets,
     window,
 )
 from fcos_lidar_jax.types import CHANNELS
@@ -38,6 +39,7 @@ def image_of(rounds: int = 2, seed: int = 0):
     raw[..., :3, :] = points
     raw[..., CHANNELS.index("azimuth"), :] = np.arctan2(points[..., 1, :], points[..., 0, :])
     raw[..., CHANNELS.index("existence"), :] = 1
+    raw[..., 8, :] = rng.uniform(0, 0.5, (*SHAPE, rounds))
     image = np.where(exists[..., None, :], (raw - np.array(MEAN)[:, None]) / np.array(SCALE)[:, None], 0)
     first = np.where(exists[..., :1], points[..., 0], np.nan)
     return jnp.asarray(image.reshape(*SHAPE, -1), jnp.float32), first
@@ -82,6 +84,52 @@ def test_offsets_are_their_definition_in_loops_also_under_jit_and_vmap(circular,
     assert len(window()) == 20
 
 
+def later_by_loops(image, rounds: int):
+    """Offsets to the later rounds by their definition, pixel by pixel."""
+    raw = np.asarray(image, np.float64).reshape(*SHAPE, 9, rounds)
+    found = np.zeros((*SHAPE, rounds - 1, 5))
+    for place in np.ndindex(*SHAPE):
+        both = raw[place][CHANNELS.index("existence")] > 0
+        points = raw[place][:3] * np.array(SCALE)[:3, None] + np.array(MEAN)[:3, None]
+        turn = np.arctan2(points[1, 0], points[0, 0])
+        for r in range(1, rounds):
+            if both[0] and both[r]:
+                dx, dy, dz = points[:, r] - points[:, 0]
+                radial, left = np.cos(turn) * dx + np.sin(turn) * dy, np.cos(turn) * dy - np.sin(turn) * dx
+                lag = raw[place][8, r] - raw[place][8, 0]
+                found[(*place, r - 1)] = [*np.arcsinh(np.array([radial, left, dz]) / UNIT_M), lag, 1]
+    return found.reshape(*SHAPE, -1)
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 4])
+def test_offsets_between_rounds_are_their_definition_in_loops(rounds):
+    image = image_of(rounds)[0]
+
+    def compute(image):
+        return round_offsets(image, mean=MEAN, scale=SCALE)
+
+    expected = later_by_loops(image, rounds)
+    assert expected.shape[-1] == 5 * (rounds - 1)
+    np.testing.assert_allclose(compute(image), expected, atol=1e-3)
+    np.testing.assert_allclose(jax.jit(compute)(image), expected, atol=1e-3)
+    np.testing.assert_allclose(jax.vmap(compute)(image[:, None])[:, 0], expected, atol=1e-3)
+    if rounds > 1:
+        assert 0.2 < (expected[..., 4::5] == 1).mean() < 0.8
+        assert len(np.unique(expected[..., 3::5])) > 9
+
+
+def test_features_with_later_rounds_use_their_offsets():
+    image = image_of(rounds=2)[0]
+    module = LocalGeometry(5, MEAN, SCALE, later_rounds=True)
+    variables = module.init(jax.random.key(0), image, train=False)
+    assert variables["params"]["linear0"].shape == (90, HIDDEN)
+    features = module.apply(variables, image, train=False)
+    moved = image.at[..., 1].add(jnp.where(image[..., 15] > 0, 0.1, 0.0))  # x of the second round
+    assert float(jnp.abs(module.apply(variables, moved, train=False) - features).max()) > 0
+    with pytest.raises(ValueError, match="round_offsets: got True, expected False without local_geometry"):
+        dataclasses.replace(CONFIG.model, local_geometry=False, round_offsets=True)
+
+
 def own_by_loops(image, rounds: int):
     """Channels of the first round by name, pixel by pixel."""
     names = "z", "range", "inclination", "intensity", "existence"
@@ -111,11 +159,12 @@ def test_features_are_two_layers_of_the_offsets_and_of_the_points_own_numbers():
     assert (x > 0).any()
 
 
+@pytest.mark.parametrize("later_rounds", [False, True])
 @pytest.mark.parametrize("points", [0, 1])
-def test_gradients_are_finite_where_nothing_is_near(points):
-    image = np.zeros((1, 4, 9, 9), np.float32)
-    image[0, 2, 4, [0, 1, 7]] = points
-    module = LocalGeometry(5, MEAN, SCALE)
+def test_gradients_are_finite_where_nothing_is_near(points, later_rounds):
+    image = np.zeros((1, 4, 9, 18), np.float32)
+    image[0, 2, 4, [0, 2, 14]] = points
+    module = LocalGeometry(5, MEAN, SCALE, later_rounds=later_rounds)
     variables = module.init(jax.random.key(0), jnp.asarray(image), train=False)
 
     def total(params, image):
