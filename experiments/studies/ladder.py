@@ -3,6 +3,7 @@
     python -m experiments.studies.ladder --trials base CenterPoint
     python -m experiments.studies.ladder --trials base "local geometry" --seeds 0 1 2
     python -m experiments.studies.ladder --trials "local geometry" larger  # the sizes of compact today
+    python -m experiments.studies.ladder --trials larger "second round marks objects"  # can it use a second round?
 
 Each trial is a change of ``compact`` with its former, smaller sizes, trained on a quarter of the view of nuScenes'
 HDL-32E (32 x 272 pixels) with one sweep and one round: 4,000 frames of varied simulated streets, 3,000 steps of
@@ -20,6 +21,8 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.cached import CachedFrames
 from experiments.changes import SLIM, Change, change
 from experiments.hardware import hardware
@@ -27,9 +30,11 @@ from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
+from experiments.studies.round_use import FirstRound
 from fcos_lidar_jax.config import CloudReading, Config
-from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
-from fcos_lidar_jax.files import read_json
+from fcos_lidar_jax.data.box_geometry import points_in_boxes
+from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFrames
+from fcos_lidar_jax.files import checksum, read_json
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, NUSCENES
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
@@ -40,6 +45,7 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
+_BEHIND_M = 1.0  # Distance of a mark from the object's point.
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
 _SIZES = ("stem", "backbone_blocks", "backbone_widths", "fpn_channels", "head_channels")
 _LARGER = {f"model__{name}": getattr(COMPACT.model, name) for name in _SIZES}
@@ -56,12 +62,14 @@ BASE: Change = change(
     augment__flip_y_probability=0.0,
     augment__max_rotation_rad=math.radians(5),
 )
+MARKED = "second round marks objects"
 TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
     "local geometry": change(),
     "larger": change(**_LARGER),
     "larger, without local geometry": change(**_LARGER, model__local_geometry=False),
+    MARKED: change(**_LARGER, projection__num_rounds=2),
 }
 
 
@@ -75,6 +83,26 @@ class Args(Options):
     work: Path = Path("outputs/ladder")  # Folder of frames and runs.
 
 
+@dataclasses.dataclass(frozen=True)
+class Marked(WrappedFrames):
+    """Frames whose first round is the cloud's, and whose second round has a point only where there is an object.
+
+    It is 1 m behind the object's point. A network that learns no more from it cannot use a second round.
+    """
+
+    frames: FrameSet
+
+    def frame(self, index: int) -> Frame:
+        frame = FirstRound(self.frames, prioritize_current=False).frame(index)
+        inside = points_in_boxes(frame.points, frame.boxes)
+        marks = frame.points[np.unique(np.concatenate([np.zeros(0, int), *inside]))]
+        marks[:, :3] *= 1 + _BEHIND_M / np.linalg.norm(marks[:, :3], axis=1, keepdims=True)
+        return dataclasses.replace(frame, points=np.concatenate([frame.points, marks]))
+
+    def fingerprint(self) -> str:
+        return checksum(repr((self.frames.fingerprint(), "marked")).encode())
+
+
 def frames(work: Path, split: str) -> FrameSet:
     """Open the frames of a split, which are simulated once."""
     number, first = {"train": (TRAIN_FRAMES, 0), "test": (TEST_FRAMES, UNSEEN_SEED)}[split]
@@ -85,12 +113,14 @@ def frames(work: Path, split: str) -> FrameSet:
 
 def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     """Train a trial and score it."""
-    tests = frames(args.work, "test")
+    seen, tests = (frames(args.work, split) for split in ("train", "test"))
+    if name == MARKED:
+        seen, tests = Marked(seen), Marked(tests)
     curve_frames = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
     folder = args.work / f"{name.replace(' ', '_').replace(',', '')}_{args.steps}_{seed}"
     schedule = Schedule(-(-args.steps // 10), -(-args.steps // 4), 1)
     options = {"steps": args.steps, "seed": seed, "tests": curve_frames, "schedule": schedule}
-    detector = trained(folder, config, frames(args.work, "train"), **options)
+    detector = trained(folder, config, seen, **options)
     summary, records = benchmark(*detections(detector, tests)).summary, read_metrics(folder)
     seconds = [r["seconds"] for r in records if "seconds" in r]
     return {
