@@ -1,33 +1,36 @@
 """Lines on stderr: progress of long operations, with rate and time left, and notes."""
 
+import collections
 import sys
 import time
 
 import jax
 
+_LINES = 30  # Number of lines whose work determines the rate.
+
 
 class Progress:
     """Prints progress lines to stderr, identical on a terminal and in a pipe.
 
-    The rate excludes the work before the first call, which often includes compilation. ``unit`` names the counted
-    items, in the plural. Lines are at least ``every_s`` seconds apart; the last item always prints one. Without
-    ``total``, lines have no time left.
+    The rate is that of the last lines, five minutes by default, so that a pause or a slow beginning is forgotten.
+    It excludes the work before the first call, which often includes compilation. ``unit`` names the counted items,
+    in the plural. Lines are at least ``every_s`` seconds apart; the last item always prints one. Lines without
+    ``total`` have no time left.
     """
 
     def __init__(self, unit: str, total: int | None, *, every_s: float = 10.0) -> None:
         self.unit, self.total, self.every_s = unit, total, every_s
-        self._began: tuple[float, int] | None = None
+        self._shown = collections.deque[tuple[float, int]](maxlen=_LINES)
         self._next = 0.0
 
     def show(self, done: int, text: str = "") -> None:
         """Report ``done`` finished items, with ``text`` between the count and the rate."""
         now = time.monotonic()
-        if self._began is None:
-            self._began = now, done
         if now < self._next and done != self.total:
             return
         self._next = now + self.every_s
-        began, first = self._began
+        began, first = self._shown[0] if self._shown else (now, done)
+        self._shown.append((now, done))
         line = f"{self.unit} {done}" + ("" if self.total is None else f"/{self.total}")
         line += f"  {text}" if text else ""
         if done > first and now > began:

@@ -41,6 +41,19 @@ def test_the_rate_of_resumed_work_counts_only_new_items(capsys):
     assert float(left[1]) <= 20
 
 
+def test_a_pause_is_forgotten(capsys, monkeypatch):
+    clock = iter([*range(0, 400, 10), *range(4000, 4400, 10)])  # an hour of pause after the 40th line
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    progress = Progress("steps", 1000)
+    for line in range(80):
+        progress.show(10 * line)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 80
+    assert lines[39].endswith("1.00 steps/s, 610 s left")
+    assert float(re.search(r"([\d.]+) steps/s", lines[40])[1]) < 0.1
+    assert lines[-1] == "steps 790/1000  1.00 steps/s, 210 s left"
+
+
 def test_a_line_is_told_once_and_only_by_the_first_process(capsys, monkeypatch):
     for _ in range(2):
         tell("often")

@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -145,6 +145,17 @@ class InMemoryFrames(FrameSet):
         return checksum(repr((self.classes, self.sensor, [checksum(data) for data in arrays])).encode())
 
 
+def check_frames(frames: Any) -> None:
+    """Refuse what is not a set of frames, such as the folder of a data set.
+
+    >>> check_frames("data/nuscenes")
+    Traceback (most recent call last):
+    ValueError: frames: got 'str', expected a set of frames, as open_frames returns
+    """
+    are_frames = hasattr(frames, "classes") and hasattr(frames, "frame")
+    check(are_frames, "frames", type(frames).__name__, "a set of frames, as open_frames returns")
+
+
 @dataclasses.dataclass(frozen=True)
 class WrappedFrames(FrameSet):
     """Base of frame sets that change another one: everything is passed on unless a subclass overrides it."""
@@ -154,8 +165,7 @@ class WrappedFrames(FrameSet):
     sensor: Sensor = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        are_frames = hasattr(self.frames, "classes")
-        check(are_frames, "frames", type(self.frames).__name__, "a set of frames, as open_frames returns")
+        check_frames(self.frames)
         object.__setattr__(self, "classes", self.frames.classes)
         object.__setattr__(self, "sensor", self.frames.sensor)
 

@@ -13,7 +13,7 @@ from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, sensor_mismatch, tell_truncation
-from fcos_lidar_jax.data.frame import Frame, FrameSet, without_points
+from fcos_lidar_jax.data.frame import Frame, FrameSet, check_frames, without_points
 from fcos_lidar_jax.devices.agreement import agreed
 from fcos_lidar_jax.devices.mesh import make_mesh, shard_batch
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
@@ -97,6 +97,7 @@ def predict_groups(
     Processes can synchronise between two groups; if another one cannot read its frames, an OSError says so.
     """
     check(batch_size >= 1, "batch_size", batch_size, "at least 1")
+    check_frames(frames)
     mesh, config, sensor = make_mesh(devices), detector.config, detector.sensor
     aligned = Alignment(frames.sensor, sensor, yaw_rad, notes)
     program = detector.program(mesh, batch_size)

@@ -1,6 +1,7 @@
 """Predictions and evaluations of frames."""
 
 import dataclasses
+import inspect
 
 import jax
 import numpy as np
@@ -65,5 +66,7 @@ def test_groups_contain_one_batch_per_device(detector):
     for a, b in zip(one_by_one, (found for group in groups for found in group), strict=True):
         jax.tree.map(np.testing.assert_array_equal, a.detections, b.detections)
 
+    with pytest.raises(ValueError, match="frames: got 'str', expected a set of frames, as open_frames returns"):
+        next(inspect.unwrap(predict_groups)(detector, "my_lidar"))  # without the type checks of the tests
     with pytest.raises(ValueError, match="batch_size: got 0, expected at least 1"):
         next(predict(detector, FRAMES, batch_size=0))
