@@ -7,10 +7,12 @@
 - ``nuscenes``: the paper's detector on a data set in the nuScenes layout, prepared by ``fcos-lidar prepare``.
 """
 
+import contextlib
 import dataclasses
 import functools
 import math
 import operator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +22,7 @@ import tyro
 
 from experiments.cached import CachedFrames
 from experiments.changes import SLIM, change
+from experiments.pool import simulating
 from experiments.real_frames import scores_by_range
 from experiments.runs import benchmark, detections, trained
 from fcos_lidar_jax.config import CloudReading, Config, InferenceConfig, StemConfig
@@ -120,6 +123,16 @@ class Simulated:
             streets=self.streets,
         )
         return NewestSweeps(CachedFrames(made, self._folder(f"{split}_{number}", sweeps)), num_sweeps)
+
+    @contextlib.contextmanager
+    def simulating(self, processes: int) -> Iterator[None]:
+        """Context manager in which a number of processes simulate the frames, and one more the test frames."""
+        with contextlib.ExitStack() as started:
+            for split, number in (("train", processes), ("test", min(processes, 1))):
+                cached = self.frames(split, self.base.num_sweeps).frames
+                assert isinstance(cached, CachedFrames)
+                started.enter_context(simulating(cached, number))
+            yield
 
     def _folder(self, content: str, num_sweeps: int) -> Path:
         return self.cache / f"{self.sensor.name}_{content}_{num_sweeps}_sweeps"

@@ -1,5 +1,6 @@
 """Tables: rows, training of their cells, record, Markdown and pictures."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,6 +41,8 @@ class Args:
     data: Path | None = None
     """Folder with ten_sweep_cloud/ for figures of a real cloud; default: the environment's FCOS_LIDAR_REAL_DATA,
     otherwise a simulated cloud."""
+    simulators: int = 0
+    """Processes that simulate the frames of smoke and sector ahead of the training; for a GPU."""
     only_figures: bool = False  # Only measure what needs no training, into separate files.
     nuscenes: tyro.conf.OmitArgPrefixes[NuScenesLayout] = dataclasses.field(default_factory=NuScenesLayout)
     """Options of --scale nuscenes."""
@@ -176,6 +179,10 @@ def _check(args: Args) -> None:
         if seed < 0 or args.seeds.count(seed) > 1:
             raise ValueError(f"--seeds: got {args.seeds}, expected different seeds of at least 0")
     real_cloud(args.data)
+    if args.simulators < 0:
+        raise ValueError(f"--simulators: got {args.simulators}, expected at least 0")
+    if args.scale == "nuscenes" and args.simulators:
+        raise ValueError("--simulators: only for simulated frames, got --scale nuscenes")
     if args.scale != "nuscenes":
         for field in dataclasses.fields(NuScenesLayout):
             if getattr(args.nuscenes, field.name) != field.default:
@@ -192,7 +199,8 @@ def _cells(table: Table, scale: Scale, seeds: tuple[int, ...], results: Path, ar
     # Seed by seed, so that an interrupted table has whole seeds.
     pairs = [(config, seed) for seed in seeds for config in configs.values()]
     labels = [f"{label}, seed {seed}" for seed in seeds for label in configs]
-    cells = run_cells(pairs, scale, results=results, runs=args.runs / args.scale, labels=labels)
+    with scale.simulating(args.simulators) if isinstance(scale, Simulated) else contextlib.nullcontext():
+        cells = run_cells(pairs, scale, results=results, runs=args.runs / args.scale, labels=labels)
     return {label: cells[row :: len(configs)] for row, label in enumerate(configs)}
 
 

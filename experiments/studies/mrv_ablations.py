@@ -10,8 +10,9 @@ The paper's figures for one round, one sweep and no priority are -2.06, -3.66 an
 offsets" adds the offsets between the points of each pixel's rounds, since the heads otherwise see the local
 geometry of the first round only. CenterPoint is trained on the same samples.
 
-Processes with the same folders share the cells. Cost: on one H100, 8 minutes for the frames and then 4 minutes per
-cell, with up to six processes side by side; several hours of one CPU core per cell.
+Processes with the same folders share the cells; one of them can have ``--simulators 12`` on a machine with many
+cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and then 4 minutes per cell, with up to six
+processes side by side; several hours of one CPU core per cell.
 """
 
 import dataclasses

@@ -221,6 +221,11 @@ def test_a_table_that_cannot_be_printed_is_refused_before_training(labels, field
     ("options", "message"),
     [
         (["--seeds", "0", "0"], "--seeds: got (0, 0), expected different seeds of at least 0"),
+        (["--simulators", "-1"], "--simulators: got -1, expected at least 0"),
+        (
+            ["--scale", "nuscenes", "--simulators", "2"],
+            "--simulators: only for simulated frames, got --scale nuscenes",
+        ),
         (["--data", "nowhere"], "--data: nowhere: no ten_sweep_cloud/cloud.f16.bin there"),
         (["--data-root", "nowhere"], "--data-root: only for --scale nuscenes, got --scale smoke"),
         (["--scale", "sector", "--steps", "5"], "--steps: only for --scale nuscenes, got --scale sector"),

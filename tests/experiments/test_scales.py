@@ -1,8 +1,10 @@
 """What the cells of each scale are trained and evaluated on."""
 
 import dataclasses
+import multiprocessing
 import re
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -138,3 +140,16 @@ def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path,
     NuScenesLayout._data.cache_clear()
     with pytest.raises(ValueError, match=r"^--test-version: .*\.pcd\.bin: no such file"):
         testing.checked()
+
+
+def test_other_processes_simulate_the_frames_of_a_scale(tmp_path):
+    scale = dataclasses.replace(smoke(tmp_path), train_frames=2, test_frames=1)
+    folders = {split: scale.frames(split, 10).frames for split in ("train", "test")}
+    with scale.simulating(0):
+        assert not multiprocessing.active_children()
+    with scale.simulating(1):
+        while [len(cached.made()) for cached in folders.values()] != [2, 1]:
+            time.sleep(0.1)
+    assert not multiprocessing.active_children()
+    again = dataclasses.replace(scale, cache=tmp_path / "again").frames("train", 10).frame(1)
+    np.testing.assert_array_equal(folders["train"].frame(1).points, again.points)
