@@ -1,5 +1,6 @@
 """Use of the extra rounds: clouds reduced to the first round, and the scores of networks with them."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,11 +9,12 @@ import pytest
 
 from experiments.changes import change
 from experiments.studies import round_use as study
-from experiments.studies.round_use import Args, FirstRound, measure
+from experiments.studies.round_use import Args, FirstRound, by_motion, measure
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
+from fcos_lidar_jax.types import Detections
 
 
 @pytest.mark.parametrize("prioritize_current", [True, False])
@@ -43,3 +45,43 @@ def test_networks_with_several_rounds_are_also_scored_without_the_later_ones(mon
         "five": {"all rounds": "NewestSweeps", "first round only": "FirstRound"},
         "one": {"all rounds": "NewestSweeps"},
     }
+
+
+def test_detections_are_split_with_the_objects_they_belong_to():
+    frame = SimulatedFrames(TINY, 1).frame(0)
+    truth = np.zeros((3, 9), np.float32)
+    truth[:, 0], truth[:, 3:6] = (10, 13, 30), 1
+    truth[0, 7] = 5.0  # moves; the second is of the same class and stands, the third of another class and moves
+    truth[2, 8] = -0.6
+    labels = np.array([0, 0, 1], np.int32)
+    frame = dataclasses.replace(frame, boxes=truth, labels=labels, num_points=np.full(3, 9, np.int32))
+    boxes = np.zeros((6, 9), np.float32)
+    boxes[:, 0] = 10.1, 11.4, 11.6, 30.0, 30.1, 60.0
+    found = Detections(
+        boxes,
+        np.linspace(1, 0.1, 6, dtype=np.float32),
+        np.array([0, 0, 0, 0, 1, 0]),
+        np.arange(6) < 6,
+        np.int32(0),
+    )
+    kept = {}
+    for moving in (True, False):
+        selected, part = by_motion(found, frame, moving)
+        kept[moving] = (np.flatnonzero(selected.valid).tolist(), part.boxes[:, 0].tolist())
+    # The fourth is of another class than the object beside it, the last is near none: both count twice.
+    assert kept == {True: ([0, 1, 3, 4, 5], [10, 30]), False: ([2, 3, 5], [13])}
+
+
+def test_scores_of_cars_are_those_of_the_benchmark(monkeypatch):
+    frames = [frame for frame in map(SimulatedFrames(TINY, 3).frame, range(3)) if len(frame.boxes)]
+    perfect = []
+    for frame in frames:
+        boxes = frame.boxes.copy()
+        boxes[:, 7] += 0.5  # every velocity is 0.5 m/s off
+        ones, number = np.ones(len(boxes), np.float32), len(boxes)
+        perfect.append(Detections(boxes, ones, frame.labels, np.ones(number, bool), np.int32(0)))
+    monkeypatch.setattr(study, "detections", lambda *_: (perfect, frames))
+    record = study.scores(None, None)
+    cars = {name: record[name] for name in ("cars", "moving cars", "standing cars")}
+    assert cars == {name: {"AP": 1.0, "velocity error": 0.5} for name in cars}
+    assert record["AP"]["car"] == 1
