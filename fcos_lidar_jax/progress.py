@@ -12,10 +12,10 @@ _LINES = 30  # Number of lines whose work determines the rate.
 class Progress:
     """Prints progress lines to stderr, identical on a terminal and in a pipe.
 
-    The rate is that of the last lines, five minutes by default, so that a pause or a slow beginning is forgotten.
-    It excludes the work before the first call, which often includes compilation. ``unit`` names the counted items,
-    in the plural. Lines are at least ``every_s`` seconds apart; the last item always prints one. Lines without
-    ``total`` have no time left.
+    The rate covers the last 30 lines, five minutes with the default interval and quick items, so that older pauses
+    and slow beginnings do not count. It excludes the work before the first call, which often includes compilation.
+    ``unit`` names the counted items, in the plural. Lines are at least ``every_s`` seconds apart; the last item
+    always prints one. Lines without ``total`` have no time left.
     """
 
     def __init__(self, unit: str, total: int | None, *, every_s: float = 10.0) -> None:

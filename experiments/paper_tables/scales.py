@@ -126,7 +126,7 @@ class Simulated:
 
     @contextlib.contextmanager
     def simulating(self, processes: int) -> Iterator[None]:
-        """Context manager in which a number of processes simulate the frames, and one more the test frames."""
+        """Context manager in which a number of processes simulate the training frames, and one the test frames."""
         with contextlib.ExitStack() as started:
             for split, number in (("train", processes), ("test", min(processes, 1))):
                 cached = self.frames(split, self.base.num_sweeps).frames

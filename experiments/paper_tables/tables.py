@@ -42,7 +42,8 @@ class Args:
     """Folder with ten_sweep_cloud/ for figures of a real cloud; default: the environment's FCOS_LIDAR_REAL_DATA,
     otherwise a simulated cloud."""
     simulators: int = 0
-    """Processes that simulate the frames of smoke and sector ahead of the training; for a GPU."""
+    """Processes that simulate the training frames of smoke and sector beside the training, for a GPU. One more
+    simulates the test frames."""
     only_figures: bool = False  # Only measure what needs no training, into separate files.
     nuscenes: tyro.conf.OmitArgPrefixes[NuScenesLayout] = dataclasses.field(default_factory=NuScenesLayout)
     """Options of --scale nuscenes."""
@@ -162,7 +163,9 @@ def make_record(
 ) -> dict[str, Any]:
     """Combine the cells of a table's rows with the figures that need no training."""
     reference = next(row for row in table.rows if row.label == table.reference)
-    trained = {} if scale is None else {**scale.describe(), "base": config_to_json(reference.change(scale.base))}
+    trained = (
+        {} if scale is None else {**scale.describe(), "reference": config_to_json(reference.change(scale.base))}
+    )
     return {
         "table": table.name,
         "scale": scale_name,
@@ -303,8 +306,8 @@ def _warnings(record: dict[str, Any]) -> list[str]:
 
 
 def _training_text(trained_on: dict[str, Any]) -> str:
-    """Describe the training of the base configuration."""
-    optimizer, precision = trained_on["base"]["optimizer"], trained_on["base"]["model"]["precision"]
+    """Describe the training of the table's reference row."""
+    optimizer, precision = trained_on["reference"]["optimizer"], trained_on["reference"]["model"]["precision"]
     shown = {name: value for name, value in trained_on.items() if isinstance(value, int | float | str)}
     shown |= {
         "scale": None,

@@ -5,14 +5,15 @@
 
 Tables 1, 2 and 7 compare networks of the scale ``sector``, which are small and have no local geometry, after 8,000
 samples: their curves end where learning begins. These rows have the local geometry and the sizes of ``compact``,
-and see 16,000 samples in batches of four. Each takes one part away from five rounds of ten sweeps with priority.
-The paper's figures for one round, one sweep and no priority are -2.06, -3.66 and -2.79 points of mAP. "With round
+and see 16,000 samples in batches of four, with a higher learning rate. The first row has five rounds of ten sweeps
+with priority. Four rows have fewer rounds, fewer sweeps or no priority, and one row has no local geometry. The
+paper's figures for one round, one sweep and no priority are -2.06, -3.66 and -2.79 points of mAP. "With round
 offsets" adds the offsets between the points of each pixel's rounds, since the heads otherwise see the local
 geometry of the first round only. CenterPoint is trained on the same samples.
 
 Processes with the same folders share the cells; one of them can have ``--simulators 12`` on a machine with many
-cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and then 4 minutes per cell, with up to six
-processes side by side; several hours of one CPU core per cell.
+cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and 3.5 minutes per cell with two processes side
+by side; six fit its memory. On a CPU core, several hours per cell.
 """
 
 import dataclasses

@@ -1,6 +1,6 @@
 """Use of the extra rounds: what a network trained with five rounds loses if four of them are empty.
 
-    python -m experiments.studies.round_use --trained outputs/runs/sector/model.local_geometry=true_seed=0 \
+    python -m experiments.studies.round_use --trained RUN_OF_FIVE_ROUNDS RUN_OF_ONE_ROUND \
         --out experiments/results/round_use.json
 
 Scores networks of the scale ``sector`` on its test frames. Networks with several rounds are also scored on clouds
@@ -80,9 +80,10 @@ def _cars(summary: dict[str, Any]) -> dict[str, float]:
 
 
 def by_motion(found: Detections, frame: Frame, moving: bool) -> tuple[Detections, Frame]:
-    """Select the objects that move, or that stand, and the detections that are not nearer to one of the others.
+    """Select the moving or the standing objects.
 
-    A detection belongs to the nearest object of its class within 2 m; without one, it counts in both selections.
+    A detection within 2 m of an object of its class belongs to the nearest one, and is dropped if that one is not
+    selected. All other detections stay in both selections, so both APs include them as false positives.
     """
     own = (np.hypot(frame.boxes[:, 7], frame.boxes[:, 8]) > _MOVING_MPS) == moving
     boxes, labels = np.asarray(found.boxes), np.asarray(found.labels)

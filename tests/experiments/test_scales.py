@@ -147,8 +147,10 @@ def test_other_processes_simulate_the_frames_of_a_scale(tmp_path):
     folders = {split: scale.frames(split, 10).frames for split in ("train", "test")}
     with scale.simulating(0):
         assert not multiprocessing.active_children()
+    end = time.monotonic() + 120
     with scale.simulating(1):
         while [len(cached.made()) for cached in folders.values()] != [2, 1]:
+            assert time.monotonic() < end
             time.sleep(0.1)
     assert not multiprocessing.active_children()
     again = dataclasses.replace(scale, cache=tmp_path / "again").frames("train", 10).frame(1)

@@ -60,7 +60,10 @@ CASES = {
     ),
     "local geometry with the offsets of the later rounds": (
         with_model(
-            with_stem(), local_geometry=True, round_offsets=True, channel_scale=(12.0, 11.5, 0.9, *[2.0] * 6)
+            with_stem(rounds=3),
+            local_geometry=True,
+            round_offsets=True,
+            channel_scale=(12.0, 11.5, 0.9, *[2.0] * 6),
         ),
         ODD,
     ),
