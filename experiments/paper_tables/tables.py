@@ -24,6 +24,7 @@ from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import file_lock
 
 SCORES = ("mAP", "NDS")
+_ERRORS = {"trans_err": "m", "scale_err": "1 - IoU", "orient_err": "rad", "vel_err": "m/s"}
 _SMOKE_NOTE = "the scores mean nothing"
 
 
@@ -256,7 +257,7 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
     lines += ["", f"Differences are to {_references(record)}{drawn}.", *_power(record), *_warnings(record), ""]
     lines += [f"{row['label']}: {line}" for row in record["rows"] for line in row.get("diverged", ())]
-    lines += by_distance(record["rows"])
+    lines += by_distance(record["rows"]) + true_positive_errors(record["rows"])
     if trained:
         lines += [f"Trained by revision {'; '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
@@ -283,6 +284,21 @@ def by_distance(rows: list[dict[str, Any]]) -> list[str]:
     rule = "|---" * len(header) + "|"
     said = f"Minutes of the training's steps, on machines that may have done other things: {', '.join(seconds)}."
     return [title, "", "| " + " | ".join(header) + " |", rule, *table, "", said, ""]
+
+
+def true_positive_errors(rows: list[dict[str, Any]]) -> list[str]:
+    """Format nuScenes' errors of true positives, for rows that have them."""
+    table = list[str]()
+    for row in rows:
+        cells = [cell["errors"] for cell in row.get("scores", ()) if cell and "errors" in cell]
+        for kind in cells[0] if cells else ():
+            values = [np.mean([cell[kind].get(name, np.nan) for cell in cells]) for name in _ERRORS]
+            table.append("| " + " | ".join([row["label"], kind, *map(_number, values)]) + " |")
+    if not table:
+        return []
+    title = "Errors of true positives, of all classes and of cars, means over the seeds:"
+    header = ["", "of", *_ERRORS.values()]
+    return [title, "", "| " + " | ".join(header) + " |", "|---" * len(header) + "|", *table, ""]
 
 
 def _power(record: dict[str, Any]) -> Iterator[str]:
@@ -324,7 +340,7 @@ def _references(record: dict[str, Any]) -> str:
 
 
 def _number(value: Any, sign: bool = False) -> str:
-    if value is None:
+    if value is None or np.isnan(value):
         return "-"
     return f"{value:+.2f}" if sign else f"{value:.2f}"
 

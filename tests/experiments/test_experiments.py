@@ -164,6 +164,18 @@ def test_scores_by_distance_and_class_are_means_over_the_seeds(tmp_path):
     assert tables.by_distance([{"label": "none", "scores": [{"mAP": 0.1}, None]}]) == []
 
 
+def test_errors_of_true_positives_are_means_over_the_seeds():
+    names = "trans_err", "scale_err", "orient_err", "vel_err", "attr_err"
+    errors = [
+        {"mean": dict(zip(names, (0.5, 0.2, 1.0, v, 1.0), strict=True)), "car": {"vel_err": v}} for v in (1, 2)
+    ]
+    rows = [{"label": "ours", "scores": [*({"errors": e} for e in errors), None]}, {"label": "untrained"}]
+    *_, whole, cars, _ = tables.true_positive_errors(rows)
+    assert whole == "| ours | mean | 0.50 | 0.20 | 1.00 | 1.50 |"
+    assert cars == "| ours | car | - | - | - | 1.50 |"
+    assert tables.true_positive_errors([{"label": "none", "scores": [{"mAP": 0.1}, None]}]) == []
+
+
 def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_table):
     scale = Pretended(diverges=((1, 0), (3, 0), (3, 1)))
     options = {"scale": scale, "seeds": (0, 1, 2)}
