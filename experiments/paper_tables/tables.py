@@ -24,7 +24,12 @@ from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import file_lock
 
 SCORES = ("mAP", "NDS")
-_ERRORS = {"trans_err": "m", "scale_err": "1 - IoU", "orient_err": "rad", "vel_err": "m/s"}
+_ERRORS = {
+    "trans_err": "translation, m",
+    "scale_err": "scale, 1 - IoU",
+    "orient_err": "orientation, rad",
+    "vel_err": "velocity, m/s",
+}
 _SMOKE_NOTE = "the scores mean nothing"
 
 
@@ -43,7 +48,7 @@ class Args:
     """Folder with ten_sweep_cloud/ for figures of a real cloud; default: the environment's FCOS_LIDAR_REAL_DATA,
     otherwise a simulated cloud."""
     simulators: int = 0
-    """Processes that simulate the training frames of smoke and sector beside the training, for a GPU. One more
+    """Processes that simulate the training frames of smoke and sector during the training, for a GPU. One more
     simulates the test frames."""
     only_figures: bool = False  # Only measure what needs no training, into separate files.
     nuscenes: tyro.conf.OmitArgPrefixes[NuScenesLayout] = dataclasses.field(default_factory=NuScenesLayout)
@@ -163,15 +168,15 @@ def make_record(
     table: Table, scale_name: str, scale: Scale | None, cells: dict[str, list[Cell]], figures: dict[str, Any]
 ) -> dict[str, Any]:
     """Combine the cells of a table's rows with the figures that need no training."""
-    reference = next(row for row in table.rows if row.label == table.reference)
-    trained = (
-        {} if scale is None else {**scale.describe(), "reference": config_to_json(reference.change(scale.base))}
-    )
+    trained_on = None
+    if scale is not None:
+        reference = next(row for row in table.rows if row.label == table.reference)
+        trained_on = {**scale.describe(), "reference": config_to_json(reference.change(scale.base))}
     return {
         "table": table.name,
         "scale": scale_name,
         "seeds": [cell["seed"] for cell in next(iter(cells.values()), [])],
-        "trained_on": trained or None,
+        "trained_on": trained_on,
         "rows": [_row_record(table, row, cells) for row in table.rows],
         "figures": figures,
         "cells_of": sorted({f"{cell['git']} on {cell['device']}" for row in cells.values() for cell in row}),
@@ -297,7 +302,7 @@ def true_positive_errors(rows: list[dict[str, Any]]) -> list[str]:
     if not table:
         return []
     title = "Errors of true positives, of all classes and of cars, means over the seeds:"
-    header = ["", "of", *_ERRORS.values()]
+    header = ["", "classes", *_ERRORS.values()]
     return [title, "", "| " + " | ".join(header) + " |", "|---" * len(header) + "|", *table, ""]
 
 

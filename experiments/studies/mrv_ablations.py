@@ -2,6 +2,7 @@
 
     python -m experiments.studies.mrv_ablations  # smoke: minutes, a toy
     python -m experiments.studies.mrv_ablations --scale sector --seeds 0 1 2
+    python -m experiments.studies.mrv_ablations --scale sector --seeds 0 1 2 --small  # for CPUs
 
 Tables 1, 2 and 7 compare networks of the scale ``sector``, which are small and have no local geometry, after 8,000
 samples: their curves end where learning begins. These rows have the local geometry and the sizes of ``compact``,
@@ -13,7 +14,8 @@ geometry of the first round only. CenterPoint is trained on the same samples.
 
 Processes with the same folders share the cells; one of them can have ``--simulators 12`` on a machine with many
 cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and 3.5 minutes per cell with two processes side
-by side; six fit its memory. On a CPU core, several hours per cell.
+by side; six fit its memory. On a CPU core, several hours per cell; with ``--small``, which keeps the sizes and the
+8,000 samples of the scale, one hour.
 """
 
 import dataclasses
@@ -43,17 +45,19 @@ _SECTOR = change(
 class AblationArgs(Args):
     """Options of the table."""
 
-    epochs: int | None = None  # Passes over the training frames; default: 4 for sector, 2 for smoke.
+    epochs: int | None = None  # Passes over the training frames; default: 4, or 2 for smoke and with --small.
+    small: bool = False  # Keep the sizes, batches and epochs of the scale.
 
 
-def make_table(epochs: int | None = None) -> Table:
-    """Create the table; its files are named after the epochs."""
+def make_table(epochs: int | None = None, *, small: bool = False) -> Table:
+    """Create the table; its files are named after the options."""
 
     def trained(part: Change) -> Change:
         length = {} if epochs is None else {"optimizer__epochs": epochs}
 
         def apply(config: Config) -> Config:
-            return change(**length)(part(_SECTOR(config) if config.name == "sector" else config))
+            grown = config.name == "sector" and not small
+            return change(**length)(part(_SECTOR(config) if grown else config))
 
         return apply
 
@@ -64,6 +68,8 @@ def make_table(epochs: int | None = None) -> Table:
         return trained(lambda config: PEER.change(change(**fields)(config)))
 
     name, title = "mrv_ablations", "Rounds, sweeps and priority, with local geometry"
+    if small:
+        name, title = f"{name}_small", f"{title}, small networks"
     if epochs is not None:
         name, title = f"{name}_{epochs}_epochs", f"{title}, {epochs} epochs"
     rows = (
@@ -81,6 +87,7 @@ def make_table(epochs: int | None = None) -> Table:
 
 
 TABLE = make_table()
+SMALL = make_table(small=True)
 
 
 def main(args: AblationArgs) -> None:
@@ -89,7 +96,7 @@ def main(args: AblationArgs) -> None:
         raise ValueError("--scale: got nuscenes, expected smoke or sector")
     if args.epochs is not None and args.epochs < 1:
         raise ValueError(f"--epochs: got {args.epochs}, expected at least 1")
-    run_table(make_table(args.epochs), args)
+    run_table(make_table(args.epochs, small=args.small), args)
 
 
 if __name__ == "__main__":

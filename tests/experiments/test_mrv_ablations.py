@@ -52,20 +52,21 @@ def test_at_scale_sector_the_network_has_the_sizes_of_compact_and_larger_batches
     assert whole.model == dataclasses.replace(base.model, **model)
     assert (whole.optimizer.batch_size, whole.optimizer.epochs) == (4, 4)
     assert whole.optimizer.ema_decay == pytest.approx(base.optimizer.ema_decay**4, abs=1e-4)
-    small = smoke(tmp_path).base
-    assert make_table().rows[0].change(small) == change(model__local_geometry=True)(small)
+    toy = smoke(tmp_path).base
+    for table, own in ((make_table(), toy), (make_table(small=True), base)):
+        assert table.rows[0].change(own) == change(model__local_geometry=True)(own)
 
 
 def test_the_number_of_samples_is_an_option(tmp_path, monkeypatch, capsys):
     scale = Pretended()
     monkeypatch.setattr(tables, "make_scale", lambda _: scale)
     monkeypatch.chdir(tmp_path)
-    for words in ([], ["--epochs", "4"]):
+    for words in ([], ["--epochs", "4"], ["--small"]):
         monkeypatch.setattr(sys, "argv", ["ablations", "--seeds", "0", "1", *words])
         with pytest.raises(SystemExit, match="0"):
             run_script(mrv_ablations.main, AblationArgs, None)
     names = {file.name for file in (tmp_path / "outputs" / "tables" / "smoke").glob("*.md")}
-    assert names == {"mrv_ablations.md", "mrv_ablations_4_epochs.md"}
+    assert names == {"mrv_ablations.md", "mrv_ablations_4_epochs.md", "mrv_ablations_small.md"}
     assert "with local geometry, 4 epochs" in capsys.readouterr().out
     epochs = {config.optimizer.epochs for config in (row.change(scale.base) for row in make_table(4).rows)}
     assert epochs == {4}
