@@ -33,7 +33,7 @@ READING = quarter(Path("unused")).base.reading  # Ten sweeps, without the trail 
 GROUPS = ("background", "standing objects", "moving objects")
 KINDS = ("within 0.1 m", "0.1 to 1 m", "beyond 1 m")
 _EDGES_M = (0.1, 1.0)
-_MOVING_MPS = 0.5
+MOVING_MPS = 0.5
 _MIN_POINTS = 100  # Smaller rounds have no shares.
 _REPEATS = 1000  # Bootstrap samples of an interval.
 
@@ -85,7 +85,7 @@ def contents(points: np.ndarray, boxes: np.ndarray) -> Counts:
     distance_m = np.linalg.norm(points[later, :3] - points[first, None, :3], axis=2)
     kind = np.digitize(distance_m, _EDGES_M)[..., None] == np.arange(len(KINDS))
     age_s, first_age_s = points[later, 4], points[first, 4]
-    owner, moving = find_owners(points, boxes), np.hypot(boxes[:, 7], boxes[:, 8]) > _MOVING_MPS
+    owner, moving = find_owners(points, boxes), np.hypot(boxes[:, 7], boxes[:, 8]) > MOVING_MPS
     older = there & (age_s > first_age_s[:, None])
     history = (owner[first] >= 0) & (older & (owner[later] == owner[first, None])).any(axis=1)
     values = {"cells": np.ones(len(first), int), "history": history}
@@ -101,17 +101,18 @@ def contents(points: np.ndarray, boxes: np.ndarray) -> Counts:
 
 def summarize(frames: Sequence[Counts], groups: Sequence[str] = GROUPS) -> dict[str, Any]:
     """Compute shares over all frames, by group; intervals if there are several frames."""
-    number = len(frames)
-    resampled = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), _REPEATS)
-    weights = np.concatenate([np.ones((1, number), int), resampled if number > 1 else resampled[:0]])
+    weights = resampling(len(frames))
     sums = {name: np.tensordot(weights, np.array([f[name] for f in frames]), 1) for name in frames[0]}
     objects, older, two_sweeps = sums.pop("objects").T
-    record: dict[str, Any] = {"frames": number, "all": _shares({name: v.sum(axis=1) for name, v in sums.items()})}
+    record: dict[str, Any] = {
+        "frames": len(frames),
+        "all": _shares({name: v.sum(axis=1) for name, v in sums.items()}),
+    }
     for g, group in enumerate(groups):
         record[group] = _shares({name: v[:, g] for name, v in sums.items()}, of_objects=g > 0)
     if groups:
         own = {"older in a later round": older, "two sweeps in the first round": two_sweeps}
-        own = {name: _percent(part, objects) for name, part in own.items()}
+        own = {name: percent(part, objects) for name, part in own.items()}
         record["each moving object"] = {"objects": int(objects[0]), **own}
     return record
 
@@ -119,18 +120,24 @@ def summarize(frames: Sequence[Counts], groups: Sequence[str] = GROUPS) -> dict[
 def _shares(sums: Counts, *, of_objects: bool = False) -> dict[str, Any]:
     cells = sums["cells"]
     record: dict[str, Any] = {"cells": int(cells[0])}
-    record |= {"older in a later round": _percent(sums["history"], cells)} if of_objects else {}
+    record |= {"older in a later round": percent(sums["history"], cells)} if of_objects else {}
     for r in range(ROUNDS - 1):
         kinds, number = sums["kinds"][:, r], sums["kinds"][:, r].sum(axis=1)
-        own: dict[str, Any] = {"filled": _percent(number, cells)}
+        own: dict[str, Any] = {"filled": percent(number, cells)}
         record[f"round {r + 2}"] = own
         if number[0] >= _MIN_POINTS:
-            own |= {name: _percent(kinds[:, k], number) for k, name in enumerate(KINDS)}
+            own |= {name: percent(kinds[:, k], number) for k, name in enumerate(KINDS)}
             own["mean age, s"] = round(float(sums["age_s"][0, r] / number[0]), 3)
     return record
 
 
-def _percent(part: np.ndarray, whole: np.ndarray) -> list[float]:
+def resampling(number: int) -> np.ndarray:
+    """Weights of the frames, i64[k, number]: ones, then those of bootstrap samples if there are several frames."""
+    resampled = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), _REPEATS)
+    return np.concatenate([np.ones((1, number), int), resampled if number > 1 else resampled[:0]])
+
+
+def percent(part: np.ndarray, whole: np.ndarray) -> list[float]:
     """Share, with the ends of its interval if there are bootstrap samples."""
     share, *resampled = 100 * part / np.maximum(whole, 1)
     bounds = np.quantile(resampled, [0.025, 0.975]) if resampled else ()
