@@ -9,6 +9,8 @@ row of a table of the paper, and its verdict follows from the 95 % interval of t
 - excludes zero, with the paper's sign: agrees; agrees only in direction if it also excludes the paper's figure
 - excludes zero, with the other sign: disagrees
 - contains zero: undecided; disagrees if it excludes the paper's figure
+
+The claims about rounds, sweeps and priority appear once more for networks with local geometry.
 """
 
 import dataclasses
@@ -26,6 +28,7 @@ from experiments.paper_tables.scales import Simulated, quarter
 from experiments.paper_tables.tables import Row, Table
 from experiments.script import run_script, write_text
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
+from experiments.studies import mrv_ablations
 from fcos_lidar_jax.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
@@ -110,6 +113,14 @@ FIGURES = (
     ),
 )
 
+LOCAL_GEOMETRY = {
+    ("table1", "single, 5 rounds"): ("five rounds of one sweep", "one round of one sweep"),
+    ("table1", "multi, 5 rounds"): ("five rounds of ten sweeps", "one round of ten sweeps"),
+    ("table2", "with priority"): ("five rounds of ten sweeps", "without priority"),
+    ("table7", "multi-frame"): ("five rounds of ten sweeps", "five rounds of one sweep"),
+}
+"""Table and row of the paper -> row and reference in networks with local geometry."""
+
 
 def verdict_of_figure(figure: Figure, ours: float) -> str:
     """Compare our figure with the paper's: agreement is within a tenth, or above a lower bound.
@@ -184,6 +195,14 @@ def claims(score: str) -> Iterator[tuple[str, Table, Row, float]]:
             label, paper = table.reference_of(row).label, table.paper_difference(row).get(score)
             if row.label != label and paper is not None:
                 yield f"{table.title}: {row.label} instead of {label}", table, row, paper
+    for ablations in (mrv_ablations.SMALL, mrv_ablations.TABLE):
+        rows = {row.label: row for row in ablations.rows}
+        for (name, paper_label), (label, reference) in LOCAL_GEOMETRY.items():
+            of_paper = next(row for row in TABLES[name].rows if row.label == paper_label)
+            paper = TABLES[name].paper_difference(of_paper)[score]
+            row = dataclasses.replace(rows[label], reference=reference)
+            pair = Table(ablations.name, ablations.title, (rows[reference], row), reference)
+            yield f"{ablations.title}: {label} instead of {reference}", pair, row, paper
 
 
 def training_lines(results: Path, score: str) -> tuple[list[str], list[str]]:

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -89,3 +90,25 @@ def test_an_undecided_claim_names_the_seeds_that_would_decide():
 def test_a_document_without_marks_is_refused():
     with pytest.raises(ValueError, match="no marks of the ledger"):
         with_ledger("text", "ledger")
+
+
+def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(tmp_path):
+    """Five rounds instead of one, and ten sweeps instead of one, from cells written by hand."""
+    scores = {"base": 0.5, "projection.num_rounds=1": 0.4, "num_sweeps=1": 0.3}
+    lines = ["changes,seed,scores.mAP,scores.NDS,device,git"]
+    for changes, score in scores.items():
+        both = "model.local_geometry=true" if changes == "base" else f"{changes},model.local_geometry=true"
+        lines.append(f'"{", ".join(sorted(both.split(",")))}",0,{score},{score},cpu,abc')
+    (tmp_path / "cells.csv").write_text("\n".join(lines) + "\n")
+    shutil.copy(RESULTS / "tables/sector/scale.json", tmp_path)
+    found = {}
+    for claim, table, row, paper in claims("mAP"):
+        if "small networks" in claim:
+            gains, samples = gains_of(table, row, quarter(Path("unused")), tmp_path)
+            found[claim.partition(": ")[2]] = (gains, samples, paper)
+    assert found == {
+        "five rounds of ten sweeps instead of one round of ten sweeps": ([pytest.approx(10)], 8000, 2.06),
+        "five rounds of ten sweeps instead of five rounds of one sweep": ([pytest.approx(20)], 8000, 3.66),
+        "five rounds of one sweep instead of one round of one sweep": ([], 8000, 0.28),
+        "five rounds of ten sweeps instead of without priority": ([], 8000, 2.79),
+    }
