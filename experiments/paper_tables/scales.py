@@ -38,7 +38,7 @@ from fcos_lidar_jax.inference import CloudDetector
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import steps_per_epoch
+from fcos_lidar_jax.input_pipeline.loader import default_threads, steps_per_epoch
 from fcos_lidar_jax.input_pipeline.open import default_split, find_data_set
 from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, Sensor, sector
@@ -49,6 +49,7 @@ from fcos_lidar_jax.training import Schedule
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 _CURVE_FRAMES = 100  # Test frames of evaluations during training.
+_PROCESSES = 4  # Processes that may train cells on the same cores, on a machine with many.
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, which leaves a trail in fused sweeps.
 
 
@@ -158,10 +159,11 @@ class Simulated:
         """
         frames, tests = (self.frames(split, config.num_sweeps) for split in ("train", "test"))
         objects = None if config.copy_paste is None else self.objects(config.num_sweeps)
-        steps, options = config.optimizer.epochs * steps_per_epoch(frames, config), dict[str, Any]()
+        steps = config.optimizer.epochs * steps_per_epoch(frames, config)
+        options: dict[str, Any] = {"threads": max(default_threads() // _PROCESSES, 1)}
         if self.evaluations:
             first = SelectedFrames(tests, tuple(range(min(_CURVE_FRAMES, len(tests)))))
-            options = {"tests": first, "schedule": Schedule(-(-steps // 20), -(-steps // self.evaluations))}
+            options |= {"tests": first, "schedule": Schedule(-(-steps // 20), -(-steps // self.evaluations))}
         detector = trained(folder, config, frames, steps=steps, seed=seed, objects=objects, **options)
         boxes, test_frames = detections(detector, tests)
         scores = _scores(benchmark(boxes, test_frames).summary)
