@@ -46,7 +46,8 @@ def _made(frames: CachedFrames, moment: float) -> list[int]:
 
 @contextlib.contextmanager
 def simulating(frames: CachedFrames, processes: int) -> Iterator[None]:
-    """Context manager in which a number of processes fill a cache in the order of its frames."""
+    """Context manager in which processes fill a cache in the order of its frames, unless it is full."""
+    processes = processes if len(frames.made()) < len(frames) else 0
     spawn = multiprocessing.get_context("spawn")
     started = [spawn.Process(target=_fill, args=(frames, first, processes)) for first in range(processes)]
     for process in started:
