@@ -4,13 +4,13 @@
     python -m experiments.ledger --write  # also write it into experiments/README.md
 
 The ledger reads our figures from ``experiments/results``, without training or timing. A claim about accuracy is a
-row of a table of the paper, and its verdict follows from the 95 % interval of the gain over the seeds:
+row of a table of the paper. The claims about rounds, sweeps and priority appear twice more, for networks with
+local geometry, which the paper does not have: small networks, and larger ones trained longer in batches of four.
+The verdict follows from the 95 % interval of the gain over the seeds:
 
 - excludes zero, with the paper's sign: agrees; agrees only in direction if it also excludes the paper's figure
 - excludes zero, with the other sign: disagrees
 - contains zero: undecided; disagrees if it excludes the paper's figure
-
-The claims about rounds, sweeps and priority appear once more for networks with local geometry.
 """
 
 import dataclasses
@@ -195,18 +195,18 @@ def claims(score: str) -> Iterator[tuple[str, Table, Row, float]]:
             label, paper = table.reference_of(row).label, table.paper_difference(row).get(score)
             if row.label != label and paper is not None:
                 yield f"{table.title}: {row.label} instead of {label}", table, row, paper
-    for ablations in (mrv_ablations.SMALL, mrv_ablations.TABLE):
+    for sizes, ablations in (("small networks", mrv_ablations.SMALL), ("sizes of compact", mrv_ablations.TABLE)):
         rows = {row.label: row for row in ablations.rows}
         for (name, paper_label), (label, reference) in LOCAL_GEOMETRY.items():
             of_paper = next(row for row in TABLES[name].rows if row.label == paper_label)
             paper = TABLES[name].paper_difference(of_paper)[score]
-            row = dataclasses.replace(rows[label], reference=reference)
+            row, full = rows[label], label if reference != "without priority" else "with priority"
             pair = Table(ablations.name, ablations.title, (rows[reference], row), reference)
-            yield f"{ablations.title}: {label} instead of {reference}", pair, row, paper
+            yield f"With local geometry, {sizes}: {full} instead of {reference}", pair, row, paper
 
 
 def training_lines(results: Path, score: str) -> tuple[list[str], list[str]]:
-    """Return a line of Markdown for each claim about a score, and the claims without trained cells."""
+    """Return a line of Markdown for each claim about a score, and the claims without a pair of cells."""
     scale, lines, missing = quarter(Path("unused")), list[str](), list[str]()
     for claim, table, row, paper in claims(score):
         gains, samples = gains_of(table, row, scale, results / "tables" / scale.name, score)
@@ -236,7 +236,7 @@ def as_markdown(results: Path) -> str:
     for score, rows, note in (("mAP", lines, ""), ("NDS", training_lines(results, "NDS")[0], _OUR_NDS)):
         parts.append(f"Gains in points of {score}.{note}\n\n{head}" + "\n".join(rows))
     if missing:
-        parts.append("Not run, or diverged:\n\n" + "\n".join(missing))
+        parts.append("Without scores of both rows for a seed:\n\n" + "\n".join(missing))
     return "\n\n".join(parts) + "\n"
 
 

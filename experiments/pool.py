@@ -46,7 +46,10 @@ def _made(frames: CachedFrames, moment: float) -> list[int]:
 
 @contextlib.contextmanager
 def simulating(frames: CachedFrames, processes: int) -> Iterator[None]:
-    """Context manager in which processes fill a cache in the order of its frames, unless it is full."""
+    """Context manager in which a number of processes fill a cache in the order of its frames.
+
+    A full cache starts no process.
+    """
     processes = processes if len(frames.made()) < len(frames) else 0
     spawn = multiprocessing.get_context("spawn")
     started = [spawn.Process(target=_fill, args=(frames, first, processes)) for first in range(processes)]

@@ -20,6 +20,7 @@ import numpy as np
 from experiments.benchmarks.latency import fused_cloud, real_cloud
 from experiments.paper_tables.scales import quarter
 from experiments.script import Options, run_measurement
+from experiments.statistics import bootstrap_weights, percent
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.progress import Progress
@@ -35,7 +36,6 @@ KINDS = ("within 0.1 m", "0.1 to 1 m", "beyond 1 m")
 _EDGES_M = (0.1, 1.0)
 MOVING_MPS = 0.5
 _MIN_POINTS = 100  # Smaller rounds have no shares.
-_REPEATS = 1000  # Bootstrap samples of an interval.
 
 Counts = dict[str, np.ndarray]
 
@@ -60,7 +60,10 @@ def boxes_when_seen(boxes: np.ndarray, lag_s: float) -> np.ndarray:
 
 
 def find_owners(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Number of the box that contained each point when it was measured, i64[n]; -1 for the background."""
+    """Number of the box that contained each point when it was measured, i64[n]; -1 for the background.
+
+    The last of several boxes counts.
+    """
     owner = np.full(len(points), -1)
     for lag_s in np.unique(points[:, 4]):
         rows = np.flatnonzero(points[:, 4] == lag_s)
@@ -101,7 +104,7 @@ def contents(points: np.ndarray, boxes: np.ndarray) -> Counts:
 
 def summarize(frames: Sequence[Counts], groups: Sequence[str] = GROUPS) -> dict[str, Any]:
     """Compute shares over all frames, by group; intervals if there are several frames."""
-    weights = resampling(len(frames))
+    weights = bootstrap_weights(len(frames))
     sums = {name: np.tensordot(weights, np.array([f[name] for f in frames]), 1) for name in frames[0]}
     objects, older, two_sweeps = sums.pop("objects").T
     record: dict[str, Any] = {
@@ -129,19 +132,6 @@ def _shares(sums: Counts, *, of_objects: bool = False) -> dict[str, Any]:
             own |= {name: percent(kinds[:, k], number) for k, name in enumerate(KINDS)}
             own["mean age, s"] = round(float(sums["age_s"][0, r] / number[0]), 3)
     return record
-
-
-def resampling(number: int) -> np.ndarray:
-    """Weights of the frames, i64[k, number]: ones, then those of bootstrap samples if there are several frames."""
-    resampled = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), _REPEATS)
-    return np.concatenate([np.ones((1, number), int), resampled if number > 1 else resampled[:0]])
-
-
-def percent(part: np.ndarray, whole: np.ndarray) -> list[float]:
-    """Share, with the ends of its interval if there are bootstrap samples."""
-    share, *resampled = 100 * part / np.maximum(whole, 1)
-    bounds = np.quantile(resampled, [0.025, 0.975]) if resampled else ()
-    return [round(float(value), 1) for value in (share, *bounds)]
 
 
 def measure(args: Args) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.script import run_measurement
 from experiments.studies import first_round as study
-from experiments.studies.first_round import Args, cells_of_objects, summarize
+from experiments.studies.first_round import Args, cells_of_objects, in_image, summarize
 from experiments.studies.round_contents import READING, SENSOR
 from fcos_lidar_jax.data.box_geometry import inside_box
 from fcos_lidar_jax.projection import project_points
@@ -18,7 +18,8 @@ from fcos_lidar_jax.simulation.frame_set import city_frames
 from fcos_lidar_jax.simulation.lidar import SWEEP_S
 
 STILL, MOVING = (0, 20, 0, 2, 2, 2, 0, 0, 0), (20, 0, 0, 2, 2, 2, 0, 10, 0)
-"""Boxes x, y, z, l, w, h, yaw, vx, vy; a tenth of a second before, the second was one metre nearer."""
+"""Boxes x, y, z, l, w, h, yaw, vx, vy. The sensor sees the second half a turn before the end of a sweep: at
+19.75 m in the current sweep, at 18.75 m a tenth of a second before."""
 NOW = [(0, 19.5, 0, 0), (19.6, 0, 0, 0)]
 NEARER_BEFORE = [(0, 19.2, 0, 0.1), (17.9, 0, 0, 0.1)]  # In the boxes of their time; the second no longer.
 BEHIND = [(17.9, 0, -0.6, 0.1)]  # As the second, in a cell below.
@@ -36,6 +37,24 @@ def test_priority_keeps_the_candidate_of_a_moving_object_and_not_what_it_left_be
     assert {name: v.tolist() for name, v in kept.items()} == {"candidates": [1, 1], "left behind": [0, 1]}
     lost = cells_of_objects(points, boxes, prioritize_current=False)
     assert {name: v.tolist() for name, v in lost.items()} == {"candidates": [1, 0], "left behind": [0, 2]}
+
+
+def test_without_older_sweeps_no_cell_is_left_behind():
+    points, boxes = cloud(*NOW, *NEARER_BEFORE, *BEHIND), np.array([STILL, MOVING], np.float32)
+    kept = cells_of_objects(points, boxes, only_current=True)
+    assert {name: v.tolist() for name, v in kept.items()} == {"candidates": [1, 1], "left behind": [0, 0]}
+
+
+def test_a_point_in_two_boxes_is_a_candidate_of_the_smaller_box_as_in_training():
+    inner = (0, 19.5, 0, 1, 1, 1, 0, 0, 0)
+    boxes = np.array([inner, STILL, inner], np.float32)
+    assert cells_of_objects(cloud(*NOW), boxes)["candidates"].tolist() == [1, 0, 0]
+
+
+def test_only_objects_with_a_current_point_within_the_limits_count():
+    far = (0, 60, 0, 2, 2, 2, 0, 0, 0)
+    points = cloud(NOW[0], (0, 60, 0, 0), *NEARER_BEFORE)
+    assert in_image(points, np.array([STILL, MOVING, far], np.float32)).tolist() == [True, False, False]
 
 
 def test_no_points_and_no_objects_are_counted_as_nothing():
@@ -74,14 +93,16 @@ def test_shares_are_of_all_objects_and_their_intervals_over_frames():
     assert record["standing objects"] == {
         "objects": 1,
         "without candidates": [0.0, 0.0, 0.0],
-        "candidates per object": 4.0,
-        "left behind": [0.0, 0.0, 0.0],
+        "candidates, median": 4.0,
+        "candidates, mean": 4.0,
+        "left behind, of these and the candidates": [0.0, 0.0, 0.0],
     }
     assert record["moving objects"] == {
         "objects": 2,
         "without candidates": [50.0, 0.0, 100.0],
-        "candidates per object": 2.5,
-        "left behind": [44.4, 16.7, 100.0],
+        "candidates, median": 2.5,
+        "candidates, mean": 2.5,
+        "left behind, of these and the candidates": [44.4, 16.7, 100.0],
     }
 
 
@@ -97,13 +118,18 @@ def test_the_file_holds_the_objects_of_each_setting(tmp_path, monkeypatch):
     assert run(monkeypatch, "--frames", "1", "--out", str(out)) == 0
     record = json.loads(out.read_text())
     frame = dataclasses.replace(city_frames(SENSOR, 1, Args.seed), reading=READING).frame(0)
-    assert frame.num_points.min() > 0
+    seen = np.array([np.any(inside_box(_current_within_limits(frame.points), box)) for box in frame.boxes])
     moving = np.hypot(*frame.boxes[:, 7:9].T) > 0.5
-    expected = [(~moving).sum(), moving.sum()]
+    expected = [(seen & ~moving).sum(), (seen & moving).sum()]
     for setting in study.SETTINGS:
         assert [record[setting][group]["objects"] for group in study.GROUPS] == expected
-    with_priority, without = (record[name]["moving objects"] for name in list(study.SETTINGS)[:2])
-    assert with_priority["candidates per object"] > without["candidates per object"]
+    ten, without, one = (record[name]["moving objects"]["candidates, mean"] for name in study.SETTINGS)
+    assert ten > one > without
+
+
+def _current_within_limits(points: np.ndarray) -> np.ndarray:
+    x, y, z, _, lag = points.T
+    return points[(lag == 0) & (np.abs(x) < 54) & (np.abs(y) < 54) & (z > -5) & (z < 3)]
 
 
 def test_a_mistake_is_one_line(monkeypatch, capsys):

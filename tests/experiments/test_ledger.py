@@ -93,22 +93,30 @@ def test_a_document_without_marks_is_refused():
 
 
 def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(tmp_path):
-    """Five rounds instead of one, and ten sweeps instead of one, from cells written by hand."""
-    scores = {"base": 0.5, "projection.num_rounds=1": 0.4, "num_sweeps=1": 0.3}
+    """Rounds, sweeps and priority, small networks, from cells written by hand."""
+    scores = {
+        "": 0.5,
+        "projection.num_rounds=1": 0.4,
+        "num_sweeps=1": 0.3,
+        "projection.prioritize_current=false": 0.6,
+    }
     lines = ["changes,seed,scores.mAP,scores.NDS,device,git"]
-    for changes, score in scores.items():
-        both = "model.local_geometry=true" if changes == "base" else f"{changes},model.local_geometry=true"
-        lines.append(f'"{", ".join(sorted(both.split(",")))}",0,{score},{score},cpu,abc')
+    for name, score in scores.items():
+        changes = ", ".join(sorted(filter(None, ["model.local_geometry=true", name])))
+        lines.append(f'"{changes}",0,{score},{score},cpu,abc')
     (tmp_path / "cells.csv").write_text("\n".join(lines) + "\n")
     shutil.copy(RESULTS / "tables/sector/scale.json", tmp_path)
-    found = {}
+    found = {"small networks": {}, "sizes of compact": {}}
     for claim, table, row, paper in claims("mAP"):
-        if "small networks" in claim:
+        if "local geometry" in claim:
+            size, _, text = claim.rpartition(", ")[2].partition(": ")
             gains, samples = gains_of(table, row, quarter(Path("unused")), tmp_path)
-            found[claim.partition(": ")[2]] = (gains, samples, paper)
-    assert found == {
-        "five rounds of ten sweeps instead of one round of ten sweeps": ([pytest.approx(10)], 8000, 2.06),
-        "five rounds of ten sweeps instead of five rounds of one sweep": ([pytest.approx(20)], 8000, 3.66),
+            found[size][text] = ([round(gain) for gain in gains], samples, paper)
+    assert found["small networks"] == {
+        "five rounds of ten sweeps instead of one round of ten sweeps": ([10], 8000, 2.06),
+        "five rounds of ten sweeps instead of five rounds of one sweep": ([20], 8000, 3.66),
         "five rounds of one sweep instead of one round of one sweep": ([], 8000, 0.28),
-        "five rounds of ten sweeps instead of without priority": ([], 8000, 2.79),
+        "with priority instead of without priority": ([-10], 8000, 2.79),
     }
+    papers = {text: ([], 16_000, paper) for text, (_, _, paper) in found["small networks"].items()}
+    assert found["sizes of compact"] == papers
