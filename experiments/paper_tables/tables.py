@@ -295,10 +295,12 @@ def true_positive_errors(rows: list[dict[str, Any]]) -> list[str]:
     """Format nuScenes' errors of true positives, for rows that have them."""
     table = list[str]()
     for row in rows:
-        cells = [cell["errors"] for cell in row.get("scores", ()) if cell and "errors" in cell]
+        scores = [cell for cell in row.get("scores", ()) if cell]
+        cells = [cell["errors"] for cell in scores if "errors" in cell]
+        label = row["label"] + (f" ({len(cells)} of {len(scores)} seeds)" if len(cells) < len(scores) else "")
         for kind in cells[0] if cells else ():
             values = [np.mean([cell[kind].get(name, np.nan) for cell in cells]) for name in _ERRORS]
-            table.append("| " + " | ".join([row["label"], kind, *map(_number, values)]) + " |")
+            table.append("| " + " | ".join([label, kind, *map(_number, values)]) + " |")
     if not table:
         return []
     title = "Errors of true positives, of all classes and of cars, means over the seeds:"
@@ -362,7 +364,7 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     from fcos_lidar_jax.visualization.figure import new_figure, save_png
 
     rows = record["rows"]
-    figure = new_figure(7.5, 1.2 + 0.45 * len(rows))
+    figure = new_figure(7.5, 1.4 + 0.45 * len(rows))
     axis = figure.add_subplot()
     for i, row in enumerate(rows):
         ours, paper = row["mAP_difference"], row["paper_difference"].get("mAP")
@@ -377,7 +379,7 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     axis.set_ylim(len(rows) - 0.5, -0.5)
     axis.set_xlabel(f"mAP, points more than {_references(record)}")
     note = f", {_SMOKE_NOTE}" if record["scale"] == "smoke" else ""
-    axis.set_title(f"{table.title} ({record['scale']}, {len(record['seeds'])} seeds{note})", fontsize=11)
+    figure.suptitle(f"{table.title}\n({record['scale']}, {len(record['seeds'])} seeds{note})", fontsize=11)
     handles, labels = axis.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
     axis.legend(kinds.values(), kinds.keys(), fontsize=9, frameon=False)

@@ -173,6 +173,8 @@ def test_errors_of_true_positives_are_means_over_the_seeds():
     *_, whole, cars, _ = tables.true_positive_errors(rows)
     assert whole == "| ours | mean | 0.50 | 0.20 | 1.00 | 1.50 |"
     assert cars == "| ours | car | - | - | - | 1.50 |"
+    rows[0]["scores"].append({"mAP": 0.1})  # of a former version, without errors
+    assert tables.true_positive_errors(rows)[-3] == "| ours (2 of 3 seeds) | mean | 0.50 | 0.20 | 1.00 | 1.50 |"
     assert tables.true_positive_errors([{"label": "none", "scores": [{"mAP": 0.1}, None]}]) == []
 
 
