@@ -1,4 +1,4 @@
-"""Objects in the first round: a cloud made by hand, and a simulated frame by loops."""
+"""Candidates in the first round: a cloud made by hand, and a simulated frame by loops."""
 
 import dataclasses
 import json
