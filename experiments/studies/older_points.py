@@ -4,11 +4,13 @@
 
 Compares runs of the scale ``sector`` that saw the same frames, such as rows of ``mrv_ablations`` with one seed. A
 *ghost* is a detection whose centre lies in no object, but in a box of the last half second: the current box of an
-object, moved back at constant velocity. Points of older sweeps lie there. The record has, for each run:
+object, moved back at constant velocity. Its points of older sweeps lie there. The record names each run by its
+folder, and has:
 
-- the mean training losses over the last thousand steps
+- the losses of the boxes over the last thousand training steps, per positive location, and the positives per step.
+  The classification loss is left out: it is a sum over all occupied locations, of which ten sweeps have more
 - mAP and AP by class on the test frames: of all detections, without the ghosts, and, to compare, without the
-  detections as far ahead of the objects, where there are no older points
+  detections that are as far ahead of an object and no ghosts
 
 Cost: one minute of one CPU core per run.
 """
@@ -30,9 +32,8 @@ from fcos_lidar_jax.simulation.lidar import SWEEP_S
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Detections
 
-LAGS_S = SWEEP_S * np.arange(1, 10)  # Nine older sweeps.
+LAGS_S = SWEEP_S * np.arange(1, 11)  # The oldest points of ten sweeps were measured half a second ago.
 STEPS = 1000
-_LOSSES = ("classification", "iou", "l1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,11 +66,18 @@ def ghosts(boxes: np.ndarray, truth: np.ndarray, lags_s: np.ndarray = LAGS_S) ->
     return np.any([in_object(lag) for lag in lags_s], axis=0) & ~in_object(0.0)
 
 
+def ahead(boxes: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Find the boxes that are as far ahead of an object as ghosts are behind it, without the ghosts of others."""
+    return ghosts(boxes, truth, -LAGS_S) & ~ghosts(boxes, truth)
+
+
 def training_losses(metrics: list[dict[str, Any]]) -> dict[str, float]:
-    """Average the losses over the last thousand steps."""
+    """Average the losses of the boxes over the positives of the last thousand steps."""
     rows = [row for row in metrics if "loss/total" in row]
     last = [row for row in rows if row["step"] > rows[-1]["step"] - STEPS]
-    return {name: round(float(np.mean([row[f"loss/{name}"] for row in last])), 3) for name in _LOSSES}
+    positives = [row["positives"] for row in last]
+    means = {name: np.average([row[f"loss/{name}"] for row in last], weights=positives) for name in ("iou", "l1")}
+    return {"positives": round(float(np.mean(positives)), 1)} | {k: round(float(v), 3) for k, v in means.items()}
 
 
 def scores(
@@ -96,7 +104,7 @@ def measure(args: Args) -> dict[str, Any]:
             "training losses": training_losses(read_metrics(path)),
             "all detections": scores(found, frames, None),
             "without ghosts": scores(found, frames, ghosts),
-            "without detections ahead": scores(found, frames, lambda boxes, truth: ghosts(boxes, truth, -LAGS_S)),
+            "without detections ahead": scores(found, frames, ahead),
         }
     return record
 

@@ -6,8 +6,9 @@
 Scores networks of the scale ``sector`` on its test frames. Networks with several rounds are also scored on clouds
 reduced to the points that the first round keeps: the first round stays the same, and the others are empty. Equal
 scores would mean that the network does not use the later rounds. Lower scores mean that it does, or that empty
-rounds, which it has not seen in training, disturb it. The record also has NDS, AP by class, and AP and velocity
-error of all cars, of those faster than 0.5 m/s and of the others. Cost: some minutes of one CPU core per network.
+rounds, which it has not seen in training, disturb it. The record also has NDS, AP by class, AP and velocity error
+of cars, and the same for objects faster than 0.5 m/s and for the others; the mAP of each kind is over the classes
+that have such objects. It names each run by its folder. Cost: some minutes of one CPU core per network.
 """
 
 import dataclasses
@@ -19,13 +20,14 @@ import numpy as np
 from experiments.paper_tables.scales import quarter
 from experiments.runs import benchmark, detections
 from experiments.script import Options, run_measurement
+from experiments.studies.round_contents import MOVING_MPS
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import Frame, FrameSet, WrappedFrames
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.types import Detections
 
-_MOVING_MPS = 0.5
 _NEAR_M = 2.0
 _STEP = 8192  # Clouds are padded to its multiples, so that few sizes are compiled.
 
@@ -59,19 +61,27 @@ class FirstRound(WrappedFrames):
 
 
 def scores(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
-    """Score a detector: mAP, NDS, AP by class, and AP and velocity error in m/s of cars by motion."""
+    """Score a detector: mAP, NDS, AP by class, AP and velocity error in m/s of cars, and the same by motion."""
     found, tests = detections(detector, frames)
     summary = benchmark(found, tests).summary
     record: dict[str, Any] = {
         "mAP": round(summary["mean_ap"], 4),
         "NDS": round(summary["nd_score"], 4),
-        "AP": {name: round(ap, 3) for name, ap in summary["mean_dist_aps"].items()},
+        "AP": _by_class(summary),
         "cars": _cars(summary),
     }
-    for name, moving in (("moving cars", True), ("standing cars", False)):
+    for motion, moving in (("moving", True), ("standing", False)):
         parts = [by_motion(d, frame, moving) for d, frame in zip(found, tests, strict=True)]
-        record[name] = _cars(benchmark([d for d, _ in parts], [frame for _, frame in parts]).summary)
+        summary = benchmark([d for d, _ in parts], [frame for _, frame in parts]).summary
+        labels = np.unique(np.concatenate([frame.labels for _, frame in parts]))
+        present = [summary["mean_dist_aps"][NUSCENES_CLASSES[label]] for label in labels]
+        record[f"{motion} objects"] = {"mAP": round(float(np.mean(present)), 4), "AP": _by_class(summary)}
+        record[f"{motion} cars"] = _cars(summary)
     return record
+
+
+def _by_class(summary: dict[str, Any]) -> dict[str, float]:
+    return {name: round(ap, 3) for name, ap in summary["mean_dist_aps"].items()}
 
 
 def _cars(summary: dict[str, Any]) -> dict[str, float]:
@@ -85,7 +95,7 @@ def by_motion(found: Detections, frame: Frame, moving: bool) -> tuple[Detections
     A detection within 2 m of an object of its class belongs to the nearest one, and is dropped if that one is not
     selected. All other detections stay in both selections, so both APs include them as false positives.
     """
-    own = (np.hypot(frame.boxes[:, 7], frame.boxes[:, 8]) > _MOVING_MPS) == moving
+    own = (np.hypot(frame.boxes[:, 7], frame.boxes[:, 8]) > MOVING_MPS) == moving
     boxes, labels = np.asarray(found.boxes), np.asarray(found.labels)
     distance = np.linalg.norm(boxes[:, None, :2] - frame.boxes[:, :2], axis=2)
     distance = np.where(labels[:, None] == frame.labels, distance, np.inf)

@@ -59,6 +59,14 @@ def test_a_claim_is_in_the_ledger_with_its_gain_or_as_not_run():
         assert (f"| {claim} | +" in ledger or f"| {claim} | -" in ledger) != (f"- {claim}\n" in ledger)
 
 
+def test_velocity_adds_nothing_to_nds_as_the_ledger_says():
+    with (RESULTS / "tables/sector/cells.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["scores.errors.mean.vel_err"]]
+    assert rows
+    assert all("model.local_geometry=true" in row["changes"] for row in rows)
+    assert min(float(row["scores.errors.mean.vel_err"]) for row in rows) > 1
+
+
 def test_a_seed_without_its_reference_does_not_count(tmp_path):
     assert gains_of(TABLE, TABLE.rows[1], quarter(tmp_path), tmp_path) == ([], 8000)
 

@@ -13,7 +13,7 @@ from fcos_lidar_jax.types import Detections
 
 STILL = (0, 20, 0, 2, 2, 2, 0, 0, 0)
 MOVING = (20, 0, 0, 2, 2, 2, 0, 10, 0)
-"""Boxes x, y, z, l, w, h, yaw, vx, vy; the second was at x = 15.5 m nine sweeps before."""
+"""Boxes x, y, z, l, w, h, yaw, vx, vy; the second was at x = 15 m half a second before."""
 
 
 def at(*centres: tuple[float, float, float]) -> np.ndarray:
@@ -41,8 +41,8 @@ def detected(boxes: np.ndarray, *ranks: float) -> Detections:
     [
         ((20.9, 0, 0), False, False),  # In the moving object.
         ((18.9, 0, 0), True, False),
-        ((14.6, 0, 0), True, False),  # In it nine sweeps before.
-        ((14.4, 0, 0), False, False),  # Before all sweeps.
+        ((14.1, 0, 0), True, False),  # In it half a second before.
+        ((13.9, 0, 0), False, False),  # Before all sweeps.
         ((18.0, 1.1, 0), False, False),  # Beside its way.
         ((18.0, 0, 1.1), False, False),  # Above it.
         ((25.4, 0, 0), False, True),
@@ -52,13 +52,28 @@ def detected(boxes: np.ndarray, *ranks: float) -> Detections:
 def test_ghosts_lie_where_an_object_was_and_none_is(centre, behind, ahead):
     truth = np.array([STILL, MOVING], np.float32)
     assert ghosts(at(centre), truth).tolist() == [behind]
-    assert ghosts(at(centre), truth, -study.LAGS_S).tolist() == [ahead]
+    assert study.ahead(at(centre), truth).tolist() == [ahead]
 
 
 def test_a_detection_in_another_object_is_no_ghost():
     follower = (17, 0, 0, 2, 2, 2, 0, 10, 0)
     truth = np.array([MOVING, follower], np.float32)
     assert ghosts(at((17, 0, 0), (18.5, 0, 0)), truth).tolist() == [False, True]
+
+
+def test_ghosts_of_turned_objects_lie_against_their_velocity():
+    diagonal = (0, 0, 0, 4, 1, 2, np.pi / 4, 5, 5)
+    truth, way = np.array([diagonal], np.float32), np.sqrt(0.5)
+    behind, beside = (-3 * way, -3 * way, 0), (-3 * way + way, -3 * way - way, 0)
+    assert ghosts(at(behind, beside), truth).tolist() == [True, False]
+    assert study.ahead(at((3 * way, 3 * way, 0), behind), truth).tolist() == [True, False]
+
+
+def test_the_trail_of_a_leading_object_is_not_ahead_of_its_follower():
+    leader, follower = (18, 0, 0, 2, 2, 2, 0, 10, 0), (8, 0, 0, 2, 2, 2, 0, 10, 0)
+    truth = np.array([leader, follower], np.float32)
+    assert ghosts(at((13, 0, 0), (11, 0, 0)), truth).tolist() == [True, False]
+    assert study.ahead(at((13, 0, 0), (11, 0, 0)), truth).tolist() == [False, True]
 
 
 def test_no_ghosts_without_objects_or_detections():
@@ -77,13 +92,14 @@ def test_scores_without_ghosts_are_those_of_the_other_detections():
     assert found.valid.all()
 
 
-def test_training_losses_are_means_of_the_last_thousand_steps():
+def test_training_losses_are_means_over_the_positives_of_the_last_thousand_steps():
     rows = [
-        {"step": s, "loss/total": 1.0, "loss/classification": s, "loss/iou": 0.5, "loss/l1": -s}
-        for s in range(1, 3001)
+        {"step": s, "loss/total": 1.0, "loss/iou": 0.5, "loss/l1": 9.0, "positives": 1} for s in range(1, 2001)
     ]
-    metrics = [*rows, {"step": 3000, "test/mAP": 0.1}]
-    assert training_losses(metrics) == {"classification": 2500.5, "iou": 0.5, "l1": -2500.5}
+    for row in rows[1000:]:
+        row |= {"loss/l1": 1.0, "positives": 30} if row["step"] % 2 else {"loss/l1": 2.0, "positives": 10}
+    metrics = [*rows, {"step": 2000, "test/mAP": 0.1}]
+    assert training_losses(metrics) == {"positives": 20.0, "iou": 0.5, "l1": 1.25}
 
 
 def test_each_run_is_measured_on_frames_with_its_sweeps(monkeypatch, tmp_path):
