@@ -36,8 +36,8 @@ README = Path(__file__).parent / "README.md"
 _DIRECTION = "agrees only in direction"
 _OUR_NDS = (
     " Simulated objects have no attributes, so the attribute error is 1 in every row. The mean\n"
-    "velocity error exceeds 1 m/s in every cell that records it (those with local geometry), and adds nothing to NDS\n"
-    "either. NDS is then at most 80, and gains in both errors, which the paper's gains include, cannot appear."
+    "velocity error exceeds 1 m/s in every cell that records it (with local geometry), and adds nothing to NDS.\n"
+    "NDS is then at most 80, and gains in both errors, which the paper's gains include, cannot appear."
 )
 _MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- end of the ledger -->\n")
 
