@@ -4,8 +4,8 @@
 
 Compares runs of the scale ``sector`` that saw the same frames, such as rows of ``mrv_ablations`` with one seed. A
 *ghost* is a detection whose centre lies in no object, but in a box of the last half second: the current box of an
-object, moved back at constant velocity. Its points of older sweeps lie there. The record names each run by its
-folder, and has:
+object, moved back at constant velocity. The older points of the object lie there. The record names each run by
+its folder, and has:
 
 - the losses of the boxes over the last thousand training steps, per positive location, and the positives per step.
   The classification loss is left out: it is a sum over all occupied locations, of which ten sweeps have more

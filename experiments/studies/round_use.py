@@ -6,9 +6,10 @@
 Scores networks of the scale ``sector`` on its test frames. Networks with several rounds are also scored on clouds
 reduced to the points that the first round keeps: the first round stays the same, and the others are empty. Equal
 scores would mean that the network does not use the later rounds. Lower scores mean that it does, or that empty
-rounds, which it has not seen in training, disturb it. The record also has NDS, AP by class, AP and velocity error
-of cars, and the same for objects faster than 0.5 m/s and for the others; the mAP of each kind is over the classes
-that have such objects. It names each run by its folder. Cost: some minutes of one CPU core per network.
+rounds, which it has not seen in training, disturb it. The record also has NDS, AP by class, and AP and velocity
+error of cars. For objects faster than 0.5 m/s, and for the others, it has the mAP over the classes with such
+objects, AP by class, and AP and velocity error of cars. It names each run by its folder. Cost: some minutes of one
+CPU core per network.
 """
 
 import dataclasses
@@ -61,7 +62,7 @@ class FirstRound(WrappedFrames):
 
 
 def scores(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
-    """Score a detector: mAP, NDS, AP by class, AP and velocity error in m/s of cars, and the same by motion."""
+    """Score a detector: mAP, NDS, AP by class, AP and velocity error in m/s of cars; all but NDS also by motion."""
     found, tests = detections(detector, frames)
     summary = benchmark(found, tests).summary
     record: dict[str, Any] = {

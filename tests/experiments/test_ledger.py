@@ -105,6 +105,7 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
     scores = {
         "": 0.5,
         "projection.num_rounds=1": 0.4,
+        "num_sweeps=1, projection.num_rounds=1": 0.25,
         "num_sweeps=1": 0.3,
         "projection.prioritize_current=false": 0.6,
     }
@@ -123,7 +124,9 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
     assert found["small networks"] == {
         "five rounds of ten sweeps instead of one round of ten sweeps": ([10], 8000, 2.06),
         "five rounds of ten sweeps instead of five rounds of one sweep": ([20], 8000, 3.66),
-        "five rounds of one sweep instead of one round of one sweep": ([], 8000, 0.28),
+        "five rounds of one sweep instead of one round of one sweep": ([5], 8000, 0.28),
+        "one round of ten sweeps instead of one round of one sweep": ([15], 8000, 1.88),
+        "five rounds of ten sweeps instead of one round of one sweep": ([25], 8000, 3.94),
         "with priority instead of without priority": ([-10], 8000, 2.79),
     }
     papers = {text: ([], 16_000, paper) for text, (_, _, paper) in found["small networks"].items()}
