@@ -62,7 +62,7 @@ class FirstRound(WrappedFrames):
 
 
 def scores(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
-    """Score a detector: mAP, NDS, AP by class, AP and velocity error in m/s of cars; all but NDS also by motion."""
+    """Score a detector: mAP, NDS, AP by class, AP and velocity error of cars in m/s; all but NDS by motion too."""
     found, tests = detections(detector, frames)
     summary = benchmark(found, tests).summary
     record: dict[str, Any] = {
