@@ -309,7 +309,7 @@ def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
 
 
 def load_sensor(path: str | Path) -> Sensor:
-    """Load a sensor by preset name, or from a JSON file in the format of :func:`sensor_from_json`.
+    """Load a sensor by preset name, or from a JSON file in the format of :func:`sensor_from_json` or with a name.
 
     Raises:
         ValueError: naming the file, the field, the found and the expected value.
@@ -326,4 +326,8 @@ def load_sensor(path: str | Path) -> Sensor:
         record = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not JSON: {error}") from None
+    if isinstance(record, str):  # A folder's ``sensor.json`` may hold the name only.
+        if record in PRESETS:
+            return PRESETS[record]
+        raise ValueError(f"{path}: got {record!r}, expected a JSON object or one of {', '.join(PRESETS)}")
     return sensor_from_json(record, str(path))

@@ -194,6 +194,15 @@ def test_missing_and_corrupt_files_are_rejected(tmp_path):
         load_sensor(tmp_path / "a.json")
 
 
+def test_a_file_may_hold_the_name_of_a_preset(tmp_path):
+    """As ``sensor.json`` in a folder of own data may."""
+    (tmp_path / "sensor.json").write_text('"tiny"')
+    assert load_sensor(tmp_path / "sensor.json") == TINY
+    (tmp_path / "sensor.json").write_text('"tinny"')
+    with pytest.raises(ValueError, match=r"sensor\.json: got 'tinny', expected a JSON object or one of nuscenes"):
+        load_sensor(tmp_path / "sensor.json")
+
+
 @pytest.mark.parametrize("field", ["inclinations_rad", "origin_m", "limit_z_m"])
 def test_lists_are_rejected_because_sensors_are_hashed(field):
     with pytest.raises(ValueError, match=rf"{field}: got \[.*\], expected a tuple"):

@@ -18,7 +18,7 @@ from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.models.layers import init_variables
 from fcos_lidar_jax.sensors import Sensor
 
-_BEYOND_M = 10.0  # Maximum distance of a box outside the map, and above or below the sensor.
+_BEYOND_M = 10.0  # Maximum distance of a box outside the map, and maximum height or depth of its centre.
 
 
 def build(config: CenterPointConfig, sensor: Sensor) -> Detector:

@@ -79,6 +79,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
 
     Raises:
         NonFiniteStateError: a value is not finite; nothing is written.
+        CheckpointError: the folder holds something else than a checkpoint; nothing is written.
         OSError: writing failed; the message is one line.
 
     >>> import tempfile
@@ -90,6 +91,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
     7
     """
     folder = local_path(folder).absolute()
+    _check_replaceable(folder)
     parts = {_VARIABLES: checkpoint.variables} | ({} if state is None else {_STATE: _as_arrays(state)})
     # Replicated arrays are complete on every device.
     parts = jax.tree.map(lambda x: np.asarray(x.addressable_data(0) if isinstance(x, jax.Array) else x), parts)
@@ -117,6 +119,15 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
         _replace_folder(beside, folder)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Refuse to replace anything but a checkpoint, such as the folder of a run, which stands for its last one."""
+    is_checkpoint = (folder / _DESCRIPTION).is_file()
+    if is_checkpoint or not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    found = f"a folder without {_DESCRIPTION}" if folder.is_dir() else "a file"
+    raise CheckpointError(f"{folder}: found {found}, expected a checkpoint to replace, or nothing")
 
 
 def _replace_folder(beside: Path, folder: Path) -> None:
@@ -303,7 +314,7 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     return {**config, **later}
 
 
-def check_arrays(where: Path, expected: Any, found: Any, *, whose: str) -> None:
+def check_arrays(where: Path | str, expected: Any, found: Any, *, whose: str) -> None:
     """Compare names and shapes of the arrays found at ``where`` with the expected arrays, which belong to
     ``whose``.
 

@@ -68,9 +68,9 @@ class DataOptions:
     ) -> MappedFrames:
         """Open frames whose labels index the classes of a configuration.
 
-        Boxes of other classes are left out and counted on standard error. ``samples``, from ``option``, are ranges
-        of the split's frames, see :func:`parse_ranges`. ``sensor`` is for formats that do not define one, by
-        default the configuration's.
+        Boxes of other classes are left out, which a line on standard error reports. ``samples``, from ``option``,
+        are ranges of the split's frames, see :func:`parse_ranges`. ``sensor`` is for formats that do not define
+        one, by default the configuration's.
         """
         frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:
@@ -79,9 +79,11 @@ class DataOptions:
             mapped = MappedFrames(frames, config.classes)
         except ValueError as error:
             raise ValueError(f"{error}; {self.data_set.reader.named_maps}") from None
-        if left_out := mapped.left_out() if set(frames.classes) - set(config.classes) else {}:
-            counts = ", ".join(f"{count} {name}" for name, count in left_out.items())
-            tell(f"left out boxes of classes that the detector does not have: {counts}")
+        if missing := [name for name in frames.classes if name not in config.classes]:
+            if self.data_set.on_disk:  # To count the boxes of simulated frames, all would have to be simulated.
+                missing = [f"{count} {name}" for name, count in mapped.left_out().items()]
+            if missing:
+                tell(f"left out boxes of classes that the detector does not have: {', '.join(missing)}")
         return mapped
 
     def open_whole(

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from fcos_lidar_jax.checkpoints.storage import shipped_checkpoints
 from fcos_lidar_jax.cli import demo_training
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder, option_name
 from fcos_lidar_jax.cli.scoring import Task, run_detector, write_reports, write_scores
@@ -62,7 +63,7 @@ def run(args: Demo) -> None:
             raise ValueError(f"{option_name(name)}: expected --train with it")
     began = time.monotonic()
     tell(f"simulating a drive of {args.keyframes} keyframes")
-    detector, title = load_detector(WEIGHTS), f"{WEIGHTS} on an unseen simulated drive"
+    detector, title = load_detector(shipped_checkpoints()[WEIGHTS]), f"{WEIGHTS} on an unseen simulated drive"
     frames = _simulate(args, detector)
     truth = split_truth(frames.nuscenes, frames.tokens)
     comparison = compare_by_benchmark(truth, "the drive", detector.classes, frames)

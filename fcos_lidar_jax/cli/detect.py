@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -44,6 +45,7 @@ from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
+_PICTURE = "picture {}"  # Key of a picture in the log of finished files.
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
 
@@ -121,7 +123,10 @@ def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
         if file.suffix.lower() == ".json":
             raise ValueError(f"{file}: expected a point file, or --sweeps before a list of sweeps")
     if args.sweeps is None:
-        files = tuple(dict.fromkeys(find_clouds(args.files)))
+        distinct = dict[str, Path]()
+        for file in find_clouds(args.files):
+            distinct.setdefault(os.path.abspath(file), file)
+        files = tuple(distinct.values())
         if args.full_turn and not any(usual_sensor(file) == KITTI_HDL64E for file in files):
             raise ValueError(f"--full-turn: expected none for {files[0]}: only files of KITTI are cropped")
         return files, []
@@ -199,7 +204,7 @@ def _detect(
     todo = [
         index
         for index, (state, picture) in enumerate(zip(states, pictures, strict=True))
-        if state not in log or (picture is not None and not picture.exists())
+        if state not in log or (picture is not None and not _drawn(picture, state, log))
     ]
     progress, num_truncated, unusable = Progress("files", len(clouds)), 0, dict[str, Any]()
     if done := len(states) - len(todo):
@@ -220,6 +225,8 @@ def _detect(
         record = cloud_record(detections, cloud, detector.classes)
         if line is None:
             log.add(states[index], [{"file": str(file), **record}])
+            if picture is not None:
+                log.add(_PICTURE.format(picture.name), [{"of": states[index]}])
         else:
             unusable[line] = states[index], [{"file": str(file), **record}]
         num_truncated += cloud.num_truncated
@@ -232,6 +239,15 @@ def _detect(
         log.add(state, entries)
     if line := truncation(num_truncated, detector.config):
         tell(line)
+
+
+def _drawn(picture: Path, state: str, log: ResumeLog) -> bool:
+    """Whether a picture is of a file in this state: its number is of another file after files were added."""
+    token = _PICTURE.format(picture.name)
+    if token not in log or not picture.exists():
+        return False
+    (_, entry), *_ = log.entries([token])
+    return json.loads(entry)[0]["of"] == state
 
 
 def _draw(

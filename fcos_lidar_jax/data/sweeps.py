@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
+from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.files import read_json
@@ -81,8 +82,8 @@ def fuse_sweeps(sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading) 
 def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any) -> tuple[np.ndarray, int]:
     """Fuse the sweeps of a JSON list, at most ``reading.num_sweeps``; returns the result of :func:`fuse_sweeps`.
 
-    Without points in the current sweep, older sweeps are left out: as in ``stream``, there is nothing to detect.
-    ``layout`` are options of :func:`~fcos_lidar_jax.data.point_files.read_points`, for each file of the list.
+    Without usable points in the current sweep, older sweeps are left out: as in ``stream``, there is nothing to
+    detect. ``layout`` are options of :func:`~fcos_lidar_jax.data.point_files.read_points`, for each file.
     """
 
     def read(index: int, each: ListedSweep) -> Sweep:
@@ -94,7 +95,10 @@ def read_sweeps(path: Path, sensor: Sensor, reading: CloudReading, **layout: Any
 
     sweeps = (read(index, each) for index, each in enumerate(read_list(path)[: reading.num_sweeps]))
     current = next(sweeps)
-    return fuse_sweeps(itertools.chain([current], sweeps if len(current.points) else ()), sensor, reading)
+    points, num_close = fuse_sweeps([current], sensor, reading)
+    if not np.any(usable_rows(points)):
+        return points, num_close
+    return fuse_sweeps(itertools.chain([current], sweeps), sensor, reading)
 
 
 def read_list(path: Path) -> list[ListedSweep]:

@@ -144,6 +144,8 @@ class CloudDetector(abc.ABC):
 def _scaled_once(points: Rows, sensor: Sensor) -> np.ndarray:
     """An array in the columns of a sensor; its intensities are scaled unless they were before."""
     rows = points_from_array(points, sensor)
+    if sensor.intensity_scale == 1:
+        return rows
     if np.count_nonzero(rows[:, 3] > 255) > len(rows) / 2:
         tell(
             "note: intensities are not scaled, since most would exceed 255: they seem to be scaled already",

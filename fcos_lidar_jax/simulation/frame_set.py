@@ -45,10 +45,13 @@ class SimulatedFrames(FrameSet):
         return self.number
 
     def frame(self, index: int) -> Frame:
-        return make_frame(self.first_seed + index, self.sensor, **{name: getattr(self, name) for name in _OPTIONS})
+        return make_frame(self._seed(index), self.sensor, **{name: getattr(self, name) for name in _OPTIONS})
 
     def name(self, index: int) -> str:
-        return f"seed {self.first_seed + index}"
+        return f"seed {self._seed(index)}"
+
+    def _seed(self, index: int) -> int:
+        return self.first_seed + range(self.number)[index]
 
     def fingerprint(self) -> str:
         """Checksum of the fields and the package version, which determine all bytes of the frames."""

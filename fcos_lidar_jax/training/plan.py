@@ -215,15 +215,18 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
 
 def _initial_weights(detector: Detector, weights: str | Path | Variables | None) -> Variables | None:
     """Load initial weights, and report differences of the network's configuration that shapes do not show."""
+    if weights is None:
+        return None
+    shapes, whose = jax.eval_shape(detector.init, jax.random.key(0)), "the network to be trained"
     if not isinstance(weights, str | Path):
+        check_arrays("weights", shapes, weights, whose=whose)
         return weights
     folder = find_checkpoint(Path(weights))
     checkpoint = read_checkpoint(folder)
     classes, expected = checkpoint.config.classes, detector.config.classes
     if classes != expected:
         raise CheckpointError(f"{folder}: classes: got {classes}, expected the classes to be trained, {expected}")
-    shapes = jax.eval_shape(detector.init, jax.random.key(0))
-    check_arrays(folder, shapes, checkpoint.variables, whose="the network to be trained")
+    check_arrays(folder, shapes, checkpoint.variables, whose=whose)
     own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
     for name, was, now in _differences(own, new, "model"):
         tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")

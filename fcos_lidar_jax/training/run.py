@@ -266,9 +266,11 @@ def _start(run: Run, *, resume: bool) -> TrainState:
         if (newest := run.checkpoints.newest(like)) is not None:
             return newest[1]
         # Only a run that was killed before its first checkpoint begins again; the metrics of others would be lost.
-        if (done := last_step(run.folder)) > (first := next(filter(run.saves_at, range(1, run.num_steps + 1)))):
-            found = f"found none, but metrics of {done} steps, of which step {first} was saved"
-            raise ValueError(f"{run.checkpoints.folder}: {found}, expected the checkpoints of the run")
+        first = next(filter(run.saves_at, range(1, run.num_steps)), run.num_steps)
+        if (done := last_step(run.folder)) > first:
+            found = f"found none, but metrics of {done} steps, and this schedule saves step {first}"
+            expected = "the checkpoints of the run, or the schedule that it began with"
+            raise ValueError(f"{run.checkpoints.folder}: {found}: expected {expected}")
     return make_state(run.detector, run.optimizer, key, variables=run.weights)
 
 

@@ -83,3 +83,4 @@ def test_points_to_boxes_in_any_order_and_of_nothing():
     every = np.ones(len(points), bool)
     for nothing in (detect(variables, points, ~every), detect(variables, points * np.nan, every)):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nothing))
+        assert not nothing.valid.any()

@@ -222,6 +222,24 @@ def test_a_missing_parent_folder_is_named(tmp_path, checkpoint):
         save_checkpoint(tmp_path / "gone" / "c", checkpoint)
 
 
+@pytest.mark.parametrize("target", ["run", "run/notes.txt"])
+def test_only_a_checkpoint_is_replaced(copy, checkpoint, target):
+    """A run stands for its last checkpoint when it is read, but writing there would delete the run."""
+    run = copy.parent / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "notes.txt").write_text("mine")
+    before = contents(copy.parent)
+    with pytest.raises(
+        CheckpointError, match=rf"{target}: found a .*, expected a checkpoint to replace, or nothing"
+    ):
+        save_checkpoint(copy.parent / target, checkpoint)
+    assert contents(copy.parent) == before
+    (copy.parent / "empty").mkdir()
+    for free in (copy, copy.parent / "empty", copy.parent / "new"):
+        save_checkpoint(free, dataclasses.replace(checkpoint, step=9))
+        assert load_checkpoint(free).step == 9
+
+
 def test_a_failed_write_keeps_the_old_checkpoint(copy, checkpoint, monkeypatch):
     """The last file, the description, cannot be written."""
     before = contents(copy.parent)

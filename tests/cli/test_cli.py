@@ -134,12 +134,16 @@ def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more
     assert_one_line_error(capsys, [*words, "--out", "boxes.json"], "d.npy: no such file")
     assert not (tmp_path / "boxes.json").exists()
     log = tmp_path / ".boxes.json.resume_log"
-    done = len(log.read_text().splitlines()) - 1
+
+    def finished():
+        return sum(not line.startswith('"picture ') for line in log.read_text().splitlines()) - 1
+
+    done = finished()
     assert 1 <= done <= 3
     # A mistake with other options before their first result loses nothing.
     other = "--min-score", "0.5", "--out", "boxes.json"
     assert_one_line_error(capsys, detect(home, "d.npy", *other), "no such")
-    assert len(log.read_text().splitlines()) == 1 + done
+    assert finished() == done
     shutil.move(tmp_path / "away.npy", clouds[3])
     if more:
         next((tmp_path / "pictures").iterdir()).unlink()  # a missing picture is drawn again
@@ -156,6 +160,31 @@ def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more
         assert page["score"] == 0.3
         names = sorted(picture.name for picture in (tmp_path / "pictures").iterdir())
         assert names == [f"000{i}_{name}.npy.png" for i, name in enumerate("abcd", 1)]
+
+
+def test_pictures_of_files_with_one_name_follow_their_numbers(home, tmp_path, capsys, monkeypatch):
+    """A resumed call has one more file before the others, so the second number is of another file."""
+    monkeypatch.chdir(tmp_path)
+    rng, clouds = np.random.default_rng(0), [Path(name) / "x.npy" for name in "abcd"]
+    for number, cloud in enumerate(clouds, 1):
+        cloud.parent.mkdir()
+        np.save(cloud, np.load(home / "good.npy")[rng.permutation(100 * number)])
+    how = "--pictures", "p", "--out", "x.json"
+    assert_one_line_error(capsys, detect(home, *clouds[1:], "none.npy", *how), "none.npy: no such file")
+    before = Path("p/0002_x.npy.png").read_bytes()
+    command(*detect(home, *clouds, *how))
+    assert Path("p/0002_x.npy.png").read_bytes() != before
+    command(*detect(home, *clouds, "--pictures", "new", "--out", "y.json"))
+    for picture in Path("new").iterdir():
+        assert (Path("p") / picture.name).read_bytes() == picture.read_bytes()
+
+
+def test_a_file_in_two_spellings_is_processed_once(home, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(home / "good.npy", "a.npy")
+    shutil.copy(home / "good.npy", "b.npy")
+    command(*detect(home, "./b.npy", "a.npy", tmp_path / "b.npy", "--out", "x.json"))
+    assert [file["file"] for file in files_of(Path("x.json"))] == ["b.npy", "a.npy"]
 
 
 def test_clouds_without_usable_points_have_no_boxes_and_are_counted(home, tmp_path, capsys):
@@ -400,7 +429,7 @@ def drive(home):
     """The results of a demo of three keyframes and two training steps, with a network that compiles in seconds."""
     small = {"model": TINY_CONFIG.model, "inference": TINY_CONFIG.inference}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "WEIGHTS", str(home / "checkpoint"))
+        patch.setattr(demo, "shipped_checkpoints", lambda: {demo.WEIGHTS: home / "checkpoint"})
         patch.setattr(demo_training, "QUICKSTART", dataclasses.replace(QUICKSTART, **small))
         command("demo --keyframes 3 --train --steps 2 --test-frames 3 --out", home / "demo")
     return home / "demo"

@@ -293,3 +293,13 @@ def test_larger_batches_change_boxes_only_by_rounding():
         assert sure.any()
         np.testing.assert_allclose(b.scores[: sure.sum()], a.scores[sure], atol=1e-4)
         np.testing.assert_allclose(b.boxes[: sure.sum()], a.boxes[sure], atol=1e-4)
+
+
+def test_boxes_of_simulated_frames_are_not_counted(monkeypatch, capsys):
+    """To count the boxes of left out classes, all frames would have to be simulated."""
+    monkeypatch.setattr(SimulatedFrames, "frame", Mock(side_effect=AssertionError))
+    config = dataclasses.replace(QUICKSTART, classes=("car", "bus"))
+    frames = DataOptions(format="simulated").open(config, split="train")
+    assert frames.classes == ("car", "bus")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("left out boxes of classes that the detector does not have: truck, trailer")

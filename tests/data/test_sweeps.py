@@ -78,6 +78,14 @@ def test_sweeps_may_be_empty(tmp_path):
     assert fuse(tmp_path, [entry("none.npy", timestamp_us=9), entry(timestamp_us=1)])[0].shape == (0, 5)
 
 
+def test_a_current_sweep_without_usable_points_is_not_filled_by_older_ones(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((3, 3), 9.0))
+    np.save(tmp_path / "bad.npy", np.full((2, 3), np.nan))
+    np.save(tmp_path / "half.npy", np.array([[np.nan] * 3, [9.0] * 3]))
+    assert fuse(tmp_path, [entry("bad.npy", timestamp_us=9), entry(timestamp_us=1)])[0].shape == (2, 5)
+    assert fuse(tmp_path, [entry("half.npy", timestamp_us=9), entry(timestamp_us=1)])[0].shape == (5, 5)
+
+
 @pytest.mark.parametrize(
     ("rotation", "place", "message"),
     [

@@ -298,10 +298,19 @@ def test_a_run_without_its_checkpoints_keeps_its_metrics(finished, tmp_path):
     folder = shutil.copytree(finished[0], tmp_path / "run")
     shutil.rmtree(folder / "checkpoints")
     before = contents(folder)
-    message = "checkpoints: found none, but metrics of 4 steps, of which step 1 was saved, expected"
+    message = "checkpoints: found none, but metrics of 4 steps, and this schedule saves step 1: expected the"
     with pytest.raises(ValueError, match=message):
         train_tiny(folder, evaluate=2, tests=TESTS, weights=weights(), resume=True)
     assert contents(folder) == before
+
+
+def test_a_run_that_would_save_only_at_its_end_begins_again(tmp_path):
+    run = tmp_path / "run"
+    first = train_tiny(run, save=9, weights=weights())
+    shutil.rmtree(run / "checkpoints")  # As if it had been killed during the last step.
+    again = train_tiny(run, save=9, weights=weights(), resume=True)
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000004"]
+    assert bits(again) == bits(first)
 
 
 STOPPED = """
@@ -393,6 +402,15 @@ def test_a_different_specification_is_refused_and_the_field_named(begun, change,
     with pytest.raises(ValueError, match=rf"run.json: {message}.*: only the same run can be resumed$"):
         train_tiny(begun, resume=True)
     assert [path.name for path in begun.iterdir()] == ["run.json"]
+
+
+@pytest.mark.parametrize("part", ["params", "network"])
+def test_arrays_of_another_network_are_refused_before_anything_is_written(tmp_path, part):
+    own = weights()
+    given = own["params"] if part == "params" else {**own, "params": {"kernel": np.ones(3)}}
+    with pytest.raises(ValueError, match=r"^weights: .*: the arrays do not belong to the network to be trained"):
+        train_tiny(tmp_path / "run", weights=given)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(tmp_path):
