@@ -36,8 +36,9 @@ README = Path(__file__).parent / "README.md"
 _DIRECTION = "agrees only in direction"
 _OUR_NDS = (
     " Simulated objects have no attributes, so the attribute error is 1 in every row. In the cells\n"
-    "that record it (all with local geometry), the mean velocity error exceeds 1 m/s and adds nothing to NDS.\n"
-    "NDS is then at most 80. Gains in these two errors, which the paper's gains may include, do not appear here."
+    "that record it (with local geometry, and CenterPoint's), the mean velocity error exceeds 1 m/s and adds\n"
+    "nothing to NDS. NDS is then at most 80. Gains in these errors, which the paper's may include, do not\n"
+    "appear here."
 )
 _MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- end of the ledger -->\n")
 

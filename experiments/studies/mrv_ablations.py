@@ -1,4 +1,4 @@
-"""Rounds, sweeps and priority in a detector that has learned, and CenterPoint beside it.
+"""Rounds, sweeps and priority in a detector that has learned.
 
     python -m experiments.studies.mrv_ablations  # smoke: minutes, a toy
     python -m experiments.studies.mrv_ablations --scale sector --seeds 0 1 2
@@ -10,7 +10,7 @@ and see 16,000 samples in batches of four, with a higher learning rate. The firs
 with priority. Four rows have fewer rounds, fewer sweeps or no priority, and one row has no local geometry. The
 paper's figures for one round, one sweep and no priority are -2.06, -3.66 and -2.79 points of mAP. "With round
 offsets" adds the offsets between the points of each pixel's rounds, since the heads otherwise see the local
-geometry of the first round only. CenterPoint is trained on the same samples.
+geometry of the first round only.
 
 Processes with the same folders share the cells; one of them can have ``--simulators 12`` on a machine with many
 cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and 3.5 minutes per cell with two processes side
@@ -24,7 +24,6 @@ from typing import Any
 from experiments.changes import Change, change
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
-from experiments.studies.centerpoint import PEER
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.presets import COMPACT
 
@@ -64,9 +63,6 @@ def make_table(epochs: int | None = None, *, small: bool = False) -> Table:
     def ours(**fields: Any) -> Change:
         return trained(change(model__local_geometry=True, **fields))
 
-    def peer(**fields: Any) -> Change:
-        return trained(lambda config: PEER.change(change(**fields)(config)))
-
     name, title = "mrv_ablations", "Rounds, sweeps and priority, with local geometry"
     if small:
         name, title = f"{name}_small", f"{title}, small networks"
@@ -80,8 +76,6 @@ def make_table(epochs: int | None = None, *, small: bool = False) -> Table:
         Row("one round of one sweep", ours(num_sweeps=1, projection__num_rounds=1)),
         Row("with round offsets", ours(model__round_offsets=True)),
         Row("without local geometry", trained(change())),
-        Row("CenterPoint, ten sweeps", peer()),
-        Row("CenterPoint, one sweep", peer(num_sweeps=1), reference="five rounds of one sweep"),
     )
     return Table(name, title, rows, reference=rows[0].label)
 

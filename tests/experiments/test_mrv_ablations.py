@@ -33,11 +33,9 @@ def test_every_row_changes_the_named_part_only(tmp_path, make_scale):
     scale = make_scale(tmp_path)
     configs = {row.label: row.change(scale.base) for row in make_table().rows}
     whole = configs.pop(WHOLE)
-    ten, one = configs.pop("CenterPoint, ten sweeps"), configs.pop("CenterPoint, one sweep")
     assert (whole.num_sweeps, whole.projection.num_rounds, whole.projection.prioritize_current) == (10, 5, True)
     assert {label: changes_of(config, whole) for label, config in configs.items()} == CHANGED
-    assert (ten.num_sweeps, changes_of(one, ten)) == (10, "num_sweeps=1")
-    for config in (whole, ten, one, *configs.values()):
+    for config in (whole, *configs.values()):
         assert config.optimizer == whole.optimizer
         detector = build_detector(config, scale.sensor)
         assert jax.eval_shape(detector.init, jax.random.key(0))["params"]

@@ -22,18 +22,19 @@ from fcos_lidar_jax.types import Detections
 
 def test_both_detectors_share_all_but_themselves(tmp_path):
     scale = quarter(tmp_path)
-    base = scale.base
-    peer, ours, longer = (row.change(base) for row in centerpoint.ROWS)
-    assert ours == base
-    assert peer.pillars == CENTERPOINT_COMPACT.pillars
-    inference = dataclasses.replace(base.inference, iou_exponent=1.0, candidates_per_level=4450)
-    assert peer.inference == inference
+    for rows, sweeps in ((centerpoint.ROWS[:3], 10), (centerpoint.ROWS[3:], 1)):
+        base = dataclasses.replace(scale.base, num_sweeps=sweeps)
+        peer, ours, plain = (row.change(scale.base) for row in rows)
+        assert plain == base
+        assert ours == change(model__local_geometry=True)(base)
+        assert peer.pillars == CENTERPOINT_COMPACT.pillars
+        inference = dataclasses.replace(base.inference, iou_exponent=1.0, candidates_per_level=4450)
+        assert peer.inference == inference
+        shared = {"model": base.model, "loss": base.loss, "inference": base.inference}
+        assert Config.of(peer, **shared) == base
+        assert [centerpoint.TABLE.reference_of(row) for row in rows[1:]] == [rows[0]] * 2
     sizes = image_layout(scale.sensor, base.model).level_sizes  # (location, class) pairs of the range view
     assert sum(min(base.inference.candidates_per_level, len(base.classes) * size) for size in sizes) == 4450
-    shared = {"model": base.model, "loss": base.loss, "inference": base.inference}
-    assert Config.of(peer, **shared) == base
-    assert (base.optimizer.epochs, longer.optimizer.epochs) == (2, 3)
-    assert dataclasses.replace(longer, optimizer=base.optimizer) == base
 
 
 def test_the_stages_that_are_timed_are_the_detector(tmp_path):
@@ -50,6 +51,21 @@ def test_the_stages_that_are_timed_are_the_detector(tmp_path):
     expected = whole.boxes, whole.scores, whole.labels, whole.valid
     for stage, of_whole in zip(calls["boxes"](), expected, strict=True):
         np.testing.assert_allclose(stage, of_whole, rtol=1e-5, atol=1e-5)
+
+
+def test_after_equal_time_the_slower_detector_has_seen_fewer_samples():
+    curves = [[[100, 0.1], [200, 0.2], [300, 0.6]], [[100, 0.2], [200, 0.3], [300, 0.7]]]
+    peer = [{"curve": curve} for curve in curves]
+    ours = [{"curve": [[100, 0.1], [300, 0.4]]}, None]  # The second seed diverged.
+    record = {
+        "rows": [
+            {"label": "CenterPoint", "reference": "CenterPoint", "scores": peer},
+            {"label": "ours", "reference": "CenterPoint", "scores": ours},
+        ],
+        "figures": {"columns": {"ours": {"training step, ms": 10}, "CenterPoint": {"training step, ms": 12}}},
+    }
+    (line,) = centerpoint.equal_time(record)
+    assert line == "ours: mAP 40.0; CenterPoint after as much time, 250 samples: 40.0"
 
 
 def test_the_peer_refuses_a_data_set():
