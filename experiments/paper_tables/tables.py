@@ -76,6 +76,7 @@ class Table:
     reference: str  # Label of the row that differences are relative to, unless a row names its own.
     figures: Callable[[Args], dict[str, Any]] | None = None
     """Measures what needs no training: ``{"columns": {label: {column: value}}, "lines": [text], ...}``."""
+    lines: Callable[[dict[str, Any]], Iterator[str]] | None = None  # Makes more lines from the table's record.
 
     def __post_init__(self) -> None:
         labels, gains = [row.label for row in self.rows], PAPER["text"]
@@ -147,6 +148,8 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
     # One process at a time, so that processes of the same table do not disturb each other's times.
     with file_lock(args.runs / args.scale / f"{file.name}.lock", wait=True):
         record = make_record(table, args.scale, scale, cells, table.figures(args) if table.figures else {})
+        if table.lines is not None:
+            record["figures"]["lines"] = [*record["figures"].get("lines", ()), *table.lines(record)]
         text = as_markdown(table, record)
         print(text, flush=True)
         # Scores and training data are in the files of the cells.

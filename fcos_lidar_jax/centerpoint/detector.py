@@ -39,8 +39,10 @@ def build(config: CenterPointConfig, sensor: Sensor) -> Detector:
         outputs, updates = network.apply(variables, pillars, train=train, mutable=["batch_stats"] if train else [])
         return outputs, updates["batch_stats"] if train else variables["batch_stats"]
 
-    def candidates(outputs: CentreOutputs, _: Pillars) -> tuple[Array, Array, Array, Array]:
-        return centre_candidates(outputs, config=config, grid=cells)
+    def candidates(outputs: CentreOutputs, pillars: Pillars) -> tuple[Array, Array, Array, Array]:
+        boxes, scores, labels, valid = centre_candidates(outputs, config=config, grid=cells)
+        valid &= (pillars.cell < grid.num_cells).any()  # The heat map of nothing has peaks, too.
+        return boxes, jnp.where(valid, scores, 0.0), labels, valid
 
     return Detector(prepare, init, apply, make_sums(config, cells), candidates, config, sensor)
 

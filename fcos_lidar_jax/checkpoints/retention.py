@@ -12,6 +12,7 @@ from pathlib import Path
 from fcos_lidar_jax.checkpoints.storage import (
     Checkpoint,
     CheckpointError,
+    is_checkpoint,
     read_checkpoint,
     read_description,
     read_state,
@@ -37,6 +38,8 @@ class Checkpoints:
         """Write a checkpoint, then remove old ones; if writing fails, the other checkpoints are unchanged."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{checkpoint.step:08d}"
+        if path.is_dir() and not is_checkpoint(path):  # Damaged: the run resumed before it.
+            self._remove(path)
         save_checkpoint(path, checkpoint, state=state)
         for leftover in self.folder.glob(".*"):  # from saves that were killed
             shutil.rmtree(leftover, ignore_errors=True)
@@ -53,10 +56,13 @@ class Checkpoints:
         # The run resumed before any later checkpoints because they are corrupt. They must not count as the newest.
         paths, corrupt = ([p for p in self.paths() if (p > newest) == later] for later in (False, True))
         for old in {*corrupt, *paths[: -self.keep]} - {best_of(paths)}:
-            # Network file systems cannot remove the folder while another process reads it: the next save does.
-            leftover = Path(tempfile.mkdtemp(dir=self.folder, prefix="."))
-            old.rename(leftover / old.name)
-            shutil.rmtree(leftover, ignore_errors=True)
+            self._remove(old)
+
+    def _remove(self, path: Path) -> None:
+        # Network file systems cannot remove the folder while another process reads it: the next save does.
+        leftover = Path(tempfile.mkdtemp(dir=self.folder, prefix="."))
+        path.rename(leftover / path.name)
+        shutil.rmtree(leftover, ignore_errors=True)
 
     def paths(self) -> list[Path]:
         """All checkpoints, oldest first, without verification."""

@@ -79,7 +79,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
 
     Raises:
         NonFiniteStateError: a value is not finite; nothing is written.
-        CheckpointError: the folder holds something else than a checkpoint; nothing is written.
+        CheckpointError: the folder holds something other than a checkpoint; nothing is written.
         OSError: writing failed; the message is one line.
 
     >>> import tempfile
@@ -122,9 +122,8 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, *, state: TrainS
 
 
 def _check_replaceable(folder: Path) -> None:
-    """Refuse to replace anything but a checkpoint, such as the folder of a run, which stands for its last one."""
-    is_checkpoint = (folder / _DESCRIPTION).is_file()
-    if is_checkpoint or not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
+    """Refuse to replace anything but a checkpoint. The folder of a run can be read as one, but not replaced."""
+    if is_checkpoint(folder) or not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return
     found = f"a folder without {_DESCRIPTION}" if folder.is_dir() else "a file"
     raise CheckpointError(f"{folder}: found {found}, expected a checkpoint to replace, or nothing")
@@ -142,6 +141,11 @@ def _replace_folder(beside: Path, folder: Path) -> None:
             os.replace(old, folder)
         raise
     shutil.rmtree(old, ignore_errors=True)
+
+
+def is_checkpoint(folder: Path) -> bool:
+    """Whether a folder has the description of a checkpoint; its other files may be damaged."""
+    return (folder / _DESCRIPTION).is_file()
 
 
 def save_score(folder: str | Path, score: float) -> None:

@@ -68,9 +68,9 @@ class DataOptions:
     ) -> MappedFrames:
         """Open frames whose labels index the classes of a configuration.
 
-        Boxes of other classes are left out, which a line on standard error reports. ``samples``, from ``option``,
-        are ranges of the split's frames, see :func:`parse_ranges`. ``sensor`` is for formats that do not define
-        one, by default the configuration's.
+        Boxes of other classes are left out. A line on standard error names these classes, with counts for data on
+        disk. ``samples``, from ``option``, are ranges of the split's frames, see :func:`parse_ranges`. ``sensor``
+        is for formats that do not define one, by default the configuration's.
         """
         frames = self.open_whole(split, config.reading, sensor or load_sensor(config.sensor))
         if samples is not None:

@@ -45,7 +45,6 @@ from fcos_lidar_jax.types import Detections
 from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
 from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
 
-_PICTURE = "picture {}"  # Key of a picture in the log of finished files.
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
 
@@ -211,6 +210,12 @@ def _detect(
         progress.show(done, "detected before")
     how: dict[str, Any] = {"batch_size": args.batch_size, "yaw_rad": aligned.yaw_rad, "notes": aligned.notes}
     groups = predict_groups(detector, clouds, indices=todo, **how)
+
+    def finish(index: int, entries: list[dict[str, Any]]) -> None:
+        log.add(states[index], entries)
+        if (picture := pictures[index]) is not None:
+            log.add(_token(picture), [{"of": states[index]}])
+
     for number, prediction in enumerate(itertools.chain.from_iterable(groups), done + 1):
         index, detections, cloud = prediction.index, prediction.detections, prediction.cloud
         assert prediction.frame is not None
@@ -224,26 +229,29 @@ def _detect(
             _draw(picture, points, detections, detector, shown_score)
         record = cloud_record(detections, cloud, detector.classes)
         if line is None:
-            log.add(states[index], [{"file": str(file), **record}])
-            if picture is not None:
-                log.add(_PICTURE.format(picture.name), [{"of": states[index]}])
+            finish(index, [{"file": str(file), **record}])
         else:
-            unusable[line] = states[index], [{"file": str(file), **record}]
+            unusable[line] = index, [{"file": str(file), **record}]
         num_truncated += cloud.num_truncated
         scores = [box["score"] for box in record["boxes"]]
         clear = sum(score >= shown_score for score in scores)
         progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
     if line := unusable_clouds([*unusable], len(clouds)):
         tell(f"note: {line}")
-    for state, entries in unusable.values():  # not before: if all are unusable, the next call must fail, too
-        log.add(state, entries)
+    for finished in unusable.values():  # not before: if all are unusable, the next call must fail, too
+        finish(*finished)
     if line := truncation(num_truncated, detector.config):
         tell(line)
 
 
+def _token(picture: Path) -> str:
+    """Key of a picture in the log of finished files."""
+    return f"picture {picture.absolute()}"
+
+
 def _drawn(picture: Path, state: str, log: ResumeLog) -> bool:
-    """Whether a picture is of a file in this state: its number is of another file after files were added."""
-    token = _PICTURE.format(picture.name)
+    """Whether a picture shows this state of its file. Once files are added, its number belongs to another file."""
+    token = _token(picture)
     if token not in log or not picture.exists():
         return False
     (_, entry), *_ = log.entries([token])

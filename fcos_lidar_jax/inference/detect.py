@@ -84,7 +84,7 @@ def make_detect(detector: Detector) -> Detect:
     Returns:
         pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` for one cloud, to be jitted by the
         caller; compiled once per number of points. Does not remove close points, see
-        :func:`fcos_lidar_jax.projection.remove_close`. A cloud without a point in the input has no boxes.
+        :func:`fcos_lidar_jax.projection.remove_close`. A cloud without a point in view has no boxes.
 
     >>> from fcos_lidar_jax.inference import load_trained
     >>> detector = load_trained("quickstart").model
@@ -105,8 +105,7 @@ def make_detect(detector: Detector) -> Detect:
             boxes, *rest = stages.candidates(stages.network(variables, sample), sample)
             candidates.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
         boxes, scores, labels, used = (jnp.concatenate(parts) for parts in zip(*candidates, strict=True))
-        seen = jnp.count_nonzero(valid) > inputs[0].num_dropped  # CenterPoint also predicts boxes without points.
-        best = suppress(boxes, scores, labels, used & seen, config.inference)
+        best = suppress(boxes, scores, labels, used, config.inference)
         return Detections(*best, inputs[0].num_dropped)
 
     return detect

@@ -267,7 +267,7 @@ def _start(run: Run, *, resume: bool) -> TrainState:
             return newest[1]
         # Only a run that was killed before its first checkpoint begins again; the metrics of others would be lost.
         first = next(filter(run.saves_at, range(1, run.num_steps)), run.num_steps)
-        if (done := last_step(run.folder)) > first:
+        if (done := last_step(run.folder)) > first or done == run.num_steps:
             found = f"found none, but metrics of {done} steps, and this schedule saves step {first}"
             expected = "the checkpoints of the run, or the schedule that it began with"
             raise ValueError(f"{run.checkpoints.folder}: {found}: expected {expected}")

@@ -17,7 +17,7 @@ from fcos_lidar_jax.centerpoint.pillars import Grid
 from fcos_lidar_jax.centerpoint.types import CentreOutputs
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.inference import make_detect
-from fcos_lidar_jax.inference.detect import suppress
+from fcos_lidar_jax.inference.detect import make_stages, suppress
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -84,3 +84,9 @@ def test_points_to_boxes_in_any_order_and_of_nothing():
     for nothing in (detect(variables, points, ~every), detect(variables, points * np.nan, every)):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nothing))
         assert not nothing.valid.any()
+    stages = make_stages(detector)
+    empty = stages.prepare(points, ~every)
+    boxes, scores, _, valid = stages.candidates(stages.network(variables, empty), empty)
+    assert len(boxes) > 0
+    assert not valid.any()
+    assert not scores.any()

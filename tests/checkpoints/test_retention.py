@@ -131,6 +131,14 @@ def test_a_run_that_resumed_before_a_corrupt_checkpoint_removes_it(copy, keep):
     assert find_checkpoint(copy.folder.parent / "best") == copy.folder / "00000002"
 
 
+def test_a_checkpoint_without_its_description_is_replaced_by_the_run(copy):
+    """The run resumed from step 4 and reaches step 6 again."""
+    (copy.folder / "00000006" / "checkpoint.json").unlink()
+    save(copy, 6, 0.2)
+    assert bits(copy.newest(state_at(0))[1]) == bits(state_at(6))
+    assert [path.name for path in copy.folder.glob(".*")] == []
+
+
 def test_a_run_with_only_corrupt_checkpoints_is_not_started_again(copy):
     for path in copy.paths():
         truncate(path)

@@ -431,6 +431,8 @@ def drive(home):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "shipped_checkpoints", lambda: {demo.WEIGHTS: home / "checkpoint"})
         patch.setattr(demo_training, "QUICKSTART", dataclasses.replace(QUICKSTART, **small))
+        patch.chdir(home)
+        (home / demo.WEIGHTS).mkdir()  # a folder of this name does not matter
         command("demo --keyframes 3 --train --steps 2 --test-frames 3 --out", home / "demo")
     return home / "demo"
 

@@ -53,19 +53,27 @@ def test_the_stages_that_are_timed_are_the_detector(tmp_path):
         np.testing.assert_allclose(stage, of_whole, rtol=1e-5, atol=1e-5)
 
 
-def test_after_equal_time_the_slower_detector_has_seen_fewer_samples():
+@pytest.mark.parametrize(
+    ("own_ms", "peer_ms", "seen", "theirs"), [(10, 12, 250, "40.0, 50.0"), (12, 10, 300, "60.0, 70.0")]
+)
+def test_after_equal_time_the_slower_detector_has_seen_fewer_samples(own_ms, peer_ms, seen, theirs):
     curves = [[[100, 0.1], [200, 0.2], [300, 0.6]], [[100, 0.2], [200, 0.3], [300, 0.7]]]
     peer = [{"curve": curve} for curve in curves]
-    ours = [{"curve": [[100, 0.1], [300, 0.4]]}, None]  # The second seed diverged.
+    ours = [{"curve": [[100, 0.1], [300, 0.35]]}, None]  # The second seed diverged.
+    times = {"ours": {"training step, ms": own_ms}, "CenterPoint": {"training step, ms": peer_ms}}
     record = {
         "rows": [
             {"label": "CenterPoint", "reference": "CenterPoint", "scores": peer},
             {"label": "ours", "reference": "CenterPoint", "scores": ours},
         ],
-        "figures": {"columns": {"ours": {"training step, ms": 10}, "CenterPoint": {"training step, ms": 12}}},
+        "figures": {"columns": times},
     }
     (line,) = centerpoint.equal_time(record)
-    assert line == "ours: mAP 40.0; CenterPoint after as much time, 250 samples: 40.0"
+    assert "mAP on the frames of the curves: 35.0 at the end; " in line
+    assert f"CenterPoint after as much time, {seen} samples: {theirs}." in line
+    for row in record["rows"]:
+        del row["scores"]
+    assert list(centerpoint.equal_time(record)) == []
 
 
 def test_the_peer_refuses_a_data_set():

@@ -1,6 +1,7 @@
 """Hostile clouds give finite images and boxes, each row at most once, bit-identical when repeated."""
 
 import dataclasses
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from tiny_run import bits
 
 from fcos_lidar_jax.data.cloud_policy import make_cloud
+from fcos_lidar_jax.inference import detector as detector_module
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
@@ -115,3 +117,12 @@ def test_boxes_are_finite():
         assert bits(found) == bits(again), seed
         boxes += int(found.valid.sum())
     assert boxes
+
+
+def test_no_note_about_scaled_intensities_if_the_sensor_does_not_scale(monkeypatch):
+    monkeypatch.setattr(detector_module, "tell", told := Mock())
+    points = np.full((10, 4), 60_000.0, np.float32)
+    np.testing.assert_array_equal(detector_module._scaled_once(points, TINY)[:, 3], points[:, 3])
+    told.assert_not_called()
+    _ = detector_module._scaled_once(points, dataclasses.replace(TINY, intensity_scale=255.0))
+    told.assert_called_once()

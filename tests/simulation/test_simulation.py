@@ -168,3 +168,11 @@ def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep():
         assert not (close & ~old).any()
         passed += (close & old).sum()  # points ahead of the ego vehicle that it has since reached
     assert passed > 20
+
+
+def test_frames_beyond_the_number_are_refused():
+    frames = SimulatedFrames(TINY, 3, first_seed=7)
+    assert [frames.name(index) for index in (0, 2)] == ["seed 7", "seed 9"]
+    for get in (frames.frame, frames.name):
+        with pytest.raises(IndexError):
+            get(3)

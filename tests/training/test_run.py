@@ -304,10 +304,15 @@ def test_a_run_without_its_checkpoints_keeps_its_metrics(finished, tmp_path):
     assert contents(folder) == before
 
 
-def test_a_run_that_would_save_only_at_its_end_begins_again(tmp_path):
+def test_a_run_that_would_save_only_at_its_end_begins_again_if_it_was_killed_before(tmp_path):
     run = tmp_path / "run"
     first = train_tiny(run, save=9, weights=weights())
-    shutil.rmtree(run / "checkpoints")  # As if it had been killed during the last step.
+    shutil.rmtree(run / "checkpoints")
+    with pytest.raises(ValueError, match="found none, but metrics of 4 steps, and this schedule saves step 4"):
+        train_tiny(run, save=9, weights=weights(), resume=True)
+    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[:-1]))
+    assert len(losses(run)) == STEPS - 1
     again = train_tiny(run, save=9, weights=weights(), resume=True)
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000004"]
     assert bits(again) == bits(first)
@@ -413,6 +418,12 @@ def test_arrays_of_another_network_are_refused_before_anything_is_written(tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
+def begin_again(run):
+    """Make a run look as if it had been killed before its first checkpoint."""
+    shutil.rmtree(run / "checkpoints")
+    (run / "metrics.jsonl").unlink()
+
+
 def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(tmp_path):
     start, run = tmp_path / "start", tmp_path / "run"
     options = {"weights": start, "steps": 1}
@@ -422,7 +433,7 @@ def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_agai
     other = jax.tree.map(lambda leaf: leaf * 2, first)
     save_checkpoint(start, Checkpoint(CONFIG, SENSOR, other, 1))
     train_tiny(run, resume=True, **options)  # from its own checkpoint
-    shutil.rmtree(run / "checkpoints")
+    begin_again(run)
     with pytest.raises(ValueError, match=r"run.json: weights_hash: was '\w+', got '\w+': only the same run"):
         train_tiny(run, resume=True, **options)
     save_checkpoint(start, Checkpoint(CONFIG, SENSOR, first, 2, score=0.5))  # the same weights
@@ -430,7 +441,7 @@ def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_agai
     spec = json.loads((run / "run.json").read_text())
     del spec["weights_hash"]  # as in a run of an earlier version
     (run / "run.json").write_text(json.dumps(spec))
-    shutil.rmtree(run / "checkpoints")
+    begin_again(run)
     save_checkpoint(start, Checkpoint(CONFIG, SENSOR, other, 1))
     train_tiny(run, resume=True, **options)
 
