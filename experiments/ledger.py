@@ -115,6 +115,7 @@ FIGURES = (
     ),
 )
 
+_WITH_OFFSETS = "five rounds of ten sweeps with round offsets"
 LOCAL_GEOMETRY = {
     ("five rounds of one sweep", "one round of one sweep"): ("table1", "single, 5", "single, 1"),
     ("five rounds of ten sweeps", "one round of ten sweeps"): ("table1", "multi, 5", "multi, 1"),
@@ -122,6 +123,8 @@ LOCAL_GEOMETRY = {
     ("five rounds of ten sweeps", "five rounds of one sweep"): ("table1", "multi, 5", "single, 5"),
     ("one round of ten sweeps", "one round of one sweep"): ("table1", "multi, 1", "single, 1"),
     ("five rounds of ten sweeps", "one round of one sweep"): ("table1", "multi, 5", "single, 1"),
+    (_WITH_OFFSETS, "one round of ten sweeps"): ("table1", "multi, 5", "multi, 1"),
+    (_WITH_OFFSETS, "one round of one sweep"): ("table1", "multi, 5", "single, 1"),
 }
 """Row and reference in networks with local geometry -> table, row and reference of the paper."""
 

@@ -8,9 +8,9 @@ Tables 1, 2 and 7 compare networks of the scale ``sector``, which are small and 
 samples: their curves end where learning begins. These rows have the local geometry and the sizes of ``compact``,
 and see 16,000 samples in batches of four, with a higher learning rate. The first row has five rounds of ten sweeps
 with priority. Four rows have fewer rounds, fewer sweeps or no priority, and one row has no local geometry. The
-paper's figures for one round, one sweep and no priority are -2.06, -3.66 and -2.79 points of mAP. "With round
-offsets" adds the offsets between the points of each pixel's rounds, since the heads otherwise see the local
-geometry of the first round only.
+paper's figures for one round, one sweep and no priority are -2.06, -3.66 and -2.79 points of mAP. Round offsets
+are the offsets between the points of each pixel's rounds: without them, the heads see the local geometry of the
+first round only.
 
 Processes with the same folders share the cells; one of them can have ``--simulators 12`` on a machine with many
 cores. Cost: on one H100 with 16 cores, 8 minutes for the frames and 3.5 minutes per cell with two processes side
@@ -74,7 +74,7 @@ def make_table(epochs: int | None = None, *, small: bool = False) -> Table:
         Row("without priority", ours(projection__prioritize_current=False)),
         Row("five rounds of one sweep", ours(num_sweeps=1)),
         Row("one round of one sweep", ours(num_sweeps=1, projection__num_rounds=1)),
-        Row("with round offsets", ours(model__round_offsets=True)),
+        Row("five rounds of ten sweeps with round offsets", ours(model__round_offsets=True)),
         Row("without local geometry", trained(change())),
     )
     return Table(name, title, rows, reference=rows[0].label)

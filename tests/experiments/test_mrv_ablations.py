@@ -23,7 +23,7 @@ CHANGED = {
     "without priority": "projection.prioritize_current=false",
     "five rounds of one sweep": "num_sweeps=1",
     "one round of one sweep": "num_sweeps=1, projection.num_rounds=1",
-    "with round offsets": "model.round_offsets=true",
+    "five rounds of ten sweeps with round offsets": "model.round_offsets=true",
     "without local geometry": "model.local_geometry=false",
 }
 
