@@ -108,6 +108,7 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
         "num_sweeps=1, projection.num_rounds=1": 0.25,
         "num_sweeps=1": 0.3,
         "projection.prioritize_current=false": 0.6,
+        "model.round_offsets=true": 0.7,
     }
     lines = ["changes,seed,scores.mAP,scores.NDS,device,git"]
     for name, score in scores.items():
@@ -127,6 +128,8 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
         "five rounds of one sweep instead of one round of one sweep": ([5], 8000, 0.28),
         "one round of ten sweeps instead of one round of one sweep": ([15], 8000, 1.88),
         "five rounds of ten sweeps instead of one round of one sweep": ([25], 8000, 3.94),
+        "five rounds of ten sweeps with round offsets instead of one round of ten sweeps": ([30], 8000, 2.06),
+        "five rounds of ten sweeps with round offsets instead of one round of one sweep": ([45], 8000, 3.94),
         "with priority instead of without priority": ([-10], 8000, 2.79),
     }
     papers = {text: ([], 16_000, paper) for text, (_, _, paper) in found["small networks"].items()}
