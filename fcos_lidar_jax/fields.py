@@ -1,8 +1,9 @@
 """Fields of frozen dataclasses: checks at construction, and conversion from parsed JSON."""
 
 import dataclasses
+import difflib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 
@@ -27,6 +28,16 @@ def check_per_class(field: str, values: Collection[object], classes: Collection[
     """Check that a field has one value per class, or no values, which stand for the usual ones."""
     expected = f"{len(classes)} values, one per class, or no values for the usual ones"
     check(len(values) in (0, len(classes)), field, values, expected)
+
+
+def unknown_name(name: str, known: Iterable[str]) -> str:
+    """Part of a message: the unknown name, and the nearest known names or else all of them.
+
+    >>> unknown_name("trunk", ("car", "truck"))
+    "got 'trunk', expected truck"
+    """
+    known = list(known)
+    return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"
 
 
 def check_types(record: Any) -> None:

@@ -1,14 +1,14 @@
 """LiDAR sensors as data: beams, columns and limits, with presets and a JSON format."""
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from fcos_lidar_jax.fields import check, check_types, from_json
+from fcos_lidar_jax.fields import check, check_types, from_json, unknown_name
+from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.namespaces import own_names
 
 __dir__ = own_names(__name__)
@@ -319,15 +319,11 @@ def load_sensor(path: str | Path) -> Sensor:
     """
     if str(path) in PRESETS:
         return PRESETS[str(path)]
-    file = Path(path)
-    if not file.is_file():
+    if not Path(path).is_file():
         raise ValueError(f"{path}: no such sensor file, and no preset ({', '.join(PRESETS)})")
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not JSON: {error}") from None
-    if isinstance(record, str):  # A folder's ``sensor.json`` may hold the name only.
-        if record in PRESETS:
-            return PRESETS[record]
-        raise ValueError(f"{path}: got {record!r}, expected a JSON object or one of {', '.join(PRESETS)}")
-    return sensor_from_json(record, str(path))
+    record = read_json(Path(path))
+    if not isinstance(record, str):
+        return sensor_from_json(record, str(path))
+    if record not in PRESETS:
+        raise ValueError(f"{path}: {unknown_name(record, PRESETS)}")
+    return PRESETS[record]

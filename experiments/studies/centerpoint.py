@@ -76,7 +76,7 @@ def figures(args: Args) -> dict[str, Any]:
     scale = simulated_scale(args)
     assert scale is not None
     calls, columns = dict[tuple[str, str], Call](), {}
-    for row in ROWS:
+    for row in TABLE.only(args.rows).rows:
         config = row.change(scale.base)
         frame = scale.frames("test", config.num_sweeps).frame(0)
         parts, parameters = stage_calls(config, frame.points, scale.sensor)

@@ -8,7 +8,7 @@ from typing import Annotated
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.options import option
-from fcos_lidar_jax.data.class_mapping import unknown_name
+from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, in_frame_of, load_sensor
 from fcos_lidar_jax.simulation.nuscenes_export import splits, write_dataset

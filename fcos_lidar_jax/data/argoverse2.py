@@ -11,12 +11,13 @@ import numpy as np
 from fcos_lidar_jax.classes import ARGOVERSE2_CLASSES
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes
-from fcos_lidar_jax.data.class_mapping import map_labels, unknown_name
+from fcos_lidar_jax.data.class_mapping import map_labels
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points, size_and_time
 from fcos_lidar_jax.data.nuscenes.build import velocities
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_feather, read_points
 from fcos_lidar_jax.data.sweeps import Sweep, check_poses, fuse_sweeps
+from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.geometry import pose_matrix, wrap_angle
 from fcos_lidar_jax.sensors import ARGOVERSE2, Sensor
 

@@ -1,8 +1,7 @@
 """Mapping of classes by name, from a data set to a detector."""
 
 import dataclasses
-import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -37,16 +36,6 @@ def mapped_classes(of: Sequence[str], class_map: ClassMap) -> tuple[str, ...]:
     """
     names = (class_map.get(name, name) for name in of)
     return tuple(dict.fromkeys(name for name in names if name is not None))
-
-
-def unknown_name(name: str, known: Iterable[str]) -> str:
-    """Part of a message: the unknown name, and the nearest known names or else all of them.
-
-    >>> unknown_name("trunk", ("car", "truck"))
-    "got 'trunk', expected truck"
-    """
-    known = list(known)
-    return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -12,7 +12,6 @@ import numpy as np
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import point_files
 from fcos_lidar_jax.data.box_geometry import LIMITS, check_boxes, count_inside
-from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import (
     Frame,
     FrameSet,
@@ -22,10 +21,11 @@ from fcos_lidar_jax.data.frame import (
 )
 from fcos_lidar_jax.data.splits import SPLITS, distinct_names, own_splits
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
+from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.progress import tell
-from fcos_lidar_jax.sensors import PRESETS, Sensor, sensor_from_json
+from fcos_lidar_jax.sensors import PRESETS, Sensor, load_sensor
 
 _SENSOR, _CLASSES = "sensor.json", "classes.json"
 _CLOUDS, _BOXES, _SWEEPS = "clouds", "boxes", "sweeps"
@@ -244,12 +244,7 @@ def read_sensor(root: Path, inside: Path | None = None) -> Sensor:
         names = ", ".join(f'"{name}"' for name in PRESETS)
         raise ValueError(f"{file}: no such file, expected the fields of the LiDAR, or its name in quotes: {names}")
     _expect_file(file, inside, str(file))
-    record = read_json(file, str | dict[str, Any])
-    if isinstance(record, dict):
-        return sensor_from_json(record, str(file))
-    if record not in PRESETS:
-        raise ValueError(f"{file}: {unknown_name(record, PRESETS)}")
-    return PRESETS[record]
+    return load_sensor(file)
 
 
 def _read_split(root: Path, file: str | Path | None, split: str, clouds: Collection[str]) -> tuple[str, ...]:

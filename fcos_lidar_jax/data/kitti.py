@@ -6,12 +6,12 @@ import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import check_boxes, count_inside
-from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint
 from fcos_lidar_jax.data.point_files import read_points
 from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.splits import distinct_names
 from fcos_lidar_jax.data.text_files import read_lines, read_matrices, read_number
+from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.kitti import read_objects
+from fcos_lidar_jax.fields import unknown_name
 
 MIN_OVERLAP = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
 """Class that KITTI evaluates -> overlap that a detection must exceed, from above and in 3D."""

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, overload
 
 import numpy as np
 
-from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, TrueBoxes
+from fcos_lidar_jax.fields import unknown_name
 
 _TABLE_ROWS = 20
 

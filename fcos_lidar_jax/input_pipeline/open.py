@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data import argoverse2, kitti
-from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes, unknown_name
+from fcos_lidar_jax.data.class_mapping import ClassMap, MappedFrames, mapped_classes
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import default_index
@@ -17,6 +17,7 @@ from fcos_lidar_jax.data.nuscenes.reader import open_keyframes
 from fcos_lidar_jax.data.nuscenes.splits import official_splits
 from fcos_lidar_jax.data.recorded import check_scale
 from fcos_lidar_jax.data.splits import own_splits
+from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.files import local_path
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, Sensor, in_frame_of

@@ -5,8 +5,8 @@ import dataclasses
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading, Config
-from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet
+from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame

@@ -10,7 +10,6 @@ import numpy as np
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.class_mapping import unknown_name
 from fcos_lidar_jax.data.frame import Frame, FrameSet, files_fingerprint, no_points
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, column_checksums, default_index, has_index, open_index
@@ -18,6 +17,7 @@ from fcos_lidar_jax.data.nuscenes.names import label_of
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
 from fcos_lidar_jax.data.point_files import MAX_POINTS, check_inside
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
+from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.geometry import pose_matrix, rotation_matrix, wrap_angle
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor
