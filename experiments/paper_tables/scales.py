@@ -2,8 +2,9 @@
 
 - ``smoke``: a toy network and a few steps on a few simulated frames, to check in minutes that everything runs. Its
   scores mean nothing.
-- ``sector``: the former, smaller network of compact on ten sweeps in a quarter of the view of nuScenes' sensor, at
-  full resolution and range, of varied simulated streets. Half an hour of one CPU core per cell.
+- ``sector``: a small network, with sizes that compact had before 2026-11-27, on ten sweeps of varied simulated
+  streets in a quarter of the view of nuScenes' sensor, at full resolution and range. Half an hour of one CPU core
+  per cell.
 - ``nuscenes``: the paper's detector on a data set in the nuScenes layout, prepared by ``fcos-lidar prepare``.
 """
 

@@ -38,7 +38,7 @@ class Args:
     """Options of a table."""
 
     scale: Literal["smoke", "sector", "nuscenes"] = "smoke"
-    """smoke: a toy network, in minutes. sector: the former, smaller network of compact on simulated streets,
+    """smoke: a toy network, in minutes. sector: a small network on simulated streets,
     in a quarter of the view of the nuScenes sensor. nuscenes: the paper's detector on nuScenes."""
     rows: tuple[str, ...] = ()  # Labels of the rows to train, in addition to the reference; default: all.
     seeds: tuple[int, ...] = ()  # Seeds of each row; default: 0 for smoke, otherwise 0, 1 and 2.

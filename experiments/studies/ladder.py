@@ -5,13 +5,14 @@
     python -m experiments.studies.ladder --trials "local geometry" larger  # the sizes of compact today
     python -m experiments.studies.ladder --trials larger "second round marks objects"  # can it use a second round?
 
-Each trial is a change of ``compact`` with its former, smaller sizes, trained on a quarter of the view of nuScenes'
-HDL-32E (32 x 272 pixels) with one sweep, and one round except in "second round marks objects": 4,000 frames of
-varied simulated streets, 3,000 steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on 200
-unseen frames, and on 60 of them after each quarter of the training. The same command resumes a trial. Trials that
-are already in the file of ``--out`` are not repeated: with ``--out experiments/results/ladder.json`` it prints the
-table of the committed trials. ``experiments/LOG.md`` has one line per trial. Cost: half an hour of one core per
-trial, and some minutes once for the frames.
+Each trial is a change of ``compact`` with its smaller sizes before 2026-11-27, trained on a quarter of the view of
+nuScenes' HDL-32E (32 x 272 pixels) with one sweep, and one round except in "second round marks objects": 4,000
+frames of varied simulated streets, 3,000 steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on
+200 unseen frames, and on 60 of them after each quarter of the training.
+
+The same command resumes a trial. Trials that are already in the file of ``--out`` are not repeated: with
+``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has
+one line per trial. Cost: half an hour of one core per trial, and some minutes once for the frames.
 """
 
 import dataclasses

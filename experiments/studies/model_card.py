@@ -68,7 +68,8 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield f"Preset `{trained['preset']}` for the sensor `{detector.sensor.name}`: {parameters:,} parameters,"
     yield f"{record['bytes'] / 2**20:.1f} MiB as float16, under the licence of the package.\n"
     yield "## What it is for\n"
-    yield f"The input is one sweep of this sensor: {_AXES}, and intensities from 0 to 255. The classes are"
+    yield f"The input is one sweep of this sensor, in one projection round: {_AXES}, and intensities from 0"
+    yield "to 255. The classes are"
     yield f"{', '.join(label.replace('_', ' ') for label in detector.classes)}.\n"
     yield "The weights are a starting point for fine-tuning and for first trials, not a usable detector. They were"
     yield "trained only on simulated streets. As the tables show, they miss objects and report objects that do not"
@@ -76,7 +77,7 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield "## Scores\n"
     low, high = record["interval"]["low"], record["interval"]["high"]
     scored = f"mAP {record['mAP']:.3f} ({low:.3f} to {high:.3f})"
-    yield f"On {record['unseen_frames']} unseen simulated frames, {_UNSEEN[name]}: {scored}.\n"
+    yield f"On {record['unseen_frames']} unseen simulated single frames, {_UNSEEN[name]}: {scored}.\n"
 
 
 def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
@@ -85,17 +86,18 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield "Only simulated streets:\n"
     for leg in (*record["earlier"], trained):
         streets = f"{leg['streets']:,} streets" if "streets" in leg else "as many streets"
-        done = f"{leg['frames_seen']:,} frames of {streets}, step {leg['steps']:,} of {leg['steps_planned']:,}"
+        steps = f"{leg['steps']:,} of {leg['steps_planned']:,} planned steps"
+        done = f"{leg['frames_seen']:,} frames of {streets}, {steps}"
         seconds, machine = leg["seconds_of_steps"], f" on {leg['device']}" if "device" in leg else ""
         time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
         more = (f", {leg['parameters']:,} parameters" if "parameters" in leg else "") + _average(leg)
-        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of steps{machine}{more}"
+        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of training steps{machine}{more}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it. If the preset had become"
         yield "larger, `experiments.studies.widened_weights` enlarged them first."
     if share := trained.get("logit_adjustment"):
-        yield f"\nThe export added {share} times the log ratio of the class frequencies of nuScenes and of the"
-        yield "training to the class logits (logit adjustment)."
+        yield "\nnuScenes and the training streets have different class frequencies. So the export added"
+        yield f"{share} log(frequency in nuScenes / frequency in training) to each class logit (logit adjustment)."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
 
@@ -129,6 +131,8 @@ def _figures(file: Path, weights: str) -> Iterator[str]:
     yield f"Average precision by centre distance, mean over 0.5, 1, 2 and 4 m, measured by {command}."
     yield "Numbers of boxes are in brackets. Bootstrap intervals resample simulated drives or real keyframes."
     yield "Intervals over keyframes are too narrow, because keyframes of a scene are similar."
+    yield "mAP is the mean over the classes that occur: do not compare it between scenes with other classes."
+    yield "*Official* scores are the nuScenes benchmark's own."
     for name, part in record.items():
         if isinstance(part, dict) and "all" in part:
             yield from _part(name, part)

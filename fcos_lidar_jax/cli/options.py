@@ -39,7 +39,7 @@ Backend = Annotated[
     inference.Backend,
     option(
         text="Runtime of the network. openvino is faster on CPUs, uses bfloat16 where the processor supports it, "
-        "and needs pip install 'fcos-lidar-jax[cpu]'."
+        "and needs pip install -e '.[cpu]' in the repository."
     ),
 ]
 BatchSize = Annotated[
@@ -49,7 +49,7 @@ Close = Annotated[
     Literal["all", "sweeps", "none"] | None,
     option(
         "{all,sweeps,none}",
-        default="as the detector was trained, else sweeps",
+        default="as the detector was trained",
         text="Drop points within a metre of the sensor in x and y: all sweeps, only older sweeps, or none.",
     ),
 ]
@@ -92,7 +92,7 @@ Rrd = Annotated[
     Path | None,
     option(
         "FILE.rrd",
-        text="Also write a recording for the Rerun viewer. Needs pip install 'fcos-lidar-jax[viz]'.",
+        text="Also write a recording for the Rerun viewer. Needs pip install -e '.[viz]' in the repository.",
     ),
 ]
 Page = Annotated[

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -37,7 +37,8 @@ class Project:
     sensor: options.Sensor = "nuscenes_hdl32e"
     rounds: int = 5  # Rounds of the projection.
     prioritize_current: bool = True  # Let points of the current sweep win every collision with older points.
-    remove_close: options.Close = None
+    remove_close: Literal["all", "sweeps", "none"] = ProjectionConfig.remove_close
+    """Drop points within a metre of the sensor in x and y: all sweeps, only older sweeps, or none."""
     columns: options.Columns = None
     dtype: options.Dtype = None
     max_file_points: options.MaxFilePoints = MAX_POINTS
@@ -54,7 +55,7 @@ def run(args: Project) -> None:
     points = read_points(
         args.file, sensor, columns=args.columns, dtype=args.dtype, max_points=args.max_file_points
     )
-    projection = ProjectionConfig(remove_close=args.remove_close or ProjectionConfig.remove_close)
+    projection = ProjectionConfig(remove_close=args.remove_close)
     config = Config(max_points=max(len(points), 1), projection=projection)
     cloud = make_cloud(points, config, sensor=sensor)
     rounds = {"num_rounds": args.rounds, "prioritize_current": args.prioritize_current}

@@ -153,7 +153,7 @@ def read_feather(path: Path, kinds: Mapping[str, str], *, max_rows: int = MAX_PO
     try:
         import pyarrow
     except ImportError:
-        how = "pip install 'fcos-lidar-jax[argoverse2]'"
+        how = "pip install -e '.[argoverse2]' in the repository"
         raise ValueError(f"{path}: pyarrow is not installed, which reads .feather: {how}") from None
     content = _read_whole(path, max_rows)
     try:

@@ -93,7 +93,7 @@ class _Bag(contextlib.AbstractContextManager):
         try:
             from rosbags import rosbag1, rosbag2
         except ImportError:
-            how = "pip install 'fcos-lidar-jax[ros]'"
+            how = "pip install -e '.[ros]' in the repository"
             raise ValueError(f"{path}: rosbags is not installed, which reads recordings: {how}") from None
         if not path.exists():
             raise ValueError(f"{path}: no such file or folder, expected a recording")

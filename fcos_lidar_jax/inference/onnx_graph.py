@@ -41,7 +41,7 @@ def cpu_package(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise ValueError(f"{name} is not installed: pip install 'fcos-lidar-jax[cpu]'") from None
+        raise ValueError(f"{name} is not installed: pip install -e '.[cpu]' in the repository") from None
     finally:
         if reporter is None:
             del sys.modules[_TELEMETRY]

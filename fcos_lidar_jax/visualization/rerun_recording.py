@@ -19,7 +19,7 @@ def check_rerun() -> None:
     try:
         import rerun  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise ValueError("--rrd: rerun is not installed: pip install 'fcos-lidar-jax[viz]'") from None
+        raise ValueError("--rrd: rerun is not installed: pip install -e '.[viz]' in the repository") from None
 
 
 @contextlib.contextmanager

@@ -233,5 +233,5 @@ def test_a_sweep_can_be_read_as_a_point_file(root):
 
 def test_without_pyarrow_the_error_names_the_extra(root, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with refused("pyarrow is not installed", "pip install 'fcos-lidar-jax[argoverse2]'"):
+    with refused("pyarrow is not installed", "pip install -e '.[argoverse2]' in the repository"):
         Argoverse2Frames(root).frame(0)

@@ -416,5 +416,5 @@ def test_damaged_metadata_are_refused(tmp_path, text):
 def test_without_rosbags_the_error_names_the_extra(tmp_path, monkeypatch):
     (tmp_path / "a.bag").touch()
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    with refused("a.bag: rosbags is not installed", "pip install 'fcos-lidar-jax[ros]'"):
+    with refused("a.bag: rosbags is not installed", "pip install -e '.[ros]' in the repository"):
         ros_bag_drive(tmp_path / "a.bag", TINY)
