@@ -15,7 +15,8 @@ __dir__ = own_names(__name__)
 
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
 _SAME_HEADING_RAD = 1e-3  # headings typed with few digits are the same
-_MAX_ROWS = 4096  # Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.
+# Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.
+_MAX_ROWS, _MAX_COLUMNS = 4096, 65536
 
 
 def _finite(*values: float) -> bool:
@@ -64,8 +65,10 @@ class Sensor:
             raise ValueError("inclinations_rad: expected finite radians within [-pi/2, pi/2]")
         if not (np.diff(table) < 0).all():
             raise ValueError("inclinations_rad: expected strictly decreasing values, the highest beam first")
+        check(table.size <= _MAX_ROWS, "inclinations_rad", f"{table.size} beams", f"at most {_MAX_ROWS}")
         columns, origin, limits_z = self.num_columns, self.origin_m, self.limit_z_m
-        check(isinstance(columns, int) and columns >= 2, "num_columns", columns, "an integer of at least 2")
+        fits = isinstance(columns, int) and 2 <= columns <= _MAX_COLUMNS
+        check(fits, "num_columns", columns, f"an integer from 2 to {_MAX_COLUMNS}")
         check(len(origin) == 3 and _finite(*origin), "origin_m", origin, "three finite numbers")
         ordered = len(limits_z) == 2 and _finite(*limits_z) and limits_z[0] < limits_z[1]
         check(ordered, "limit_z_m", limits_z, "finite (low, high) with low < high")

@@ -140,6 +140,8 @@ BAD = [
     ({**GOOD, "num_columns": "many"}, "num_columns: got 'many'"),
     ({**GOOD, "num_columns": 1}, "num_columns: got 1"),
     ({**GOOD, "num_columns": True}, "num_columns: got True"),
+    ({**GOOD, "num_columns": 100_000_000}, "num_columns: got 100000000, expected an integer from 2 to 65536"),
+    ({**GOOD, "inclinations_rad": [-i / 1e4 for i in range(5000)]}, "got '5000 beams', expected at most 4096"),
     ({**GOOD, "inclinations_rad": [0.0, 0.1]}, "strictly decreasing"),
     ({**GOOD, "inclinations_rad": [0.1]}, "got 1 beams"),
     ({**GOOD, "inclinations_rad": [3.0, 0.0]}, "within"),

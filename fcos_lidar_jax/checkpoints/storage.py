@@ -22,7 +22,7 @@ import fcos_lidar_jax.presets  # noqa: F401  (a checkpoint may hold the configur
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints.preemption import after_the_block
 from fcos_lidar_jax.config import Config, config_from_json, config_to_json
-from fcos_lidar_jax.files import atomic_write, checksum, local_path, naming, read_json
+from fcos_lidar_jax.files import checksum, local_path, naming, read_json
 from fcos_lidar_jax.models import Variables, build_detector
 from fcos_lidar_jax.sensors import Sensor, sensor_from_json, sensor_to_json
 from fcos_lidar_jax.types import TrainState
@@ -153,7 +153,11 @@ def save_score(folder: str | Path, score: float) -> None:
     file = Path(folder).absolute() / _DESCRIPTION
     read_description(file.parent)
     text = _with_hash(read_json(file, dict[str, Any]) | {"score": score})
-    atomic_write(file, lambda path: path.write_text(text, encoding="utf-8"))
+    # Written beside the checkpoint: a file that a kill leaves in it would count as damage.
+    with naming(file), tempfile.TemporaryDirectory(prefix=f".{file.parent.name}.", dir=file.parents[1]) as beside:
+        new = Path(beside) / _DESCRIPTION
+        new.write_text(text, encoding="utf-8")
+        os.replace(new, file)
 
 
 def _with_hash(description: dict[str, Any]) -> str:

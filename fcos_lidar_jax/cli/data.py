@@ -54,8 +54,16 @@ class DataOptions:
     def data_set(self) -> DataSet:
         return find_data_set(self.data_root, self.format, self.version)
 
-    def split(self, purpose: Literal["train", "val"], *, required: bool = True) -> str | None:
+    def split(self, purpose: Literal["train", "val"], given: str | None, *, required: bool = True) -> str | None:
+        """The given split, or the default for a purpose."""
+        if given is not None:
+            return given
         return default_split(self.data_set, purpose, required=required, splits=self.splits)
+
+    def refuse_index(self, why: str) -> None:
+        """Reject --index where it would be ignored."""
+        if self.index is not None:
+            raise ValueError(f"--index: got {self.index}, expected none: {why}")
 
     def open(
         self,

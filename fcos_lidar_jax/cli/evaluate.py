@@ -199,6 +199,8 @@ def _open(args: Evaluate) -> Task:
         comparison = compare_by_benchmark(read_truth(args.ground_truth), str(args.ground_truth))
         return Task(args.ground_truth.name, comparison, sensor)
     data = args.data.data_set
+    if data.tables is None:
+        args.data.refuse_index("only the tables of nuScenes have an index")
     official = detector is None or (set(detector.classes) <= set(NUSCENES_CLASSES) and args.data.class_map is None)
     benchmark = data.tables is not None and official
     _check_metric(args, detector, benchmark=benchmark)
@@ -237,7 +239,7 @@ def _open(args: Evaluate) -> Task:
 
 def _split(args: Evaluate) -> str | None:
     """The given split or the default, with a note if that is not a validation split."""
-    split = args.split or args.data.split("val")
+    split = args.data.split("val", args.split)
     if args.split is None and split not in (None, "val", "mini_val"):
         only = f"no split val: evaluating {split}, the only split, which train uses too"
         tell(f"{args.data.data_set.root}: {only}; {_TOO_HIGH}")

@@ -14,6 +14,7 @@ from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import CopyPasteConfig
+from fcos_lidar_jax.data.folder import belongs_to_own_data
 from fcos_lidar_jax.data.nuscenes.build import build_index
 from fcos_lidar_jax.data.nuscenes.index import Index, has_index, open_index, save_index
 from fcos_lidar_jax.data.nuscenes.splits import scenes_of_split
@@ -53,6 +54,8 @@ def run(args: Prepare) -> None:
         raise ValueError("--format: got simulated, expected a data set: simulated frames need no preparation")
     folder = args.data.index or data.index
     check_out_folder(folder, "--index")
+    if belongs_to_own_data(folder / "objects"):
+        raise ValueError(f"--index: {folder}: a folder of own data, expected another one")
     jax.config.update("jax_platforms", "cpu")  # accelerators are not needed, and may be in use
     with folder_lock(folder, "preparing"):
         record = _prepare(args, data, folder)
@@ -81,10 +84,10 @@ def _training_split(args: Prepare, data: DataSet) -> str | None:
     """The split to cut objects from, checked before the index of nuScenes is made, which takes minutes."""
     tables = data.tables
     if tables is None or not tables.is_dir():
-        return args.train_split or args.data.split("train")
+        return args.data.split("train", args.train_split)
     if not any(read_table(tables, SampleAnnotation)):  # reads up to the first annotation
         return None
-    split = args.train_split or args.data.split("train")
+    split = args.data.split("train", args.train_split)
     assert split is not None
     scenes = {scene.name for piece in read_table(tables, Scene) for scene in piece}
     scenes_of_split(split, tables, scenes, file=args.data.splits)

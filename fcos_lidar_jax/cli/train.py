@@ -15,7 +15,7 @@ from fcos_lidar_jax.cli.checks import check_out_folder, option_name
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
-from fcos_lidar_jax.config import Config
+from fcos_lidar_jax.config import Config, config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
@@ -25,7 +25,7 @@ from fcos_lidar_jax.input_pipeline.open import DataSet
 from fcos_lidar_jax.presets import ABOUT, PRESETS
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training import Schedule, train
-from fcos_lidar_jax.training.plan import RUN_SPEC
+from fcos_lidar_jax.training.plan import RUN_SPEC, check_run
 from fcos_lidar_jax.training.run import run_folder
 
 _PRESETS: Any = (
@@ -104,6 +104,9 @@ def run(args: Train) -> None:
     try:
         with agreed("cannot train"):
             if task.cuts_objects and is_main_process:  # the other processes open the result
+                # A run with other frames or options keeps its objects.
+                cut_from = {"config": config_to_json(task.config), "objects": task.frames.fingerprint()}
+                check_run(args.out, json.loads(json.dumps(cut_from)), resume=resume)
                 with run_folder(args.out, resume=resume):
                     _cut_objects(args, task)
         with agreed("cannot train"):
@@ -155,7 +158,7 @@ def _open(args: Train) -> _Task:
     index = args.data.index or data.index
     if data.tables is not None and data.tables.is_dir() and not has_index(index):
         raise ValueError(f"{index}: no index here, expected one: run fcos-lidar prepare")
-    split = args.train_split or args.data.split("train")
+    split = args.data.split("train", args.train_split)
     frames = args.data.open(config, split=split, samples=args.samples)
     _check_sensor(config, data, frames)
     if absent := [name for name in config.classes if name not in frames.frames.classes]:
@@ -174,6 +177,8 @@ def _open(args: Train) -> _Task:
         _check_simulated(len(frames), config)
     steps = args.steps if args.steps is not None else config.optimizer.epochs * steps_per_epoch(frames, config)
     cuts_objects = config.copy_paste is not None and (args.samples is not None or not data.on_disk)
+    if data.tables is None and (config.copy_paste is None or cuts_objects):
+        args.data.refuse_index("no prepared objects are used")
     return _Task(config, data, split, frames, tests, steps, cuts_objects)
 
 
@@ -187,8 +192,8 @@ def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:
 
 
 def _open_tests(args: Train, config: Config, root: Path) -> FrameSet | None:
-    split = args.val_split or args.data.split("val", required=False)
-    if split != "none" and (split or args.val_samples):
+    split = args.data.split("val", args.val_split, required=False)
+    if split != "none" and (split is not None or args.val_samples):
         return args.data.open(config, split=split, samples=args.val_samples, option="--val-samples")
     off = f", expected --val-split or --val-samples too: {root} has no split to evaluate on"
     if split == "none":

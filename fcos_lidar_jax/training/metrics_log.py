@@ -11,7 +11,7 @@ import numpy as np
 
 from fcos_lidar_jax.files import atomic_write, naming
 
-_FILE = "metrics.jsonl"
+METRICS = "metrics.jsonl"  # file of the metrics in the folder of a run
 _START = 1  # SessionLog.START
 
 
@@ -24,7 +24,7 @@ class MetricsLog:
     def __init__(self, folder: Path, *, first_step: int) -> None:
         from tensorboardX import RecordWriter  # the thread of SummaryWriter would print its errors
 
-        file = folder / _FILE
+        file = folder / METRICS
         if file.exists():
             kept = [json.dumps(line) + "\n" for line in read_metrics(folder) if line["step"] <= first_step]
             atomic_write(file, lambda path: path.write_text("".join(kept), encoding="utf-8"))
@@ -84,7 +84,7 @@ class MetricsLog:
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """All records of a run, in order, without invalid lines, such as an incomplete line of a killed run."""
     lines = []
-    for text in (folder / _FILE).read_bytes().splitlines():
+    for text in (folder / METRICS).read_bytes().splitlines():
         with contextlib.suppress(ValueError, RecursionError):  # invalid JSON or UTF-8
             line = json.loads(text)
             if isinstance(line, dict) and isinstance(line.get("step"), int):
@@ -103,4 +103,4 @@ def last_step(folder: Path) -> int:
 
 
 def _records(folder: Path) -> list[dict[str, Any]]:
-    return read_metrics(folder) if (folder / _FILE).exists() else []
+    return read_metrics(folder) if (folder / METRICS).exists() else []

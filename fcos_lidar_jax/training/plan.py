@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
@@ -29,7 +30,7 @@ from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.packing import Packing
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import sensor_to_json, turn_between
-from fcos_lidar_jax.training.metrics_log import evaluated_steps
+from fcos_lidar_jax.training.metrics_log import METRICS, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.step import make_state
 
@@ -118,7 +119,7 @@ def plan_run(
     packing: bool | None,
 ) -> Run:
     """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``."""
-    check(type(steps) is int and steps >= 1, "steps", steps, "an integer of at least 1")
+    check(type(steps) is int and 1 <= steps < 2**31, "steps", steps, f"an integer from 1 to {2**31 - 1}")
     check(type(seed) is int and 0 <= seed < NUM_SEEDS, "seed", seed, f"an integer from 0 to {NUM_SEEDS - 1}")
     order = SampleOrder(frames, config, seed=seed)
     epoch_steps = -(-order.epoch_size // config.optimizer.batch_size)
@@ -189,7 +190,7 @@ def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
 def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume: bool) -> None:
     """Check that a run can be started or resumed in a folder; names the first field in which another run differs.
 
-    ``spec`` is the expected content of ``run.json``; None checks only whether there is a run.
+    ``spec`` has fields of ``run.json`` that a resumed run must have; None checks only whether there is a run.
     """
     folder = local_path(folder)
     file = folder / RUN_SPEC
@@ -200,12 +201,15 @@ def check_run(folder: str | Path, spec: dict[str, Any] | None = None, *, resume:
             raise ValueError(f"{file}: found nothing, expected the run to resume")
         if saved := Checkpoints(folder / CHECKPOINTS).paths():  # a new run would remove them
             raise ValueError(f"{saved[-1]}: found a checkpoint without {RUN_SPEC}, expected another folder")
+        if (metrics := folder / METRICS).exists() and metrics.stat().st_size:  # a new run would empty it
+            raise ValueError(f"{metrics}: found metrics without {RUN_SPEC}, expected another folder")
         return
     if not resume:
         raise ValueError(f"{folder}: holds a run, expected another folder or --resume, in Python resume=True")
     recorded = read_json(file, dict[str, Any], what="the specification of a run")
     if spec is None:
         return
+    recorded = {name: value for name, value in recorded.items() if name in spec}
     for name, was, now in _differences(recorded, spec):
         # Runs of earlier versions lack the hash, and a run with checkpoints does not use its first weights again.
         if name == "weights_hash" and (name not in recorded or Checkpoints(folder / CHECKPOINTS).paths()):
@@ -220,7 +224,7 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
     shapes, whose = jax.eval_shape(detector.init, jax.random.key(0)), "the network to be trained"
     if not isinstance(weights, str | Path):
         check_arrays("weights", shapes, weights, whose=whose)
-        return weights
+        return jax.tree.map(lambda expected, leaf: jnp.asarray(leaf, expected.dtype), shapes, weights)
     folder = find_checkpoint(Path(weights))
     checkpoint = read_checkpoint(folder)
     classes, expected = checkpoint.config.classes, detector.config.classes

@@ -34,7 +34,7 @@ from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Variables
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
-from fcos_lidar_jax.training.metrics_log import MetricsLog, last_step
+from fcos_lidar_jax.training.metrics_log import MetricsLog, evaluated_steps, last_step
 from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
 from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, plan_run
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
@@ -266,8 +266,9 @@ def _start(run: Run, *, resume: bool) -> TrainState:
         if (newest := run.checkpoints.newest(like)) is not None:
             return newest[1]
         # Only a run that was killed before its first checkpoint begins again; the metrics of others would be lost.
+        # A recorded evaluation comes after a checkpoint.
         first = next(filter(run.saves_at, range(1, run.num_steps)), run.num_steps)
-        if (done := last_step(run.folder)) > first or done == run.num_steps:
+        if (done := last_step(run.folder)) > first or evaluated_steps(run.folder):
             found = f"found none, but metrics of {done} steps, and this schedule saves step {first}"
             expected = "the checkpoints of the run, or the schedule that it began with"
             raise ValueError(f"{run.checkpoints.folder}: {found}: expected {expected}")

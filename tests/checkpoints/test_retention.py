@@ -85,6 +85,21 @@ def test_recording_a_score_does_not_change_the_arrays(copy):
     assert steps(copy) == [6]  # step 2 was the best before
 
 
+def test_a_kill_while_a_score_is_recorded_does_not_damage_the_checkpoint(copy, tmp_path, monkeypatch):
+    def killed(*_):
+        shutil.copytree(copy.folder, left.folder)  # what a kill leaves at this moment
+        raise KeyboardInterrupt
+
+    left = Checkpoints(tmp_path / "left")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(storage.os, "replace", killed)
+        copy.record_score(6, 0.7)
+    assert len(list(left.folder.glob(".*"))) == 1
+    assert left.newest(shapes())[0].step == 6
+    save(left, 7)
+    assert list(left.folder.glob(".*")) == []  # the next save tidies up
+
+
 @pytest.mark.parametrize("number", [1, 2])
 def test_an_interruption_of_the_replacement_keeps_the_old_checkpoint(copy, monkeypatch, number):
     before = contents(copy)

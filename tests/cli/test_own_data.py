@@ -115,6 +115,21 @@ def test_objects_of_changed_frames_without_splits_are_refused(tmp_path, capsys):
     assert_one_line_error(capsys, [*train.split(), *CLASSES], message)
 
 
+def test_an_index_is_refused_where_it_would_be_ignored_or_spoil_the_data(tmp_path, capsys):
+    data = make_folder(tmp_path / "data", train=1, val=1)
+    spoilt = f"prepare --data-root {data} --index {data}/clouds".split()
+    assert_one_line_error(capsys, spoilt, "--index: .*clouds: a folder of own data, expected another one")
+    train = f"train quickstart --data-root {data} --out {tmp_path}/out --steps 1 --index {tmp_path}/index"
+    for more in (["--no-copy-paste"], ["--samples", "0:1"]):
+        args = [*train.split(), "--classes", *CLASSES, "--copy-paste.targets", *"222", *more]
+        assert_one_line_error(capsys, args, "--index: got .*index, expected none: no prepared objects are used")
+    evaluate = f"evaluate --data-root {data} --checkpoint quickstart --out {tmp_path}/out --index {tmp_path}/index"
+    message = "--index: got .*index, expected none: only the tables of nuScenes have an index"
+    assert_one_line_error(capsys, evaluate.split(), message)
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+    assert {path.suffix for path in (data / "clouds").iterdir()} == {".npy"}
+
+
 def test_classes_that_the_data_do_not_have_are_named_in_a_warning(tmp_path, capsys):
     data = make_folder(tmp_path / "data", train=1, val=0)
     for name, warned in (("vehicel", True), ("vehicle", False)):

@@ -165,7 +165,8 @@ def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, 
 
 
 BAD = mistakes(r"""
---steps 0 => steps: got 0, expected an integer of at least 1
+--steps 0 => steps: got 0, expected an integer from 1 to 2147483647
+--steps 3000000000 => steps: got 3000000000, expected an integer from 1
 --save-every 0 => schedule.save_every: got 0
 --evaluate-every -1 => schedule.evaluate_every: got -1
 --keep 0 => schedule.keep: got 0
@@ -226,6 +227,25 @@ def test_objects_of_more_sweeps_are_taken_and_their_frames_opened_once(root, tmp
     (tmp_path / "map.json").write_text('{"car": "truck"}')
     renamed = [*args, "--class-map", str(tmp_path / "map.json")]
     assert_one_line_error(capsys, renamed, "cut from other frames than split 'train', .* as --class-map or --full")
+
+
+def test_a_refused_resume_leaves_the_objects_of_the_run(root, tmp_path, capsys):
+    out = tmp_path / "run"
+    command(*train(root, out, "--samples", "0:1", "--val-split", "none"))
+    before = {path: path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
+    for more, field in (
+        (["--samples", "0:2"], "objects: was "),
+        (["--copy-paste.min-points", "3"], "config.copy_p"),
+    ):
+        args = train(root, out, "--resume", "--val-split", "none", "--samples", "0:1", *more)
+        assert_one_line_error(capsys, args, f"run.json: {field}.*: only the same run can be resumed")
+    assert {path: path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()} == before
+
+
+@pytest.mark.parametrize("option", ["--train-split", "--val-split"])
+def test_a_split_without_a_name_is_refused(root, tmp_path, capsys, option):
+    assert_one_line_error(capsys, train(root, tmp_path / "out", option, ""), "split '': not found")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_in_use_is_left_alone(root, tmp_path, capsys):

@@ -307,15 +307,42 @@ def test_a_run_without_its_checkpoints_keeps_its_metrics(finished, tmp_path):
 def test_a_run_that_would_save_only_at_its_end_begins_again_if_it_was_killed_before(tmp_path):
     run = tmp_path / "run"
     first = train_tiny(run, save=9, weights=weights())
-    shutil.rmtree(run / "checkpoints")
+    for steps in (STEPS - 1, STEPS):  # killed in the last step, or in its save
+        shutil.rmtree(run / "checkpoints")
+        lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+        (run / "metrics.jsonl").write_text("".join(lines[:steps]))
+        assert len(losses(run)) == steps
+        again = train_tiny(run, save=9, weights=weights(), resume=True)
+        assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000004"]
+        assert bits(again) == bits(first)
+
+
+def test_a_complete_run_without_its_checkpoints_keeps_its_scores(finished, tmp_path):
+    folder = shutil.copytree(finished[0], tmp_path / "run")
+    shutil.rmtree(folder / "checkpoints")
+    before = contents(folder)
     with pytest.raises(ValueError, match="found none, but metrics of 4 steps, and this schedule saves step 4"):
-        train_tiny(run, save=9, weights=weights(), resume=True)
-    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
-    (run / "metrics.jsonl").write_text("".join(lines[:-1]))
-    assert len(losses(run)) == STEPS - 1
-    again = train_tiny(run, save=9, weights=weights(), resume=True)
-    assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000004"]
-    assert bits(again) == bits(first)
+        train_tiny(folder, evaluate=9, save=9, tests=TESTS, weights=weights(), resume=True)
+    assert contents(folder) == before
+
+
+def test_a_new_run_does_not_empty_other_metrics(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"epoch": 1}\n')
+    with pytest.raises(ValueError, match=r"metrics\.jsonl: found metrics without run\.json, expected another"):
+        train_tiny(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.jsonl"]
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 1}\n'
+
+
+def test_weights_in_half_precision_are_trained_in_float32(tmp_path):
+    half, same = (
+        {"weights": jax.tree.map(cast, weights())}
+        for cast in (
+            lambda leaf: np.asarray(leaf, np.float16),
+            lambda leaf: np.asarray(leaf, np.float16).astype(np.float32),
+        )
+    )
+    assert bits(train_tiny(tmp_path / "half", **half)) == bits(train_tiny(tmp_path / "same", **same))
 
 
 STOPPED = """
@@ -545,7 +572,7 @@ EMPTY = InMemoryFrames(tuple(map(without_points, range(3))), FRAMES.sensor, FRAM
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps: got 0, expected an integer of at least 1"),
+        ({"steps": 0}, "steps: got 0, expected an integer from 1 to 2147483647"),
         ({"steps": 2.5}, "steps: got 2.5, expected an integer"),
         ({"seed": 2**32}, "seed: got 4294967296, expected an integer from 0 to 4294967295"),
         ({"config": dataclasses.replace(CONFIG, copy_paste=CopyPasteConfig())}, "copy_paste: got no ground-truth"),
