@@ -110,16 +110,14 @@ def _average(leg: Mapping[str, Any]) -> str:
 
 
 def _curve(legs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Table of the mAP over the frames of all trainings."""
-    ends = np.cumsum([leg["frames_seen"] for leg in legs]).tolist()
-    begins = [0, *ends[:-1]]
-    points = [(n + seen, score) for n, leg in zip(begins, legs, strict=True) for seen, score in leg["curve"]]
-    if not points:
+    """Table of the last mAP during each training, over the frames of all trainings."""
+    begins = np.cumsum([0, *(leg["frames_seen"] for leg in legs[:-1])]).tolist()
+    last = [(begin, *leg["curve"][-1]) for begin, leg in zip(begins, legs, strict=True) if leg["curve"]]
+    if not last:
         return
-    yield "\nScores during training, on the same few unseen frames. When the learning rate rises again, the score"
-    yield "may fall at first:\n"
-    yield "| training frames | mAP |\n|---|---|"
-    yield from (f"| {seen:,} | {score:.3f} |" for seen, score in points)
+    yield "\nThe last score during each of these trainings, on the same few unseen frames:\n"
+    yield "| training frames, all together | mAP |\n|---|---|"
+    yield from (f"| {begin + seen:,} | {score:.3f} |" for begin, seen, score in last)
 
 
 def _figures(file: Path, weights: str) -> Iterator[str]:

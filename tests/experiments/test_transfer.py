@@ -297,9 +297,9 @@ def test_fine_tuning_trains_the_network_and_keeps_the_augmentation_of_its_checkp
 
 def test_a_card_counts_the_frames_of_all_trainings(shipped, tmp_path):
     _, record = shipped
-    legs = [{**record["training"], "frames_seen": n, "curve": [[n - 1, n / 10]]} for n in (3, 5)]
+    legs = [{**record["training"], "frames_seen": n, "curve": [[1, 0.1], [n - 1, n / 10]]} for n in (3, 5)]
     card = model_card.write_card("hdl32e", tmp_path, {**record, "earlier": legs[:1], "training": legs[1]})
-    assert "| training frames | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n" in card.read_text()
+    assert "| training frames, all together | mAP |\n|---|---|\n| 2 | 0.300 |\n| 7 | 0.500 |\n" in card.read_text()
 
 
 def test_only_a_card_may_stand_beside_a_checkpoints_files(shipped):
