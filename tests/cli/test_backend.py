@@ -101,5 +101,5 @@ def test_an_exported_program_has_no_other_backend(home, tmp_path, capsys):
 def test_a_missing_package_is_one_line(home, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     words = ["export", "--network-only", "--format", "onnx", "--checkpoint", str(home / "checkpoint"), "--out"]
-    assert_one_line_error(capsys, [*words, str(tmp_path / "a")], r"pip install 'fcos-lidar-jax\[cpu\]'")
+    assert_one_line_error(capsys, [*words, str(tmp_path / "a")], r"pip install -e '\.\[cpu\]'")
     assert list(tmp_path.iterdir()) == []

@@ -244,12 +244,12 @@ def test_warns_if_frames_are_both_trained_and_evaluated_on(messages):
 def test_prepares_into_another_folder_and_evaluates_given_detections(tmp_path, monkeypatch):
     """For data on a read-only disk; training finds the objects there, and the report names the frames."""
     root, data = own_data(tmp_path, train=2, val=2)
-    data += f" --index {tmp_path}/prepared"
-    command("prepare", data)
+    prepared = f"{data} --index {tmp_path}/prepared"
+    command("prepare", prepared)
     assert not (root / ".fcos_lidar").exists()
     monkeypatch.setattr("fcos_lidar_jax.cli.train.train", trained := Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(AssertionError):  # interrupted
-        command("train quickstart", data, "--out", tmp_path / "run")
+        command("train quickstart", prepared, "--out", tmp_path / "run")
     assert trained.call_args.kwargs["objects"].folder.is_relative_to(tmp_path / "prepared")
     out, evaluate = tmp_path / "scores", f"evaluate {data} --checkpoint quickstart --out"
     command(evaluate, out)
@@ -266,7 +266,7 @@ def test_a_command_recognises_its_data_set_once(tmp_path, monkeypatch):
     recognise = Mock(wraps=open_module._recognise)
     monkeypatch.setattr(open_module, "_recognise", recognise)
     data = DataOptions(make_folder(tmp_path / "data", train=2, val=1))
-    assert len(data.open_whole(data.split("train"), CloudReading())) == 2
+    assert len(data.open_whole(data.split("train", None), CloudReading())) == 2
     assert data.data_set.reader.name == "folder"
     recognise.assert_called_once_with(tmp_path / "data")
 

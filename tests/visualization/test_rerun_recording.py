@@ -70,5 +70,5 @@ def test_a_failed_recording_leaves_no_file(tmp_path):
 
 def test_without_rerun_one_line_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ValueError, match=r"^--rrd: rerun is not installed.*pip install 'fcos-lidar-jax\[viz\]'$"):
+    with pytest.raises(ValueError, match=r"^--rrd: rerun is not installed.*pip install -e '\.\[viz\]' in"):
         check_rerun()
