@@ -36,7 +36,7 @@ README = Path(__file__).parent / "README.md"
 _DIRECTION = "agrees only in direction"
 _OUR_NDS = (
     " Simulated objects have no attributes, so the attribute error is 1 in every row. The mean\n"
-    "velocity error exceeds 1 m/s in all cells that record it (most with local geometry, some of CenterPoint)\n"
+    "velocity error exceeds 1 m/s in all cells that record it (most with local geometry, most of CenterPoint)\n"
     "and adds nothing to NDS, which is then at most 80. The paper's gains may include gains in these two errors;\n"
     "the gains here do not."
 )

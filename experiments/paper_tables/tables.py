@@ -380,7 +380,7 @@ def draw(table: Table, record: dict[str, Any], path: Path) -> None:
     axis.axvline(0, color="#888888", linewidth=0.8)
     axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
     axis.set_ylim(len(rows) - 0.5, -0.5)
-    axis.set_xlabel(f"mAP, points more than {_references(record)}")
+    axis.set_xlabel(f"mAP, points more than {_references(record)}".replace(" or ", " or\n"))
     note = f", {_SMOKE_NOTE}" if record["scale"] == "smoke" else ""
     figure.suptitle(f"{table.title}\n({record['scale']}, {len(record['seeds'])} seeds{note})", fontsize=11)
     handles, labels = axis.get_legend_handles_labels()
