@@ -13,8 +13,8 @@ The steps of both are timed in turns. CenterPoint's steps take longer, so it see
 mAP there is read from its learning curve, in the middle of its schedule. These times, and the times of the stages
 from cloud to boxes, need no training (``--only-figures``). They are of random weights, which have fewer candidates
 than trained ones, so the times of the stage ``boxes`` cannot be compared. The paper compares both in table 7, but
-not after equal training. Cost: one hour of a CPU core per cell. Expected: CenterPoint leads after equal samples and
-after equal time.
+not after equal training. Cost: one hour of a CPU core per cell. Expected: CenterPoint leads after equal samples
+and equal time.
 """
 
 from collections.abc import Iterator
