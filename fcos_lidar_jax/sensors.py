@@ -16,7 +16,8 @@ __dir__ = own_names(__name__)
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
 _SAME_HEADING_RAD = 1e-3  # headings typed with few digits are the same
 # Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.
-_MAX_ROWS, _MAX_COLUMNS = 4096, 65536
+_MAX_ROWS = 4096
+_MAX_COLUMNS = 65536
 
 
 def _finite(*values: float) -> bool:
