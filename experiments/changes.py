@@ -32,10 +32,12 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
 
 
 SLIM = change(
+    refinement=None,
     model__stem__out_channels=16,
     model__backbone_blocks=(2, 3, 3, 2),
     model__backbone_widths=(16, 48, 64, 64),
     model__fpn_channels=48,
     model__head_channels=32,
 )
-"""Former sizes of ``compact``, which the ladder and the scale ``sector`` keep, so that trials stay comparable."""
+"""Former sizes of ``compact``, without its second look. The ladder and the scale ``sector`` keep them, so that
+trials stay comparable."""

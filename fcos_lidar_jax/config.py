@@ -172,6 +172,9 @@ class LossConfig:
     iou_weight: float = 1.0  # Our choice: weight of the IoU loss.
     iou_prediction_weight: float = 1.0  # Our choice: weight of the predicted IoU's binary cross-entropy.
     velocity_weight: float = 0.2  # Our choice: weight of the velocity within the L1 loss.
+    refined_class_weight: float = 4.0
+    """Weight of the second look's cross-entropy; not in the paper, see :class:`RefinementConfig`."""
+    refined_box_weight: float = 0.5  # Weight of the second look's L1 loss.
     quality: Literal["iou", "centreness"] = "iou"
     """Target of the quality prediction, by which the score is multiplied: the rotated 3D IoU, or the distance
     between predicted and true centre (not in the paper), see :func:`fcos_lidar_jax.losses.centreness`."""
@@ -221,6 +224,39 @@ class InferenceConfig:
         check_least(self, 1, "max_detections", "candidates_per_level")
         check(0 <= self.iou_exponent < math.inf, "iou_exponent", self.iou_exponent, "finite, 0 or more")
         check(self.merge_iou is None or 0 <= self.merge_iou <= 1, "merge_iou", self.merge_iou, "within [0, 1]")
+
+
+@dataclasses.dataclass(frozen=True)
+class RefinementConfig:
+    """A second look at the points of the best boxes (not in the paper), see :mod:`fcos_lidar_jax.refinement`.
+
+    >>> RefinementConfig(num_points=0)
+    Traceback (most recent call last):
+    ValueError: num_points: got 0, expected at least 1
+    """
+
+    num_boxes: int = 64  # Best boxes of a cloud that are looked at; others are dropped.
+    num_points: int = 128  # Maximum number of points per box.
+    margin_m: float = 1.0  # Boxes are enlarged by this on every side, metres.
+    point_channels: tuple[int, ...] = (32, 64, 128)  # Channels of the layers on each point.
+    box_channels: tuple[int, ...] = (128, 128)  # Channels of the layers on each box.
+    radius_range_m: tuple[float, float] = (1.0, 2.0)
+    """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can
+    stand for it."""
+    between_weight: float = 0.3
+    """Weight of boxes between one and two radii in the classification: they are neither right nor wrong."""
+    freeze_detector: bool = False
+    """Train only the second look; the detector is applied as in detection. For ``train --weights``."""
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        check_least(self, 1, "num_boxes", "num_points")
+        check(0 <= self.margin_m < math.inf, "margin_m", self.margin_m, "finite metres of at least 0")
+        for name in ("point_channels", "box_channels"):
+            check(min(getattr(self, name), default=0) >= 1, name, getattr(self, name), "counts of at least 1")
+        low, high = self.radius_range_m
+        check(0 < low <= high < math.inf, "radius_range_m", self.radius_range_m, "(low, high), 0 < low <= high")
+        check(0 <= self.between_weight <= 1, "between_weight", self.between_weight, "within [0, 1]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -335,6 +371,7 @@ class Config:
     model: ModelConfig = ModelConfig()  # The network.
     loss: LossConfig = LossConfig()  # Assignment and losses.
     inference: InferenceConfig = InferenceConfig()  # Predictions to detections.
+    refinement: RefinementConfig | None = None  # Not in the paper: a second look at the boxes, or None.
     augment: AugmentConfig | None = AugmentConfig()  # Augmentation in training, or None.
     optimizer: OptimizerConfig = OptimizerConfig()  # Optimizer and schedule.
 

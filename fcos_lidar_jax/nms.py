@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float32, Int32
 
+from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import wrap_angle
@@ -124,6 +125,32 @@ def merge_boxes(
     arrays = jnp.asarray(boxes, jnp.float32), weights, labels, usable, kept, used
     rows, matrix = (functools.partial(merge, mean) for merge in (_merged_by_rows, _merged_by_matrix))
     return in_form(form, {"rows": rows, "matrix": matrix}, *arrays, cpu="rows", default="matrix")
+
+
+def suppress(
+    boxes: Array, scores: Array, labels: Array, valid: Array, config: InferenceConfig
+) -> tuple[Array, Array, Array, Array]:
+    """Apply rotated NMS, per class unless ``config.nms_across_classes``, to the candidates of one cloud.
+
+    Returns boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
+    """
+    options: dict[str, Any] = {"overlap": config.nms_overlap}
+    with jax.named_scope("nms"):
+        index, used = rotated_nms(
+            boxes,
+            scores,
+            valid,
+            **options,
+            labels=None if config.nms_across_classes else labels,
+            iou_threshold=config.iou_threshold,
+            max_outputs=config.max_detections,
+        )
+    if config.merge_iou is None:
+        best_boxes = jnp.where(used[:, None], boxes[index], 0.0)
+    else:
+        options |= {"labels": labels, "iou_threshold": config.merge_iou}
+        best_boxes = merge_boxes(boxes, scores, valid, index, used, **options)
+    return best_boxes, jnp.where(used, scores[index], 0.0), jnp.where(used, labels[index], 0), used
 
 
 def _is_vertical(overlap: str) -> bool:

@@ -125,7 +125,8 @@ def network_parts(config: Config, sensor: Sensor) -> Parts:
 def path_calls(config: Config, sensor: Sensor, variables: Variables, cloud: Cloud) -> dict[str, Call]:
     """Make calls of the stages for one cloud, with precomputed inputs."""
     parts, detector = network_parts(config, sensor), build_detector(config, sensor)
-    prepare, network, _, postprocess = map(jax.jit, make_stages(detector))
+    stages = make_stages(detector)
+    prepare, network, postprocess = map(jax.jit, (stages.prepare, stages.network, stages.postprocess))
     detect = jax.jit(make_detect(detector))
     body = jax.jit(lambda v, f: parts.backbone(v, parts.stem(v, parts.preprocess(f))))
     front = jax.jit(lambda v, levels: parts.heads(v, parts.fpn(v, levels)))

@@ -4,11 +4,13 @@
     python -m experiments.studies.ladder --trials base "local geometry" --seeds 0 1 2
     python -m experiments.studies.ladder --trials "local geometry" larger  # the sizes of compact today
     python -m experiments.studies.ladder --trials larger "second round marks objects"  # can it use a second round?
+    python -m experiments.studies.ladder --trials larger "larger, looked at again" "larger, joint" --seeds 0 1 2
 
 Each trial is a change of ``compact`` with its smaller sizes before 2026-11-27, trained on a quarter of the view of
 nuScenes' HDL-32E (32 x 272 pixels) with one sweep, and one round except in "second round marks objects": 4,000
 frames of varied simulated streets, 3,000 steps of one frame, one one-cycle schedule. The score is nuScenes' mAP on
-200 unseen frames, and on 60 of them after each quarter of the training.
+200 unseen frames, and on 60 of them after each quarter of the training. A second look (``refinement``) is trained
+in the same step ("joint"), or afterwards on the same frames, with the first trial's weights frozen.
 
 The same command resumes a trial. Trials that are already in the file of ``--out`` are not repeated: with
 ``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has
@@ -32,7 +34,7 @@ from experiments.script import Options, run_script, save
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from experiments.studies.round_use import FirstRound
-from fcos_lidar_jax.config import CloudReading, Config
+from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFrames
 from fcos_lidar_jax.files import checksum, read_json
@@ -64,6 +66,9 @@ BASE: Change = change(
     augment__max_rotation_rad=math.radians(5),
 )
 MARKED = "second round marks objects"
+AFTERWARDS = {"larger, looked at again": "larger", "CenterPoint, looked at again": "CenterPoint"}
+"""Trials of a second look, and the trials whose weights it gets, frozen."""
+_FROZEN = change(refinement=RefinementConfig(freeze_detector=True))
 TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
@@ -71,7 +76,9 @@ TRIALS: dict[str, Change] = {
     "larger": change(**_LARGER),
     "larger, without local geometry": change(**_LARGER, model__local_geometry=False),
     MARKED: change(**_LARGER, projection__num_rounds=2),
+    "larger, joint": change(**_LARGER, refinement=RefinementConfig()),
 }
+TRIALS |= {name: lambda config, first=first: _FROZEN(TRIALS[first](config)) for name, first in AFTERWARDS.items()}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -112,15 +119,22 @@ def frames(work: Path, split: str) -> FrameSet:
     return CachedFrames(made, work / f"frames_{split}_{number}")
 
 
+def run_folder(name: str, seed: int, args: Args) -> Path:
+    """Folder of the training of a trial."""
+    return args.work / f"{name.replace(' ', '_').replace(',', '')}_{args.steps}_{seed}"
+
+
 def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
     """Train a trial and score it."""
     seen, tests = (frames(args.work, split) for split in ("train", "test"))
     if name == MARKED:
         seen, tests = Marked(seen), Marked(tests)
     curve_frames = SelectedFrames(tests, tuple(range(CURVE_FRAMES)))
-    folder = args.work / f"{name.replace(' ', '_').replace(',', '')}_{args.steps}_{seed}"
+    folder = run_folder(name, seed, args)
     schedule = Schedule(-(-args.steps // 10), -(-args.steps // 4), 1)
-    options = {"steps": args.steps, "seed": seed, "tests": curve_frames, "schedule": schedule}
+    options: dict[str, Any] = {"steps": args.steps, "seed": seed, "tests": curve_frames, "schedule": schedule}
+    if (first := AFTERWARDS.get(name)) is not None:
+        options["weights"] = run_folder(first, seed, args)
     detector = trained(folder, config, seen, **options)
     summary, records = benchmark(*detections(detector, tests)).summary, read_metrics(folder)
     seconds = [r["seconds"] for r in records if "seconds" in r]

@@ -91,11 +91,13 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
         seconds, machine = leg["seconds_of_steps"], f" on {leg['device']}" if "device" in leg else ""
         time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
         more = (f", {leg['parameters']:,} parameters" if "parameters" in leg else "") + _average(leg)
+        more += ", only the second look, with everything else frozen" if "trained" in leg else ""
         yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of training steps{machine}{more}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it. If the preset had become"
         yield "larger, `experiments.studies.widened_weights` enlarged them first."
-    if share := trained.get("logit_adjustment"):
+    legs = (*record["earlier"], trained)
+    if share := next((leg["logit_adjustment"] for leg in reversed(legs) if "logit_adjustment" in leg), None):
         yield "\nnuScenes and the training streets have different class frequencies. So the export added"
         yield f"{share} log(frequency in nuScenes / frequency in training) to each class logit (logit adjustment)."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."

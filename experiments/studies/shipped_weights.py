@@ -18,6 +18,11 @@ streets from ``seed * frames``; choose a seed whose streets no earlier training 
     python -m experiments.studies.shipped_weights --name hdl32e --work outputs/hdl32e --steps 15000 --seed 1 \
         --batch-size 4 --learning-rate 4e-3 --simulators 12 --workers 3  # on a GPU
 
+``--second-look`` trains only the second look, with the detector of ``--warm-start`` frozen:
+
+    python -m experiments.studies.shipped_weights --name hdl32e --work outputs/second_look --warm-start hdl32e \
+        --second-look --seed 4 --steps 8000 --simulators 1
+
 ``--average CHECKPOINT`` exports the average with the weights of an earlier training, such as those that this one
 started from: a training on other streets loses some of what the earlier one had learned. The logits
 of weights in the package are adjusted already; those of a run's checkpoints are not.
@@ -120,6 +125,7 @@ class Args(Options):
     )
     workers: int = 0  # Processes that prepare batches, in addition to a thread.
     warm_start: Path | None = None  # Checkpoint or shipped weights to start from; default: random weights.
+    second_look: bool = False  # Train only the second look, with the detector of --warm-start frozen.
     save_every: int = 150  # Steps between two checkpoints.
     export: bool = False  # Write the current weights into the package instead of training.
     average: Path | None = None  # Checkpoint of an earlier training to average the exported weights with.
@@ -128,8 +134,8 @@ class Args(Options):
 
 
 _TRAINING_OPTIONS = (
-    *("steps", "seed", "batch_size", "learning_rate", "simulators", "workers", "warm_start", "save_every"),
-    *("export", "average", "average_share"),
+    *("steps", "seed", "batch_size", "learning_rate", "simulators", "workers", "warm_start", "second_look"),
+    *("save_every", "export", "average", "average_share"),
 )
 """Options that require ``work``."""
 
@@ -152,6 +158,8 @@ def train(args: Args, work: Path) -> dict[str, Any]:
     config = CONFIGS[args.name]
     given = {"optimizer__batch_size": args.batch_size, "optimizer__peak_learning_rate": args.learning_rate}
     config = change(**{name: value for name, value in given.items() if value is not None})(config)
+    if args.second_look:
+        config = change(refinement__freeze_detector=True)(config)
     # Rejects before hours of training what the export would reject.
     earlier_trainings(args.name, {"begun_with": str(args.warm_start), "seed": args.seed}, RESULTS)
     number = _POOL // config.optimizer.batch_size if args.simulators else args.steps
@@ -203,8 +211,14 @@ def training_record(run: Path) -> dict[str, Any]:
         "frames_seen": done * batch,
         "seconds_of_steps": round(sum(r.get("seconds", 0.0) for r in records)),
         "curve": [[r["step"] * batch, round(r["test/mAP"], 4)] for r in records if "test/mAP" in r],
+        **({"trained": "second look"} if is_frozen(config) else {}),
         **(read_json(pooled, dict[str, Any]) if pooled.exists() else {}),
     }
+
+
+def is_frozen(config: Config) -> bool:
+    """Whether only the second look was trained."""
+    return config.refinement is not None and config.refinement.freeze_detector
 
 
 def earlier_trainings(name: str, training: Mapping[str, Any], results: Path) -> list[dict[str, Any]]:
@@ -286,7 +300,8 @@ def export(args: Args, work: Path) -> dict[str, Any]:
     training["curve"] = training["curve"] or curve_of(work)
     earlier = earlier_trainings(args.name, training, RESULTS)
     checkpoint = with_todays_inference(load_checkpoint(work), args.name)
-    if share := _LOGIT_ADJUSTMENT.get(args.name):
+    share = _LOGIT_ADJUSTMENT.get(args.name)
+    if share and not is_frozen(checkpoint.config):  # The logits of a frozen detector are adjusted already.
         checkpoint = with_adjusted_logits(checkpoint, share)
         training["logit_adjustment"] = share
     if args.average is not None:
@@ -312,6 +327,8 @@ def main(args: Args) -> None:
         raise ValueError(f"--average-share: got {args.average_share}, expected above 0 and below 1")
     if args.average is not None and not args.export:
         raise ValueError("--average: only for --export")
+    if args.second_look and args.warm_start is None:
+        raise ValueError("--second-look: expected the detector to freeze in --warm-start")
     if args.average is None and args.average_share != Args.average_share:
         raise ValueError("--average-share: only with --average")
     if args.work is None:

@@ -14,8 +14,8 @@ from fcos_lidar_jax.centerpoint.network import CenterPoint
 from fcos_lidar_jax.centerpoint.objective import make_sums
 from fcos_lidar_jax.centerpoint.pillars import Grid, make_pillars, pillar_grid
 from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
+from fcos_lidar_jax.initialization import init_variables
 from fcos_lidar_jax.models import Detector, Variables
-from fcos_lidar_jax.models.layers import init_variables
 from fcos_lidar_jax.sensors import Sensor
 
 _BEYOND_M = 10.0  # Maximum distance of a box outside the map, and maximum height or depth of its centre.

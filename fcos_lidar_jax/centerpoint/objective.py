@@ -59,15 +59,17 @@ def sample_losses(
     return parts, counts
 
 
-def make_sums(config: CenterPointConfig, grid: Grid) -> Callable[[CentreOutputs, Any, Batch], Sums]:
+def make_sums(config: CenterPointConfig, grid: Grid) -> Callable[[Any, CentreOutputs, Any, Batch], Sums]:
     """Make the function from outputs and ground truth of a batch to the sums of its losses.
+
+    The first and third argument, variables and pillars, have no influence.
 
     The loss of each group of classes is averaged over the group's own boxes: its sum is weighted so that the
     division by all boxes gives this average. With micro-batches this is exact for one group only, since the
     weights of several groups are computed per micro-batch.
     """
 
-    def sums(outputs: CentreOutputs, _: Any, batch: Batch) -> Sums:
+    def sums(_variables: Any, outputs: CentreOutputs, _pillars: Any, batch: Batch) -> Sums:
         parts, counts = jax.vmap(lambda *sample: sample_losses(*sample, config=config, grid=grid))(
             outputs, batch.boxes, batch.labels, batch.box_valid
         )

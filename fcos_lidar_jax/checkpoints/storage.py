@@ -30,10 +30,12 @@ from fcos_lidar_jax.types import TrainState
 _FORMAT = 3
 LATER_FIELDS = {
     "model": {"remat": False, "regression_axes": "lidar", "local_geometry": False, "round_offsets": False},
-    "loss": {"quality": "iou", "centreness_m": 0.75},
+    "loss": {"quality": "iou", "centreness_m": 0.75, "refined_class_weight": 4.0, "refined_box_weight": 0.5},
     "inference": {"iou_exponent": 1.0, "merge_iou": None, "flips": "none", "nms_across_classes": False},
 }
 """Configuration fields added to format 3 later, and their values in checkpoints without them."""
+LATER_SECTIONS = {"refinement": None}
+"""Sections of the configuration added later, and their values in checkpoints without them."""
 GONE_FIELDS = {"model": {"meta_kernel": False}}
 """Removed configuration fields, and the only values with which a configuration is still accepted."""
 _DESCRIPTION, _VARIABLES, _STATE = "checkpoint.json", "variables", "state"
@@ -313,7 +315,7 @@ def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
     >>> with_later_fields({"model": {"remat": True, "meta_kernel": False}})["model"]
     {'remat': True, 'regression_axes': 'lidar', 'local_geometry': False, 'round_offsets': False}
     """
-    later = dict[str, Any]()
+    later: dict[str, Any] = {name: config.get(name, value) for name, value in LATER_SECTIONS.items()}
     for section, fields in LATER_FIELDS.items():
         if isinstance(values := config.get(section, {}), dict):
             gone = GONE_FIELDS.get(section, {})

@@ -143,17 +143,23 @@ def _in_turn(function: Callable[[Any], Any], values: Iterable[Any]) -> Call:
 
 def _stages(detector: TrainedDetector, clouds: list[Cloud]) -> dict[str, Call]:
     stages = make_stages(detector.model)
-    prepare, postprocess = jax.jit(stages.prepare), jax.jit(stages.postprocess)
+    prepare, postprocess, refine = map(jax.jit, (stages.prepare, stages.postprocess, stages.refine))
     run_by_xla = functools.partial(jax.jit(stages.network), jax.device_put(detector.variables))
     network = detector.network if isinstance(detector, OpenVinoDetector) else run_by_xla
     on_device = [jax.device_put((cloud.points, cloud.valid)) for cloud in clouds]
     images = [prepare(*cloud) for cloud in on_device]
     outputs = [network(image) for image in images]
-    return {
+    calls: dict[str, Call] = {
         "prepare": _in_turn(lambda cloud: prepare(*cloud), on_device),
         "network": _in_turn(network, images),
         "postprocess": _in_turn(lambda pair: postprocess(*pair), list(zip(outputs, images, strict=True))),
     }
+    if detector.model.refine is not None:
+        variables = jax.device_put(detector.variables)
+        boxes = [postprocess(*pair) for pair in zip(outputs, images, strict=True)]
+        looked = list(zip(on_device, boxes, strict=True))
+        calls["refine"] = _in_turn(lambda pair: refine(variables, *pair[0], *pair[1]), looked)
+    return calls
 
 
 def as_text(record: dict[str, Any]) -> str:

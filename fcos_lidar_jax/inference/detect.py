@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from fcos_lidar_jax.augment import flip_x, flip_y
-from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.models import Detector
-from fcos_lidar_jax.nms import merge_boxes, rotated_nms
+from fcos_lidar_jax.nms import suppress
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
@@ -19,43 +18,19 @@ Detect = Callable[[Any, Array, Array], Detections]
 _MIRRORS = {"none": ("",), "x": ("", "x"), "y": ("", "y"), "xy": ("", "x", "y", "xy")}
 
 
-def suppress(
-    boxes: Array, scores: Array, labels: Array, valid: Array, config: InferenceConfig
-) -> tuple[Array, Array, Array, Array]:
-    """Apply rotated NMS, per class unless ``config.nms_across_classes``, to the candidates of one cloud.
-
-    Returns boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
-    """
-    options: dict[str, Any] = {"overlap": config.nms_overlap}
-    with jax.named_scope("nms"):
-        index, used = rotated_nms(
-            boxes,
-            scores,
-            valid,
-            **options,
-            labels=None if config.nms_across_classes else labels,
-            iou_threshold=config.iou_threshold,
-            max_outputs=config.max_detections,
-        )
-    if config.merge_iou is None:
-        best_boxes = jnp.where(used[:, None], boxes[index], 0.0)
-    else:
-        options |= {"labels": labels, "iou_threshold": config.merge_iou}
-        best_boxes = merge_boxes(boxes, scores, valid, index, used, **options)
-    return best_boxes, jnp.where(used, scores[index], 0.0), jnp.where(used, labels[index], 0), used
-
-
 class Stages(NamedTuple):
     """Stages of detection in one cloud, as pure functions.
 
     >>> Stages._fields
-    ('prepare', 'network', 'candidates', 'postprocess')
+    ('prepare', 'network', 'candidates', 'postprocess', 'refine')
     """
 
     prepare: Callable[..., Any]  # ``(points f32[n, c], valid bool[n]) -> input``
     network: Callable[..., Any]  # ``(variables, input) -> outputs``
     candidates: Callable[..., tuple[Array, ...]]  # ``(outputs, input) -> boxes, scores, labels, valid``
-    postprocess: Callable[..., tuple[Array, ...]]  # Candidates after NMS, see ``suppress``.
+    postprocess: Callable[..., tuple[Array, ...]]  # Candidates after NMS, see ``nms.suppress``.
+    refine: Callable[..., tuple[Array, ...]]
+    """``(variables, points, valid, *boxes after NMS) -> boxes``; the same boxes without a second look."""
 
 
 def make_stages(detector: Detector) -> Stages:
@@ -75,11 +50,14 @@ def make_stages(detector: Detector) -> Stages:
     def postprocess(outputs: Any, sample: Any) -> tuple[Array, Array, Array, Array]:
         return suppress(*detector.candidates(outputs, sample), detector.config.inference)
 
-    return Stages(detector.prepare, network, detector.candidates, postprocess)
+    def unchanged(variables: Any, points: Any, valid: Any, *boxes: Array) -> tuple[Array, ...]:
+        return boxes
+
+    return Stages(detector.prepare, network, detector.candidates, postprocess, detector.refine or unchanged)
 
 
 def make_detect(detector: Detector) -> Detect:
-    """Make the whole path from points to boxes: prepare, network, candidates, NMS.
+    """Make the whole path from points to boxes: prepare, network, candidates, NMS, second look if configured.
 
     Returns:
         pure ``(variables, points f32[n, c], valid bool[n]) -> Detections`` for one cloud, to be jitted by the
@@ -106,6 +84,7 @@ def make_detect(detector: Detector) -> Detect:
             candidates.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
         boxes, scores, labels, used = (jnp.concatenate(parts) for parts in zip(*candidates, strict=True))
         best = suppress(boxes, scores, labels, used, config.inference)
+        best = stages.refine(variables, jnp.asarray(points), jnp.asarray(valid), *best)
         return Detections(*best, inputs[0].num_dropped)
 
     return detect

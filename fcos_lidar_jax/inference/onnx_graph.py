@@ -22,6 +22,7 @@ from fcos_lidar_jax.models.layers import EPSILON, norm_groups
 from fcos_lidar_jax.models.lidar_net import STAGE_STRIDES
 from fcos_lidar_jax.models.local_geometry import COLUMNS, OWN, ROWS, UNIT_M, window
 from fcos_lidar_jax.models.modality import block_diagonal, channel_groups
+from fcos_lidar_jax.refinement import without_second_look
 from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.types import CHANNELS
 
@@ -54,14 +55,15 @@ def network_graph(detector: TrainedDetector) -> bytes:
 
     The input is ``features`` f32[b, h, w, 9, r], a range image from ``project_points`` in raw units. The outputs
     are ``logits``, ``regression`` and ``iou_logits``, see :class:`~fcos_lidar_jax.types.Outputs`. Everything is
-    float32 regardless of ``config.model.precision``. The metadata hold classes, configuration and sensor as JSON.
+    float32 regardless of ``config.model.precision``. A second look is not part of the graph. The metadata hold
+    classes, configuration and sensor as JSON.
     """
     config, model = detector.config, detector.config.model
     if type(config) is not Config:
         raise ValueError(f"ONNX: got the detector {config.name!r}, expected one on range images")
     onnx = cpu_package("onnx")
     layout, rounds = image_layout(detector.sensor, model), config.projection.num_rounds
-    network = _Network(onnx, detector.variables, circular=model.circular_width)
+    network = _Network(onnx, without_second_look(detector.variables), circular=model.circular_width)
     image = _preprocessing(network, "features", model, layout)
     stem = _stem(network, image, model.stem, channel_groups(model.stem, rounds))
     levels = _pyramid(network, _backbone(network, stem, model.backbone_blocks))

@@ -1,6 +1,6 @@
 """Detectors whose network runs in OpenVINO, which is fast on CPUs.
 
-XLA compiles the projection, OpenVINO the network, and XLA decoding and NMS.
+XLA compiles the projection, OpenVINO the network, and XLA decoding, NMS and the second look.
 """
 
 import dataclasses
@@ -43,12 +43,12 @@ class OpenVinoDetector(TrainedDetector):
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         """See :meth:`CloudDetector.program`; clouds of a batch run one by one, with identical results."""
-        prepare, postprocess = _jitted_stages(self.model)
+        prepare, postprocess, refine = _jitted_stages(self.model)
 
         def one(points: np.ndarray, valid: np.ndarray) -> Detections:
             image = prepare(points, valid)
-            boxes, scores, labels, used = postprocess(self.network(image), image)
-            return Detections(boxes, scores, labels, used, image.num_dropped)
+            best = postprocess(self.network(image), image)
+            return Detections(*refine(self.variables, points, valid, *best), image.num_dropped)
 
         def several(points: Any, valid: Any) -> Detections:
             detections = [one(*cloud) for cloud in zip(np.asarray(points), np.asarray(valid), strict=True)]
@@ -58,9 +58,9 @@ class OpenVinoDetector(TrainedDetector):
 
 
 @functools.lru_cache(maxsize=8)
-def _jitted_stages(detector: Detector) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _jitted_stages(detector: Detector) -> tuple[Callable[..., Any], ...]:
     stages = make_stages(detector)
-    return jax.jit(stages.prepare), jax.jit(stages.postprocess)
+    return jax.jit(stages.prepare), jax.jit(stages.postprocess), jax.jit(stages.refine)
 
 
 def _check_flips(config: Config) -> None:

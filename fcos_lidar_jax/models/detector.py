@@ -12,16 +12,18 @@ import numpy as np
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import Config, ModelConfig
+from fcos_lidar_jax.initialization import init_variables
 from fcos_lidar_jax.locations import STRIDES, ImageLayout, image_layout, image_sensor, locate, pad_image
 from fcos_lidar_jax.models.candidates import select_candidates
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.heads import Heads
-from fcos_lidar_jax.models.layers import Image, init_variables, recomputed
+from fcos_lidar_jax.models.layers import Image, recomputed
 from fcos_lidar_jax.models.lidar_net import Backbone
 from fcos_lidar_jax.models.local_geometry import LocalGeometry
 from fcos_lidar_jax.models.modality import Stem
 from fcos_lidar_jax.models.objective import make_sums
 from fcos_lidar_jax.projection import project_points
+from fcos_lidar_jax.refinement import add_refinement
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CHANNELS, Batch, Outputs, RangeImage, Sums
 
@@ -39,11 +41,13 @@ class Detector(NamedTuple):
         apply: ``(variables, inputs, train=False) -> (outputs, batch_stats)`` for a batch of inputs. The batch
             statistics are unchanged unless training. FCOS-LiDAR's outputs are
             :class:`~fcos_lidar_jax.types.Outputs`.
-        sums: ``(outputs, inputs, batch) -> Sums``, the losses of a batch.
+        sums: ``(variables, outputs, inputs, batch) -> Sums``, the losses of a batch.
         candidates: ``(outputs, input) -> (boxes f32[c, 9], scores f32[c], labels i32[c], valid bool[c])`` for one
             cloud, before NMS.
         config: the configuration.
         sensor: the sensor whose clouds it takes.
+        refine: ``(variables, points f32[n, c], valid bool[n], boxes, scores, labels, valid) -> (boxes, scores,
+            labels, valid)`` for one cloud, after NMS; None without a second look.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
     >>> from fcos_lidar_jax.sensors import SHORT_RANGE
@@ -59,10 +63,11 @@ class Detector(NamedTuple):
     prepare: Callable[..., Any]
     init: Callable[[Any], Variables]
     apply: Callable[..., tuple[Any, Any]]
-    sums: Callable[[Any, Any, Batch], Sums]
+    sums: Callable[[Variables, Any, Any, Batch], Sums]
     candidates: Callable[[Any, Any], tuple[Array, Array, Array, Array]]
     config: Config
     sensor: Sensor
+    refine: Callable[..., tuple[Array, Array, Array, Array]] | None = None
 
 
 class Network(nn.Module):
@@ -127,8 +132,12 @@ def build_detector(config: Config, sensor: Sensor) -> Detector:
     >>> sorted(jax.eval_shape(detector.init, jax.random.key(0)))
     ['batch_stats', 'params']
     """
-    if (other := config.build(sensor)) is not None:
-        return other
+    detector = config.build(sensor) or _build(config, sensor)
+    return detector if config.refinement is None else add_refinement(detector)
+
+
+def _build(config: Config, sensor: Sensor) -> Detector:
+    """FCOS-LiDAR without a second look."""
     network, layout = Network(config.model, len(config.classes)), image_layout(sensor, config.model)
     projection, sensor_of_image = config.projection, image_sensor(sensor, config.model)
     options = {"num_rounds": projection.num_rounds, "prioritize_current": projection.prioritize_current}

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from fcos_lidar_jax.initialization import normal
 from fcos_lidar_jax.models.convolution import Image, convolve
-from fcos_lidar_jax.models.layers import Conv, GroupNorm, at_least_float32, normal, pieces
+from fcos_lidar_jax.models.layers import Conv, GroupNorm, at_least_float32, pieces
 from fcos_lidar_jax.types import Outputs
 
 _REGRESSION = {"centre": 3, "size": 3, "heading": 2, "velocity": 2}  # Numbers per class of the sibling layers.

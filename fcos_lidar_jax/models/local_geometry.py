@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fcos_lidar_jax.initialization import kernel_init
 from fcos_lidar_jax.models.convolution import Image, pointwise
-from fcos_lidar_jax.models.layers import BatchNorm, kernel_init
+from fcos_lidar_jax.models.layers import BatchNorm
 from fcos_lidar_jax.types import CHANNELS
 
 ROWS, COLUMNS = 1, 3

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from fcos_lidar_jax.config import StemConfig
+from fcos_lidar_jax.initialization import kernel_init
 from fcos_lidar_jax.models.convolution import FULL, Image, Kernel, convolve, pointwise
-from fcos_lidar_jax.models.layers import BatchNorm, kernel_init, pieces
+from fcos_lidar_jax.models.layers import BatchNorm, pieces
 from fcos_lidar_jax.types import CHANNELS
 
 _MODALITIES = (3, 3, 1, 1, 1)

@@ -96,12 +96,15 @@ def sample_losses(
     return parts, targets, counts
 
 
-def make_sums(config: Config, sensor: Sensor) -> Callable[[Outputs, RangeImage, Batch], Sums]:
-    """Make the function from outputs, range images and ground truth of a batch to the sums of its losses."""
+def make_sums(config: Config, sensor: Sensor) -> Callable[[Any, Outputs, RangeImage, Batch], Sums]:
+    """Make the function from outputs, range images and ground truth of a batch to the sums of its losses.
+
+    Its first argument, the variables, has no influence.
+    """
     options: dict[str, Any] = {"layout": image_layout(sensor, config.model), "axes": config.model.regression_axes}
     losses_of = functools.partial(sample_losses, config=config.loss, **options)
 
-    def sums(outputs: Outputs, images: RangeImage, batch: Batch) -> Sums:
+    def sums(_: Any, outputs: Outputs, images: RangeImage, batch: Batch) -> Sums:
         pairs, _, counts = jax.vmap(losses_of)(outputs, images, batch.boxes, batch.labels, batch.box_valid)
         parts = {name: pair[0] for name, pair in pairs.items()}
         parts, counts = jax.tree.map(lambda leaf: leaf.sum(axis=0), (parts, counts))

@@ -29,7 +29,7 @@ def make_objective(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Metr
         inputs = prepare(batch.points, batch.valid)
         variables = {"params": params, "batch_stats": batch_stats}
         outputs, batch_stats = detector.apply(variables, inputs, train=True)
-        sums = detector.sums(outputs, inputs, batch)
+        sums = detector.sums(variables, outputs, inputs, batch)
         totals = {count: weighted(losses, config) for count, losses in sums.losses.items()}
         counts = sums.counts | {"dropped_points": inputs.num_dropped.sum()}
         return totals, (batch_stats, sums._replace(counts=counts))

@@ -29,6 +29,7 @@ from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_optio
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.packing import Packing
 from fcos_lidar_jax.progress import tell
+from fcos_lidar_jax.refinement import SECOND_LOOK, without_second_look
 from fcos_lidar_jax.sensors import sensor_to_json, turn_between
 from fcos_lidar_jax.training.metrics_log import METRICS, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
@@ -230,7 +231,8 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
     classes, expected = checkpoint.config.classes, detector.config.classes
     if classes != expected:
         raise CheckpointError(f"{folder}: classes: got {classes}, expected the classes to be trained, {expected}")
-    check_arrays(folder, shapes, checkpoint.variables, whose=whose)
+    variables = _with_second_look(folder, checkpoint.variables, detector)
+    check_arrays(folder, shapes, variables, whose=whose)
     own, new = (config_to_json(config)["model"] for config in (checkpoint.config, detector.config))
     for name, was, now in _differences(own, new, "model"):
         tell(f"{folder}: weights of {name} {was!r}, to be trained with {now!r}")
@@ -242,7 +244,20 @@ def _initial_weights(detector: Detector, weights: str | Path | Variables | None)
         tell(
             f"{folder}: weights trained with the LiDAR at {was} m, here at {now} m: expect scores to fall at first"
         )
-    return checkpoint.variables
+    return variables
+
+
+def _with_second_look(where: Path, variables: Variables, detector: Detector) -> Variables:
+    """Variables with those of the second look that the detector has and they lack, or without those it lacks."""
+    params, trained = variables["params"], SECOND_LOOK in variables["params"]
+    if trained == (detector.refine is not None):
+        return variables
+    if trained:
+        tell(f"{where}: the second look is left out, since refinement is None")
+        return without_second_look(variables)
+    tell(f"{where}: has no second look: it starts with random weights")
+    new = jax.jit(detector.init)(jax.random.key(0))["params"][SECOND_LOOK]
+    return variables | {"params": params | {SECOND_LOOK: new}}
 
 
 def _differences(was: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:

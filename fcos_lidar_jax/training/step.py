@@ -15,6 +15,7 @@ from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.models import Detector, Variables
 from fcos_lidar_jax.packing import unpack
+from fcos_lidar_jax.refinement import trainable
 from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
 from fcos_lidar_jax.types import Batch, PackedBatch, Sums, TrainState, check_rows
@@ -50,7 +51,7 @@ def make_state(
         params=variables["params"],
         batch_stats=variables["batch_stats"],
         # Compiled, since each array is a program of its own otherwise.
-        opt_state=jax.jit(optimizer.init)(variables["params"]),
+        opt_state=jax.jit(optimizer.init)(trainable(variables["params"], detector.config)),
         # A copy, because the step donates its buffers and cannot donate one twice.
         ema=_copied(variables["params"]) if detector.config.optimizer.ema_decay > 0 else None,
         key=key,
@@ -73,7 +74,8 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
     and candidates, has a gradient of its own.
 
     Returns:
-        pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``.
+        pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``. The gradient has the trainable
+        part of the parameters, see :func:`fcos_lidar_jax.refinement.trainable`.
     """
     config, objective = detector.config, make_objective(detector)
     num_micro = config.optimizer.accumulate
@@ -81,7 +83,9 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
     def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
         def visit(batch_stats: Any, micro: Batch) -> tuple[Any, tuple[Any, Sums]]:
             totals, pull_back, (batch_stats, sums) = jax.vjp(
-                lambda params: objective(params, batch_stats, micro), params, has_aux=True
+                lambda part: objective(params | part, batch_stats, micro),
+                trainable(params, config),
+                has_aux=True,
             )
             zero = jax.tree.map(jnp.zeros_like, totals)
             grads = {name: pull_back(zero | {name: jnp.ones_like(t)})[0] for name, t in totals.items()}
@@ -160,8 +164,9 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         _check_batch(batch)
         batch = augmented(state, batch)
         grads, batch_stats, metrics = gradient(state.params, state.batch_stats, batch)
-        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, updates)
+        part = trainable(state.params, config)
+        updates, opt_state = optimizer.update(grads, state.opt_state, part)
+        params = state.params | optax.apply_updates(part, updates)
         metrics["gradient_norm"] = optax.tree.norm(grads)
         metrics.update(current_hyperparameters(opt_state))
         ema = state.ema

@@ -357,37 +357,6 @@ def test_network_input_normalises_joins_by_type_and_keeps_empty_slots_zero():
         assert image[0, row, column, kind * 3 + r] == pytest.approx(expected, rel=1e-5, abs=1e-6)
 
 
-@pytest.mark.parametrize("shape", [(3, 3, 5, 7), (1,), (4, 16)])
-def test_random_weights_equal_the_librarys(shape):
-    key = jax.random.key(7)
-    np.testing.assert_array_equal(layers.normal(key, shape, 0.01), jax.random.normal(key, shape) * 0.01)
-    he = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
-    if len(shape) > 1:
-        np.testing.assert_array_equal(layers.kernel_init(key, shape), he(key, shape))
-        assert float(jnp.std(layers.kernel_init(key, (3, 3, 64, 64)))) == pytest.approx((2 / 576) ** 0.5, rel=0.02)
-
-
-def test_variables_equal_those_of_flax_without_its_forward_pass():
-    class Small(nn.Module):
-        @nn.compact
-        def __call__(self, x, *, train):
-            x = layers.Conv(4, use_bias=True)(x)
-            (x,) = layers.BatchNorm()([x], train=train)
-            kernel = self.param("kernel", lambda key: jax.random.normal(key, (4, 4)))
-            jax.debug.callback(lambda: ran.append(1))
-            return x @ (kernel * 2.0)
-
-    ran = []
-    shape, key = jax.ShapeDtypeStruct((1, 8, 8, 3), jnp.float32), jax.random.key(5)
-    variables = layers.init_variables(Small(), key, shape)
-    jax.effects_barrier()
-    assert not ran
-    expected = Small().init(key, jnp.zeros(shape.shape), train=False)
-    jax.tree.map(np.testing.assert_array_equal, variables, expected)
-    compiled = jax.jit(lambda key: layers.init_variables(Small(), key, shape))(key)
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-9), compiled, expected)
-
-
 def test_networks_seed_decides_the_parameters():
     init = build_detector(CONFIG, SENSOR).init
     a, b, c = (jax.tree.leaves(init(jax.random.key(seed))["params"]) for seed in (0, 0, 1))

@@ -1,0 +1,229 @@
+"""The second look as a stage of a detector, trained in the same step."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from fcos_lidar_jax.config import Config, RefinementConfig
+from fcos_lidar_jax.forms import in_form
+from fcos_lidar_jax.initialization import init_variables
+from fcos_lidar_jax.losses import cross_entropy
+from fcos_lidar_jax.nms import rotated_nms, suppress
+from fcos_lidar_jax.refinement.crops import crop_points
+from fcos_lidar_jax.refinement.network import SecondLook, box_features, point_features
+from fcos_lidar_jax.refinement.targets import RefinementTargets, match_boxes, move_boxes
+from fcos_lidar_jax.types import Batch, Sums
+
+if TYPE_CHECKING:
+    from fcos_lidar_jax.models import Detector
+
+SECOND_LOOK = "refinement"  # Name of the parameters of the second look.
+Boxes = tuple[Array, Array, Array, Array]
+"""Boxes f32[m, 9], scores f32[m], labels i32[m] and valid bool[m] of one cloud, best first."""
+
+
+def add_refinement(detector: "Detector") -> "Detector":
+    """Add the second look of ``config.refinement`` to a detector: variables, the stage ``refine``, losses.
+
+    Its parameters are ``params["refinement"]``. With ``config.refinement.freeze_detector``, the detector is
+    applied as in detection, and only the second look has losses.
+    """
+    config, refinement = detector.config, _config_of(detector.config)
+    network = make_network(config)
+
+    def init(key: Any) -> dict[str, Any]:
+        variables, look = detector.init(key), init_variables(network, jax.random.fold_in(key, 1), _shapes(config))
+        return variables | {"params": variables["params"] | {SECOND_LOOK: look["params"]}}
+
+    def apply(variables: Any, inputs: Any, *, train: bool = False) -> tuple[Any, Any]:
+        return detector.apply(
+            without_second_look(variables), inputs, train=train and not refinement.freeze_detector
+        )
+
+    def sums(variables: Any, outputs: Any, inputs: Any, batch: Batch) -> Sums:
+        of_boxes = refinement_sums(detector, network, variables, outputs, inputs, batch)
+        if refinement.freeze_detector:
+            return of_boxes
+        of_detector = detector.sums(without_second_look(variables), outputs, inputs, batch)
+        return Sums(*(a | b for a, b in zip(of_detector, of_boxes, strict=True)))
+
+    refine = functools.partial(refine_boxes, network, config)
+    return detector._replace(init=init, apply=apply, sums=sums, refine=refine)
+
+
+def without_second_look(variables: dict[str, Any]) -> dict[str, Any]:
+    """Variables of a detector without those of the second look.
+
+    >>> without_second_look({"params": {"heads": 1, "refinement": 2}, "batch_stats": {}})
+    {'params': {'heads': 1}, 'batch_stats': {}}
+    """
+    return variables | {
+        "params": {name: part for name, part in variables["params"].items() if name != SECOND_LOOK}
+    }
+
+
+def make_network(config: Config) -> SecondLook:
+    """The network of a configuration with a second look."""
+    refinement = _config_of(config)
+    return SecondLook(len(config.classes), refinement.point_channels, refinement.box_channels)
+
+
+def trainable(params: dict[str, Any], config: Config) -> dict[str, Any]:
+    """The part of the parameters that a training changes: all, or those of the second look only.
+
+    >>> trainable({"heads": 1, "refinement": 2}, Config())
+    {'heads': 1, 'refinement': 2}
+    """
+    frozen = config.refinement is not None and config.refinement.freeze_detector
+    return {SECOND_LOOK: params[SECOND_LOOK]} if frozen else params
+
+
+def best_boxes(boxes: Boxes, number: int) -> Boxes:
+    """The best of the boxes, padded where there are fewer.
+
+    >>> boxes = jnp.ones((3, 9)), jnp.array([0.9, 0.5, 0.1]), jnp.array([0, 1, 0]), jnp.ones(3, bool)
+    >>> best_boxes(boxes, 2)[1].tolist()
+    [0.8999999761581421, 0.5]
+    """
+    missing = max(0, number - len(boxes[0]))
+    cut = [jnp.pad(part[:number], ((0, missing), *[(0, 0)] * (part.ndim - 1))) for part in boxes]
+    return cut[0], cut[1], cut[2], cut[3]
+
+
+def look_at(
+    network: SecondLook, config: Config, variables: Any, points: Array, valid: Array, boxes: Boxes
+) -> tuple[Array, Array]:
+    """Class logits [m, k + 1] and residuals [m, 8] of the boxes of one cloud."""
+    inputs = look_inputs(config, points, valid, boxes)
+    return network.apply({"params": variables["params"][SECOND_LOOK]}, inputs)  # type: ignore[return-value]
+
+
+def look_inputs(config: Config, points: Array, valid: Array, boxes: Boxes) -> tuple[Array, Array, Array]:
+    """Features of the points, their mask, and features of the boxes of one cloud."""
+    refinement = _config_of(config)
+    place, scores, labels, _ = boxes
+    crops = crop_points(points, valid, place, num_points=refinement.num_points, margin_m=refinement.margin_m)
+    of_boxes = box_features(place, scores, labels, crops.count, len(config.classes))
+    return point_features(crops, place), crops.valid, of_boxes
+
+
+def refine_boxes(
+    network: SecondLook, config: Config, variables: Any, points: Array, valid: Array, *boxes: Array
+) -> Boxes:
+    """Score the best boxes of one cloud anew, and move them; boxes beyond ``num_boxes`` are dropped.
+
+    Args:
+        variables: ``params`` of the detector, with the second look's.
+        points, valid: the cloud, f32[n, c] and bool[n].
+        boxes: boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d] after NMS, best first.
+
+    Returns:
+        d boxes, scores, labels and their mask, best first; zero where invalid.
+    """
+    refinement = _config_of(config)
+    place, scores, labels, used = best_boxes((boxes[0], boxes[1], boxes[2], boxes[3]), refinement.num_boxes)
+    with jax.named_scope("refine"):
+        logits, residual = look_at(network, config, variables, points, valid, (place, scores, labels, used))
+        probability = jnp.take_along_axis(jax.nn.softmax(logits), labels[:, None], axis=1)[:, 0]
+        scores = jnp.where(used, probability, 0.0)
+        place = move_boxes(place, residual)
+        index, used = rotated_nms(
+            place,
+            scores,
+            used,
+            labels=None if config.inference.nms_across_classes else labels,
+            overlap=config.inference.nms_overlap,
+            iou_threshold=config.inference.iou_threshold,
+            max_outputs=len(place),
+        )
+        best = (
+            jnp.where(used[:, None], place[index], 0.0),
+            jnp.where(used, scores[index], 0.0),
+            jnp.where(used, labels[index], 0),
+            used,
+        )
+        return best_boxes(best, len(boxes[0]))
+
+
+def refinement_sums(
+    detector: "Detector",
+    network: SecondLook,
+    variables: Any,
+    outputs: Any,
+    inputs: Any,
+    batch: Batch,
+) -> Sums:
+    """The losses of the second look on the detector's own boxes, which have no gradient, as sums over the batch.
+
+    ``refined_class`` is the cross-entropy of all boxes, ``refined_box`` the L1 distance of the residuals of boxes
+    near an object.
+    """
+    config, refinement = detector.config, _config_of(detector.config)
+    inference = dataclasses.replace(config.inference, max_detections=refinement.num_boxes)
+
+    def prepared(sample: Any) -> tuple[tuple[Array, Array, Array], RefinementTargets]:
+        outputs, input_, one = sample
+        boxes = suppress(*detector.candidates(outputs, input_), inference)
+        targets = match_boxes(
+            boxes[0],
+            boxes[2],
+            boxes[3],
+            one.boxes,
+            one.labels,
+            one.box_valid,
+            num_classes=len(config.classes),
+            radius_range_m=refinement.radius_range_m,
+            between_weight=refinement.between_weight,
+        )
+        return look_inputs(config, one.points, one.valid, boxes), targets
+
+    with jax.named_scope("refine"):
+        samples = lax.stop_gradient((outputs, inputs, batch))
+        looked, targets = over_samples(prepared, samples)
+        logits, residual = network.apply({"params": variables["params"][SECOND_LOOK]}, looked)  # type: ignore[misc]
+        entropy = jax.vmap(cross_entropy)(logits, targets.label)
+        distance = jnp.abs(residual - targets.residual).sum(axis=-1)
+        used = targets.weight > 0
+        right = (logits.argmax(axis=-1) == targets.label) & used
+    losses = {
+        "refined_boxes": {"refined_class": (entropy * targets.weight).sum()},
+        "refined_near": {"refined_box": jnp.where(targets.near, distance, 0.0).sum()},
+    }
+    counts = {
+        "refined_boxes": used.sum(dtype=jnp.int32),
+        "refined_near": targets.near.sum(dtype=jnp.int32),
+        "refined_objects": (targets.label < len(config.classes)).sum(dtype=jnp.int32),
+    }
+    return Sums(losses, counts, {"refined_boxes": {"refined_accuracy": right.sum(dtype=jnp.float32)}})
+
+
+def over_samples(function: Callable[[Any], Any], samples: Any) -> Any:
+    """Apply a function to the samples of a batch: one after the other on CPUs, where NMS then stops early."""
+    leaves, tree = jax.tree.flatten(samples)
+    one_by_one = lambda *leaves: lax.map(function, jax.tree.unflatten(tree, leaves))  # noqa: E731
+    together = lambda *leaves: jax.vmap(function)(jax.tree.unflatten(tree, leaves))  # noqa: E731
+    if len(leaves[0]) == 1:  # no loop, in which XLA is slower on CPUs
+        return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda leaf: leaf[0], samples)))
+    return in_form(None, {"map": one_by_one, "vmap": together}, *leaves, cpu="map", default="vmap")
+
+
+def _config_of(config: Config) -> RefinementConfig:
+    assert config.refinement is not None
+    return config.refinement
+
+
+def _shapes(config: Config) -> tuple[jax.ShapeDtypeStruct, ...]:
+    """Shapes of the network's inputs for one box of one point."""
+    points = jax.eval_shape(lambda: look_inputs(config, *_nothing()))
+    return points
+
+
+def _nothing() -> tuple[Array, Array, Boxes]:
+    none = jnp.zeros((1, 9)), jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.zeros(1, bool)
+    return jnp.zeros((1, 5)), jnp.zeros(1, bool), none

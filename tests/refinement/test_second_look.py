@@ -1,0 +1,183 @@
+"""The second look as a stage of both detectors, and trained in their step."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_peer
+import tiny_run
+from tiny_run import SENSOR, bits, host_batch, train_tiny, untrained
+
+from fcos_lidar_jax.checkpoints import load_checkpoint
+from fcos_lidar_jax.config import RefinementConfig
+from fcos_lidar_jax.inference import make_detect
+from fcos_lidar_jax.models import build_detector
+from fcos_lidar_jax.refinement.network import SecondLook
+from fcos_lidar_jax.refinement.stage import best_boxes, over_samples, refinement_sums, trainable
+from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+from fcos_lidar_jax.training.step import make_gradient
+
+SMALL = RefinementConfig(num_boxes=8, num_points=16, point_channels=(8, 8), box_channels=(8,))
+FROZEN = dataclasses.replace(SMALL, freeze_detector=True)
+CONFIGS = {"FCOS-LiDAR": tiny_run.CONFIG, "CenterPoint": tiny_peer.CONFIG}
+BOTH = pytest.mark.parametrize("name", CONFIGS)
+
+
+@functools.cache
+def detector(name: str, refinement: RefinementConfig | None):
+    """A detector, and random weights of it."""
+    config = dataclasses.replace(CONFIGS[name], refinement=refinement)
+    return build_detector(config, SENSOR), jax.tree.map(jnp.asarray, untrained(config, SENSOR))
+
+
+def found(name: str, refinement: RefinementConfig | None, variables=None, cloud: int = 0):
+    model, weights = detector(name, refinement)
+    batch = host_batch()
+    program = jax.jit(make_detect(model))
+    return jax.device_get(program(variables or weights, batch.points[cloud], batch.valid[cloud]))
+
+
+@BOTH
+def test_boxes_are_the_detectors_best_with_the_probability_of_their_class(name):
+    """With zero weights all classes are equally probable and no box moves."""
+    _, variables = detector(name, SMALL)
+    zero = jax.tree.map(jnp.zeros_like, variables["params"]["refinement"])
+    after = found(name, SMALL, variables | {"params": variables["params"] | {"refinement": zero}})
+    before = found(name, None)
+    number = int(before.valid.sum())
+    assert number > 8
+    assert after.valid.sum() == 8
+    np.testing.assert_allclose(after.scores[:8], 1 / 11, rtol=1e-6)
+    np.testing.assert_allclose(after.boxes[:8], before.boxes[:8], rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(after.labels[:8], before.labels[:8])
+    assert not after.boxes[8:].any()
+    assert after.boxes.shape == before.boxes.shape
+
+
+def test_moved_boxes_do_not_overlap_and_are_sorted():
+    after = found("FCOS-LiDAR", SMALL)
+    number = int(after.valid.sum())
+    assert 0 < number <= 8
+    assert (np.diff(after.scores[:number]) <= 0).all()
+    assert len(np.unique(after.scores[:number])) > 1
+
+
+@BOTH
+def test_the_detectors_own_losses_and_gradients_stay(name):
+    model, variables = detector(name, None)
+    refined, both = detector(name, SMALL)
+    batch, own = host_batch(), variables["params"]
+    alone, _, metrics = jax.jit(make_gradient(model))(own, variables["batch_stats"], batch)
+    params = own | {"refinement": both["params"]["refinement"]}
+    joint, _, with_look = jax.jit(make_gradient(refined))(params, variables["batch_stats"], batch)
+    for name_of, gradient in alone.items():
+        for a, b in zip(*map(jax.tree.leaves, (gradient, joint[name_of])), strict=True):
+            # Unoptimised programs round the two uses of a pillar's maximum differently, which cuts its gradient.
+            if name == "FCOS-LiDAR":
+                np.testing.assert_allclose(a, b, atol=1e-4 * max(1.0, float(jnp.abs(a).max())))
+    assert float(with_look["loss/refined_class"]) > 0
+    assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(joint["refinement"])) > 0
+    for key in metrics.keys() - {"loss/total"}:
+        np.testing.assert_allclose(with_look[key], metrics[key], rtol=1e-5)
+
+
+@BOTH
+def test_a_frozen_detector_is_not_changed(name):
+    model, variables = detector(name, FROZEN)
+    optimizer = make_optimizer(model.config.optimizer, 10)
+    state = make_state(model, optimizer, jax.random.key(0), variables=variables)
+    after, metrics = jax.jit(make_train_step(model, optimizer))(state, host_batch())
+    assert bits(after.batch_stats) == bits(state.batch_stats)
+    for trained in (after.params, after.ema):
+        assert bits({k: v for k, v in trained.items() if k != "refinement"}) == bits(
+            {k: v for k, v in variables["params"].items() if k != "refinement"}
+        )
+    assert bits(after.params["refinement"]) != bits(variables["params"]["refinement"])
+    assert sorted(m for m in metrics if m.startswith("loss/")) == [
+        "loss/refined_box",
+        "loss/refined_class",
+        "loss/total",
+    ]
+    # The optimizer's state has nothing of the detector either.
+    size = sum(leaf.size for leaf in jax.tree.leaves(trainable(variables["params"], model.config)))
+    assert sum(leaf.size for leaf in jax.tree.leaves(after.opt_state)) < 2 * size + 20
+
+
+def test_losses_equal_sums_over_the_samples():
+    """Two samples are processed in a loop, one sample without it."""
+    model, variables = detector("FCOS-LiDAR", SMALL)
+    network, batch = SecondLook(10, SMALL.point_channels, SMALL.box_channels), host_batch()
+    boxes = jnp.concatenate([batch.boxes[0, :4], batch.boxes[1, :3] + 0.3]), jnp.linspace(0.9, 0.1, 7)
+    labels = jnp.concatenate([batch.labels[0, :4], batch.labels[1, :3]])
+    model = model._replace(candidates=lambda outputs, image: (*boxes, labels, jnp.ones(7, bool)))
+
+    @jax.jit
+    def sums(batch):
+        inputs = jax.vmap(model.prepare)(batch.points, batch.valid)
+        outputs, _ = model.apply(variables, inputs)
+        return refinement_sums(model, network, variables, outputs, inputs, batch)
+
+    whole = sums(batch)
+    parts = [sums(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], batch)) for i in range(2)]
+    total = jax.tree.map(jnp.add, *parts)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), whole, total)
+    assert 8 <= int(whole.counts["refined_boxes"]) <= 14
+    assert int(whole.counts["refined_objects"]) > 4
+
+
+def test_a_cloud_without_points_has_finite_gradients_and_no_boxes():
+    model, variables = detector("FCOS-LiDAR", SMALL)
+    batch = dataclasses.replace(host_batch(), valid=np.zeros((2, 1024), bool))
+    gradient, _, metrics = jax.jit(make_gradient(model))(variables["params"], variables["batch_stats"], batch)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert float(metrics["refined_boxes"]) == 0
+    empty = jax.jit(make_detect(model))(variables, batch.points[0], batch.valid[0])
+    assert not empty.valid.any()
+
+
+def test_points_of_boxes_decide_the_scores():
+    """The same boxes with other points: the network sees the cloud, not only the boxes."""
+    model, variables = detector("FCOS-LiDAR", SMALL)
+    batch = host_batch()
+    before = found("FCOS-LiDAR", None)
+    boxes = before.boxes, before.scores, before.labels, before.valid
+    refine = jax.jit(model.refine)
+    _, scores, *_ = refine(variables, batch.points[0], batch.valid[0], *boxes)
+    _, others, *_ = refine(variables, batch.points[1], batch.valid[1], *boxes)
+    order = np.random.default_rng(0).permutation(1024)
+    _, same, *_ = refine(variables, batch.points[0][order], batch.valid[0][order], *boxes)
+    np.testing.assert_array_equal(scores, same)
+    assert float(jnp.abs(scores - others).max()) > 0.1 * float(scores.max())
+
+
+def test_both_ways_through_a_batch_agree():
+    samples = jnp.arange(6.0).reshape(3, 2), {"a": jnp.arange(3)}
+    double = jax.jit(lambda samples: over_samples(lambda s: (s[0] * 2, s[1]["a"]), samples))(samples)
+    np.testing.assert_array_equal(double[0], samples[0] * 2)
+    np.testing.assert_array_equal(double[1], samples[1]["a"])
+
+
+def test_best_boxes_are_padded():
+    boxes = jnp.ones((2, 9)), jnp.array([0.9, 0.5]), jnp.array([0, 1]), jnp.ones(2, bool)
+    assert best_boxes(boxes, 3)[3].tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("refinement", [SMALL, FROZEN], ids=["joint", "frozen"])
+def test_training_starts_from_weights_without_a_second_look(tmp_path, refinement, capsys):
+    train_tiny(tmp_path / "first")
+    # So few steps predict nothing that is more probable.
+    inference = dataclasses.replace(tiny_run.CONFIG.inference, min_probability=0.0)
+    config = dataclasses.replace(tiny_run.CONFIG, refinement=refinement, inference=inference)
+    train_tiny(tmp_path / "second", config=config, weights=str(tmp_path / "first"))
+    assert "has no second look: it starts with random weights" in capsys.readouterr().err
+    first, second = (load_checkpoint(tmp_path / name) for name in ("first", "second"))
+    assert second.config.refinement == refinement
+    same = bits(first.variables["params"]) == bits(
+        {k: v for k, v in second.variables["params"].items() if k != "refinement"}
+    )
+    assert same == refinement.freeze_detector
+    train_tiny(tmp_path / "third", weights=str(tmp_path / "second"))
+    assert "the second look is left out" in capsys.readouterr().err

@@ -1,0 +1,110 @@
+"""Targets of the second look against a loop over boxes and objects."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+
+from fcos_lidar_jax.refinement.targets import encode_residual, match_boxes, move_boxes
+
+OPTIONS = {"num_classes": 3, "radius_range_m": (1.0, 2.0), "between_weight": 0.25}
+match = jax.jit(match_boxes, static_argnames=tuple(OPTIONS))
+
+
+def scene(seed: int):
+    rng = np.random.default_rng(seed)
+    truth = oracles.random_boxes(rng, 8, 5.0).astype(np.float32)
+    boxes = truth[rng.integers(0, 8, 40)] + rng.normal(0, 1.2, (40, 7)).astype(np.float32)
+    boxes[:, 3:6] = np.maximum(np.abs(boxes[:, 3:6]), 0.3)
+    labels, true_labels = (rng.integers(0, 3, n).astype(np.int32) for n in (40, 8))
+    return boxes, labels, rng.random(40) < 0.9, truth, true_labels, rng.random(8) < 0.9
+
+
+def expected(boxes, labels, valid, truth, true_labels, true_valid):
+    """Labels, owners and weights by loops."""
+    label, owner, weight = np.full(len(boxes), 3), np.full(len(boxes), -1), valid.astype(float)
+    radius = np.clip(truth[:, 3:5].max(axis=1) / 2, 1, 2)
+    best = {}
+    for i in np.flatnonzero(valid):
+        distance = np.hypot(*(truth[:, :2] - boxes[i, :2]).T)
+        near = [j for j in np.flatnonzero(true_valid) if distance[j] < radius[j]]
+        if near:
+            cost, owner[i] = min(((labels[i] != true_labels[j], distance[j]), j) for j in near)
+            best[owner[i]] = min(best.get(owner[i], (cost, i)), (cost, i))
+        elif (distance < 2 * radius)[true_valid].any():
+            weight[i] = 0.25
+    for j, (_, i) in best.items():
+        label[i] = true_labels[j]
+    return label, owner, weight
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_targets_equal_a_loop(seed):
+    arrays = scene(seed)
+    targets = jax.device_get(match(*arrays, **OPTIONS))
+    label, owner, weight = expected(*arrays)
+    np.testing.assert_array_equal(targets.label, label)
+    np.testing.assert_array_equal(targets.near, owner >= 0)
+    np.testing.assert_allclose(targets.weight, weight)
+    boxes, truth = arrays[0], arrays[3]
+    moved = np.asarray(move_boxes(jnp.asarray(boxes), jnp.asarray(targets.residual)))[owner >= 0]
+    own = truth[owner[owner >= 0]]
+    np.testing.assert_allclose(moved[:, :3], own[:, :3], atol=1e-4)
+    np.testing.assert_allclose(np.cos(moved[:, 6] - own[:, 6]), 1, atol=1e-5)
+    assert not targets.residual[owner < 0].any()
+    assert (label < 3).sum() > 3
+    assert 0.25 in weight
+
+
+def test_a_box_of_the_right_class_stands_before_a_nearer_one():
+    boxes = np.array([[0.1, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0], [0.6, 0, 0, 4, 2, 1, 0]], np.float32)
+    truth = np.array([[0, 0, 0, 4, 2, 1, 0]], np.float32), np.array([2]), np.ones(1, bool)
+    assert match(boxes, np.array([0, 2, 2]), np.ones(3, bool), *truth, **OPTIONS).label.tolist() == [3, 2, 3]
+    assert match(boxes, np.array([0, 1, 1]), np.ones(3, bool), *truth, **OPTIONS).label.tolist() == [2, 3, 3]
+
+
+def test_without_boxes_or_objects_everything_is_background():
+    boxes, labels, valid, *truth = scene(0)
+    none = np.zeros((0, 7), np.float32), np.zeros(0, np.int32), np.zeros(0, bool)
+    alone = match_boxes(boxes, labels, valid, *none, **OPTIONS)
+    assert (alone.label == 3).all()
+    assert not alone.near.any()
+    np.testing.assert_array_equal(alone.weight, valid)
+    assert match_boxes(*none, *truth, **OPTIONS).label.shape == (0,)
+
+
+def test_eager_jit_and_vmap_agree():
+    scenes = [scene(seed) for seed in range(2)]
+    both = jax.vmap(functools.partial(match_boxes, **OPTIONS))(*map(np.stack, zip(*scenes, strict=True)))
+    for i, one in enumerate(scenes):
+        for found in (match_boxes(*one, **OPTIONS), jax.tree.map(lambda leaf, i=i: leaf[i], both)):
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, match(*one, **OPTIONS))
+
+
+def test_residuals_are_coded_in_the_frame_of_the_box():
+    box = np.array([[3.0, 4, 5, 4, 2, 1, np.pi / 2, 7, 8]], np.float32)
+    target = np.array([[2.0, 6, 5.5, 8, 2, 0.5, np.pi, 0, 0]], np.float32)
+    box, target = map(jnp.asarray, (box, target))
+    residual = encode_residual(box, target)
+    np.testing.assert_allclose(residual, [[2, 1, 0.5, np.log(2), 0, -np.log(2), 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(move_boxes(box, residual)[0, 7:], [7, 8])
+    # Sizes change by at most a factor of e.
+    np.testing.assert_allclose(move_boxes(box, residual.at[0, 3].set(5.0))[0, 3], 4 * np.e, rtol=1e-6)
+
+
+def test_gradients_are_finite_for_degenerate_boxes():
+    boxes = jnp.zeros((3, 9))
+    gradients = [
+        jax.grad(lambda b: encode_residual(b, boxes).sum())(boxes),
+        jax.grad(lambda b: encode_residual(boxes, b).sum())(boxes),
+        *jax.grad(lambda b, r: move_boxes(b, r).sum(), argnums=(0, 1))(boxes, jnp.zeros((3, 8))),
+        jax.grad(
+            lambda b: match_boxes(
+                b, jnp.zeros(3, int), jnp.ones(3, bool), boxes, jnp.zeros(3, int), jnp.ones(3, bool), **OPTIONS
+            ).residual.sum()
+        )(boxes),
+    ]
+    assert all(np.isfinite(g).all() for g in gradients)
