@@ -235,11 +235,12 @@ class RefinementConfig:
     ValueError: num_points: got 0, expected at least 1
     """
 
-    num_boxes: int = 64  # Best boxes of a cloud that are looked at; others are dropped.
+    num_boxes: int = 100  # Best boxes of a cloud that are looked at; others are dropped.
     num_points: int = 128  # Maximum number of points per box.
     margin_m: float = 1.0  # Boxes are enlarged by this on every side, metres.
     point_channels: tuple[int, ...] = (32, 64, 128)  # Channels of the layers on each point.
     box_channels: tuple[int, ...] = (128, 128)  # Channels of the layers on each box.
+    move_boxes: bool = True  # Move the boxes in detection; without, only their scores change.
     radius_range_m: tuple[float, float] = (1.0, 2.0)
     """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can
     stand for it."""

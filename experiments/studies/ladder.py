@@ -68,7 +68,8 @@ BASE: Change = change(
 MARKED = "second round marks objects"
 AFTERWARDS = {"larger, looked at again": "larger", "CenterPoint, looked at again": "CenterPoint"}
 """Trials of a second look, and the trials whose weights it gets, frozen."""
-_FROZEN = change(refinement=RefinementConfig(freeze_detector=True))
+_LOOK = RefinementConfig(num_boxes=64)  # As many as a quarter of the view has.
+_FROZEN = change(refinement=dataclasses.replace(_LOOK, freeze_detector=True))
 TRIALS: dict[str, Change] = {
     "base": change(model__local_geometry=False),
     "CenterPoint": PEER.change,
@@ -76,7 +77,7 @@ TRIALS: dict[str, Change] = {
     "larger": change(**_LARGER),
     "larger, without local geometry": change(**_LARGER, model__local_geometry=False),
     MARKED: change(**_LARGER, projection__num_rounds=2),
-    "larger, joint": change(**_LARGER, refinement=RefinementConfig()),
+    "larger, joint": change(**_LARGER, refinement=_LOOK),
 }
 TRIALS |= {name: lambda config, first=first: _FROZEN(TRIALS[first](config)) for name, first in AFTERWARDS.items()}
 

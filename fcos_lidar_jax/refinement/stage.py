@@ -132,7 +132,8 @@ def refine_boxes(
         logits, residual = look_at(network, config, variables, points, valid, (place, scores, labels, used))
         probability = jnp.take_along_axis(jax.nn.softmax(logits), labels[:, None], axis=1)[:, 0]
         scores = jnp.where(used, probability, 0.0)
-        place = move_boxes(place, residual)
+        if refinement.move_boxes:
+            place = move_boxes(place, residual)
         index, used = rotated_nms(
             place,
             scores,

@@ -49,7 +49,7 @@ class ToyConfig(Config):
             boxes = jnp.pad(seen.mean, ((0, 0), (0, 6)))[:, None] + variables["params"]["boxes"]
             return boxes, variables["batch_stats"]
 
-        def sums(boxes, seen, batch):
+        def sums(variables, boxes, seen, batch):
             predicted = jnp.take_along_axis(boxes, batch.labels[..., None], axis=1)
             off = jnp.where(batch.box_valid[..., None], jnp.abs(predicted - batch.boxes), 0)
             return Sums({"boxes": {"distance": off.sum()}}, {"boxes": batch.box_valid.sum()})

@@ -375,7 +375,7 @@ def test_a_new_loss_is_divided_by_the_locations_of_the_regression(monkeypatch):
     def losses(detector, params, batch):
         images = jax.vmap(detector.prepare)(batch.points, batch.valid)
         outputs, _ = detector.apply({"params": params}, images, train=True)
-        return detector.sums(outputs, images, batch).losses
+        return detector.sums({}, outputs, images, batch).losses
 
     monkeypatch.setattr(objective, "sample_losses", with_height)
     for regress_on in ("positives", "candidates"):
@@ -433,7 +433,7 @@ def squares():
     def apply(variables, images, train):
         return jnp.broadcast_to(variables["params"]["w"], images.num_dropped.shape), {}
 
-    def sums(outputs, _, batch):
+    def sums(_variables, outputs, _, batch):
         jax.debug.callback(lambda rows: row_lists.append(rows.tolist()), batch.boxes[:, 0, 0], ordered=True)
         count = batch.box_valid.sum(dtype=jnp.int32)
         total = jnp.where(batch.box_valid, jnp.square(outputs[:, None] - batch.boxes[..., 0]), 0.0).sum()
