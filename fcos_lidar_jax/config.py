@@ -241,6 +241,8 @@ class RefinementConfig:
     point_channels: tuple[int, ...] = (32, 64, 128)  # Channels of the layers on each point.
     box_channels: tuple[int, ...] = (128, 128)  # Channels of the layers on each box.
     move_boxes: bool = True  # Move the boxes in detection; without, only their scores change.
+    nms_across_classes: bool = False
+    """NMS after the second look also removes boxes that overlap a better box of another class: one per object."""
     radius_range_m: tuple[float, float] = (1.0, 2.0)
     """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can
     stand for it."""

@@ -126,8 +126,7 @@ more training no longer helped, stem, first stage, pyramid and heads were widene
 block (2026-11-27). Doubled rows contain the same points. The image wraps around, so there is no seam behind the
 vehicle. NMS at 0.1, weighted NMS and the IoU exponent are not in the paper;
 ``python -m experiments.studies.post_processing`` measures what each adds. The regression axes are not in the paper
-either; ``experiments/LOG.md`` compares them with the paper's. Nor is the second look, which orders the boxes better
-(2026-11-28).
+either, nor is the second look, which orders the boxes better; ``experiments/LOG.md`` has what both add.
 """
 
 KITTI_COMPACT = dataclasses.replace(

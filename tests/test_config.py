@@ -16,6 +16,7 @@ from fcos_lidar_jax.config import (
     ModelConfig,
     OptimizerConfig,
     ProjectionConfig,
+    RefinementConfig,
     StemConfig,
     config_from_json,
     config_to_json,
@@ -74,10 +75,16 @@ def test_small_presets_differ_in_numbers_only(preset, large, own):
     small, full = kinds(preset), kinds(large)
     for record in (small, full):
         del record["name"], record["sensor"]
+        del record["refinement"]
         del record["projection"]["remove_close"]  # as the shipped weights were trained
         for part, name in own:
             del record[part][name]
     assert small == full
+
+
+def test_only_compact_looks_at_its_boxes_again():
+    assert [name for name, preset in PRESETS.items() if preset.refinement is not None] == ["compact"]
+    assert COMPACT.refinement == RefinementConfig()
 
 
 def test_kitti_compact_has_the_data_of_kitti_and_the_network_of_compact():
@@ -160,6 +167,9 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: LossConfig(iou_loss="l2"),  # type: ignore[arg-type]
         lambda: Config(model=ModelConfig(stem=StemConfig(group_rounds=False, channels_per_type=4))),  # five rounds
         lambda: LossConfig(centreness_m=2.0),  # of no use: the factor is trained to be the IoU
+        lambda: RefinementConfig(num_boxes=0),
+        lambda: RefinementConfig(point_channels=()),
+        lambda: RefinementConfig(radius_range_m=(2.0, 1.0)),
         lambda: InferenceConfig(iou_threshold=2),
         lambda: InferenceConfig(nms_overlap="4d"),  # type: ignore[arg-type]
         lambda: InferenceConfig(iou_exponent=-0.5),

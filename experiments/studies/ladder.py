@@ -34,6 +34,7 @@ from experiments.script import Options, run_script, save
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
 from experiments.studies.round_use import FirstRound
+from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
 from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFrames
@@ -48,6 +49,7 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 
 SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
+DISTANCES_M = ("0.5", "1.0", "2.0", "4.0")
 _BEHIND_M = 1.0  # Distance of a mark from the object's point.
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
 _SIZES = ("stem", "backbone_blocks", "backbone_widths", "fpn_channels", "head_channels")
@@ -146,6 +148,9 @@ def trial(name: str, config: Config, seed: int, args: Args) -> dict[str, Any]:
         "mAP": round(summary["mean_ap"], 4),
         "curve": [round(r["test/mAP"], 4) for r in records if "test/mAP" in r],
         "AP": {k: round(v, 3) for k, v in summary["mean_dist_aps"].items() if v > 0.001},
+        "by_distance": {
+            d: round(statistics.mean(aps[d] for aps in summary["label_aps"].values()), 4) for d in DISTANCES_M
+        },
         "step_s": round(statistics.median(seconds), 3),
         "parameters": count_parameters(detector.variables["params"])["total"],
         "git": hardware()["git"],
@@ -164,19 +169,21 @@ def measure(args: Args) -> None:
                 rows.append(trial(name, TRIALS[name](BASE(SLIM(COMPACT))), seed, args))
                 save({"rows": rows}, out, json.dumps(rows[-1]))
     print(table(rows))
+    print("\n" + details(rows))
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown: mean score per trial and length, and the difference from the base of the same seeds.
+    """Markdown: mean score per trial and length, and differences from base and CenterPoint with the same seeds.
 
     >>> rows = [{"trial": n, "steps": 9, "seed": s, "mAP": m + 0.01 * s, "step_s": 0.3, "parameters": 7}
     ...         for n, m in (("base", 0.1), ("wide", 0.2)) for s in (0, 1)]
     >>> print(table(rows).splitlines()[-1])
-    | wide | 9 | 0.2000, 0.2100 | 0.2050 | +0.1000 [+0.1000, +0.1000] | 1.95 | 0.30 | 7 |
+    | wide | 9 | 0.2000, 0.2100 | 0.2050 | +0.1000 [+0.1000, +0.1000] | 1.95 |  | 0.30 | 7 |
     """
     lines = [
-        "| trial | steps | mAP by seed | mean | minus base, 95 % | times base | s per step | parameters |",
-        "|---|---|---|---|---|---|---|---|",
+        "| trial | steps | mAP by seed | mean | minus base, 95 % | times base | minus CenterPoint, 95 % "
+        "| s per step | parameters |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     scores: dict[tuple[int, str], dict[int, float]] = {}
     for row in rows:
@@ -184,18 +191,42 @@ def table(rows: list[dict[str, Any]]) -> str:
     for (steps, name), own in sorted(scores.items()):
         all_of = [r for r in rows if (r["steps"], r["trial"]) == (steps, name)]
         step_s = min(r["step_s"] for r in all_of)  # of the seed that was least disturbed
-        base = scores.get((steps, "base"), {})
-        seeds = sorted(own.keys() & base.keys())
-        difference, ratio = "", ""
-        if name != "base" and seeds:
+        base, peer = (scores.get((steps, other), {}) if name != other else {} for other in ("base", "CenterPoint"))
+        seeds, ratio = own.keys() & base.keys(), ""
+        if seeds:
             ratio = f"{sum(own[s] for s in seeds) / max(sum(base[s] for s in seeds), 1e-9):.2f}"
-            if bounds := interval([own[s] - base[s] for s in seeds]):
-                difference = "{:+.4f} [{:+.4f}, {:+.4f}]".format(*bounds)
         each, mean = ", ".join(f"{own[s]:.4f}" for s in sorted(own)), statistics.mean(own.values())
         lines.append(
             f"| {name} | {steps:,} | {each} | {mean:.4f} "
-            f"| {difference} | {ratio} | {step_s:.2f} | {all_of[0]['parameters']:,} |"
+            f"| {_difference(own, base)} | {ratio} | {_difference(own, peer)} | {step_s:.2f} "
+            f"| {all_of[0]['parameters']:,} |"
         )
+    return "\n".join(lines)
+
+
+def _difference(own: dict[int, float], other: dict[int, float]) -> str:
+    """Mean and interval of the differences of equal seeds; empty for fewer than two."""
+    bounds = interval([own[s] - other[s] for s in sorted(own.keys() & other.keys())])
+    return "{:+.4f} [{:+.4f}, {:+.4f}]".format(*bounds) if bounds else ""
+
+
+def details(rows: list[dict[str, Any]]) -> str:
+    """Markdown: AP by class and by distance, as means over the seeds that record them.
+
+    >>> row = {"trial": "wide", "steps": 9, "seed": 0, "AP": {"car": 0.5}}
+    >>> rows = [row | {"by_distance": dict.fromkeys(DISTANCES_M, 0.1)}]
+    >>> print(details(rows).splitlines()[-1])
+    | wide | 9 | 0.100 / 0.100 / 0.100 / 0.100 | 0.500 |
+    """
+    rows = [row for row in rows if "by_distance" in row]
+    classes = [c for c in NUSCENES_CLASSES if any(c in row["AP"] for row in rows)]
+    head = " | ".join(name.replace("_", " ") for name in classes)
+    lines = [f"| trial | steps | AP at 0.5 / 1 / 2 / 4 m | {head} |", "|---|---|---|" + "---|" * len(classes)]
+    for steps, name in sorted({(row["steps"], row["trial"]) for row in rows}):
+        own = [row for row in rows if (row["steps"], row["trial"]) == (steps, name)]
+        at = " / ".join(f"{statistics.mean(row['by_distance'][d] for row in own):.3f}" for d in DISTANCES_M)
+        aps = " | ".join(f"{statistics.mean(row['AP'].get(c, 0.0) for row in own):.3f}" for c in classes)
+        lines.append(f"| {name} | {steps:,} | {at} | {aps} |")
     return "\n".join(lines)
 
 

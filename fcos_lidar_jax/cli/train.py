@@ -5,7 +5,7 @@ import json
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import tyro
@@ -15,7 +15,7 @@ from fcos_lidar_jax.cli.checks import check_out_folder, option_name
 from fcos_lidar_jax.cli.data import DataOptions
 from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.cli.processes import ProcessOptions, check_processes, join_processes
-from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.config import Config, RefinementConfig, config_to_json
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.index import has_index
 from fcos_lidar_jax.devices.agreement import agreed, check_same
@@ -76,6 +76,8 @@ class Train:
     keep: int = 2  # Number of newest checkpoints to keep, in addition to the best one.
     no_augment: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Turn off flips, rotations and scaling.
     no_copy_paste: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Turn off copy-paste of objects.
+    second_look: Annotated[Literal["on", "off"] | None, option("{on,off}", default="the preset's")] = None
+    """Turn the second look at the best boxes on or off (refinement; not in the paper)."""
     threads: Annotated[
         int | None, option("N", default="the cores per worker, minus one if more than two; at most 16")
     ] = None
@@ -151,6 +153,7 @@ def _open(args: Train) -> _Task:
         args.config,
         augment=None if args.no_augment else args.config.augment,
         copy_paste=None if args.no_copy_paste else args.config.copy_paste,
+        refinement=_refinement(args),
     )
     options = {"threads": args.threads, "workers": args.workers, "num_processes": jax.process_count()}
     check_loader_options(config, **options)  # before objects are cut
@@ -180,6 +183,12 @@ def _open(args: Train) -> _Task:
     if data.tables is None and (config.copy_paste is None or cuts_objects):
         args.data.refuse_index("no prepared objects are used")
     return _Task(config, data, split, frames, tests, steps, cuts_objects)
+
+
+def _refinement(args: Train) -> RefinementConfig | None:
+    if args.second_look is None:
+        return args.config.refinement
+    return None if args.second_look == "off" else args.config.refinement or RefinementConfig()
 
 
 def _check_sensor(config: Config, data: DataSet, frames: FrameSet) -> None:

@@ -40,7 +40,7 @@ class Crops:
 def crop_points(
     points: Float32[Array, "n c"],
     valid: Bool[Array, "n"],
-    boxes: Float32[Array, "m c"],
+    boxes: Float32[Array, "m k"],
     *,
     num_points: int,
     margin_m: float,

@@ -138,7 +138,7 @@ def refine_boxes(
             place,
             scores,
             used,
-            labels=None if config.inference.nms_across_classes else labels,
+            labels=None if refinement.nms_across_classes or config.inference.nms_across_classes else labels,
             overlap=config.inference.nms_overlap,
             iou_threshold=config.inference.iou_threshold,
             max_outputs=len(place),

@@ -34,7 +34,7 @@ def match_boxes(
     boxes: Float32[Array, "m c"],
     labels: Int32[Array, "m"],
     valid: Bool[Array, "m"],
-    true_boxes: Float32[Array, "t c"],
+    true_boxes: Float32[Array, "t k"],
     true_labels: Int32[Array, "t"],
     true_valid: Bool[Array, "t"],
     *,
@@ -98,7 +98,7 @@ def _first_of_all(cost: Array) -> tuple[Array, Array]:
     return cost.argmin(axis=0), cost.min(axis=0) < _FAR_M
 
 
-def encode_residual(boxes: Float32[Array, "m c"], targets: Float32[Array, "m c"]) -> Float32[Array, "m 8"]:
+def encode_residual(boxes: Float32[Array, "m c"], targets: Float32[Array, "m k"]) -> Float32[Array, "m 8"]:
     """Residual from boxes to targets, in the frame of each box.
 
     Offset of the centre along the heading, to the left and upwards (metres), log ratios of length, width and

@@ -27,6 +27,9 @@ PARAMETERS = {
     "larger": 1_929_694,
     "larger, without local geometry": 1_887_870,
     MARKED: 1_930_342,
+    "larger, joint": 1_978_833,
+    "larger, looked at again": 1_978_833,
+    "CenterPoint, looked at again": 788_935,
 }
 
 
