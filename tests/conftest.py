@@ -17,16 +17,8 @@ _UNCHECKED = ("types", "sensors", "config", "cli")
 _PACKAGE = Path(__file__).parents[1] / "fcos_lidar_jax"
 _MODULES = [p.stem for p in _PACKAGE.glob("*.py") if p.stem not in ("__init__", "__main__", *_UNCHECKED)]
 _SECOND = [f"centerpoint.{name}" for name in ("pillars", "centres", "network", "objective", "detector")]
-_ROOMS = [
-    "models",
-    "refinement",
-    "inference",
-    "evaluation",
-    "checkpoints",
-    "devices",
-    "data.cloud_policy",
-    *_SECOND,
-]
+_SECOND += [f"refinement.{name}" for name in ("crops", "targets", "network", "stage")]
+_ROOMS = ["models", "inference", "evaluation", "checkpoints", "devices", "data.cloud_policy", *_SECOND]
 # A run, like a command, checks its numbers in its own words.
 _STEP = [
     f"training.{p.stem}" for p in (_PACKAGE / "training").glob("*.py") if p.stem not in ("__init__", "plan", "run")

@@ -1,40 +1,18 @@
 """Points of each box, in the frame of the box."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float32
 
-from fcos_lidar_jax.forms import in_form, search
+from fcos_lidar_jax.forms import in_form
+from fcos_lidar_jax.refinement.types import Crops
 from fcos_lidar_jax.types import BOX, check_columns, check_rows
 
 _WORD = 32  # Bits of a word.
+_ROW_BITS = 24  # Bits of the row of a point; the remaining 40 of a 64-bit word are its hash.
 _FAR_M = np.float32(1e9)  # Position of rows that belong to no box.
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Crops:
-    """Points of enlarged boxes, at most p of each.
-
-    >>> slots = np.full((64, 128), -1)
-    >>> Crops(np.zeros((64, 128, 5)), slots, np.zeros(64, int)).valid.any()
-    np.False_
-    """
-
-    points: Float32[Array, "*b m p 5"]
-    """x, y, z from the centre of the box (metres; x along the heading, y to the left), intensity (0-255), time lag
-    (seconds); zero where invalid."""
-    index: Int32[Array, "*b m p"]  # Row of the point in the cloud, -1 in slots without a point.
-    count: Int32[Array, "*b m"]  # Number of points in the enlarged box, which may exceed p.
-
-    @property
-    def valid(self) -> Bool[Array, "*b m p"]:
-        """False for slots without a point."""
-        return self.index >= 0
 
 
 def crop_points(
@@ -62,21 +40,23 @@ def crop_points(
     >>> car = jnp.array([[10.0, 0, 0, 4, 2, 1.5, jnp.pi / 2]])
     >>> cloud = jnp.array([[10.0, 1, 0, 7, 0], [10, 9, 0, 7, 0]])
     >>> crops = crop_points(cloud, jnp.ones(2, bool), car, num_points=3, margin_m=1.0)
-    >>> crops.points[0, 0].round(3).tolist(), crops.count.tolist()
-    ([1.0, -0.0, 0.0, 7.0, 0.0], [1])
+    >>> crops.points[0, 0, :3].round().tolist(), crops.count.tolist()
+    ([1.0, -0.0, 0.0], [1])
     """
     check_columns("points", points, "x, y, z, intensity, time lag, ...")
     check_columns("boxes", boxes, BOX)
-    check_rows(len(points), valid=valid)
-    num_words = max(1, -(-len(points) // _WORD))
-    points = jnp.pad(jnp.asarray(points, jnp.float32)[:, :5], ((0, num_words * _WORD - len(points)), (0, 0)))
+    number = points.shape[0]  # which may be symbolic in an exported program
+    check_rows(number, valid=valid)
+    num_words = number // _WORD + 1
+    padding = num_words * _WORD - number
     # The barrier isolates the arithmetic, so that points round identically in every program that contains it.
-    points = lax.optimization_barrier(points)
-    usable = jnp.pad(valid, (0, len(points) - len(valid))) & jnp.isfinite(points).all(axis=1)
+    points = lax.optimization_barrier(jnp.asarray(points, jnp.float32)[:, :5])
+    points = jnp.concatenate([points, jnp.zeros((padding, 5), jnp.float32)])
+    usable = jnp.concatenate([jnp.asarray(valid), jnp.zeros(padding, bool)]) & jnp.isfinite(points).all(axis=1)
     points = jnp.where(usable[:, None], points, 0.0)
     order = _order(points, usable)
     points = points[order]
-    usable = jnp.arange(len(points)) < usable.sum()
+    usable = jnp.arange(points.shape[0]) < usable.sum()
     half = jnp.minimum(boxes[:, 3:6], limit_m) / 2 + margin_m
     frame = jnp.cos(boxes[:, 6]), jnp.sin(boxes[:, 6])
 
@@ -115,7 +95,7 @@ def _order(points: Array, usable: Array) -> Array:
 def _hash(points: Array, seed: int) -> Array:
     """A 32-bit hash of the bits of each row; both zeros are the same."""
     bits = lax.bitcast_convert_type(points + 0.0, jnp.uint32)
-    mixed = jnp.full(len(points), seed, jnp.uint32)
+    mixed = jnp.full(points.shape[0], seed, jnp.uint32)
     for column in range(bits.shape[1]):
         mixed = (mixed ^ bits[:, column]) * jnp.uint32(0x85EBCA6B)
         mixed = (mixed ^ (mixed >> 15)) * jnp.uint32(0xC2B2AE35)
@@ -126,25 +106,27 @@ def _hash(points: Array, seed: int) -> Array:
 def _by_word(high: Array, low: Array) -> Array:
     # One word sorts five times faster than several columns. The row takes the place of the lowest bits.
     with jax.enable_x64(True):
-        bits = max(1, (len(low) - 1).bit_length())
-        word = ((high.astype(jnp.uint64) << 32) | low.astype(jnp.uint64)) >> bits << bits
-        row = jnp.uint64((1 << bits) - 1)
-        return (jnp.sort(word | lax.iota(jnp.uint64, len(low))) & row).astype(jnp.int32)
+        word = ((high.astype(jnp.uint64) << 32) | low.astype(jnp.uint64)) >> _ROW_BITS << _ROW_BITS
+        row = jnp.uint64((1 << _ROW_BITS) - 1)
+        return (jnp.sort(word | lax.iota(jnp.uint64, low.shape[0])) & row).astype(jnp.int32)
 
 
 def _by_columns(high: Array, low: Array) -> Array:
-    return lax.sort((high, low, lax.iota(jnp.int32, len(low))), num_keys=3)[2]
+    return lax.sort((high, low >> _ROW_BITS << _ROW_BITS, lax.iota(jnp.int32, low.shape[0])), num_keys=3)[2]
 
 
 def _first_set_bits(words: Array, number: int) -> tuple[Array, Array]:
     """Positions of the first set bits in each row of words u32[m, w], and the number of all set bits."""
     counts = lax.population_count(words).astype(jnp.int32)
     until = jnp.cumsum(counts, axis=1)
-    slot = jnp.arange(number, dtype=jnp.int32)
-    word = jax.vmap(lambda ascending: search(ascending, slot, side="right"))(until)
-    word = jnp.minimum(word, words.shape[1] - 1)
+    before = until - counts
+    # The last word that begins at or before a slot.
+    begins = jnp.where(counts > 0, jnp.minimum(before, number), number)
+    boxes, order = jnp.arange(words.shape[0])[:, None], lax.broadcasted_iota(jnp.int32, words.shape, 1)
+    word = jnp.zeros((words.shape[0], number + 1), jnp.int32).at[boxes, begins].max(order)[:, :number]
+    word = lax.cummax(word, axis=1)
     bits = jnp.take_along_axis(words, word, axis=1)
-    rank = slot - jnp.take_along_axis(until - counts, word, axis=1)  # Within the word.
+    rank = jnp.arange(number) - jnp.take_along_axis(before, word, axis=1)  # Within the word.
     prefixes = np.uint32((np.uint64(2) << np.arange(_WORD, dtype=np.uint64)) - 1)
     within = lax.population_count(bits[..., None] & prefixes).astype(jnp.int32)
     return word * _WORD + (within <= rank[..., None]).sum(axis=-1, dtype=jnp.int32), until[:, -1]

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float32, Int32
 
 from fcos_lidar_jax.geometry import atan2, safe_norm
 from fcos_lidar_jax.initialization import kernel_init
-from fcos_lidar_jax.refinement.crops import Crops
+from fcos_lidar_jax.refinement.types import Crops
 
 RESIDUAL = 8  # Numbers of a residual, see ``targets.encode_residual``.
 _FINE_M = 0.2  # Distance from the centre up to which asinh resolves positions finely.

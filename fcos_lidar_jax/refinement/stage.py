@@ -17,7 +17,8 @@ from fcos_lidar_jax.losses import cross_entropy
 from fcos_lidar_jax.nms import rotated_nms, suppress
 from fcos_lidar_jax.refinement.crops import crop_points
 from fcos_lidar_jax.refinement.network import SecondLook, box_features, point_features
-from fcos_lidar_jax.refinement.targets import RefinementTargets, match_boxes, move_boxes
+from fcos_lidar_jax.refinement.targets import match_boxes, move_boxes
+from fcos_lidar_jax.refinement.types import RefinementTargets
 from fcos_lidar_jax.types import Batch, Sums
 
 if TYPE_CHECKING:

@@ -1,33 +1,15 @@
 """Targets of the second look: the class and the residual of each box."""
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32
 
 from fcos_lidar_jax.geometry import atan2, safe_norm, wrap_angle
+from fcos_lidar_jax.refinement.types import RefinementTargets
 from fcos_lidar_jax.types import check_rows
 
 _FAR_M = 1e6  # Cost of a pair that is too far apart.
 _MIN_SIZE_M = 0.05
 _MAX_LOG_RATIO = 1.0  # A box grows or shrinks by at most this factor's logarithm.
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class RefinementTargets:
-    """Targets of the boxes of one cloud.
-
-    >>> no_boxes = jnp.zeros((0, 9)), jnp.zeros(0, int), jnp.zeros(0, bool)
-    >>> match_boxes(*no_boxes, *no_boxes, num_classes=10, radius_range_m=(1.0, 2.0)).label.shape
-    (0,)
-    """
-
-    label: Int32[Array, "*b m"]  # Class of the object that the box stands for, the number of classes for none.
-    residual: Float32[Array, "*b m 8"]  # To the object, see :func:`encode_residual`; zero unless near.
-    near: Bool[Array, "*b m"]  # Whether the centre of the object is within its radius.
-    weight: Float32[Array, "*b m"]  # Weight of the classification; zero where the box is invalid.
 
 
 def match_boxes(
@@ -105,8 +87,8 @@ def encode_residual(boxes: Float32[Array, "m c"], targets: Float32[Array, "m k"]
     height, sine and cosine of the turn. The residual of a box to itself is zero but for the cosine.
 
     >>> box = jnp.array([[0, 0, 0, 4, 2, 1, jnp.pi / 2]])
-    >>> encode_residual(box, box.at[0, 1].set(3.0))[0].round(3).tolist()
-    [3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    >>> encode_residual(box, box.at[0, 1].set(3.0))[0].round().tolist()
+    [3.0, -0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
     """
     cos, sin = jnp.cos(boxes[:, 6]), jnp.sin(boxes[:, 6])
     dx, dy, dz = (targets[:, i] - boxes[:, i] for i in range(3))

@@ -67,8 +67,8 @@ def test_a_box_of_the_right_class_stands_before_a_nearer_one():
 
 
 def test_without_boxes_or_objects_everything_is_background():
-    boxes, labels, valid, *truth = scene(0)
-    none = np.zeros((0, 7), np.float32), np.zeros(0, np.int32), np.zeros(0, bool)
+    boxes, labels, valid, *truth = map(jnp.asarray, scene(0))
+    none = jnp.zeros((0, 7)), jnp.zeros(0, jnp.int32), jnp.zeros(0, bool)
     alone = match_boxes(boxes, labels, valid, *none, **OPTIONS)
     assert (alone.label == 3).all()
     assert not alone.near.any()
@@ -80,7 +80,10 @@ def test_eager_jit_and_vmap_agree():
     scenes = [scene(seed) for seed in range(2)]
     both = jax.vmap(functools.partial(match_boxes, **OPTIONS))(*map(np.stack, zip(*scenes, strict=True)))
     for i, one in enumerate(scenes):
-        for found in (match_boxes(*one, **OPTIONS), jax.tree.map(lambda leaf, i=i: leaf[i], both)):
+        for found in (
+            match_boxes(*map(jnp.asarray, one), **OPTIONS),
+            jax.tree.map(lambda leaf, i=i: leaf[i], both),
+        ):
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, match(*one, **OPTIONS))
 
 

@@ -1,0 +1,47 @@
+"""Containers of the second look, registered as pytrees."""
+
+import dataclasses
+
+import jax
+from jaxtyping import Array, Bool, Float32, Int32
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Crops:
+    """Points of enlarged boxes, at most p of each.
+
+    >>> import numpy as np
+    >>> slots = np.full((64, 128), -1)
+    >>> bool(Crops(np.zeros((64, 128, 5)), slots, np.zeros(64, int)).valid.any())
+    False
+    """
+
+    points: Float32[Array, "*b m p 5"]
+    """x, y, z from the centre of the box (metres; x along the heading, y to the left), intensity (0-255), time lag
+    (seconds); zero where invalid."""
+    index: Int32[Array, "*b m p"]  # Row of the point in the cloud, -1 in slots without a point.
+    count: Int32[Array, "*b m"]  # Number of points in the enlarged box, which may exceed p.
+
+    @property
+    def valid(self) -> Bool[Array, "*b m p"]:
+        """False for slots without a point."""
+        return self.index >= 0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RefinementTargets:
+    """Targets of the boxes of one cloud.
+
+    >>> import numpy as np
+    >>> none = RefinementTargets(np.full(64, 10), np.zeros((64, 8)), np.zeros(64, bool), np.ones(64))
+    >>> int((none.label < 10).sum())  # objects that a box stands for
+    0
+    """
+
+    label: Int32[Array, "*b m"]  # Class of the object that the box stands for, the number of classes for none.
+    residual: Float32[Array, "*b m 8"]
+    """Residual to the object, see :func:`~fcos_lidar_jax.refinement.targets.encode_residual`; zero unless near."""
+    near: Bool[Array, "*b m"]  # Whether the centre of the object is within its radius.
+    weight: Float32[Array, "*b m"]  # Weight of the classification; zero where the box is invalid.
