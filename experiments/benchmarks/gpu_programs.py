@@ -93,6 +93,7 @@ class Program:
     remat: bool = False
     card: Card = "h100"
     devices: int = 1
+    frozen: bool = False  # train only the second look
 
 
 PROGRAMS = {
@@ -104,6 +105,7 @@ PROGRAMS = {
     "train-kitti": Program("train", "kitti", batch=2),
     "train-compact": Program("train", "compact", batch=2),
     "train-compact-bfloat16": Program("train", "compact", "bfloat16", batch=4),
+    "train-compact-second-look": Program("train", "compact", batch=2, frozen=True),
     "train-compact-a100": Program("train", "compact", batch=2, card="a100"),
     "train-centerpoint_compact": Program("train", "centerpoint_compact", batch=2),
     "detect-nuscenes": Program("detect", "nuscenes"),
@@ -256,6 +258,8 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
     if type(config) is Config:
         config = change(model__precision=program.precision, model__remat=program.remat)(config)
     config = change(optimizer__batch_size=program.batch)(config)
+    if program.frozen:
+        config = change(refinement__freeze_detector=True)(config)
     sensor = load_sensor(config.sensor)
     b, n, m, c = program.batch, config.max_points, config.max_boxes, sensor.point_columns
     if program.kind == "export":

@@ -8,7 +8,8 @@ FOLDER contains ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes
 another) and ``nuscenes_scene0061/`` (one of a third). The simulated keyframes are of unseen drives, as written by
 ``fcos-lidar synthesize``. Average precision is by centre distance, as in nuScenes' benchmark, over all boxes with
 a point within their class's range, and over boxes at 0-20 m and 20-40 m. Means are over the classes that occur;
-simulated drives also have the official mAP and NDS. Bootstrap intervals resample simulated drives or real
+simulated drives also have the official mAP and NDS. ``overlapping`` is the share of boxes of score 0.3 and more
+that overlap such a box of another class on the ground. Bootstrap intervals resample simulated drives or real
 keyframes; the latter are too narrow, because keyframes of a scene are similar.
 
 Fine-tuning trains on 32 keyframes of scene-0523 from the checkpoint's weights, at a third of the learning rate,
@@ -19,10 +20,12 @@ The same command resumes it. Cost: five minutes on two CPU cores, and one hour f
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments.changes import change
@@ -35,19 +38,23 @@ from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.metrics import evaluate
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
 from fcos_lidar_jax.evaluation.results import LIDAR_META, read_results, result_entries
 from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.inference import TrainedDetector, load_trained
 from fcos_lidar_jax.input_pipeline.database import cut_reading
+from fcos_lidar_jax.iou import rotated_iou_bev
 from fcos_lidar_jax.presets import COMPACT
 from fcos_lidar_jax.progress import Progress
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.simulation.nuscenes_export import write_dataset
 from fcos_lidar_jax.simulation.render import DatasetSpec
+from fcos_lidar_jax.types import Detections
 
 REAL = ("scene-0523, even", "scene-0523, odd", "scene-0103", "scene-0061")
 TEST = range(3, 11)  # Keyframes of scene-0523.
 TRAIN = [i for i in range(40) if i not in TEST]
+_OVERLAP = 0.1  # IoU on the ground from which two boxes stand for one object.
 _REPEATS = 300  # Bootstrap samples of an interval.
 
 
@@ -97,7 +104,7 @@ def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
     found, visited = detections(detector, frames)
     drives = drives_of(frames) if isinstance(frames, NuScenesFrames) else None
     scores = scores_by_range(found, visited, repeats=_REPEATS, groups=drives)
-    record: dict[str, Any] = {"keyframes": len(visited), **scores}
+    record: dict[str, Any] = {"keyframes": len(visited), **scores, "overlapping": overlapping_share(found)}
     if isinstance(frames, NuScenesFrames):
         results = {
             token: result_entries(boxes, token, frames.nuscenes.sensor_to_global(token), detector.classes)
@@ -113,6 +120,30 @@ def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
     return record
 
 
+def overlapping_share(found: Sequence[Detections]) -> float:
+    """Share of the shown boxes that overlap a shown box of another class, with an IoU above 0.1 on the ground.
+
+    >>> boxes, both = np.zeros((3, 9)) + [0, 0, 0, 4, 2, 1, 0, 0, 0], np.ones(3, bool)
+    >>> boxes[2, 0] = 9.0
+    >>> share = overlapping_share([Detections(boxes, np.ones(3), np.array([0, 1, 1]), both, np.zeros(0))])
+    >>> share  # the first two of three
+    0.6667
+    """
+    shown, overlapping = 0, 0
+    for d in found:
+        kept = np.asarray(d.valid) & (np.asarray(d.scores) >= SHOWN_SCORE)
+        pair = kept[:, None] & kept & (np.asarray(d.labels)[:, None] != np.asarray(d.labels))
+        iou = np.asarray(_overlaps(jnp.asarray(d.boxes, jnp.float32)))
+        shown += int(kept.sum())
+        overlapping += int((pair & (iou > _OVERLAP)).any(axis=1).sum())
+    return round(overlapping / max(shown, 1), 4)
+
+
+@jax.jit
+def _overlaps(boxes: jax.Array) -> jax.Array:
+    return rotated_iou_bev(boxes[:, None], boxes[None])
+
+
 def fine_tuning(args: Args) -> Iterator[dict[str, Any]]:
     """Score unseen keyframes of scene-0523 after training on the others, with and without the checkpoint.
 
@@ -123,7 +154,8 @@ def fine_tuning(args: Args) -> Iterator[dict[str, Any]]:
     test, train = (SelectedFrames(street, tuple(indices)) for indices in (TEST, TRAIN))
     record: dict[str, Any] = {"steps": args.fine_tuning_steps, "keyframes": len(train)}
     trained_before = load_trained(args.checkpoint).config
-    shared = {"model": trained_before.model, "augment": trained_before.augment}
+    look = trained_before.refinement and dataclasses.replace(trained_before.refinement, freeze_detector=False)
+    shared = {"model": trained_before.model, "augment": trained_before.augment, "refinement": look}
     scratch = change(**shared, copy_paste=None, class_balanced=False)(COMPACT)
     fine_tuned = change(optimizer__peak_learning_rate=1e-3)(scratch)
     # The hash distinguishes weights of the same name.
