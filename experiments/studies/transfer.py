@@ -3,6 +3,7 @@
     python -m experiments.studies.transfer --data FOLDER
     python -m experiments.studies.transfer --checkpoint RUN --only simulated
     python -m experiments.studies.transfer --data FOLDER --only fine_tuning
+    python -m experiments.studies.transfer --data FOLDER --only simulated --no-second-look --out without.json
 
 FOLDER contains ``nuscenes_scene0523/`` (40 keyframes of one street), ``nuscenes_scene0103/`` (two keyframes of
 another) and ``nuscenes_scene0061/`` (one of a third). The simulated keyframes are of unseen drives, as written by
@@ -35,6 +36,7 @@ from experiments.script import Options, real_data, run_script, save
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.checkpoints.retention import find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import read_description
+from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.data.frame import FrameSet, SelectedFrames
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
 from fcos_lidar_jax.evaluation.metrics import evaluate
@@ -70,6 +72,7 @@ class Args(Options):
     scenes: int = 50  # Simulated drives.
     keyframes: int = 4  # Keyframes per drive.
     seed: int = 77  # Seed of the drives.
+    second_look: bool = True  # Use the detector's second look, if it has one.
     fine_tuning_steps: int = 1000  # Updates, each on one real keyframe.
     work: Path = Path("outputs/transfer")  # Folder of simulated drives and fine-tuning runs.
 
@@ -99,12 +102,21 @@ def drives_of(frames: NuScenesFrames) -> list[int]:
     return np.unique(scenes, return_inverse=True)[1].tolist()
 
 
-def measured(detector: TrainedDetector, frames: FrameSet) -> dict[str, Any]:
-    """Score a detector on frames by range, and on simulated drives also with the official metrics."""
+def measured(
+    detector: TrainedDetector, frames: FrameSet, looked: RefinementConfig | None = None
+) -> dict[str, Any]:
+    """Score a detector on frames by range, and on simulated drives also with the official metrics.
+
+    For a detector without its second look ``looked``, also the share of boxes that this would drop.
+    """
     found, visited = detections(detector, frames)
     drives = drives_of(frames) if isinstance(frames, NuScenesFrames) else None
     scores = scores_by_range(found, visited, repeats=_REPEATS, groups=drives)
     record: dict[str, Any] = {"keyframes": len(visited), **scores, "overlapping": overlapping_share(found)}
+    if looked is not None and detector.config.refinement is None:
+        numbers = np.array([d.valid.sum() for d in found])
+        beyond = np.maximum(numbers - looked.num_boxes, 0).sum() / max(numbers.sum(), 1)
+        record["beyond num_boxes"] = round(float(beyond), 4)
     if isinstance(frames, NuScenesFrames):
         results = {
             token: result_entries(boxes, token, frames.nuscenes.sensor_to_global(token), detector.classes)
@@ -175,6 +187,8 @@ def main(args: Args) -> None:
     if unknown := {*args.only} - {"simulated", "fine_tuning", *REAL}:
         raise ValueError(f"--only: got {min(unknown)!r}, expected simulated, fine_tuning, or one of {REAL}")
     detector, folder = load_trained(args.checkpoint), find_checkpoint(args.checkpoint)
+    looked = detector.config.refinement
+    detector = detector if args.second_look else detector.without_second_look()
     out = args.out or Path("outputs/transfer.json")
     described = read_description(folder)
     of = {"name": str(args.checkpoint), "step": described["step"], "hash": described["hash"]}
@@ -182,7 +196,7 @@ def main(args: Args) -> None:
     if record.get("checkpoint") != of:
         record = {"checkpoint": of}
     for name, frames in parts(args, detector):
-        record[name] = measured(detector, frames)
+        record[name] = measured(detector, frames, looked)
         if name == "simulated":
             record["drives"] = {n: getattr(args, n) for n in ("scenes", "keyframes", "seed")}
         save(record, out, f"{name}: mAP {record[name]['all']['mAP']} on {len(frames)} keyframes")

@@ -26,6 +26,7 @@ from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.progress import tell
+from fcos_lidar_jax.refinement import without_second_look
 from fcos_lidar_jax.sensors import Sensor, load_sensor
 from fcos_lidar_jax.types import Detections
 
@@ -191,6 +192,16 @@ class TrainedDetector(CloudDetector):
         inference = dataclasses.replace(self.config.inference, **fields)
         config = dataclasses.replace(self.config, inference=inference)
         return dataclasses.replace(self, model=build_detector(config, self.sensor))
+
+    def without_second_look(self) -> "TrainedDetector":
+        """Remove the second look: the result has the boxes and scores of the detector itself.
+
+        >>> from fcos_lidar_jax.inference import load_trained
+        >>> load_trained("hdl32e").without_second_look().config.refinement is None
+        True
+        """
+        model = build_detector(dataclasses.replace(self.config, refinement=None), self.sensor)
+        return TrainedDetector(model, without_second_look(self.variables))
 
     def program(self, mesh: Mesh, batch_size: int = 1) -> Callable[..., Any]:
         if mesh not in self._placed:

@@ -97,14 +97,6 @@ def best_boxes(boxes: Boxes, number: int) -> Boxes:
     return cut[0], cut[1], cut[2], cut[3]
 
 
-def look_at(
-    network: SecondLook, config: Config, variables: Any, points: Array, valid: Array, boxes: Boxes
-) -> tuple[Array, Array]:
-    """Class logits [m, k + 1] and residuals [m, 8] of the boxes of one cloud."""
-    inputs = look_inputs(config, points, valid, boxes)
-    return network.apply({"params": variables["params"][SECOND_LOOK]}, inputs)  # type: ignore[return-value]
-
-
 def look_inputs(config: Config, points: Array, valid: Array, boxes: Boxes) -> tuple[Array, Array, Array]:
     """Features of the points, their mask, and features of the boxes of one cloud."""
     refinement = _config_of(config)
@@ -130,7 +122,8 @@ def refine_boxes(
     refinement = _config_of(config)
     place, scores, labels, used = best_boxes((boxes[0], boxes[1], boxes[2], boxes[3]), refinement.num_boxes)
     with jax.named_scope("refine"):
-        logits, residual = look_at(network, config, variables, points, valid, (place, scores, labels, used))
+        looked = look_inputs(config, points, valid, (place, scores, labels, used))
+        logits, residual = network.apply({"params": variables["params"][SECOND_LOOK]}, looked)  # type: ignore[misc]
         probability = jnp.take_along_axis(jax.nn.softmax(logits), labels[:, None], axis=1)[:, 0]
         scores = jnp.where(used, probability, 0.0)
         if refinement.move_boxes:
@@ -220,12 +213,7 @@ def _config_of(config: Config) -> RefinementConfig:
     return config.refinement
 
 
-def _shapes(config: Config) -> tuple[jax.ShapeDtypeStruct, ...]:
-    """Shapes of the network's inputs for one box of one point."""
-    points = jax.eval_shape(lambda: look_inputs(config, *_nothing()))
-    return points
-
-
-def _nothing() -> tuple[Array, Array, Boxes]:
-    none = jnp.zeros((1, 9)), jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.zeros(1, bool)
-    return jnp.zeros((1, 5)), jnp.zeros(1, bool), none
+def _shapes(config: Config) -> Any:
+    """Shapes of the network's inputs for one box of a cloud of one point."""
+    boxes = jnp.zeros((1, 9)), jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.zeros(1, bool)
+    return jax.eval_shape(lambda: look_inputs(config, jnp.zeros((1, 5)), jnp.zeros(1, bool), boxes))

@@ -6,11 +6,11 @@ from commands import run_python
 
 PREDICTIONS = """
 import jax, numpy as np
-from tiny_run import CONFIG, SENSOR, FRAMES, weights
+from tiny_run import REFINED as CONFIG, SENSOR, FRAMES, weights
 from fcos_lidar_jax.inference import TrainedDetector
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.inference.prediction import predict
-detector = TrainedDetector(build_detector(CONFIG, SENSOR), weights())
+detector = TrainedDetector(build_detector(CONFIG, SENSOR), weights(CONFIG))
 runs = []
 for n in (1, 2, 8):
     predictions = predict(detector, FRAMES, indices=range(11), devices=jax.devices()[:n])
@@ -24,7 +24,7 @@ for run in runs[1:]:
 GRADIENTS = """
 import dataclasses, jax, numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
-from tiny_run import CONFIG, SENSOR, FRAMES, weights
+from tiny_run import REFINED as CONFIG, SENSOR, FRAMES, weights
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.models import build_detector, convolution
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
@@ -37,7 +37,7 @@ for i, kept in ((0, 0), (2, 1)):  # one without boxes, one with a single one, an
     frames[i] = dataclasses.replace(frames[i], **annotated)
 frames[1] = dataclasses.replace(frames[1], points=frames[1].points[:0])
 batch = make_batch(frames, max_points=CONFIG.max_points, max_boxes=CONFIG.max_boxes)
-variables = jax.tree.map(np.float64, weights())
+variables = jax.tree.map(np.float64, weights(CONFIG))
 runs = []
 for n in (1, 8):
     mesh = make_mesh(jax.devices()[:n])
@@ -47,7 +47,9 @@ for n in (1, 8):
     runs.append(jax.device_get(gradient(placed["params"], placed["batch_stats"], shard_batch(batch, mesh))))
 one, eight = runs
 assert int(one[2]["positives"]) > 20, int(one[2]["positives"])
-for name in ("positives", "unique_positives", "positives_per_level", "candidates"):
+assert int(one[2]["refined_boxes"]) > 20
+counts = "positives", "unique_positives", "positives_per_level", "candidates", "refined_boxes", "refined_near"
+for name in counts:
     np.testing.assert_array_equal(one[2][name], eight[2][name])
 for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(eight), strict=True):
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * max(np.abs(a).max(), 1e-12))
@@ -56,7 +58,7 @@ for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(eight), strict=True):
 MAPS = """
 import dataclasses, jax, numpy as np, optax, sys, tiny_peer
 from jax.sharding import PartitionSpec
-from tiny_run import CONFIG, SENSOR, FRAMES, untrained
+from tiny_run import REFINED as CONFIG, SENSOR, FRAMES, untrained
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.devices.mesh import make_mesh, pmap_step

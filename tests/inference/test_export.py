@@ -10,7 +10,8 @@ import jax
 import numpy as np
 import pytest
 from commands import assert_one_line_error, command, run_python
-from tiny_run import TINY_CONFIG, bits, untrained
+from tiny_run import TINY_REFINED as TINY_CONFIG
+from tiny_run import bits, untrained
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint

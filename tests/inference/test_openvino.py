@@ -10,7 +10,8 @@ import jax
 import numpy as np
 import pytest
 from commands import run_python
-from tiny_run import TINY_CONFIG, bits, untrained
+from tiny_run import TINY_REFINED as TINY_CONFIG
+from tiny_run import bits, untrained
 
 from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.data.cloud_policy import make_cloud

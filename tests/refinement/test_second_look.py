@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny_peer
 import tiny_run
+from tiny_run import LOOK as SMALL
 from tiny_run import SENSOR, bits, host_batch, train_tiny, untrained
 
 from fcos_lidar_jax.checkpoints import load_checkpoint
@@ -20,7 +21,6 @@ from fcos_lidar_jax.refinement.stage import best_boxes, over_samples, refinement
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 from fcos_lidar_jax.training.step import make_gradient
 
-SMALL = RefinementConfig(num_boxes=8, num_points=16, point_channels=(8, 8), box_channels=(8,))
 FROZEN = dataclasses.replace(SMALL, freeze_detector=True)
 CONFIGS = {"FCOS-LiDAR": tiny_run.CONFIG, "CenterPoint": tiny_peer.CONFIG}
 BOTH = pytest.mark.parametrize("name", CONFIGS)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fcos_lidar_jax.config import Config, InferenceConfig, StemConfig
+from fcos_lidar_jax.config import Config, InferenceConfig, RefinementConfig, StemConfig
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Detector, build_detector
 from fcos_lidar_jax.presets import QUICKSTART
@@ -38,6 +38,9 @@ CONFIG = dataclasses.replace(
     inference=InferenceConfig(max_detections=20, candidates_per_level=20),
     optimizer=dataclasses.replace(QUICKSTART.optimizer, batch_size=2, ema_decay=0.9),
 )
+LOOK = RefinementConfig(num_boxes=8, num_points=16, point_channels=(8, 8), box_channels=(8,))
+REFINED = dataclasses.replace(CONFIG, refinement=LOOK)
+"""The run with a second look."""
 NETWORK_OPTIONS = """
     --no-class-balanced --inference.max-detections 20 --inference.candidates-per-level 20
     --optimizer.batch-size 2 --optimizer.ema-decay 0.9 --projection.num-rounds 1 --model.row-upscale 1
@@ -50,6 +53,7 @@ FRAMES = SimulatedFrames(SENSOR, 12)
 TESTS = SimulatedFrames(SENSOR, 2, 1000)
 TINY_CONFIG = dataclasses.replace(CONFIG, max_points=4096)
 """The configuration for complete clouds of the sensor TINY."""
+TINY_REFINED = dataclasses.replace(TINY_CONFIG, refinement=LOOK)
 
 
 def images_of(features: jax.Array) -> RangeImage:
@@ -59,9 +63,9 @@ def images_of(features: jax.Array) -> RangeImage:
     return RangeImage(jnp.asarray(features), index, jnp.zeros(batch, jnp.int32))
 
 
-def weights():
+def weights(config: Config = CONFIG):
     """Random weights of the run's network, made without compiling."""
-    return _weights(build_detector(CONFIG, SENSOR))
+    return _weights(build_detector(config, SENSOR))
 
 
 @functools.cache
