@@ -206,7 +206,8 @@ class InferenceConfig:
     candidates_per_level: int = 1000  # Our choice: (location, class) pairs of each level that enter NMS.
     nms_overlap: Literal["bev", "3d"] = "bev"  # Our choice: rotated IoU in the ground plane, or in 3D.
     nms_across_classes: bool = False
-    """Not in the paper: NMS also removes boxes that overlap a better box of another class."""
+    """Not in the paper: NMS also removes boxes that overlap a better box of another class; with a second look, only
+    the NMS after it."""
     iou_exponent: float = 1.0
     """Exponent of the predicted IoU, which multiplies the class probability: 1 in the paper; other values as in
     CIA-SSD (Zheng et al., AAAI 2021); 0 ignores the predicted IoU."""
@@ -241,8 +242,6 @@ class RefinementConfig:
     point_channels: tuple[int, ...] = (32, 64, 128)  # Channels of the layers on each point.
     box_channels: tuple[int, ...] = (128, 128)  # Channels of the layers on each box.
     move_boxes: bool = True  # Move the boxes in detection; without, only their scores change.
-    nms_across_classes: bool = False
-    """NMS after the second look also removes boxes that overlap a better box of another class: one per object."""
     radius_range_m: tuple[float, float] = (1.0, 2.0)
     """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can
     stand for it."""

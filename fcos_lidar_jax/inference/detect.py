@@ -11,6 +11,7 @@ from jaxtyping import Array
 from fcos_lidar_jax.augment import flip_x, flip_y
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.nms import suppress
+from fcos_lidar_jax.refinement import proposal_inference
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
@@ -43,12 +44,14 @@ def make_stages(detector: Detector) -> Stages:
     (32, 128, 1)
     """
 
+    inference = proposal_inference(detector.config)
+
     def network(variables: Any, sample: Any) -> Any:
         outputs, _ = detector.apply(variables, jax.tree.map(lambda leaf: leaf[None], sample))
         return jax.tree.map(lambda leaf: leaf[0], outputs)
 
     def postprocess(outputs: Any, sample: Any) -> tuple[Array, Array, Array, Array]:
-        return suppress(*detector.candidates(outputs, sample), detector.config.inference)
+        return suppress(*detector.candidates(outputs, sample), inference)
 
     def unchanged(variables: Any, points: Any, valid: Any, *boxes: Array) -> tuple[Array, ...]:
         return boxes
@@ -83,7 +86,7 @@ def make_detect(detector: Detector) -> Detect:
             boxes, *rest = stages.candidates(stages.network(variables, sample), sample)
             candidates.append((_mirror(view, sensor, no_points, boxes)[1], *rest))
         boxes, scores, labels, used = (jnp.concatenate(parts) for parts in zip(*candidates, strict=True))
-        best = suppress(boxes, scores, labels, used, config.inference)
+        best = suppress(boxes, scores, labels, used, proposal_inference(config))
         best = stages.refine(variables, jnp.asarray(points), jnp.asarray(valid), *best)
         return Detections(*best, inputs[0].num_dropped)
 

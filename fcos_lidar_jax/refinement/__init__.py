@@ -5,6 +5,12 @@ small PointNet sees the points of a box in the box's own frame, scores the box a
 (Li et al., CVPR 2021). It works on the boxes of any detector. ``Config.refinement`` switches it on.
 """
 
-from fcos_lidar_jax.refinement.stage import SECOND_LOOK, add_refinement, trainable, without_second_look
+from fcos_lidar_jax.refinement.stage import (
+    SECOND_LOOK,
+    add_refinement,
+    proposal_inference,
+    trainable,
+    without_second_look,
+)
 
-__all__ = ["SECOND_LOOK", "add_refinement", "trainable", "without_second_look"]
+__all__ = ["SECOND_LOOK", "add_refinement", "proposal_inference", "trainable", "without_second_look"]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from fcos_lidar_jax.config import Config, RefinementConfig
+from fcos_lidar_jax.config import Config, InferenceConfig, RefinementConfig
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.initialization import init_variables
 from fcos_lidar_jax.losses import cross_entropy
@@ -85,6 +85,17 @@ def trainable(params: dict[str, Any], config: Config) -> dict[str, Any]:
     return {SECOND_LOOK: params[SECOND_LOOK]} if frozen else params
 
 
+def proposal_inference(config: Config) -> InferenceConfig:
+    """Post-processing of the boxes before a second look, which needs the boxes of all classes.
+
+    >>> proposal_inference(Config()) == Config().inference
+    True
+    """
+    if config.refinement is None:
+        return config.inference
+    return dataclasses.replace(config.inference, nms_across_classes=False)
+
+
 def best_boxes(boxes: Boxes, number: int) -> Boxes:
     """The best of the boxes, padded where there are fewer.
 
@@ -132,7 +143,7 @@ def refine_boxes(
             place,
             scores,
             used,
-            labels=None if refinement.nms_across_classes or config.inference.nms_across_classes else labels,
+            labels=None if config.inference.nms_across_classes else labels,
             overlap=config.inference.nms_overlap,
             iou_threshold=config.inference.iou_threshold,
             max_outputs=len(place),
@@ -160,7 +171,7 @@ def refinement_sums(
     near an object.
     """
     config, refinement = detector.config, _config_of(detector.config)
-    inference = dataclasses.replace(config.inference, max_detections=refinement.num_boxes)
+    inference = dataclasses.replace(proposal_inference(config), max_detections=refinement.num_boxes)
 
     def prepared(sample: Any) -> tuple[tuple[Array, Array, Array], RefinementTargets]:
         outputs, input_, one = sample
