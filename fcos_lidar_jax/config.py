@@ -206,8 +206,8 @@ class InferenceConfig:
     candidates_per_level: int = 1000  # Our choice: (location, class) pairs of each level that enter NMS.
     nms_overlap: Literal["bev", "3d"] = "bev"  # Our choice: rotated IoU in the ground plane, or in 3D.
     nms_across_classes: bool = False
-    """Not in the paper: NMS also removes boxes that overlap a better box of another class. With a second look, only
-    the NMS after it does."""
+    """Not in the paper: NMS also removes boxes that overlap a better box of another class. With a second look,
+    only the NMS after it does."""
     iou_exponent: float = 1.0
     """Exponent of the predicted IoU, which multiplies the class probability: 1 in the paper; other values as in
     CIA-SSD (Zheng et al., AAAI 2021); 0 ignores the predicted IoU."""
