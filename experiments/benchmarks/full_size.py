@@ -2,6 +2,7 @@
 
     python -m experiments.benchmarks.full_size --data FOLDER  # on the real keyframe of scene-0061
     python -m experiments.benchmarks.full_size  # on a simulated frame
+    python -m experiments.benchmarks.full_size --preset compact --weights hdl32e  # with and without second look
     python -m experiments.benchmarks.full_size --memory-only --out experiments/results/training_memory.json
 
 ``latency.py`` times the detection. Cost: about three minutes on two CPU cores and 10 GB. Expected: 10.66 M
@@ -21,10 +22,12 @@ from experiments.benchmarks.training_steps import training_steps
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.keyframe import read_keyframe
+from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.database import cut_reading
 from fcos_lidar_jax.models import build_detector, count_parameters
 from fcos_lidar_jax.presets import PRESETS
+from fcos_lidar_jax.refinement import without_second_look
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
@@ -36,7 +39,8 @@ from fcos_lidar_jax.types import Batch
 class Args(Options):
     """Options of the measurement."""
 
-    preset: Literal["nuscenes", "nuscenes_single", "quickstart"] = "nuscenes"  # Configuration preset.
+    preset: Literal["nuscenes", "nuscenes_single", "compact", "quickstart"] = "nuscenes"  # Configuration preset.
+    weights: Path | None = None  # Trained weights, whose boxes a second look sees; default: random weights.
     data: Path | None = None
     """Folder with nuscenes_scene0061/; default: the environment's FCOS_LIDAR_REAL_DATA, else a simulated frame."""
     repeats: int = 5  # Timed steps, for the median.
@@ -84,7 +88,13 @@ def measure(args: Args) -> dict[str, Any]:
     reading = cut_reading(1)
     frame = read_keyframe(folder, sensor, reading=reading) if folder else make_frame(0, sensor, reading=reading)
     shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
-    times = interleaved({"train step": training_steps(config, sensor, [frame])}, args.repeats)
+    variables = None if args.weights is None else load_trained(args.weights).variables
+    calls = {"train step": training_steps(config, sensor, [frame], variables)}
+    if config.refinement is not None:
+        alone = dataclasses.replace(config, refinement=None)
+        own = None if variables is None else without_second_look(variables)
+        calls["train step without second look"] = training_steps(alone, sensor, [frame], own)
+    times = interleaved(calls, args.repeats)
     return {
         "preset": config.name,
         "frame": "scene-0061, real" if folder else "simulated",
