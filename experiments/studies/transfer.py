@@ -73,6 +73,7 @@ class Args(Options):
     keyframes: int = 4  # Keyframes per drive.
     seed: int = 77  # Seed of the drives.
     second_look: bool = True  # Use the detector's second look, if it has one.
+    across_classes: bool = False  # NMS across classes: one box per object.
     fine_tuning_steps: int = 1000  # Updates, each on one real keyframe.
     work: Path = Path("outputs/transfer")  # Folder of simulated drives and fine-tuning runs.
 
@@ -189,6 +190,8 @@ def main(args: Args) -> None:
     detector, folder = load_trained(args.checkpoint), find_checkpoint(args.checkpoint)
     looked = detector.config.refinement
     detector = detector if args.second_look else detector.without_second_look()
+    if args.across_classes:
+        detector = detector.with_inference(nms_across_classes=True)
     out = args.out or Path("outputs/transfer.json")
     described = read_description(folder)
     of = {"name": str(args.checkpoint), "step": described["step"], "hash": described["hash"]}

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from fcos_lidar_jax.augment import flip_x, flip_y
 from fcos_lidar_jax.models import Detector
 from fcos_lidar_jax.nms import suppress
-from fcos_lidar_jax.refinement import proposal_inference
+from fcos_lidar_jax.refinement import Boxes, proposal_inference
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import Detections
 
@@ -29,8 +29,8 @@ class Stages(NamedTuple):
     prepare: Callable[..., Any]  # ``(points f32[n, c], valid bool[n]) -> input``
     network: Callable[..., Any]  # ``(variables, input) -> outputs``
     candidates: Callable[..., tuple[Array, ...]]  # ``(outputs, input) -> boxes, scores, labels, valid``
-    postprocess: Callable[..., tuple[Array, ...]]  # Candidates after NMS, see ``nms.suppress``.
-    refine: Callable[..., tuple[Array, ...]]
+    postprocess: Callable[..., Boxes]  # Candidates after NMS, see ``nms.suppress``.
+    refine: Callable[..., Boxes]
     """``(variables, points, valid, *boxes after NMS) -> boxes``; the same boxes without a second look."""
 
 
@@ -53,8 +53,9 @@ def make_stages(detector: Detector) -> Stages:
     def postprocess(outputs: Any, sample: Any) -> tuple[Array, Array, Array, Array]:
         return suppress(*detector.candidates(outputs, sample), inference)
 
-    def unchanged(variables: Any, points: Any, valid: Any, *boxes: Array) -> tuple[Array, ...]:
-        return boxes
+    def unchanged(variables: Any, points: Any, valid: Any, *boxes: Array) -> Boxes:
+        best, scores, labels, used = boxes
+        return best, scores, labels, used
 
     return Stages(detector.prepare, network, detector.candidates, postprocess, detector.refine or unchanged)
 

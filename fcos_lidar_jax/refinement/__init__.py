@@ -7,10 +7,11 @@ small PointNet sees the points of a box in the box's own frame, scores the box a
 
 from fcos_lidar_jax.refinement.stage import (
     SECOND_LOOK,
+    Boxes,
     add_refinement,
     proposal_inference,
     trainable,
     without_second_look,
 )
 
-__all__ = ["SECOND_LOOK", "add_refinement", "proposal_inference", "trainable", "without_second_look"]
+__all__ = ["SECOND_LOOK", "Boxes", "add_refinement", "proposal_inference", "trainable", "without_second_look"]

@@ -52,7 +52,8 @@ def add_refinement(detector: "Detector") -> "Detector":
         if refinement.freeze_detector:
             return of_boxes
         of_detector = detector.sums(without_second_look(variables), outputs, inputs, batch)
-        return Sums(*(a | b for a, b in zip(of_detector, of_boxes, strict=True)))
+        (losses, counts, means), own = of_boxes, of_detector
+        return Sums(own.losses | losses, own.counts | counts, own.means | means)
 
     refine = functools.partial(refine_boxes, network, config)
     return detector._replace(init=init, apply=apply, sums=sums, refine=refine)
@@ -117,6 +118,12 @@ def look_inputs(config: Config, points: Array, valid: Array, boxes: Boxes) -> tu
     return point_features(crops, place), crops.valid, of_boxes
 
 
+def look(network: SecondLook, variables: Any, inputs: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Class logits and residuals of boxes, from the results of :func:`look_inputs`."""
+    outputs: Any = network.apply({"params": variables["params"][SECOND_LOOK]}, inputs)
+    return outputs
+
+
 def refine_boxes(
     network: SecondLook, config: Config, variables: Any, points: Array, valid: Array, *boxes: Array
 ) -> Boxes:
@@ -134,7 +141,7 @@ def refine_boxes(
     place, scores, labels, used = best_boxes((boxes[0], boxes[1], boxes[2], boxes[3]), refinement.num_boxes)
     with jax.named_scope("refine"):
         looked = look_inputs(config, points, valid, (place, scores, labels, used))
-        logits, residual = network.apply({"params": variables["params"][SECOND_LOOK]}, looked)  # type: ignore[misc]
+        logits, residual = look(network, variables, looked)
         probability = jnp.take_along_axis(jax.nn.softmax(logits), labels[:, None], axis=1)[:, 0]
         scores = jnp.where(used, probability, 0.0)
         if refinement.move_boxes:
@@ -192,7 +199,7 @@ def refinement_sums(
     with jax.named_scope("refine"):
         samples = lax.stop_gradient((outputs, inputs, batch))
         looked, targets = over_samples(prepared, samples)
-        logits, residual = network.apply({"params": variables["params"][SECOND_LOOK]}, looked)  # type: ignore[misc]
+        logits, residual = look(network, variables, looked)
         entropy = jax.vmap(cross_entropy)(logits, targets.label)
         distance = jnp.abs(residual - targets.residual).sum(axis=-1)
         used = targets.weight > 0
