@@ -48,7 +48,8 @@ class OpenVinoDetector(TrainedDetector):
         def one(points: np.ndarray, valid: np.ndarray) -> Detections:
             image = prepare(points, valid)
             best = postprocess(self.network(image), image)
-            return Detections(*refine(self.variables, points, valid, *best), image.num_dropped)
+            boxes, scores, labels, used = refine(self.variables, points, valid, *best)
+            return Detections(boxes, scores, labels, used, image.num_dropped)
 
         def several(points: Any, valid: Any) -> Detections:
             detections = [one(*cloud) for cloud in zip(np.asarray(points), np.asarray(valid), strict=True)]
