@@ -1,5 +1,6 @@
 """``fcos-lidar train`` on a small simulated data set, and one line per mistake."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -20,6 +21,7 @@ from fcos_lidar_jax import cli
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli import data
+from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.data.frame import SelectedFrames
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.sensors import sensor_to_json
@@ -52,12 +54,14 @@ def train(root: Path, out: Path, *more: str) -> list[str]:
 
 def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys):
     start, out = root.parent / "start", tmp_path / "run"
-    command(*train(root, out, "--weights", str(start), "--samples", "1:2", "--copy-paste.min-points", "3"))
+    options = ["--samples", "1:2", "--copy-paste.min-points", "3", "--second-look", "on"]
+    command(*train(root, out, "--weights", str(start), *options))
     record = json.loads(capsys.readouterr().out)
     last = str(out / "checkpoints" / "00000004")
     assert record == {"run": str(out), "steps": STEPS, "checkpoint": last, "best": last}
     spec = json.loads((out / "run.json").read_text())
     assert (spec["weights"], spec["frames"], spec["steps"]) == (str(start), 1, STEPS)
+    assert spec["config"]["refinement"] == json.loads(json.dumps(dataclasses.asdict(RefinementConfig())))
     lines = read_metrics(out)
     assert [line["step"] for line in lines if "test/mAP" in line] == [4]
     # Objects come only from the selected keyframes.
