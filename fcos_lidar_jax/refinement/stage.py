@@ -87,14 +87,17 @@ def trainable(params: dict[str, Any], config: Config) -> dict[str, Any]:
 
 
 def proposal_inference(config: Config) -> InferenceConfig:
-    """Post-processing of the boxes before a second look, which needs the boxes of all classes.
+    """Post-processing before the second look, which looks at the best boxes of all classes.
+
+    The numbers and classes of ``config.inference`` apply to the boxes after it.
 
     >>> proposal_inference(Config()) == Config().inference
     True
     """
     if config.refinement is None:
         return config.inference
-    return dataclasses.replace(config.inference, nms_across_classes=False)
+    number = config.refinement.num_boxes
+    return dataclasses.replace(config.inference, nms_across_classes=False, max_detections=number)
 
 
 def best_boxes(boxes: Boxes, number: int) -> Boxes:
@@ -135,7 +138,7 @@ def refine_boxes(
         boxes: boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d] after NMS, best first.
 
     Returns:
-        d boxes, scores, labels and their mask, best first; zero where invalid.
+        ``inference.max_detections`` boxes, scores, labels and their mask, best first; zero where invalid.
     """
     refinement = _config_of(config)
     place, scores, labels, used = best_boxes((boxes[0], boxes[1], boxes[2], boxes[3]), refinement.num_boxes)
@@ -161,7 +164,7 @@ def refine_boxes(
             jnp.where(used, labels[index], 0),
             used,
         )
-        return best_boxes(best, len(boxes[0]))
+        return best_boxes(best, config.inference.max_detections)
 
 
 def refinement_sums(
@@ -178,7 +181,7 @@ def refinement_sums(
     near an object.
     """
     config, refinement = detector.config, _config_of(detector.config)
-    inference = dataclasses.replace(proposal_inference(config), max_detections=refinement.num_boxes)
+    inference = proposal_inference(config)
 
     def prepared(sample: Any) -> tuple[tuple[Array, Array, Array], RefinementTargets]:
         outputs, input_, one = sample
