@@ -133,6 +133,11 @@ def suppress(
     """Apply rotated NMS, per class unless ``config.nms_across_classes``, to the candidates of one cloud.
 
     Returns boxes f32[d, 9], scores f32[d], labels i32[d], valid bool[d], best first; zero where invalid.
+
+    >>> boxes = jnp.array([[0, 0, 0, 4, 2, 1, 0, 0, 0], [0.5, 0, 0, 4, 2, 1, 0, 0, 0]])
+    >>> scores, labels, valid = jnp.array([0.5, 0.75]), jnp.zeros(2, jnp.int32), jnp.ones(2, bool)
+    >>> suppress(boxes, scores, labels, valid, InferenceConfig(max_detections=3))[1].tolist()
+    [0.75, 0.0, 0.0]
     """
     options: dict[str, Any] = {"overlap": config.nms_overlap}
     with jax.named_scope("nms"):

@@ -34,6 +34,13 @@ def add_refinement(detector: "Detector") -> "Detector":
 
     Its parameters are ``params["refinement"]``. With ``config.refinement.freeze_detector``, the detector is
     applied as in detection, and only the second look has losses.
+
+    >>> from fcos_lidar_jax.models import build_detector  # which calls this function
+    >>> from fcos_lidar_jax.presets import COMPACT
+    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
+    >>> variables = jax.eval_shape(build_detector(COMPACT, NUSCENES_HDL32E).init, jax.random.key(0))
+    >>> sorted(variables["params"]["refinement"])
+    ['box0', 'box1', 'norm0', 'norm1', 'norm2', 'out', 'point0', 'point1', 'point2']
     """
     config, refinement = detector.config, _config_of(detector.config)
     network = make_network(config)
