@@ -57,7 +57,7 @@ def test_boxes_are_the_detectors_best_with_the_probability_of_their_class(name):
     assert after.boxes.shape == before.boxes.shape
 
 
-def test_moved_boxes_do_not_overlap_and_are_sorted():
+def test_moved_boxes_are_sorted_by_different_scores():
     after = found("FCOS-LiDAR", SMALL)
     number = int(after.valid.sum())
     assert 0 < number <= 8
