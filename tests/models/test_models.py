@@ -319,6 +319,11 @@ def parameters_by_hand(config):
     tower = 9 * f * h + 2 * h + (model.head_convs - 1) * (9 * h + 2) * h
     if model.local_geometry:
         total += (85 + 2) * 32 + (32 + 2) * f + 6 * 2 * f * h
+    if config.refinement:
+        points, boxes = config.refinement.point_channels, config.refinement.box_channels
+        total += sum((i + 3) * w for i, w in zip((14, *points), points, strict=False))
+        total += sum((i + 1) * w for i, w in zip((points[-1] + k + 8, *boxes), boxes, strict=False))
+        total += (boxes[-1] + 1) * (k + 1 + 8)
     return total + 6 * (2 * tower + (9 * h + 1) * (k + 1 + (3 + 3 + 2 + 2 + 1) * k))
 
 
