@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
+from jaxtyping import Array
 
 from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
@@ -69,9 +70,10 @@ def _copied(params: Any) -> Any:
 def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, Any, Metrics]]:
     """Make the gradient of the loss of a batch, in ``config.optimizer.accumulate`` micro-batches.
 
-    Gradients of sums are added up and divided once by the count over all micro-batches, so the number of
-    micro-batches does not change any weight; only batch norm sees smaller batches. Each count, such as positives
-    and candidates, has a gradient of its own.
+    Sums of losses are divided by the counts over all micro-batches and devices, so the number of micro-batches
+    does not change any weight; only batch norm sees smaller batches. With several micro-batches, the counts are
+    known only after the last one, so each count, such as positives and boxes of the second look, has a gradient of
+    its own.
 
     Returns:
         pure ``(params, batch_stats, batch) -> (gradient, batch_stats, metrics)``. The gradient has the trainable
@@ -80,47 +82,52 @@ def make_gradient(detector: Detector) -> Callable[[Any, Any, Batch], tuple[Any, 
     config, objective = detector.config, make_objective(detector)
     num_micro = config.optimizer.accumulate
 
-    def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
+    def differentiate(params: Any, batch_stats: Any, micro: Batch) -> tuple[Metrics, Any, tuple[Any, Sums]]:
+        part = trainable(params, config)
+        return jax.vjp(lambda part: objective(params | part, batch_stats, micro), part, has_aux=True)
+
+    def divided(tree: Any, count: Array) -> Any:
+        scale = 1 / jnp.maximum(count, 1)
+        return jax.tree.map(lambda leaf: leaf * scale.astype(leaf.dtype), tree)
+
+    def at_once(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Sums]:
+        totals, pull_back, (batch_stats, sums) = differentiate(params, batch_stats, batch)
+        sums = sum_over_devices(sums)
+        ones = jax.tree.map(jnp.ones_like, totals)
+        (grads,) = pull_back({name: varying(divided(one, sums.counts[name])) for name, one in ones.items()})
+        return sum_over_devices(grads), batch_stats, sums
+
+    def accumulated(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Sums]:
         def visit(batch_stats: Any, micro: Batch) -> tuple[Any, tuple[Any, Sums]]:
-            totals, pull_back, (batch_stats, sums) = jax.vjp(
-                lambda part: objective(params | part, batch_stats, micro),
-                trainable(params, config),
-                has_aux=True,
-            )
+            totals, pull_back, (batch_stats, sums) = differentiate(params, batch_stats, micro)
             zero = jax.tree.map(jnp.zeros_like, totals)
             grads = {name: pull_back(zero | {name: jnp.ones_like(t)})[0] for name, t in totals.items()}
             return batch_stats, (grads, sums)
 
-        params = varying(params)
-        if num_micro == 1:
-            batch_stats, (grads, sums) = visit(batch_stats, batch)
-        else:
+        def add(carry: Any, micro: Batch) -> tuple[Any, None]:
+            batch_stats, summed = carry
+            batch_stats, new = visit(batch_stats, micro)
+            return (batch_stats, jax.tree.map(jnp.add, summed, new)), None
 
-            def add(carry: Any, micro: Batch) -> tuple[Any, None]:
-                batch_stats, summed = carry
-                batch_stats, new = visit(batch_stats, micro)
-                return (batch_stats, jax.tree.map(jnp.add, summed, new)), None
+        # Strided, so that every device holds a part of every micro-batch.
+        micros = jax.tree.map(lambda leaf: leaf.reshape(-1, num_micro, *leaf.shape[1:]).swapaxes(0, 1), batch)
+        shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        # XLA runs convolutions in a loop several times slower on CPUs.
+        carry, _ = lax.platform_dependent(
+            (batch_stats, zeros),
+            micros,
+            cpu=functools.partial(lax.scan, add, unroll=True),
+            default=functools.partial(lax.scan, add),
+        )
+        batch_stats, summed = carry
+        grads, sums = sum_over_devices(summed)
+        parts = [divided(part, sums.counts[name]) for name, part in grads.items()]
+        return functools.reduce(optax.tree.add, parts), batch_stats, sums
 
-            # Strided, so that every device holds a part of every micro-batch.
-            micros = jax.tree.map(lambda leaf: leaf.reshape(-1, num_micro, *leaf.shape[1:]).swapaxes(0, 1), batch)
-            shapes = jax.eval_shape(visit, batch_stats, jax.tree.map(lambda leaf: leaf[0], micros))[1]
-            zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-            # XLA runs convolutions in a loop several times slower on CPUs.
-            accumulated, _ = lax.platform_dependent(
-                (batch_stats, zeros),
-                micros,
-                cpu=functools.partial(lax.scan, add, unroll=True),
-                default=functools.partial(lax.scan, add),
-            )
-            batch_stats, (grads, sums) = accumulated
-
-        grads, sums = sum_over_devices((grads, sums))
-
-        def divided(name: str) -> Any:
-            scale = 1 / jnp.maximum(sums.counts[name], 1)
-            return jax.tree.map(lambda leaf: leaf * scale.astype(leaf.dtype), grads[name])
-
-        grads = functools.reduce(optax.tree.add, [divided(name) for name in grads])
+    def gradient(params: Any, batch_stats: Any, batch: Batch) -> tuple[Any, Any, Metrics]:
+        step = at_once if num_micro == 1 else accumulated
+        grads, batch_stats, sums = step(varying(params), batch_stats, batch)
         return grads, batch_stats, batch_metrics(sums, config.loss)
 
     return gradient

@@ -24,7 +24,7 @@ for run in runs[1:]:
 GRADIENTS = """
 import dataclasses, jax, numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
-from tiny_run import CONFIG, SENSOR, FRAMES, weights
+from tiny_run import REFINED as CONFIG, SENSOR, FRAMES, weights
 from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.models import build_detector, convolution
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
@@ -101,9 +101,9 @@ for other in others:
     ("code", "what", "double", "level"),
     [
         (PREDICTIONS, "", False, None),
-        (GRADIENTS, "", True, 0),
+        (GRADIENTS, "", True, 1),
         (MAPS, "ours", True, 0),
-        # Without optimisation, XLA rounds the two uses of a pillar's maximum differently, which cuts its gradient.
+        # Without optimisation, XLA rounds the two uses of a maximum differently, which cuts its gradient.
         (MAPS, "peer", True, 1),
     ],
     ids=["predictions", "gradients", "maps", "maps_of_centerpoint"],
