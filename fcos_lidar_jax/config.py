@@ -236,12 +236,15 @@ class RefinementConfig:
     ValueError: num_points: got 0, expected at least 1
     """
 
-    num_boxes: int = 100  # Best boxes of a cloud that are looked at; others are dropped.
-    num_points: int = 128  # Maximum number of points per box.
+    num_boxes: int = 200  # Best boxes of a cloud that are looked at; others are dropped.
+    num_points: int = 64  # Maximum number of points per box.
     margin_m: float = 1.0  # Boxes are enlarged by this on every side, metres.
     point_channels: tuple[int, ...] = (32, 64, 128)  # Channels of the layers on each point.
     box_channels: tuple[int, ...] = (128, 128)  # Channels of the layers on each box.
     move_boxes: bool = True  # Move the boxes in detection; without, only their scores change.
+    first_score_weight: float = 0.5
+    """Weight of the detector's score in the geometric mean with the second look's; 0 ignores it. A mean of both is
+    more robust on data unlike the training's."""
     radius_range_m: tuple[float, float] = (1.0, 2.0)
     """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can
     stand for it."""
@@ -258,7 +261,8 @@ class RefinementConfig:
             check(min(getattr(self, name), default=0) >= 1, name, getattr(self, name), "counts of at least 1")
         low, high = self.radius_range_m
         check(0 < low <= high < math.inf, "radius_range_m", self.radius_range_m, "(low, high), 0 < low <= high")
-        check(0 <= self.between_weight <= 1, "between_weight", self.between_weight, "within [0, 1]")
+        for name in ("between_weight", "first_score_weight"):
+            check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "within [0, 1]")
 
 
 @dataclasses.dataclass(frozen=True)

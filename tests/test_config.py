@@ -169,6 +169,7 @@ def test_bad_json_gets_one_line_with_the_field(path, value, message):
         lambda: LossConfig(centreness_m=2.0),  # of no use: the factor is trained to be the IoU
         lambda: RefinementConfig(num_boxes=0),
         lambda: RefinementConfig(point_channels=()),
+        lambda: RefinementConfig(first_score_weight=1.5),
         lambda: RefinementConfig(radius_range_m=(2.0, 1.0)),
         lambda: InferenceConfig(iou_threshold=2),
         lambda: InferenceConfig(nms_overlap="4d"),  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from fcos_lidar_jax.config import Config, InferenceConfig, RefinementConfig
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.initialization import init_variables
 from fcos_lidar_jax.losses import cross_entropy
-from fcos_lidar_jax.nms import rotated_nms, suppress
+from fcos_lidar_jax.nms import suppress
 from fcos_lidar_jax.refinement.crops import crop_points
 from fcos_lidar_jax.refinement.network import SecondLook, box_features, point_features
 from fcos_lidar_jax.refinement.targets import match_boxes, move_boxes
@@ -153,25 +153,11 @@ def refine_boxes(
         looked = look_inputs(config, points, valid, (place, scores, labels, used))
         logits, residual = look(network, variables, looked)
         probability = jnp.take_along_axis(jax.nn.softmax(logits), labels[:, None], axis=1)[:, 0]
-        scores = jnp.where(used, probability, 0.0)
+        share = refinement.first_score_weight
+        scores = jnp.where(used, probability ** (1 - share) * scores**share, 0.0)
         if refinement.move_boxes:
             place = move_boxes(place, residual)
-        index, used = rotated_nms(
-            place,
-            scores,
-            used,
-            labels=None if config.inference.nms_across_classes else labels,
-            overlap=config.inference.nms_overlap,
-            iou_threshold=config.inference.iou_threshold,
-            max_outputs=len(place),
-        )
-        best = (
-            jnp.where(used[:, None], place[index], 0.0),
-            jnp.where(used, scores[index], 0.0),
-            jnp.where(used, labels[index], 0),
-            used,
-        )
-        return best_boxes(best, config.inference.max_detections)
+        return suppress(place, scores, labels, used, dataclasses.replace(config.inference, merge_iou=None))
 
 
 def refinement_sums(

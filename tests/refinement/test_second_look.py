@@ -40,17 +40,21 @@ def found(name: str, refinement: RefinementConfig | None, variables=None, cloud:
     return jax.device_get(program(variables or weights, batch.points[cloud], batch.valid[cloud]))
 
 
-@BOTH
-def test_boxes_are_the_detectors_best_with_the_probability_of_their_class(name):
+@pytest.mark.parametrize(
+    ("name", "weight"), [("FCOS-LiDAR", 0.25), ("CenterPoint", 0.25), ("FCOS-LiDAR", 0.0), ("FCOS-LiDAR", 1.0)]
+)
+def test_boxes_are_the_detectors_best_with_the_mean_of_both_scores(name, weight):
     """With zero weights all classes are equally probable and no box moves."""
-    _, variables = detector(name, SMALL)
+    small = dataclasses.replace(SMALL, first_score_weight=weight)
+    _, variables = detector(name, small)
     zero = jax.tree.map(jnp.zeros_like, variables["params"]["refinement"])
-    after = found(name, SMALL, variables | {"params": variables["params"] | {"refinement": zero}})
+    after = found(name, small, variables | {"params": variables["params"] | {"refinement": zero}})
     before = found(name, None)
     number = int(before.valid.sum())
     assert number > 8
     assert after.valid.sum() == 8
-    np.testing.assert_allclose(after.scores[:8], 1 / 11, rtol=1e-6)
+    expected = np.exp(weight * np.log(before.scores[:8]) + (1 - weight) * np.log(1 / 11))
+    np.testing.assert_allclose(after.scores[:8], expected, rtol=1e-5)
     np.testing.assert_allclose(after.boxes[:8], before.boxes[:8], rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(after.labels[:8], before.labels[:8])
     assert not after.boxes[8:].any()
