@@ -91,7 +91,7 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
         seconds, machine = leg["seconds_of_steps"], f" on {leg['device']}" if "device" in leg else ""
         time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
         more = (f", {leg['parameters']:,} parameters" if "parameters" in leg else "") + _average(leg)
-        more += ", only the second look, with everything else frozen" if "trained" in leg else ""
+        more += _second_look(leg)
         yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of training steps{machine}{more}"
     if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
         yield f"\nA run from {name} started from the weights of the run before it. If the preset had become"
@@ -102,6 +102,13 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
         yield f"{share} log(frequency in nuScenes / frequency in training) to each class logit (logit adjustment)."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
     yield from _curve([*record["earlier"], trained])
+
+
+def _second_look(leg: Mapping[str, Any]) -> str:
+    if "trained" not in leg:
+        return ""
+    numbers = f"{leg['num_boxes']} boxes of at most {leg['num_points']} points per frame"
+    return f", only the second look ({numbers}), with everything else frozen"
 
 
 def _average(leg: Mapping[str, Any]) -> str:

@@ -211,9 +211,16 @@ def training_record(run: Path) -> dict[str, Any]:
         "frames_seen": done * batch,
         "seconds_of_steps": round(sum(r.get("seconds", 0.0) for r in records)),
         "curve": [[r["step"] * batch, round(r["test/mAP"], 4)] for r in records if "test/mAP" in r],
-        **({"trained": "second look"} if is_frozen(config) else {}),
+        **_of_second_look(config),
         **(read_json(pooled, dict[str, Any]) if pooled.exists() else {}),
     }
+
+
+def _of_second_look(config: Config) -> dict[str, Any]:
+    if config.refinement is None or not config.refinement.freeze_detector:
+        return {}
+    look = config.refinement
+    return {"trained": "second look", "num_boxes": look.num_boxes, "num_points": look.num_points}
 
 
 def is_frozen(config: Config) -> bool:
@@ -272,8 +279,15 @@ def with_adjusted_logits(checkpoint: Checkpoint, share: float) -> Checkpoint:
 
 
 def with_todays_inference(checkpoint: Checkpoint, name: str) -> Checkpoint:
-    """Replace a checkpoint's post-processing, which training does not depend on, by the preset's current one."""
-    config = dataclasses.replace(checkpoint.config, inference=CONFIGS[name].inference)
+    """Replace the settings that the weights do not depend on by the preset's current ones: post-processing, and
+    numbers of boxes and points of the second look, which was trained with those of its run.
+    """
+    config, today = checkpoint.config, CONFIGS[name]
+    look = config.refinement
+    if look is not None and today.refinement is not None:
+        numbers = {n: getattr(today.refinement, n) for n in ("num_boxes", "num_points", "first_score_weight")}
+        look = dataclasses.replace(look, **numbers)
+    config = dataclasses.replace(config, inference=today.inference, refinement=look)
     return dataclasses.replace(checkpoint, config=config)
 
 
