@@ -10,10 +10,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from fcos_lidar_jax.namespaces import own_names
-
-__dir__ = own_names(__name__)
-
 _Tree = TypeVar("_Tree")
 
 

@@ -11,10 +11,7 @@ from typing import Any, Literal, Self
 
 from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
 from fcos_lidar_jax.fields import check, check_least, check_per_class, check_types, from_json
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
-
-__dir__ = own_names(__name__)
 
 MAX_ROUNDS = 100  # Each round is a pass over the points: far more rounds than ever helped.
 

@@ -9,9 +9,6 @@ import numpy as np
 
 from fcos_lidar_jax.fields import check, check_types, from_json, unknown_name
 from fcos_lidar_jax.files import read_json
-from fcos_lidar_jax.namespaces import own_names
-
-__dir__ = own_names(__name__)
 
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
 _SAME_HEADING_RAD = 1e-3  # headings typed with few digits are the same

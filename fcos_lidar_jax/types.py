@@ -13,11 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float32, Int32, UInt8, UInt16
-
-from fcos_lidar_jax.namespaces import own_names
-
-__dir__ = own_names(__name__)
+from jaxtyping import Array, Bool, Float32, Int32
 
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
 """The nine channel types of a range image (paper, section 3.1)."""
@@ -106,31 +102,6 @@ class Batch:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class PackedBatch:
-    """A :class:`Batch` in fewer bytes for transfer to the device, see :mod:`fcos_lidar_jax.packing`.
-
-    Valid rows come first, in order; padding rows are zero.
-
-    >>> clouds = np.zeros((2, 4096, 3), np.float32), *[np.zeros((2, 4096), np.uint8)] * 2
-    >>> truth = np.zeros((2, 32, 9)), np.zeros((2, 32), int), np.zeros((2, 32), bool)
-    >>> PackedBatch(*clouds, np.zeros((2, 10), np.float32), None, np.array([17, 4000]), *truth).xyz.nbytes
-    98304
-    """
-
-    xyz: Float32[Array, "b n 3"]  # Metres.
-    intensity: UInt8[Array, "b n"] | Float32[Array, "b n"]  # Scale 0-255.
-    lag: UInt8[Array, "b n"] | UInt16[Array, "b n"] | Float32[Array, "b n"]
-    """Index into the sample's ``lags``, or the time lag in seconds if ``lags`` is empty."""
-    lags: Float32[Array, "b t"]  # Time lags of each sample, seconds.
-    laser: UInt8[Array, "b n"] | Float32[Array, "b n"] | None  # Laser number, if the rows come from it.
-    count: Int32[Array, "b"]  # Number of valid rows.
-    boxes: Float32[Array, "b m 9"]  # The remaining fields are the same as in :class:`Batch`.
-    labels: Int32[Array, "b m"]
-    box_valid: Bool[Array, "b m"]
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
 class HostBatch:
     """A batch before and after transfer to the device, with information for logs and messages.
 
@@ -138,10 +109,9 @@ class HostBatch:
     {'truncated_points': 3}
     """
 
-    batch: Batch | PackedBatch  # NumPy rows of this process; after transfer, arrays of the global batch.
+    batch: Batch  # NumPy rows of this process; after transfer, arrays of the global batch.
     counts: dict[str, int]  # Logged with the metrics, such as ``truncated_points``.
     names: tuple[str, ...]  # Frame names of the samples, for messages.
-    misfit: str | None = None  # Reason why this batch is unpacked in a run with packed batches.
 
 
 @jax.tree_util.register_dataclass

@@ -25,9 +25,8 @@ from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts, spread_indices
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options, packing_for
+from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options
 from fcos_lidar_jax.models import Detector, Variables, build_detector
-from fcos_lidar_jax.packing import Packing
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.refinement import SECOND_LOOK, without_second_look
 from fcos_lidar_jax.sensors import sensor_to_json, turn_between
@@ -82,7 +81,6 @@ class Run:
     devices: Sequence[Any] | None
     spec: dict[str, Any]
     weights: Variables | None  # initial weights
-    packing: Packing | None
     warnings: tuple[str, ...]
 
     def evaluation_pending(self, step: int) -> bool:
@@ -117,7 +115,6 @@ def plan_run(
     schedule: Schedule,
     threads: int | None,
     workers: int,
-    packing: bool | None,
 ) -> Run:
     """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``."""
     check(type(steps) is int and 1 <= steps < 2**31, "steps", steps, f"an integer from 1 to {2**31 - 1}")
@@ -156,7 +153,6 @@ def plan_run(
     }
     if config.copy_paste is not None and objects is not None:
         make_paste(objects, config)
-    on_cpus = mesh.devices.flat[0].platform == "cpu"
     return Run(
         folder=out,
         detector=detector,
@@ -170,7 +166,6 @@ def plan_run(
         devices=devices,
         spec=json.loads(json.dumps(spec)),
         weights=initial,
-        packing=packing_for(frames, config) if packing or (packing is None and not on_cpus) else None,
         warnings=tuple(_warnings(frames, config)),
     )
 

@@ -5,7 +5,6 @@ the best of the ``checkpoints/``, ``pictures/`` of test frames, and the curves `
 """
 
 import contextlib
-import dataclasses
 import json
 import math
 import signal
@@ -62,7 +61,6 @@ def train(
     schedule: Schedule = Schedule(),
     threads: int | None = None,
     workers: int = 0,
-    packing: bool | None = None,
 ) -> TrainState:
     """Train a detector and return the last state; Ctrl-C and SIGTERM save a checkpoint and stop.
 
@@ -81,8 +79,6 @@ def train(
         schedule: when to save and evaluate.
         threads, workers: number of threads and additional processes that prepare batches; by default as many
             threads as ``input_pipeline.loader.default_threads`` returns, and no processes.
-        packing: transfer batches to the devices in fewer bytes, with the same results, see
-            :mod:`fcos_lidar_jax.packing`; by default unless the devices are CPUs.
 
     Raises:
         ValueError: the folder holds another run, no class is shared, the devices cannot share the batch, steps or
@@ -120,11 +116,8 @@ def train(
             schedule=schedule,
             threads=threads,
             workers=workers,
-            packing=packing,
         )
-    packed = None if run.packing is None else dataclasses.asdict(run.packing)
-    program = json.dumps([run.spec, packed], sort_keys=True)
-    check_same(checksum(program.encode()), "configuration, data or packing")
+    check_same(checksum(json.dumps(run.spec, sort_keys=True).encode()), "configuration or data")
     with contextlib.ExitStack() as held:
         with agreed("cannot train"):
             if is_main_process:
@@ -157,7 +150,6 @@ def train(
             num_processes=jax.process_count(),
             threads=threads,
             workers=workers,
-            packing=run.packing,
             lend=True,
             order=run.order,
         )

@@ -14,13 +14,12 @@ from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.models import Detector, Variables
-from fcos_lidar_jax.packing import unpack
 from fcos_lidar_jax.refinement import trainable
 from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
-from fcos_lidar_jax.types import Batch, PackedBatch, Sums, TrainState, check_rows
+from fcos_lidar_jax.types import Batch, Sums, TrainState, check_rows
 
-TrainStep = Callable[[TrainState, Batch | PackedBatch], tuple[TrainState, Metrics]]
+TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
 def make_state(
@@ -130,7 +129,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
     """Make a training step: augment unless ``config.augment`` is None, predict, differentiate, update.
 
     Returns:
-        pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. A packed batch is unpacked first.
+        pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller.
         Metrics are scalars except ``positives_per_level`` i32[6]. Raises a ValueError at trace time if the arrays
         of the batch have different numbers of samples or boxes.
 
@@ -159,8 +158,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         points, boxes = jax.vmap(augment_one)(keys, batch.points, batch.boxes)
         return dataclasses.replace(batch, points=points, boxes=boxes)
 
-    def step(state: TrainState, batch: Batch | PackedBatch) -> tuple[TrainState, Metrics]:
-        batch = unpack(batch)
+    def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         _check_batch(batch)
         batch = augmented(state, batch)
         grads, batch_stats, metrics = gradient(state.params, state.batch_stats, batch)

@@ -263,7 +263,7 @@ def test_a_run_that_is_stopped_at_an_evaluation_step_evaluates_when_it_resumes(f
     assert scores(folder) == scores(finished[0])
 
 
-def test_processes_with_other_data_or_packing_are_refused_before_the_run_starts(tmp_path, monkeypatch):
+def test_processes_with_other_data_are_refused_before_the_run_starts(tmp_path, monkeypatch):
     def refuse(checksum, what):
         checksums.append(checksum)
         raise ValueError(f"process 1: {what}")
@@ -271,11 +271,11 @@ def test_processes_with_other_data_or_packing_are_refused_before_the_run_starts(
     checksums = []
     monkeypatch.setattr(runs, "check_same", refuse)
     one_frame = {"frames": InMemoryFrames((TESTS.frame(0),), TESTS.sensor, NUSCENES_CLASSES)}
-    for options in (one_frame, {"packing": True}, {}, {}):
-        with pytest.raises(ValueError, match=r"^process 1: configuration, data or packing$"):
+    for options in (one_frame, {}, {}):
+        with pytest.raises(ValueError, match=r"^process 1: configuration or data$"):
             train_tiny(tmp_path / "run", **options)
-    assert len(set(checksums)) == 3
-    assert checksums[2] == checksums[3]
+    assert len(set(checksums)) == 2
+    assert checksums[1] == checksums[2]
     assert list(tmp_path.iterdir()) == []
 
 
