@@ -9,7 +9,6 @@ from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.point_files import check_time_lags
-from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
@@ -24,7 +23,6 @@ _ORDER = "older sweeps go first, then random points"
 _BLOCK = 4096  # rows that are projected together
 _MAX_INTENSITY_READ = 255  # of all detectors
 _MIN_ROWS = 500  # too few rows say nothing about the sensor
-_MAX_COORDINATE_M = 1000.0  # a larger median is no distance in metres
 _NEAR_M = 2.0  # points on the ego vehicle say nothing about the sensor
 _MAX_BEYOND = 0.9
 _MAX_OUTSIDE = 0.3
@@ -169,7 +167,6 @@ def no_usable_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: S
         f"{name}: none of its {cloud.num_points} points is usable ({cloud.num_invalid} not finite or beyond "
         f"physical limits, {cloud.num_close} on the ego vehicle, the others out of range or view), expected some "
         f"with {_limits(sensor)} in the field of view of {sensor.name}"
-        f"{_coordinate_hint(cloud.points[cloud.valid])}"
     )
 
 
@@ -233,22 +230,12 @@ def _limits(sensor: Sensor) -> str:
     return f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m"
 
 
-def _coordinate_hint(points: np.ndarray) -> str:
-    """The end of a message if x, y or z cannot be metres (timestamps, for example); else empty."""
-    medians = np.median(np.abs(points[:, :3]), axis=0) if len(points) else np.zeros(3)
-    if medians.max() < _MAX_COORDINATE_M:
-        return ""
-    axis = int(medians.argmax())
-    expected = "metres in the columns x, y, z, intensity, time lag, laser number"
-    return f"; the values of {'xyz'[axis]} are about {medians[axis]:.4g}, expected {expected}"
-
-
-def sensor_mismatch(points: np.ndarray, sensor: Sensor, usual: Sensor | None = None) -> str | None:
+def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     """A warning that another sensor probably recorded a cloud, or None.
 
     Uses the current sweep: the share of points beyond the sensor's limits and outside its vertical field of view,
     points per image cell, the share of points with a neighbour in the next column and in the next row, and the
-    scale of the intensity. The warning names the sensor that usually records such data, and its presets.
+    scale of the intensity.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame
@@ -259,9 +246,6 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor, usual: Sensor | None = N
     """
     points = _with_columns(points, sensor)
     points = points[usable_rows(points)]
-    about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
-    if len(points) >= _MIN_ROWS and (hint := _coordinate_hint(points)):
-        return f"points do not fit {about}{hint}; expect poor detections"
     points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
     points = points[~np.asarray(close_to_sensor(points, sensor, _NEAR_M))]
     if sensor.azimuth_limits_rad is not None:
@@ -272,16 +256,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor, usual: Sensor | None = N
         return None
     if not (reason := "; ".join(_mismatch(points, sensor))):
         return None
-    return f"points do not fit {about}: {reason}; expect poor detections{_fitting(sensor, usual)}"
-
-
-def _fitting(sensor: Sensor, usual: Sensor | None) -> str:
-    """The options for data that another sensor usually records, as the end of a warning; else empty."""
-    if usual is None or usual.name == sensor.name:
-        return ""
-    presets = ", ".join(name for name, config in PRESETS.items() if config.sensor == usual.name)
-    options = f"--sensor {usual.name} (train, project) or a preset ({presets})"
-    return f". Data like these are usually of {usual.name}: expected {options}"
+    about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
+    return f"points do not fit {about}: {reason}; expect poor detections"
 
 
 def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:

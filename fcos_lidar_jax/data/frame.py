@@ -55,7 +55,6 @@ class FrameSet(Protocol):
 
     classes: tuple[str, ...]  # Class names, which labels index.
     sensor: Sensor  # Sensor that recorded the points.
-    usual_sensor: Sensor | None = None  # Preset of the sensor that records such data; None if there is none.
 
     def __len__(self) -> int: ...
 
@@ -171,10 +170,6 @@ class WrappedFrames(FrameSet):
 
     def _source(self, index: int) -> int:
         return index
-
-    @property
-    def usual_sensor(self) -> Sensor | None:  # type: ignore[override]
-        return self.frames.usual_sensor
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -66,7 +66,6 @@ class KittiFrames(FrameSet):
     """
 
     classes = CLASSES
-    usual_sensor = KITTI_HDL64E
 
     def __init__(
         self,

@@ -149,28 +149,14 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
 
 
 def _recognise(root: Path) -> Reader:
-    matching = _matching(root)
+    matching = [reader for reader in READERS if any(any(root.glob(mark)) for mark in reader.marks)]
     if len(matching) > 1:
         names = " and ".join(reader.name for reader in matching)
         raise ValueError(f"{root}: looks like {names}, expected one format: name it")
     if not matching:
         marks = ", ".join(f"{' or '.join(reader.marks)} ({reader.name})" for reader in READERS if reader.marks)
-        whole = root.resolve()
-        above = [(folder, _matching(folder, part=whole)) for folder in whole.parents[:2]]
-        below = [(folder, _matching(folder)) for folder in sorted(root.glob("*")) if folder.is_dir()]
-        found = ((folder, readers[0].name) for folder, readers in above + below if len(readers) == 1)
-        hint = next((f"; found {name} in {folder}" for folder, name in found), "")
-        raise ValueError(f"{root}: no known data set, expected one of {marks}{hint}")
+        raise ValueError(f"{root}: no known data set, expected one of {marks}")
     return matching[0]
-
-
-def _matching(root: Path, *, part: Path | None = None) -> list[Reader]:
-    """Readers whose marks are in a folder; with ``part``, only marks inside it or around it."""
-
-    def counts(mark: Path) -> bool:
-        return part is None or mark.is_relative_to(part) or part.is_relative_to(mark)
-
-    return [reader for reader in READERS if any(counts(path) for mark in reader.marks for path in root.glob(mark))]
 
 
 def _refuse(data: DataSet, **options: object) -> None:

@@ -173,7 +173,7 @@ def plan_run(
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
     clouds = {index: frames.frame(index).points for index in spread_indices(len(frames), 5)}
     for index, points in clouds.items():
-        if mismatch := sensor_mismatch(points, frames.sensor, frames.usual_sensor):
+        if mismatch := sensor_mismatch(points, frames.sensor):
             yield f"{frames.name(index)}: {mismatch}"
             break
     if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in clouds.values()):

@@ -55,8 +55,6 @@ def home(tmp_path_factory):
     np.save(folder / "flat.npy", np.zeros(4, np.float32))
     np.save(folder / "future.npy", np.full((4, 5), -1.0, np.float32))
     (folder / "nothing").mkdir()
-    (folder / "top" / "training" / "velodyne").mkdir(parents=True)
-    np.save(folder / "top" / "training" / "velodyne" / "0.npy", points)
     (folder / "link.json").symlink_to("good.npy")
     (folder / "empty.bin").write_bytes(b"")
     (folder / "cut.pcd.bin").write_bytes(points.tobytes()[:-3])
@@ -313,8 +311,6 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
 BAD = mistakes(r"""
 detect HOME/none.npy => none.npy: no such file
 detect HOME/nothing => nothing: no point file in it, expected [^;]*$
-detect HOME/top => top: no point file in it, expected .*; found some in .*/top/training/velodyne$
-detect HOME/top/training => training: no point file in it, expected .*; found some in .*/top/training/velodyne$
 detect HOME/empty.bin => empty.bin: empty file
 detect HOME/cut.pcd.bin => cut.pcd.bin: .* not a multiple of 20
 detect HOME/good.npy --yaw-deg nan => --yaw-deg: got nan, expected an angle in degrees

@@ -202,20 +202,16 @@ def test_four_and_five_columns_are_distinguished_by_their_values(tmp_path, point
     else:
         with refused("five.bin: fifth column: got whole numbers up to 31, which look"):
             read_points(five, NUSCENES_HDL32E, columns=5)
-    with refused("not plausible metres, 5 columns would fit", five):
+    with refused("4 float32 values per point, most rows are not plausible metres", five):
         read_points(five, KITTI_HDL64E)
     assert read_points(four, NUSCENES_HDL32E, columns=4).shape == (number, 5)
-    with refused("not plausible metres, 4 columns would fit", four):
+    with refused("5 float32 values per point, most rows are not plausible metres", four):
         read_points(four, NUSCENES_HDL32E)
 
 
-def test_millimetres_are_refused_with_their_values(tmp_path, points):
+def test_millimetres_are_refused(tmp_path, points):
     path = save(tmp_path / "a.bin", points[:, :4] * np.float32([1000, 1000, 1000, 1]))
-    x, y, z = (
-        f"{value:.4g}" for value in np.median(np.abs(np.fromfile(path, np.float32).reshape(-1, 4)), axis=0)[:3]
-    )
-    assert float(x) > 1000
-    with refused(f"not plausible metres (x, y, z are about {x}, {y}, {z}), expected metres; only detect", path):
+    with refused("not plausible metres", path):
         read_points(path, NUSCENES_HDL32E, columns=4)
 
 
@@ -232,26 +228,20 @@ def test_with_columns_or_dtype_a_file_of_any_name_is_raw(tmp_path, points):
 
 @pytest.mark.parametrize("stored", ["float16", "float32", "float64"])
 @pytest.mark.parametrize("named", ["float16", "float32", "float64"])
-def test_a_wrong_dtype_is_refused_and_the_right_one_named(tmp_path, points, stored, named):
+def test_a_wrong_dtype_is_refused(tmp_path, points, stored, named):
     path = save(tmp_path / "a.bin", points[:, :4].astype(stored))
     if stored == named:
         assert len(read_points(path, NUSCENES_HDL32E, dtype=named)) == len(points)
         return
-    with refused(f"not plausible metres, 4 columns would fit as {stored}"):
+    with refused(f"4 {named} values per point, most rows are not plausible metres"):
         read_points(path, NUSCENES_HDL32E, dtype=named)
 
 
 @pytest.mark.parametrize(
     ("name", "number", "options", "message"),
     [
-        *(("a.bin", 1800, {"columns": n}, "not plausible metres, 5 columns would fit") for n in (3, 4, 6)),
-        (
-            "a.bin",
-            999,
-            {},
-            "16 (4 float32 values per point): truncated, or another layout, 5 columns would fit: copy it again, "
-            "or convert it; only detect, stream and project read other layouts, by --columns and --dtype",
-        ),
+        *(("a.bin", 1800, {"columns": n}, "most rows are not plausible metres") for n in (4, 6)),
+        ("a.bin", 999, {}, "not a multiple of 16 (4 float32 values per point): truncated? detect, stream and"),
         ("a.bin", 8, {"columns": 7}, "columns: got 7, expected 3, 4, 5 or 6"),
         ("a.bin", 8, {"dtype": "int16"}, "dtype: got 'int16', expected float16"),
         ("a.npy", 8, {"columns": 4}, "columns and dtype are for raw .bin files"),
@@ -269,13 +259,12 @@ def test_a_real_keyframe_is_read_and_other_layouts_are_refused(real_data, tmp_pa
     (path,) = (real_data / "nuscenes_scene0061").glob("*.pcd.bin")
     read = read_points(path, NUSCENES_HDL32E)
     assert read.shape == (34_688, 5)
-    with refused("not plausible metres, 5 columns would fit"):
-        read_points(path, NUSCENES_HDL32E, columns=4)
-    with refused("not plausible metres, 5 columns would fit as float32"):
-        read_points(path, NUSCENES_HDL32E, dtype="float16")
+    for options in ({"columns": 4}, {"dtype": "float16"}):
+        with refused("not plausible metres"):
+            read_points(path, NUSCENES_HDL32E, **options)
     for scale in (1, 1 / 255):
         four = save(tmp_path / "four.pcd.bin", read[:34_680, :4] * np.array([1, 1, 1, scale], np.float32))
-        with refused("not plausible metres, 4 columns would fit"):
+        with refused("not plausible metres"):
             read_points(four, NUSCENES_HDL32E)
 
 

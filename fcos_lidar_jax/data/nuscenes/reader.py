@@ -286,7 +286,6 @@ class NuScenesFrames(FrameSet):
     reading: CloudReading = CloudReading()
     sensor: Sensor = NUSCENES_HDL32E
     classes = NUSCENES_CLASSES
-    usual_sensor = NUSCENES_HDL32E
 
     def __len__(self) -> int:
         return len(self.tokens)
