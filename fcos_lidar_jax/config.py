@@ -18,12 +18,7 @@ MAX_ROUNDS = 100  # Each round is a pass over the points: far more rounds than e
 
 @dataclasses.dataclass(frozen=True)
 class CloudReading:
-    """How to read point clouds, in training, evaluation and detection; see :attr:`Config.reading`.
-
-    >>> CloudReading(num_sweeps=0)
-    Traceback (most recent call last):
-    ValueError: num_sweeps: got 0, expected at least 1
-    """
+    """How to read point clouds, in training, evaluation and detection; see :attr:`Config.reading`."""
 
     num_sweeps: int = 1  # Maximum number of fused sweeps, including the current one.
     remove_close: Literal["all", "sweeps", "none"] = "sweeps"
@@ -43,11 +38,7 @@ WHOLE_SWEEP = CloudReading(remove_close="none")
 
 @dataclasses.dataclass(frozen=True)
 class ProjectionConfig:
-    """Points to range image (paper, sections 3.1 and 3.2).
-
-    >>> ProjectionConfig(num_rounds=3).prioritize_current
-    True
-    """
+    """Points to range image (paper, sections 3.1 and 3.2)."""
 
     num_rounds: int = 5  # Rounds of the multi-round projection.
     prioritize_current: bool = True  # Points of the current sweep win all collisions with older points (table 2).
@@ -65,11 +56,7 @@ class ProjectionConfig:
 
 @dataclasses.dataclass(frozen=True)
 class StemConfig:
-    """Modality-wise convolutions (paper, section 3.3, tables 3-5).
-
-    >>> StemConfig(groups="modalities").dilations
-    (1, 3, 6)
-    """
+    """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
 
     groups: Literal["types", "modalities", "all"] = "types"
     """Nine groups by channel type, five by modality, or one group (table 3)."""
@@ -92,11 +79,7 @@ class StemConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """LiDAR-Net, feature pyramid and heads (paper, section 3.4).
-
-    >>> ModelConfig(head_channels=128).stem.num_convs
-    2
-    """
+    """LiDAR-Net, feature pyramid and heads (paper, section 3.4)."""
 
     stem: StemConfig = StemConfig()  # Modality-wise convolutions.
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -151,12 +134,7 @@ class ModelConfig:
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """Assignment and losses (paper, section 3.4).
-
-    >>> LossConfig(top_q=0)
-    Traceback (most recent call last):
-    ValueError: top_q: got 0, expected at least 1
-    """
+    """Assignment and losses (paper, section 3.4)."""
 
     top_q: int = 20  # Q: the dynamic K of a box is the rounded sum of its Q highest IoUs.
     regress_on: Literal["positives", "candidates"] = "positives"
@@ -191,11 +169,7 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class InferenceConfig:
-    """Predictions to detections (paper, section 3.4).
-
-    >>> InferenceConfig(max_detections=100).iou_threshold
-    0.2
-    """
+    """Predictions to detections (paper, section 3.4)."""
 
     min_probability: float = 0.01  # Minimum class probability of a candidate, before the IoU factor.
     iou_threshold: float = 0.2  # NMS removes boxes that overlap a better box of their class by more than this.
@@ -226,12 +200,7 @@ class InferenceConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RefinementConfig:
-    """A second look at the points of the best boxes (not in the paper), see :mod:`fcos_lidar_jax.refinement`.
-
-    >>> RefinementConfig(num_points=0)
-    Traceback (most recent call last):
-    ValueError: num_points: got 0, expected at least 1
-    """
+    """A second look at the points of the best boxes (not in the paper), see :mod:`fcos_lidar_jax.refinement`."""
 
     num_boxes: int = 100  # Best boxes of a cloud that are looked at; others are dropped.
     num_points: int = 128  # Maximum number of points per box.
@@ -260,11 +229,7 @@ class RefinementConfig:
 
 @dataclasses.dataclass(frozen=True)
 class AugmentConfig:
-    """On-device augmentation of points and boxes (paper, section 4).
-
-    >>> AugmentConfig(max_rotation_rad=0.0).scale_range
-    (0.95, 1.05)
-    """
+    """On-device augmentation of points and boxes (paper, section 4)."""
 
     flip_x_probability: float = 0.5  # Our choice: probability of x -> -x.
     flip_y_probability: float = 0.5  # Our choice: probability of y -> -y, independent of the flip of x.
@@ -283,11 +248,7 @@ class AugmentConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CopyPasteConfig:
-    """Copy-paste of objects from other frames into a training frame (paper, section 4, after SECOND).
-
-    >>> CopyPasteConfig(targets=(2, 3)).min_points
-    5
-    """
+    """Copy-paste of objects from other frames into a training frame (paper, section 4, after SECOND)."""
 
     targets: tuple[int, ...] = ()
     """Our choice: number of boxes per class up to which a frame is filled, including its own boxes; () for the

@@ -61,9 +61,6 @@ class CenterPointConfig(Config):
     """Definition of a CenterPoint detector and its training, without the data.
 
     ``model`` and the rounds of ``projection`` are ignored.
-
-    >>> CenterPointConfig(classes=("car", "cyclist")).class_groups
-    (0, 0)
     """
 
     pillars: PillarConfig = PillarConfig()  # Pillars, network and targets.

@@ -66,11 +66,7 @@ class Backbone(nn.Module):
 
 
 def to_channels(x: Image, factor: int) -> Image:
-    """Move squares of ``factor`` x ``factor`` cells into the channels of one cell.
-
-    >>> to_channels(jnp.ones((1, 4, 4, 3)), 2).shape
-    (1, 2, 2, 12)
-    """
+    """Move squares of ``factor`` x ``factor`` cells into the channels of one cell."""
     b, h, w, c = x.shape
     x = x.reshape(b, h // factor, factor, w // factor, factor, c)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h // factor, w // factor, -1)

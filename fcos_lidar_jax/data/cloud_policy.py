@@ -35,15 +35,7 @@ such as the VLP-16 in place of the HDL-32E."""
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """A cloud as detectors take it, padded to ``config.max_points`` rows.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> ahead = np.array([[0, 9, 0, 50], [0, np.nan, 0, 50]], np.float32)
-    >>> cloud = make_cloud(ahead, QUICKSTART, sensor=SHORT_RANGE)
-    >>> cloud.points.shape, int(cloud.valid.sum()), cloud.num_invalid
-    ((4096, 5), 1, 1)
-    """
+    """A cloud as detectors take it, padded to ``config.max_points`` rows."""
 
     points: np.ndarray
     """f32[max_points, c]: x, y, z (m), intensity (0-255), time lag (s), and the laser number for sensors that need
@@ -128,11 +120,6 @@ def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarr
         parts: f32[n, c] each, written one after another.
         kept: bool[n of all parts]; if everything fits, the other rows are written too, as invalid.
         points, valid: outputs f32[m, c] and bool[m].
-
-    >>> points, valid = np.zeros((2, 5), np.float32), np.zeros(2, bool)
-    >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 0, 0]], np.float32)
-    >>> write_points([cloud], np.ones(3, bool), points, valid), points[:, 0].tolist()
-    (1, [1.0, 3.0])
     """
     num_truncated = 0
     if len(kept) > len(points):
@@ -193,9 +180,6 @@ def unusable_clouds(lines: Sequence[str], number: int, without: str = "boxes") -
 
     Raises:
         ValueError: the first line, if no cloud has usable points.
-
-    >>> unusable_clouds(["7.npy: no points in it, expected at least one"], 9)
-    '1 of 9 clouds without usable points, and so without boxes: 7.npy: no points in it, expected at least one'
     """
     if not lines:
         return None
@@ -206,12 +190,7 @@ def unusable_clouds(lines: Sequence[str], number: int, without: str = "boxes") -
 
 
 def truncation(number: int, config: Config) -> str | None:
-    """A line about the truncated points of all clouds, or None.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> truncation(7, QUICKSTART)
-    '7 points left out in total: the detector takes at most 4096 per cloud (max_points); older sweeps go first...'
-    """
+    """A line about the truncated points of all clouds, or None."""
     how = f"left out in total: the detector takes at most {config.max_points} per cloud (max_points)"
     return f"{number} points {how}; {_ORDER}" if number else None
 

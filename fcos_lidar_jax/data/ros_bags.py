@@ -30,11 +30,7 @@ _PoseAt = Callable[[str, int, str], np.ndarray]
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder with ``metadata.yaml``.
-
-    >>> is_ros_bag(Path("street.bag")), is_ros_bag(Path("street"))
-    (True, False)
-    """
+    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder with ``metadata.yaml``."""
     return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 

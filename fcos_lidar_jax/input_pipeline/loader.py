@@ -188,9 +188,6 @@ def default_threads(workers: int = 0) -> int:
 
     All processes together get as many threads as this process may use cores, minus one for the main thread if
     there are more than two; at least 1 each and at most 16.
-
-    >>> 1 <= default_threads() <= 16
-    True
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     free = cores - 1 if cores > 2 else cores

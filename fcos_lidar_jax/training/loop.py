@@ -16,11 +16,7 @@ Record = dict[str, float | list[float]]
 
 
 class NonFiniteLossError(ArithmeticError):
-    """A loss or gradient is not finite; the message names the step, the losses and the samples.
-
-    >>> issubclass(NonFiniteLossError, ArithmeticError)
-    True
-    """
+    """A loss or gradient is not finite; the message names the step, the losses and the samples."""
 
 
 def fit(

@@ -49,9 +49,6 @@ class Schedule:
         evaluate_every: steps between evaluations, each of which also saves a checkpoint; by default a tenth of the
             run, but at least 100. The last step is always evaluated.
         keep: number of newest checkpoints to keep, in addition to the best.
-
-    >>> Schedule(save_every=100).keep
-    2
     """
 
     save_every: int | None = None

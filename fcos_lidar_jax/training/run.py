@@ -88,13 +88,6 @@ def train(
         NonFiniteLossError, NonFiniteStateError: a value is not finite; earlier checkpoints remain.
         KeyboardInterrupt: after Ctrl-C, once the state is saved.
         SystemExit: after SIGTERM, once the state is saved; both also if the signal came during the last step.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.simulation.frame_set import fresh_streets
-    >>> config, frames = fresh_streets(QUICKSTART, steps=500)
-    >>> train(dataclasses.replace(config, classes=("boat",)), frames, "run", steps=500)
-    Traceback (most recent call last):
-    ValueError: ...
     """
     check(isinstance(config, Config), "config", config, "a Config, such as presets.COMPACT")
     check(isinstance(schedule, Schedule), "schedule", schedule, "a Schedule")

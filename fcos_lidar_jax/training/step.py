@@ -34,14 +34,6 @@ def make_state(
     Args:
         key: random key of the run.
         variables: initial ``params`` and ``batch_stats``; random by default.
-
-    >>> from fcos_lidar_jax.inference import load_trained
-    >>> from fcos_lidar_jax.training import make_optimizer
-    >>> detector = load_trained("quickstart").model
-    >>> optimizer = make_optimizer(detector.config.optimizer, 100)
-    >>> state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
-    >>> sorted(state.params)
-    ['backbone', 'fpn', 'heads', 'stem']
     """
     check(not isinstance(key, int), "key", key, f"a random key, such as jax.random.key({key})")
     variables = detector.init(key) if variables is None else variables
@@ -186,10 +178,5 @@ def _check_batch(batch: Batch) -> None:
 
 
 def detection_variables(state: TrainState) -> dict[str, Any]:
-    """Variables for detection: batch statistics, and the running mean of the weights if there is one.
-
-    >>> state = TrainState(jnp.int32(9), {"w": 3.0}, {"mean": 0.0}, (), {"w": 2.0}, jax.random.key(0))
-    >>> detection_variables(state)
-    {'params': {'w': 2.0}, 'batch_stats': {'mean': 0.0}}
-    """
+    """Variables for detection: batch statistics, and the running mean of the weights if there is one."""
     return {"params": state.params if state.ema is None else state.ema, "batch_stats": state.batch_stats}

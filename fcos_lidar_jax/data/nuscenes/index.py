@@ -72,11 +72,7 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
 
 
 def default_index(root: str | Path, version: str) -> Path:
-    """The default folder of ``prepare``'s output: the index of a version of nuScenes, and the cut objects.
-
-    >>> default_index("nuscenes", "v1.0-mini").as_posix(), default_index("kitti", "").as_posix()
-    ('nuscenes/.fcos_lidar/v1.0-mini', 'kitti/.fcos_lidar')
-    """
+    """The default folder of ``prepare``'s output: the index of a version of nuScenes, and the cut objects."""
     return Path(root) / ".fcos_lidar" / version
 
 
