@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from fcos_lidar_jax.centerpoint.config import PillarConfig
+from fcos_lidar_jax.centerpoint.pillar_config import PillarConfig
 from fcos_lidar_jax.centerpoint.pillars import cell_maxima
 from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
 from fcos_lidar_jax.collectives import sum_over_devices

@@ -593,7 +593,7 @@ def test_invalid_arguments_are_refused_before_the_run_starts(tmp_path, options, 
 
 def test_a_schedule_refuses_invalid_numbers():
     with pytest.raises(ValueError, match=r"schedule\.keep: got 0, expected an integer of at least 1"):
-        runs.Schedule(keep=0)
+        plan.Schedule(keep=0)
 
 
 @pytest.mark.parametrize(
@@ -606,5 +606,5 @@ def test_a_schedule_refuses_invalid_numbers():
     ],
 )
 def test_short_runs_evaluate_rarely_by_default(steps, every, expected):
-    run = Mock(num_steps=steps, schedule=runs.Schedule(evaluate_every=every))
-    assert [step for step in range(1, steps + 1) if plan.Run.evaluates_at(run, step)] == expected
+    run = Mock(steps=steps, schedule=plan.Schedule(evaluate_every=every))
+    assert [step for step in range(1, steps + 1) if plan.RunSpec.evaluates_at(run, step)] == expected
