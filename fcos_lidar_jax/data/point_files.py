@@ -72,9 +72,9 @@ def read_points(
     """
     path = local_path(path)
     kind = _kind(path, raw=columns is not None or dtype is not None)
-    check(columns in (None, *_RAW_COLUMNS), f"{path}: columns", columns, "3, 4, 5 or 6")
-    check(dtype in (None, *_RAW_DTYPES), f"{path}: dtype", dtype, ", ".join(_RAW_DTYPES))
-    if not kind.endswith(".bin") and (columns is not None or dtype is not None):
+    if kind.endswith(".bin"):
+        return _read_raw(path, sensor, kind, columns, dtype, max_points)
+    if columns is not None or dtype is not None:
         raise ValueError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
     if kind == ".feather":
         names = ("x", "y", "z", "intensity", "laser_number")
@@ -85,20 +85,9 @@ def read_points(
         try:
             table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_PER_POINT)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{path}: not a readable .pcd file: {error}") from None
         return assemble_points(path, sensor, table)
-    if kind in (".npy", ".npz"):
-        return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
-    if not kind.endswith(".bin"):
-        raise NotImplementedError(f"{kind} is in ENDINGS, but read_points does not read it")
-    columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
-    if (number := len(content) // (columns * np.dtype(dtype).itemsize)) > max_points:
-        raise ValueError(f"{path}: got {number} points, expected at most {max_points}")
-    rows = _read_raw(path, content, columns, dtype)
-    if kind != ".pcd.bin":
-        return points_from_array(rows, sensor, str(path))
-    sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # the format's intensities are already 0-255
-    return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
+    return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
 
 
 def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -> np.ndarray:
@@ -220,15 +209,25 @@ def _kind(path: Path, *, raw: bool) -> str:
     raise ValueError(f"{path}: unknown extension {path.suffix!r}, expected {expected}")
 
 
-def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarray:
-    layout, row = f"{columns} {dtype} values per point", columns * np.dtype(dtype).itemsize
+def _read_raw(
+    path: Path, sensor: Sensor, kind: str, columns: int | None, dtype: str | None, max_points: int
+) -> np.ndarray:
+    columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
+    check(columns in _RAW_COLUMNS, f"{path}: columns", columns, "3, 4, 5 or 6")
+    check(dtype in _RAW_DTYPES, f"{path}: dtype", dtype, ", ".join(_RAW_DTYPES))
+    content, row = _read_whole(path, max_points), columns * np.dtype(dtype).itemsize
+    check(len(content) // row <= max_points, f"{path}: points", len(content) // row, f"at most {max_points}")
+    layout = f"{columns} {dtype} values per point"
     other = "detect, stream and project read other layouts by --columns and --dtype"
     if (size := len(content)) % row:
         raise ValueError(f"{path}: got {size} bytes, not a multiple of {row} ({layout}): truncated? {other}")
     rows = np.frombuffer(content, dtype).reshape(-1, columns)
     if _plausible_share(rows[: _INSPECTED_VALUES // columns]) < _MIN_PLAUSIBLE:
         raise ValueError(f"{path}: read with {layout}, most rows are not plausible metres; {other}")
-    return rows
+    if kind != ".pcd.bin":
+        return points_from_array(rows, sensor, str(path))
+    sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # the format's intensities are already 0-255
+    return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
 def _plausible_share(rows: np.ndarray) -> float:
