@@ -148,9 +148,6 @@ def make_batches(
         an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows; it raises the errors of
         unreadable frames.
     """
-    import grain
-    from absl import flags
-
     check(0 <= first_step <= num_steps, "first_step", first_step, f"0 to {num_steps}")
     threads = default_threads(workers) if threads is None else threads
     size = config.optimizer.batch_size
@@ -168,6 +165,17 @@ def make_batches(
         fade_step=num_steps - config.fade_epochs * -(-order.epoch_size // size),
         paste=make_paste(objects, config) if objects is not None and config.copy_paste is not None else None,
     )
+    prepared = _prepared(batch_of, first_step, num_steps, threads, workers)
+    owned = _OwnedBatches(prepared, copied=workers > 0 and not lend)
+    with contextlib.closing(prepared), contextlib.closing(owned) as batches:
+        yield batches
+
+
+def _prepared(batch_of: _BatchOf, first_step: int, num_steps: int, threads: int, workers: int) -> Any:
+    """Grain's iterator over the batches, prepared ahead by threads, in this process or in workers."""
+    import grain
+    from absl import flags
+
     steps = grain.MapDataset.range(first_step, num_steps).map(batch_of)
     # Batches are large, so that only one waits beside the batches in progress.
     stream = steps.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads + 1))
@@ -177,10 +185,7 @@ def make_batches(
         stream = stream.mp_prefetch(
             grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1), _leave_signals
         )
-    prepared: Any = iter(stream)
-    owned = _OwnedBatches(prepared, copied=workers > 0 and not lend)
-    with contextlib.closing(prepared), contextlib.closing(owned) as batches:
-        yield batches
+    return iter(stream)
 
 
 def default_threads(workers: int = 0) -> int:

@@ -22,6 +22,7 @@ from made_nuscenes import write as write_nuscenes
 from toy_frames import ToyFrames
 
 from experiments.cached import CachedFrames
+from experiments.keyframe import read_keyframe
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import read_class_map
@@ -33,7 +34,6 @@ from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.drives import read_tum
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close
-from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
