@@ -49,7 +49,8 @@ Between = Annotated[float, Bounds(0, 1, above=True, below=True)]  # 0 and 1
 def check(condition: bool, field: str, got: object, expected: str) -> None:
     """Raise a ValueError with the field, the found and the expected value unless a condition holds."""
     if not condition:
-        raise ValueError(f"{field}: got {got!r}, expected {expected}")
+        text = repr(got)
+        raise ValueError(f"{field}: got {text if len(text) <= 500 else f'{text[:500]}...'}, expected {expected}")
 
 
 def check_per_class(field: str, values: Collection[object], classes: Collection[str]) -> None:

@@ -371,10 +371,8 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
         rows, recipe, unusable, boxes = arrays["rows"], str(arrays["recipe"]), arrays["unusable"], arrays["boxes"]
     except ValueError as error:
         raise ValueError(f"{file}: not a table of objects: {error}") from None
-    if rows.dtype != _ROW or rows.ndim != 1:
-        raise ValueError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; {_REBUILD}")
-    if boxes.dtype != np.int64 or boxes.shape != (2,):
-        raise ValueError(f"{file}: boxes: got {boxes.dtype} {boxes.shape}, expected two numbers; {_REBUILD}")
+    if (rows.dtype, rows.ndim, boxes.dtype, boxes.shape) != (_ROW, 1, np.int64, (2,)):
+        raise ValueError(f"{file}: not a table of objects; {_REBUILD}")
     ends = rows["count"].cumsum(dtype=np.int64)
     newest = rows["newest"]
     placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)

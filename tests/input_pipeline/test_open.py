@@ -274,7 +274,10 @@ BAD = {
     "no such version": ({"root": "nuscenes", "version": "v9"}, "v9: no such folder, expected one of v1.0-made"),
     "full turn": ({"root": "argoverse2", "full_turn": True}, "full_turn: got True, expected none"),
     "scale": ({"root": "nuscenes", "intensity_scale": 2.0}, "intensity_scale: got 2.0, expected none"),
-    "no scale": ({"root": "folder", "intensity_scale": -2.0}, "intensity_scale: got -2.0, expected a positive"),
+    "no scale": (
+        {"root": "folder", "intensity_scale": -2.0},
+        "intensity_scale: got -2.0, expected within",
+    ),
     "sweeps": ({"root": "kitti", "num_sweeps": 0}, "num_sweeps: got 0, expected at least 1"),
     "class map": (
         {"root": "kitti", "class_map": {"Lorry": "truck"}},

@@ -118,10 +118,8 @@ def _read_manifest(file: Path) -> _Manifest:
         manifest = read_json(file, _Manifest, what="a finished index")
     except ValueError as error:
         raise ValueError(f"{error}: run prepare again") from None
-    if manifest.format != _FORMAT:
-        raise ValueError(f"{file}: format: expected {_FORMAT!r}")
-    if (version := manifest.format_version) != _FORMAT_VERSION:
-        raise ValueError(f"{file}: format_version: got {version}, expected {_FORMAT_VERSION}: run prepare again")
+    if (found := (manifest.format, manifest.format_version)) != (_FORMAT, _FORMAT_VERSION):
+        raise ValueError(f"{file}: format: got {found}, expected {(_FORMAT, _FORMAT_VERSION)}: run prepare again")
     return manifest
 
 
