@@ -1,7 +1,7 @@
 """The checkpoints of a run: the newest, to resume from, and the best.
 
 Orbax's ``CheckpointManager`` is not used: it restores corrupt arrays without an error, does not fall back to an
-older checkpoint, and lets two processes write into one folder (``tests/checkpoints/test_orbax_manager.py``).
+older checkpoint, and lets two processes write into one folder (tried with Orbax 0.12).
 """
 
 import shutil
