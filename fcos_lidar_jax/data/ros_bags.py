@@ -241,13 +241,11 @@ def _parse_cloud(cloud: Any, where: str, sensor: Sensor, *, max_points: int) -> 
     if width * height > max_points:
         raise ValueError(f"{where}: got {width} x {height} points, expected at most {max_points}")
     pitch = max(pitch, width * step) if height <= 1 else pitch  # some drivers leave it 0 for a single row
-    if pitch < width * step:
-        raise ValueError(f"{where}: row_step: got {pitch}, expected {width * step}, width x point_step, or more")
-    if height and width and len(cloud.data) < (needed := (height - 1) * pitch + width * step):
-        sizes = f"got {len(cloud.data)} bytes, expected at least {needed}"
-        raise ValueError(f"{where}: data: {sizes} for {height} rows of {width} points of {step}")
     if not width * height:
         return no_points(sensor)
+    if pitch < width * step or len(cloud.data) < (height - 1) * pitch + width * step:
+        found = f"{len(cloud.data)} bytes, and row_step {pitch}"
+        raise ValueError(f"{where}: data: got {found}, expected {height} rows of {width} points of {step} bytes")
     columns = {}
     for column, dtype, offset in _columns_of(cloud, where):
         values = np.ndarray((height, width), dtype, cloud.data.data, offset, (pitch, step))
@@ -259,19 +257,18 @@ def _columns_of(cloud: Any, where: str) -> list[tuple[str, np.dtype, int]]:
     """The message's columns, with type and offset within a point."""
     columns, names = [], [field.name for field in cloud.fields]
     places = find_columns(names)
-    for axis in "xyz":
-        if axis not in places:
-            listed = ", ".join(map(repr, names))[:500] or "none"
-            raise ValueError(f"{where}: fields: got {listed}, expected one named {axis}")
+    if missing := [axis for axis in "xyz" if axis not in places]:
+        listed = ", ".join(map(repr, names))[:500] or "none"
+        raise ValueError(f"{where}: fields: got {listed}, expected one named {missing[0]}")
     places.pop("time_lag", None)  # messages hold single sweeps
     for column, place in places.items():
-        name, field = names[place], cloud.fields[place]
-        if field.datatype not in _NUMBERS or field.count > 1:
-            got = f"{field.count} of datatype {field.datatype}"
-            raise ValueError(f"{where}: field {name}: got {got}, expected one number of datatype 1 to 8")
-        dtype = np.dtype((">" if cloud.is_bigendian else "<") + _NUMBERS[field.datatype])
-        if field.offset + dtype.itemsize > cloud.point_step:
-            got, expected = f"{dtype.itemsize} bytes at offset {field.offset}", "a place within point_step"
-            raise ValueError(f"{where}: field {name}: got {got}, expected {expected} {cloud.point_step}")
-        columns.append((column, dtype, field.offset))
+        field, end = cloud.fields[place], 0
+        if field.datatype in _NUMBERS and field.count <= 1:
+            dtype = np.dtype((">" if cloud.is_bigendian else "<") + _NUMBERS[field.datatype])
+            columns.append((column, dtype, field.offset))
+            end = field.offset + dtype.itemsize
+        if not 0 < end <= cloud.point_step:
+            got = f"{field.count} of datatype {field.datatype} at offset {field.offset}"
+            expected = f"one number of datatype 1 to 8 within the {cloud.point_step} bytes of a point"
+            raise ValueError(f"{where}: field {names[place]}: got {got}, expected {expected}")
     return columns
