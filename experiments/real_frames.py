@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from experiments.keyframe import read_keyframe
 from experiments.script import real_data
 from fcos_lidar_jax import open_frames
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame, FrameSet, InMemoryFrames, SelectedFrames
-from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.frames import evaluate_frames
 from fcos_lidar_jax.evaluation.metrics import Evaluation, metric_of

@@ -35,7 +35,7 @@ _HOME = {
 }
 _MODULES = (
     *("assignment", "augment", "coding", "collectives", "config", "geometry", "iou", "locations", "losses", "nms"),
-    *("packing", "presets", "projection", "sensors", "types"),
+    *("presets", "projection", "sensors", "types"),
     *("centerpoint", "checkpoints", "data", "devices", "evaluation", "inference", "input_pipeline", "models"),
     *("simulation", "training", "visualization"),
 )

@@ -15,10 +15,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 
 from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import points_in_box
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.types import Targets, check_rows
-
-__dir__ = own_names(__name__)
 
 
 def owners(

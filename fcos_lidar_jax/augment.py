@@ -8,10 +8,7 @@ from jaxtyping import Array, Float32, Int, PRNGKeyArray, UInt32
 from fcos_lidar_jax.config import AugmentConfig
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.geometry import wrap_angle
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
-
-__dir__ = own_names(__name__)
 
 Key = PRNGKeyArray | UInt32[Array, "2"]
 Cloud = Float32[Array, "n c"]

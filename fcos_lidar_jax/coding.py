@@ -15,10 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.geometry import atan2, wrap_angle
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.types import check_columns
-
-__dir__ = own_names(__name__)
 
 Axes = Literal["lidar", "ray"]
 

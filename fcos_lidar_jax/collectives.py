@@ -10,28 +10,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from fcos_lidar_jax.namespaces import own_names
-
-__dir__ = own_names(__name__)
-
 _Tree = TypeVar("_Tree")
 
 
 def mapped_axes() -> tuple[str, ...]:
-    """Names of the device axes of ``jax.pmap`` or ``jax.shard_map`` around the caller; empty outside of both.
-
-    >>> mapped_axes()
-    ()
-    """
+    """Names of the device axes of ``jax.pmap`` or ``jax.shard_map`` around the caller; empty outside of both."""
     return tuple(jax.sharding.get_abstract_mesh().manual_axes)
 
 
 def device_index() -> Array | int:
-    """Position of the device along the mapped axes; 0 outside of a map.
-
-    >>> device_index()
-    0
-    """
+    """Position of the device along the mapped axes; 0 outside of a map."""
     axes = mapped_axes()
     return lax.axis_index(axes) if axes else 0
 
@@ -50,9 +38,6 @@ def varying(tree: _Tree) -> _Tree:
     """Mark replicated leaves as device-varying, so that each device computes its own gradient.
 
     Without the mark, ``jax.shard_map`` adds up the gradients of replicated leaves by itself, unlike ``jax.pmap``.
-
-    >>> float(varying(jnp.float32(2)))
-    2.0
     """
     axes = mapped_axes()
     return lax.pcast(tree, axes, to="varying") if axes else tree

@@ -7,37 +7,41 @@ Make variants with :func:`dataclasses.replace`. Every configuration is hashable 
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from fcos_lidar_jax.classes import DEFAULT_PASTE_TARGET, DEFAULT_RANGE_M, NUSCENES_CLASSES, PASTE_TARGETS, RANGES_M
-from fcos_lidar_jax.fields import check, check_least, check_per_class, check_types, from_json
-from fcos_lidar_jax.namespaces import own_names
+from fcos_lidar_jax.fields import (
+    Amount,
+    BelowOne,
+    Between,
+    Bounds,
+    Count,
+    Counts,
+    Natural,
+    Positive,
+    Share,
+    check,
+    check_per_class,
+    check_types,
+    from_json,
+)
 from fcos_lidar_jax.sensors import Sensor
-
-__dir__ = own_names(__name__)
 
 MAX_ROUNDS = 100  # Each round is a pass over the points: far more rounds than ever helped.
 
 
 @dataclasses.dataclass(frozen=True)
 class CloudReading:
-    """How to read point clouds, in training, evaluation and detection; see :attr:`Config.reading`.
+    """How to read point clouds, in training, evaluation and detection; see :attr:`Config.reading`."""
 
-    >>> CloudReading(num_sweeps=0)
-    Traceback (most recent call last):
-    ValueError: num_sweeps: got 0, expected at least 1
-    """
-
-    num_sweeps: int = 1  # Maximum number of fused sweeps, including the current one.
+    num_sweeps: Count = 1  # Maximum number of fused sweeps, including the current one.
     remove_close: Literal["all", "sweeps", "none"] = "sweeps"
     """Sweeps from which the points on the ego vehicle are removed, each in its own frame: all, only the older
     ones, or none."""
-    close_m: float = 1.0  # Half the side of the square around the sensor that is cleared, metres.
+    close_m: Positive = 1.0  # Half the side of the square around the sensor that is cleared, metres.
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_least(self, 1, "num_sweeps")
-        check(0 < self.close_m < math.inf, "close_m", self.close_m, "a positive number of metres")
 
 
 WHOLE_SWEEP = CloudReading(remove_close="none")
@@ -46,60 +50,43 @@ WHOLE_SWEEP = CloudReading(remove_close="none")
 
 @dataclasses.dataclass(frozen=True)
 class ProjectionConfig:
-    """Points to range image (paper, sections 3.1 and 3.2).
+    """Points to range image (paper, sections 3.1 and 3.2)."""
 
-    >>> ProjectionConfig(num_rounds=3).prioritize_current
-    True
-    """
-
-    num_rounds: int = 5  # Rounds of the multi-round projection.
+    num_rounds: Annotated[int, Bounds(1, MAX_ROUNDS)] = 5  # Rounds of the multi-round projection.
     prioritize_current: bool = True  # Points of the current sweep win all collisions with older points (table 2).
     remove_close: Literal["all", "sweeps", "none"] = CloudReading.remove_close
     """Our choice: remove the points on the ego vehicle, ``|x|, |y| < close_m``, from all sweeps, from the older
     sweeps only (which gives the paper's numbers of points), or from none."""
-    close_m: float = CloudReading.close_m
+    close_m: Positive = CloudReading.close_m
     """Our choice: half the side of the square that ``remove_close`` clears, metres."""
 
     def __post_init__(self) -> None:
         check_types(self)
-        check(1 <= self.num_rounds <= MAX_ROUNDS, "num_rounds", self.num_rounds, f"1 to {MAX_ROUNDS}")
-        check(0 < self.close_m < math.inf, "close_m", self.close_m, "a positive number of metres")
 
 
 @dataclasses.dataclass(frozen=True)
 class StemConfig:
-    """Modality-wise convolutions (paper, section 3.3, tables 3-5).
-
-    >>> StemConfig(groups="modalities").dilations
-    (1, 3, 6)
-    """
+    """Modality-wise convolutions (paper, section 3.3, tables 3-5)."""
 
     groups: Literal["types", "modalities", "all"] = "types"
     """Nine groups by channel type, five by modality, or one group (table 3)."""
     group_rounds: bool = True  # All rounds of a channel type share a group (table 3, last row: False).
-    num_convs: int = 2  # 3x3 grouped convolutions per branch (table 4).
-    dilations: tuple[int, ...] = (1, 3, 6)  # Dilation of each parallel branch; branches are summed (table 5).
-    channels_per_type: int = 32  # Features per channel type.
-    out_channels: int = 64  # Channels after the 1x1 merge.
+    num_convs: Count = 2  # 3x3 grouped convolutions per branch (table 4).
+    dilations: Counts = (1, 3, 6)  # Dilation of each parallel branch; branches are summed (table 5).
+    channels_per_type: Count = 32  # Features per channel type.
+    out_channels: Count = 64  # Channels after the 1x1 merge.
     merge: Literal["per_branch", "shared"] = "per_branch"
     """Our choice: one 1x1 merge per branch, or one shared by all branches."""
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_least(self, 1, "num_convs", "channels_per_type", "out_channels")
-        positive = min(self.dilations, default=0) >= 1
-        check(positive, "dilations", self.dilations, "one or more integers of at least 1")
         separable = self.group_rounds or self.groups == "types"
         check(separable, "group_rounds", self.group_rounds, "True unless groups is 'types'")
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """LiDAR-Net, feature pyramid and heads (paper, section 3.4).
-
-    >>> ModelConfig(head_channels=128).stem.num_convs
-    2
-    """
+    """LiDAR-Net, feature pyramid and heads (paper, section 3.4)."""
 
     stem: StemConfig = StemConfig()  # Modality-wise convolutions.
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -108,16 +95,16 @@ class ModelConfig:
     remat: bool = False
     """Recompute the activations of the stem and of the backbone's first stage in the backward pass: the same
     result with less memory and more time. Has no effect on CPUs, where XLA undoes it."""
-    row_upscale: int = 2  # Number of times each row is repeated (paper, section 4).
+    row_upscale: Count = 2  # Number of times each row is repeated (paper, section 4).
     circular_width: bool = False
     """Our choice: wrap every convolution around the azimuth instead of the paper's zero padding. The number of
     azimuth bins is then a multiple of 32."""
-    backbone_blocks: tuple[int, int, int, int] = (4, 4, 1, 1)  # Bottlenecks per stage.
-    backbone_widths: tuple[int, int, int, int] = (64, 128, 128, 128)
+    backbone_blocks: Annotated[tuple[int, int, int, int], Bounds(1)] = (4, 4, 1, 1)  # Bottlenecks per stage.
+    backbone_widths: Annotated[tuple[int, int, int, int], Bounds(1)] = (64, 128, 128, 128)
     """Bottleneck width per stage; a stage has four times as many output channels."""
-    fpn_channels: int = 256  # Our choice: channels of P2 to P7.
-    head_channels: int = 64  # Channels of both towers (128 for the test set).
-    head_convs: int = 4  # 3x3 convolutions per tower.
+    fpn_channels: Count = 256  # Our choice: channels of P2 to P7.
+    head_channels: Count = 64  # Channels of both towers (128 for the test set).
+    head_convs: Count = 4  # 3x3 convolutions per tower.
     tied_heads: bool = False  # Share one head between all levels (table 6).
     regression_axes: Literal["lidar", "ray"] = "lidar"
     """Axes of the predicted centre offset and velocity: the LiDAR frame's, as in equation 2, or the direction of
@@ -128,90 +115,79 @@ class ModelConfig:
     round_offsets: bool = False
     """Not in the paper: with local geometry, also the offsets from each location's point to the points of the
     later rounds in its pixel."""
-    background_prior: float = 0.99  # Our choice: initial background probability.
+    background_prior: Between = 0.99  # Our choice: initial background probability.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Our choice: means subtracted from the nine channels in preprocessing."""
-    channel_scale: tuple[float, ...] = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
+    channel_scale: Annotated[tuple[float, ...], Bounds(0.0, above=True)] = (
+        11.4,
+        11.4,
+        1.15,
+        10.7,
+        1.8,
+        0.19,
+        22.4,
+        1.0,
+        0.144,
+    )
     """Our choice: scales by which the nine channels are divided in preprocessing."""
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_least(self, 1, "row_upscale", "head_convs", "fpn_channels", "head_channels")
-        for name in ("backbone_blocks", "backbone_widths"):
-            stages = getattr(self, name)
-            check(len(stages) == 4 and min(stages) >= 1, name, stages, "four stages of at least 1")
         with_local = self.local_geometry or not self.round_offsets
         check(with_local, "round_offsets", self.round_offsets, "False without local_geometry")
         groups = max(1, min(32, self.head_channels // 2))  # Groups of the group norms, see models.layers.
         check(self.head_channels % groups == 0, "head_channels", self.head_channels, f"a multiple of {groups}")
-        prior = self.background_prior
-        check(0 < prior < 1, "background_prior", prior, "a probability between 0 and 1")
-        nine = len(self.channel_mean) == 9 and all(map(math.isfinite, self.channel_mean))
-        check(nine, "channel_mean", self.channel_mean, "nine finite numbers")
-        nine = len(self.channel_scale) == 9 and all(0 < scale < math.inf for scale in self.channel_scale)
-        check(nine, "channel_scale", self.channel_scale, "nine positive numbers")
+        for name in ("channel_mean", "channel_scale"):
+            nine = len(getattr(self, name)) == 9 and all(map(math.isfinite, getattr(self, name)))
+            check(nine, name, getattr(self, name), "nine finite numbers")
 
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """Assignment and losses (paper, section 3.4).
+    """Assignment and losses (paper, section 3.4)."""
 
-    >>> LossConfig(top_q=0)
-    Traceback (most recent call last):
-    ValueError: top_q: got 0, expected at least 1
-    """
-
-    top_q: int = 20  # Q: the dynamic K of a box is the rounded sum of its Q highest IoUs.
+    top_q: Count = 20  # Q: the dynamic K of a box is the rounded sum of its Q highest IoUs.
     regress_on: Literal["positives", "candidates"] = "positives"
     """Our choice: locations that box and IoU losses are averaged over: the positives, or all locations inside a
     box."""
     iou_loss: Literal["iou", "log_iou", "giou", "diou"] = "iou"
     """Our choice: 1 - IoU, UnitBox's -ln IoU, generalised IoU, or distance IoU."""
-    classification_weight: float = 1.0  # Our choice: weight of the cross-entropy.
-    l1_weight: float = 0.25  # Our choice: weight of the L1 loss.
-    iou_weight: float = 1.0  # Our choice: weight of the IoU loss.
-    iou_prediction_weight: float = 1.0  # Our choice: weight of the predicted IoU's binary cross-entropy.
-    velocity_weight: float = 0.2  # Our choice: weight of the velocity within the L1 loss.
-    refined_class_weight: float = 4.0
+    classification_weight: Amount = 1.0  # Our choice: weight of the cross-entropy.
+    l1_weight: Amount = 0.25  # Our choice: weight of the L1 loss.
+    iou_weight: Amount = 1.0  # Our choice: weight of the IoU loss.
+    iou_prediction_weight: Amount = 1.0  # Our choice: weight of the predicted IoU's binary cross-entropy.
+    velocity_weight: Amount = 0.2  # Our choice: weight of the velocity within the L1 loss.
+    refined_class_weight: Amount = 4.0
     """Weight of the second look's cross-entropy; not in the paper, see :class:`RefinementConfig`."""
-    refined_box_weight: float = 0.5  # Weight of the second look's L1 loss.
+    refined_box_weight: Amount = 0.5  # Weight of the second look's L1 loss.
     quality: Literal["iou", "centreness"] = "iou"
     """Target of the quality prediction, by which the score is multiplied: the rotated 3D IoU, or the distance
     between predicted and true centre (not in the paper), see :func:`fcos_lidar_jax.losses.centreness`."""
-    centreness_m: float = 0.75  # Distance between the centres at which the centreness is 1 / e, metres.
+    centreness_m: Positive = 0.75  # Distance between the centres at which the centreness is 1 / e, metres.
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_least(self, 1, "top_q")
-        for name, value in vars(self).items():
-            if name.endswith("_weight"):
-                check(math.isfinite(value) and value >= 0, name, value, "a finite number of at least 0")
         width = self.centreness_m
-        check(math.isfinite(width) and width > 0, "centreness_m", width, "a positive number of metres")
         relevant = self.quality == "centreness" or width == LossConfig.centreness_m
         check(relevant, "centreness_m", width, f"{LossConfig.centreness_m} unless quality is centreness")
 
 
 @dataclasses.dataclass(frozen=True)
 class InferenceConfig:
-    """Predictions to detections (paper, section 3.4).
+    """Predictions to detections (paper, section 3.4)."""
 
-    >>> InferenceConfig(max_detections=100).iou_threshold
-    0.2
-    """
-
-    min_probability: float = 0.01  # Minimum class probability of a candidate, before the IoU factor.
-    iou_threshold: float = 0.2  # NMS removes boxes that overlap a better box of their class by more than this.
-    max_detections: int = 500  # Maximum number of boxes per cloud.
-    candidates_per_level: int = 1000  # Our choice: (location, class) pairs of each level that enter NMS.
+    min_probability: BelowOne = 0.01  # Minimum class probability of a candidate, before the IoU factor.
+    iou_threshold: Share = 0.2  # NMS removes boxes that overlap a better box of their class by more than this.
+    max_detections: Count = 500  # Maximum number of boxes per cloud.
+    candidates_per_level: Count = 1000  # Our choice: (location, class) pairs of each level that enter NMS.
     nms_overlap: Literal["bev", "3d"] = "bev"  # Our choice: rotated IoU in the ground plane, or in 3D.
     nms_across_classes: bool = False
     """Not in the paper: NMS also removes boxes that overlap a better box of another class. With a second look,
     only the NMS after it does."""
-    iou_exponent: float = 1.0
+    iou_exponent: Amount = 1.0
     """Exponent of the predicted IoU, which multiplies the class probability: 1 in the paper; other values as in
     CIA-SSD (Zheng et al., AAAI 2021); 0 ignores the predicted IoU."""
-    merge_iou: float | None = None
+    merge_iou: Annotated[float | None, Bounds(0, 1)] = None
     """Not in the paper: weighted NMS, which replaces a kept box by the mean of the boxes that overlap it by more
     than this, see ``nms.merge_boxes``; None disables it."""
     flips: Literal["none", "x", "y", "xy"] = "none"
@@ -220,91 +196,61 @@ class InferenceConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check(0 <= self.min_probability < 1, "min_probability", self.min_probability, "within [0, 1)")
-        check(0 <= self.iou_threshold <= 1, "iou_threshold", self.iou_threshold, "within [0, 1]")
-        check_least(self, 1, "max_detections", "candidates_per_level")
-        check(0 <= self.iou_exponent < math.inf, "iou_exponent", self.iou_exponent, "finite, 0 or more")
-        check(self.merge_iou is None or 0 <= self.merge_iou <= 1, "merge_iou", self.merge_iou, "within [0, 1]")
 
 
 @dataclasses.dataclass(frozen=True)
 class RefinementConfig:
-    """A second look at the points of the best boxes (not in the paper), see :mod:`fcos_lidar_jax.refinement`.
+    """A second look at the points of the best boxes (not in the paper), see :mod:`fcos_lidar_jax.refinement`."""
 
-    >>> RefinementConfig(num_points=0)
-    Traceback (most recent call last):
-    ValueError: num_points: got 0, expected at least 1
-    """
-
-    num_boxes: int = 200  # Best boxes of a cloud that are looked at; others are dropped.
-    num_points: int = 64  # Maximum number of points per box.
-    margin_m: float = 1.0  # Boxes are enlarged by this on every side, metres.
-    point_channels: tuple[int, ...] = (32, 64, 128)  # Channels of the layers on each point.
-    box_channels: tuple[int, ...] = (128, 128)  # Channels of the layers on each box.
+    num_boxes: Count = 200  # Best boxes of a cloud that are looked at; others are dropped.
+    num_points: Count = 64  # Maximum number of points per box.
+    margin_m: Amount = 1.0  # Boxes are enlarged by this on every side, metres.
+    point_channels: Counts = (32, 64, 128)  # Channels of the layers on each point.
+    box_channels: Counts = (128, 128)  # Channels of the layers on each box.
     move_boxes: bool = True  # Move the boxes in detection; without, only their scores change.
-    first_score_weight: float = 0.5
+    first_score_weight: Share = 0.5
     """Weight of the detector's score in the geometric mean with the second look's; 0 ignores it. A mean of both is
     more robust on data unlike the training's."""
     radius_range_m: tuple[float, float] = (1.0, 2.0)
     """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can
     stand for it."""
-    between_weight: float = 0.3
+    between_weight: Share = 0.3
     """Weight of boxes between one and two radii in the classification: they are neither right nor wrong."""
     freeze_detector: bool = False
     """Train only the second look; the detector is applied as in detection. For ``train --weights``."""
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_least(self, 1, "num_boxes", "num_points")
-        check(0 <= self.margin_m < math.inf, "margin_m", self.margin_m, "finite metres of at least 0")
-        for name in ("point_channels", "box_channels"):
-            check(min(getattr(self, name), default=0) >= 1, name, getattr(self, name), "counts of at least 1")
         low, high = self.radius_range_m
         check(0 < low <= high < math.inf, "radius_range_m", self.radius_range_m, "(low, high), 0 < low <= high")
-        for name in ("between_weight", "first_score_weight"):
-            check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "within [0, 1]")
 
 
 @dataclasses.dataclass(frozen=True)
 class AugmentConfig:
-    """On-device augmentation of points and boxes (paper, section 4).
+    """On-device augmentation of points and boxes (paper, section 4)."""
 
-    >>> AugmentConfig(max_rotation_rad=0.0).scale_range
-    (0.95, 1.05)
-    """
-
-    flip_x_probability: float = 0.5  # Our choice: probability of x -> -x.
-    flip_y_probability: float = 0.5  # Our choice: probability of y -> -y, independent of the flip of x.
-    max_rotation_rad: float = math.pi  # The rotation about z is uniform between minus and plus this angle.
+    flip_x_probability: Share = 0.5  # Our choice: probability of x -> -x.
+    flip_y_probability: Share = 0.5  # Our choice: probability of y -> -y, independent of the flip of x.
+    max_rotation_rad: Amount = math.pi  # The rotation about z is uniform between minus and plus this angle.
     scale_range: tuple[float, float] = (0.95, 1.05)  # The scale is uniform in this range.
 
     def __post_init__(self) -> None:
         check_types(self)
-        for name in ("flip_x_probability", "flip_y_probability"):
-            check(0 <= getattr(self, name) <= 1, name, getattr(self, name), "a probability")
-        angle = self.max_rotation_rad
-        check(0 <= angle < math.inf, "max_rotation_rad", angle, "a finite angle of at least 0")
         low, high = self.scale_range
         check(0 < low <= high < math.inf, "scale_range", self.scale_range, "finite (low, high), 0 < low <= high")
 
 
 @dataclasses.dataclass(frozen=True)
 class CopyPasteConfig:
-    """Copy-paste of objects from other frames into a training frame (paper, section 4, after SECOND).
+    """Copy-paste of objects from other frames into a training frame (paper, section 4, after SECOND)."""
 
-    >>> CopyPasteConfig(targets=(2, 3)).min_points
-    5
-    """
-
-    targets: tuple[int, ...] = ()
+    targets: Annotated[tuple[int, ...], Bounds(0, empty=True)] = ()
     """Our choice: number of boxes per class up to which a frame is filled, including its own boxes; () for the
     numbers of ``classes.PASTE_TARGETS``."""
-    min_points: int = 5  # Minimum number of points of an object, over all pasted sweeps.
+    min_points: Count = 5  # Minimum number of points of an object, over all pasted sweeps.
 
     def __post_init__(self) -> None:
         check_types(self)
-        check(min(self.targets, default=0) >= 0, "targets", self.targets, "counts of at least 0")
-        check_least(self, 1, "min_points")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,36 +262,28 @@ class OptimizerConfig:
     ValueError: accumulate: got 3, expected a divisor of the batch size 32
     """
 
-    peak_learning_rate: float = 1e-2  # Learning rate at the end of the warm-up.
-    initial_divisor: float = 10.0  # The first learning rate is the peak divided by this.
-    final_divisor: float = 1e4  # The learning rate falls towards the first divided by this.
-    warmup_fraction: float = 0.4  # Fraction of the steps that belong to the warm-up.
+    peak_learning_rate: Positive = 1e-2  # Learning rate at the end of the warm-up.
+    initial_divisor: Positive = 10.0  # The first learning rate is the peak divided by this.
+    final_divisor: Positive = 1e4  # The learning rate falls towards the first divided by this.
+    warmup_fraction: Between = 0.4  # Fraction of the steps that belong to the warm-up.
     b1_range: tuple[float, float] = (0.85, 0.95)
     """Momentum range: high at both ends, low at the peak of the learning rate; cosine (our choice)."""
-    b2: float = 0.99  # Our choice: decay of the second moment.
-    weight_decay: float = 0.01  # Applied to all parameters (our choice).
-    max_gradient_norm: float = 35.0  # Our choice: global-norm clipping.
-    batch_size: int = 32  # Our choice: samples per step, over all devices.
-    accumulate: int = 1
+    b2: BelowOne = 0.99  # Our choice: decay of the second moment.
+    weight_decay: Amount = 0.01  # Applied to all parameters (our choice).
+    max_gradient_norm: Positive = 35.0  # Our choice: global-norm clipping.
+    batch_size: Count = 32  # Our choice: samples per step, over all devices.
+    accumulate: Count = 1
     """Micro-batches per step. Gradients and counts are summed and divided once; batch norm sees one
     micro-batch."""
-    ema_decay: float = 0.0  # Decay of the moving average of the weights used for detection; 0 for none (paper).
-    epochs: int = 40  # Passes over the training set.
+    ema_decay: BelowOne = 0.0  # Decay of the moving average of the weights used for detection; 0 for none (paper).
+    epochs: Count = 40  # Passes over the training set.
 
     def __post_init__(self) -> None:
         check_types(self)
-        for name in ("peak_learning_rate", "initial_divisor", "final_divisor", "max_gradient_norm"):
-            value = getattr(self, name)
-            check(0 < value < math.inf, name, value, "finite, above 0")
-        check(0 <= self.weight_decay < math.inf, "weight_decay", self.weight_decay, "finite, 0 or more")
-        check(0 <= self.b2 < 1, "b2", self.b2, "within [0, 1)")
         low, high = self.b1_range
         check(0 < low <= high < 1, "b1_range", self.b1_range, "(low, high) with 0 < low <= high < 1")
-        check(0 < self.warmup_fraction < 1, "warmup_fraction", self.warmup_fraction, "between 0 and 1")
-        check_least(self, 1, "batch_size", "epochs")
-        divides = self.accumulate >= 1 and self.batch_size % self.accumulate == 0
+        divides = self.batch_size % self.accumulate == 0
         check(divides, "accumulate", self.accumulate, f"a divisor of the batch size {self.batch_size}")
-        check(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "within [0, 1)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -365,12 +303,12 @@ class Config:
     sensor: str = "nuscenes_hdl32e"  # Sensor preset or path of a sensor file.
     classes: tuple[str, ...] = NUSCENES_CLASSES
     """Names of the detected classes. Each has one logit; the last logit is the background."""
-    class_ranges_m: tuple[float, ...] = ()
+    class_ranges_m: Annotated[tuple[float, ...], Bounds(0.0, above=True, empty=True)] = ()
     """Evaluation range per class, metres; () for the ranges of ``classes.RANGES_M``."""
-    num_sweeps: int = 10  # Sweeps fused into one cloud, including the current one.
-    max_points: int = 300_000  # Our choice: rows to which a fused cloud is padded.
-    max_boxes: int = 256  # Our choice: rows to which the ground truth is padded.
-    fade_epochs: int = 0  # Last epochs without copy-paste (paper, section 4.5: 5 for the test set).
+    num_sweeps: Count = 10  # Sweeps fused into one cloud, including the current one.
+    max_points: Count = 300_000  # Our choice: rows to which a fused cloud is padded.
+    max_boxes: Count = 256  # Our choice: rows to which the ground truth is padded.
+    fade_epochs: Natural = 0  # Last epochs without copy-paste (paper, section 4.5: 5 for the test set).
     copy_paste: CopyPasteConfig | None = CopyPasteConfig()  # Objects from the ground-truth database, or None.
     class_balanced: bool = True  # Our choice: frames are resampled so that all classes occur equally often (CBGS).
     projection: ProjectionConfig = ProjectionConfig()  # Points to range image.
@@ -383,8 +321,6 @@ class Config:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_least(self, 1, "num_sweeps", "max_points", "max_boxes")
-        check_least(self, 0, "fade_epochs")
         names = self.classes
         check(len(names) >= 1 and all(names), "classes", names, "one or more names")
         check(len(set(names)) == len(names), "classes", names, "different names")
@@ -393,7 +329,6 @@ class Config:
         expected = f"at least the {rounds} rounds, which are convolved separately"
         check(enough, "model.stem.channels_per_type", stem.channels_per_type, expected)
         check_per_class("class_ranges_m", self.class_ranges_m, names)
-        check(all(v > 0 for v in self.class_ranges_m), "class_ranges_m", self.class_ranges_m, "values above 0")
         for axis in self.inference.flips if self.inference.flips != "none" else "":
             trained = self.augment is not None and getattr(self.augment, f"flip_{axis}_probability") > 0
             check(trained, "inference.flips", self.inference.flips, f"augment.flip_{axis}_probability above 0")

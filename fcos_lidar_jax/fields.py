@@ -4,24 +4,53 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """The numbers that a field accepts, declared by ``Annotated`` and checked by :func:`check_types`.
+
+    They hold for each entry of a tuple, and for any value but None. Infinities are never accepted.
+    """
+
+    low: float
+    high: float = math.inf
+    above: bool = False  # without ``low`` itself
+    below: bool = False  # without ``high`` itself
+    empty: bool = False  # also an empty tuple
+
+    def hold(self, value: Any) -> bool:
+        numbers = value if isinstance(value, tuple) else (value,)
+        low = all(number > self.low or (number == self.low and not self.above) for number in numbers)
+        closed = not self.below and self.high < math.inf
+        high = all(number < self.high or (number == self.high and closed) for number in numbers)
+        return low and high and (self.empty or len(numbers) > 0)
+
+    def __str__(self) -> str:
+        if self.high < math.inf:
+            return f"within {'(' if self.above else '['}{self.low:g}, {self.high:g}{')' if self.below else ']'}"
+        if isinstance(self.low, int):
+            return f"at least {self.low}"
+        return f"a finite number {'above' if self.above else 'of at least'} {self.low:g}"
+
+
+Natural = Annotated[int, Bounds(0)]
+Count = Annotated[int, Bounds(1)]
+Counts = Annotated[tuple[int, ...], Bounds(1)]
+Amount = Annotated[float, Bounds(0.0)]
+Positive = Annotated[float, Bounds(0.0, above=True)]
+Positives = Annotated[tuple[float, ...], Bounds(0.0, above=True)]
+Share = Annotated[float, Bounds(0, 1)]
+BelowOne = Annotated[float, Bounds(0, 1, below=True)]
+Between = Annotated[float, Bounds(0, 1, above=True, below=True)]  # 0 and 1
 
 
 def check(condition: bool, field: str, got: object, expected: str) -> None:
-    """Raise a ValueError with the field, the found and the expected value unless a condition holds.
-
-    >>> check(0 > 1, "epochs", 0, "at least 1")
-    Traceback (most recent call last):
-    ValueError: epochs: got 0, expected at least 1
-    """
+    """Raise a ValueError with the field, the found and the expected value unless a condition holds."""
     if not condition:
-        raise ValueError(f"{field}: got {got!r}, expected {expected}")
-
-
-def check_least(record: Any, least: int, *fields: str) -> None:
-    """Check that fields of a dataclass are not below a number."""
-    for field in fields:
-        check(getattr(record, field) >= least, field, getattr(record, field), f"at least {least}")
+        text = repr(got)
+        raise ValueError(f"{field}: got {text if len(text) <= 500 else f'{text[:500]}...'}, expected {expected}")
 
 
 def check_per_class(field: str, values: Collection[object], classes: Collection[str]) -> None:
@@ -31,31 +60,31 @@ def check_per_class(field: str, values: Collection[object], classes: Collection[
 
 
 def unknown_name(name: str, known: Iterable[str]) -> str:
-    """Part of a message: the unknown name, and the nearest known names or else all of them.
-
-    >>> unknown_name("trunk", ("car", "truck"))
-    "got 'trunk', expected truck"
-    """
+    """Part of a message: the unknown name, and the nearest known names or else all of them."""
     known = list(known)
     return f"got {name!r}, expected {' or '.join(difflib.get_close_matches(name, known)) or ', '.join(known)}"
 
 
 def check_types(record: Any) -> None:
-    """Check that every field of a dataclass has its annotated type, and that a ``Literal`` is one of its choices.
+    """Check that every field of a dataclass has its annotated type, length and :class:`Bounds`.
 
     Integers fit floats. Lists and arrays do not fit: compiled programs are looked up by the hash of options.
     """
-    for name, kind in get_type_hints(type(record)).items():
-        value = getattr(record, name)
+    for name, kind in get_type_hints(type(record), include_extras=True).items():
+        value, bounds = getattr(record, name), None
+        if get_origin(kind) is Annotated:
+            kind, bounds = get_args(kind)
         check(_fits(kind, value), name, value, _expected(kind))
+        check(bounds is None or value is None or bounds.hold(value), name, value, str(bounds))
 
 
 def _fits(kind: Any, value: Any) -> bool:
     origin, args = get_origin(kind), get_args(kind)
     if origin is Literal:
         return any(type(value) is type(choice) and value == choice for choice in args)
-    if origin is tuple:  # The numbers of values are checked in the words of each field.
-        return isinstance(value, tuple) and all(_fits(args[0], entry) for entry in value)
+    if origin is tuple:
+        of_length = isinstance(value, tuple) and (args[-1] is Ellipsis or len(value) == len(args))
+        return of_length and all(_fits(args[0], entry) for entry in value)
     if args:  # AugmentConfig | None
         return any(_fits(each, value) for each in args)
     if isinstance(value, bool):
@@ -68,7 +97,8 @@ def _expected(kind: Any) -> str:
     if origin is Literal:
         return "one of " + ", ".join(map(repr, args))
     if origin is tuple:
-        return f"a tuple of {args[0].__name__}"
+        number = "" if args[-1] is Ellipsis else f"{len(args)} "
+        return f"a tuple of {number}{args[0].__name__}"
     return " or ".join("None" if each is type(None) else each.__name__ for each in args or (kind,))
 
 

@@ -32,11 +32,7 @@ def in_form(form: str | None, forms: Mapping[str, Callable[..., T]], *args: Arra
 
 
 def search(ascending: Array, values: Array, *, side: Literal["left", "right"] = "left") -> Array:
-    """``jnp.searchsorted`` by binary search on CPUs, and by comparison of all pairs, without a loop, elsewhere.
-
-    >>> search(jnp.array([1.0, 2.0, 2.0]), jnp.array([2.0]), side="right").tolist()
-    [3]
-    """
+    """``jnp.searchsorted`` by binary search on CPUs, and by comparison of all pairs, without a loop, elsewhere."""
     scan, compare = (
         functools.partial(jnp.searchsorted, side=side, method=method) for method in ("scan", "compare_all")
     )

@@ -4,11 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int32
 
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import BOX, check_columns
-
-__dir__ = own_names(__name__)
 
 # Coefficients of atan(t) / t in t^2 on [0, 1]: minimax in the relative error, 1.2e-9 in exact arithmetic.
 _ATAN = (

@@ -15,10 +15,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.types import BOX, ORIENTED, check_columns
-
-__dir__ = own_names(__name__)
 
 _TINY = 1e-7
 _COINCIDENT_M = 1e-5

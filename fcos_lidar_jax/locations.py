@@ -12,11 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float32
 
 from fcos_lidar_jax.config import ModelConfig
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CHANNELS, Locations, RangeImage
-
-__dir__ = own_names(__name__)
 
 STRIDES = (1, 2, 4, 8, 16, 32)  # Strides of P2 to P7 in the padded image.
 

@@ -15,10 +15,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from fcos_lidar_jax.config import LossConfig
 from fcos_lidar_jax.iou import oriented_overlap
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.types import ORIENTED, check_columns, check_rows
-
-__dir__ = own_names(__name__)
 
 SumCount = tuple[Float[Array, ""], Int32[Array, ""]]
 

@@ -15,10 +15,7 @@ from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.forms import in_form
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.iou import oriented, oriented_overlap
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.types import check_rows
-
-__dir__ = own_names(__name__)
 
 _T = TypeVar("_T")
 _Mean = Callable[..., Array]

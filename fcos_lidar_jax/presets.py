@@ -16,9 +16,6 @@ from fcos_lidar_jax.config import (
     RefinementConfig,
     StemConfig,
 )
-from fcos_lidar_jax.namespaces import own_names
-
-__dir__ = own_names(__name__)
 
 NUSCENES = Config()
 """The paper's detector: ten sweeps, five rounds."""

@@ -21,11 +21,8 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.forms import in_form, search
 from fcos_lidar_jax.geometry import image_columns, spherical
-from fcos_lidar_jax.namespaces import own_names
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.types import CHANNELS, RangeImage
-
-__dir__ = own_names(__name__)
 
 
 def close_to_sensor(

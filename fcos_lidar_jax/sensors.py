@@ -3,25 +3,20 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from fcos_lidar_jax.fields import check, check_types, from_json, unknown_name
+from fcos_lidar_jax.fields import Bounds, check, check_types, from_json, unknown_name
 from fcos_lidar_jax.files import read_json
-from fcos_lidar_jax.namespaces import own_names
-
-__dir__ = own_names(__name__)
 
 _MAX_NUMBER = 1e30  # Keeps float32 arithmetic finite.
 _SAME_HEADING_RAD = 1e-3  # headings typed with few digits are the same
 # Far more than any LiDAR has, so that a corrupt number cannot exhaust the memory.
 _MAX_ROWS = 4096
 _MAX_COLUMNS = 65536
-
-
-def _finite(*values: float) -> bool:
-    return all(abs(value) <= _MAX_NUMBER for value in values)
+_Place = Bounds(-_MAX_NUMBER, _MAX_NUMBER)
+_Positive = Annotated[float, Bounds(0.0, _MAX_NUMBER, above=True)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,22 +25,21 @@ class Sensor:
 
     Raises:
         ValueError: at construction, naming the field, the found and the expected value.
-
-    >>> NUSCENES_HDL32E.num_rows, NUSCENES_HDL32E.num_columns
-    (32, 1086)
     """
 
     name: str
-    inclinations_rad: tuple[float, ...]
+    inclinations_rad: Annotated[tuple[float, ...], Bounds(-math.pi / 2, math.pi / 2)]
     """Inclination of each beam in radians, one per image row and strictly decreasing: row 0 is the highest beam.
     The table is nominal for sensors with ``row_source="laser"``."""
-    num_columns: int
+    num_columns: Annotated[int, Bounds(2, _MAX_COLUMNS)]
     """Azimuth bins of one turn, or of the covered sector. Columns run clockwise; column 0 starts at azimuth pi, or
     at the left end of the sector."""
-    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # In the points' frame; subtracted before equation 1.
-    limit_xy_m: float = 54.0  # Points with ``|x|`` or ``|y|`` at or beyond this limit are dropped.
-    limit_z_m: tuple[float, float] = (-5.0, 3.0)  # Points with z outside this open interval are dropped.
-    intensity_scale: float = 1.0  # Factor from the intensity in files to the scale 0-255.
+    origin_m: Annotated[tuple[float, float, float], _Place] = (0.0, 0.0, 0.0)
+    """In the points' frame; subtracted before equation 1."""
+    limit_xy_m: _Positive = 54.0  # Points with ``|x|`` or ``|y|`` at or beyond this limit are dropped.
+    limit_z_m: Annotated[tuple[float, float], _Place] = (-5.0, 3.0)
+    """Points with z outside this open interval are dropped."""
+    intensity_scale: _Positive = 1.0  # Factor from the intensity in files to the scale 0-255.
     row_source: Literal["inclination", "laser"] = "inclination"
     """``"inclination"`` bins the inclination of each point; ``"laser"`` reads the row from a sixth point column,
     for stacked sensors whose inclinations overlap."""
@@ -53,35 +47,21 @@ class Sensor:
     """Right and left end of the covered sector, counter-clockwise and at most a turn apart, with the right end in
     [-pi, pi]; None for a full turn. Points outside the sector are dropped."""
     # Not in `repr`, which fingerprints of frames contain: it changes no point that is read.
-    forward_rad: float | None = dataclasses.field(default=None, repr=False)
+    forward_rad: Annotated[float | None, Bounds(-math.pi, math.pi)] = dataclasses.field(default=None, repr=False)
     """Azimuth of the ego vehicle's heading in the frame of the points, in [-pi, pi]: 0 where x points forward,
     pi/2 where y points forward. None if unknown; clouds are then never rotated."""
 
     def __post_init__(self) -> None:
         check_types(self)
-        table = np.asarray(self.inclinations_rad, np.float64)
-        if table.ndim != 1 or table.size < 2:
-            raise ValueError(f"inclinations_rad: got {table.size} beams, expected at least 2")
-        if not np.isfinite(table).all() or np.abs(table).max() > math.pi / 2:
-            raise ValueError("inclinations_rad: expected finite radians within [-pi/2, pi/2]")
+        table, ends = np.asarray(self.inclinations_rad, np.float64), self.azimuth_limits_rad
+        check(2 <= table.size <= _MAX_ROWS, "inclinations_rad", f"{table.size} beams", f"2 to {_MAX_ROWS}")
         if not (np.diff(table) < 0).all():
             raise ValueError("inclinations_rad: expected strictly decreasing values, the highest beam first")
-        check(table.size <= _MAX_ROWS, "inclinations_rad", f"{table.size} beams", f"at most {_MAX_ROWS}")
-        columns, origin, limits_z = self.num_columns, self.origin_m, self.limit_z_m
-        fits = isinstance(columns, int) and 2 <= columns <= _MAX_COLUMNS
-        check(fits, "num_columns", columns, f"an integer from 2 to {_MAX_COLUMNS}")
-        check(len(origin) == 3 and _finite(*origin), "origin_m", origin, "three finite numbers")
-        ordered = len(limits_z) == 2 and _finite(*limits_z) and limits_z[0] < limits_z[1]
-        check(ordered, "limit_z_m", limits_z, "finite (low, high) with low < high")
-        for name in ("limit_xy_m", "intensity_scale"):
-            value = getattr(self, name)
-            check(_finite(value) and value > 0, name, value, "a positive number")
-        if (ends := self.azimuth_limits_rad) is not None:
-            within = len(ends) == 2 and abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
+        check(self.limit_z_m[0] < self.limit_z_m[1], "limit_z_m", self.limit_z_m, "(low, high) with low < high")
+        if ends is not None:
+            within = abs(ends[0]) <= math.pi and 0 < ends[1] - ends[0] <= 2 * math.pi
             expected = "(right, left) with right in [-pi, pi] and left at most one turn further"
             check(within, "azimuth_limits_rad", ends, expected)
-        known = self.forward_rad is None or abs(self.forward_rad) <= math.pi
-        check(known, "forward_rad", self.forward_rad, "an angle in [-pi, pi], or null")
 
     @property
     def first_azimuth_rad(self) -> float:
@@ -148,9 +128,6 @@ def turn_between(data: Sensor, other: Sensor) -> float:
     """Rotation about z, radians, from one sensor's frame to another's.
 
     Maps the ego vehicle's heading in the first frame to its heading in the second; 0 if a heading is unknown.
-
-    >>> turn_between(KITTI_HDL64E, NUSCENES_HDL32E) == math.pi / 2, turn_between(VLP16, NUSCENES_HDL32E)
-    (True, 0.0)
     """
     if data.forward_rad is None or other.forward_rad is None:
         return 0.0
@@ -247,11 +224,7 @@ PRESETS: dict[str, Sensor] = {s.name: s for s in (*_REAL, TINY, SHORT_RANGE)}
 
 
 def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
-    """Convert a sensor to the JSON object that :func:`sensor_from_json` reads.
-
-    >>> sensor_from_json(sensor_to_json(TINY)) == TINY
-    True
-    """
+    """Convert a sensor to the JSON object that :func:`sensor_from_json` reads."""
     return dataclasses.asdict(sensor)
 
 
@@ -265,16 +238,13 @@ def _usual_heading(name: object) -> float | None:
 class _EvenBeams:
     """Evenly spaced beams, in degrees, of a sensor file."""
 
-    lowest: float
-    highest: float
-    rows: int
+    lowest: Annotated[float, _Place]
+    highest: Annotated[float, _Place]
+    rows: Annotated[int, Bounds(2, _MAX_ROWS)]
 
     def __post_init__(self) -> None:
         check_types(self)
-        for name in ("lowest", "highest"):
-            check(_finite(getattr(self, name)), name, getattr(self, name), "a finite number")
         check(self.lowest < self.highest, "highest", self.highest, f"more than the lowest beam, {self.lowest:g}")
-        check(2 <= self.rows <= _MAX_ROWS, "rows", self.rows, f"an integer from 2 to {_MAX_ROWS}")
 
 
 def sensor_from_json(record: Any, where: str = "sensor") -> Sensor:
@@ -317,9 +287,6 @@ def load_sensor(path: str | Path) -> Sensor:
 
     Raises:
         ValueError: naming the file, the field, the found and the expected value.
-
-    >>> load_sensor("tiny") == TINY
-    True
     """
     if str(path) in PRESETS:
         return PRESETS[str(path)]

@@ -13,11 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float32, Int32, UInt8, UInt16
-
-from fcos_lidar_jax.namespaces import own_names
-
-__dir__ = own_names(__name__)
+from jaxtyping import Array, Bool, Float32, Int32
 
 CHANNELS = ("x", "y", "z", "range", "azimuth", "inclination", "intensity", "existence", "time_lag")
 """The nine channel types of a range image (paper, section 3.1)."""
@@ -33,10 +29,6 @@ def check_columns(name: str, array: Array | np.ndarray, columns: str) -> None:
 
     Raises:
         ValueError: too few or too many columns.
-
-    >>> check_columns("box", np.zeros(5), "x, y, z, l, w, h, yaw, ...")
-    Traceback (most recent call last):
-    ValueError: box: got shape (5,), expected columns x, y, z, l, w, h, yaw, ...
     """
     names = columns.split(", ")
     number, found = len(names) - (names[-1] == "..."), array.shape[-1] if array.shape else 0
@@ -50,10 +42,6 @@ def check_rows(number: int, *, axes: int = 1, **arrays: Any) -> None:
 
     Raises:
         ValueError: an array has another length than ``number``, or another number of ``axes``.
-
-    >>> check_rows(2, scores=np.zeros((2, 1)))
-    Traceback (most recent call last):
-    ValueError: scores: got shape (2, 1), expected (2,)
     """
     for name, array in arrays.items():
         shape = np.shape(array)
@@ -64,12 +52,7 @@ def check_rows(number: int, *, axes: int = 1, **arrays: Any) -> None:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RangeImage:
-    """A multi-round range image (paper, sections 3.1 and 3.2).
-
-    >>> empty = RangeImage(np.zeros((32, 1086, 9, 5)), np.full((32, 1086, 5), -1), np.int32(0))
-    >>> empty.features[:, :, CHANNELS.index("range"), 0].shape  # ranges of the first round
-    (32, 1086)
-    """
+    """A multi-round range image (paper, sections 3.1 and 3.2)."""
 
     features: Float32[Array, "*b h w 9 r"]
     """Channels in the order of :data:`CHANNELS`, in raw units; all nine are zero in empty slots."""
@@ -106,54 +89,18 @@ class Batch:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class PackedBatch:
-    """A :class:`Batch` in fewer bytes for transfer to the device, see :mod:`fcos_lidar_jax.packing`.
-
-    Valid rows come first, in order; padding rows are zero.
-
-    >>> clouds = np.zeros((2, 4096, 3), np.float32), *[np.zeros((2, 4096), np.uint8)] * 2
-    >>> truth = np.zeros((2, 32, 9)), np.zeros((2, 32), int), np.zeros((2, 32), bool)
-    >>> PackedBatch(*clouds, np.zeros((2, 10), np.float32), None, np.array([17, 4000]), *truth).xyz.nbytes
-    98304
-    """
-
-    xyz: Float32[Array, "b n 3"]  # Metres.
-    intensity: UInt8[Array, "b n"] | Float32[Array, "b n"]  # Scale 0-255.
-    lag: UInt8[Array, "b n"] | UInt16[Array, "b n"] | Float32[Array, "b n"]
-    """Index into the sample's ``lags``, or the time lag in seconds if ``lags`` is empty."""
-    lags: Float32[Array, "b t"]  # Time lags of each sample, seconds.
-    laser: UInt8[Array, "b n"] | Float32[Array, "b n"] | None  # Laser number, if the rows come from it.
-    count: Int32[Array, "b"]  # Number of valid rows.
-    boxes: Float32[Array, "b m 9"]  # The remaining fields are the same as in :class:`Batch`.
-    labels: Int32[Array, "b m"]
-    box_valid: Bool[Array, "b m"]
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
 class HostBatch:
-    """A batch before and after transfer to the device, with information for logs and messages.
+    """A batch before and after transfer to the device, with information for logs and messages."""
 
-    >>> HostBatch(batch=None, counts={"truncated_points": 3}, names=("frame 0", "frame 7")).counts
-    {'truncated_points': 3}
-    """
-
-    batch: Batch | PackedBatch  # NumPy rows of this process; after transfer, arrays of the global batch.
+    batch: Batch  # NumPy rows of this process; after transfer, arrays of the global batch.
     counts: dict[str, int]  # Logged with the metrics, such as ``truncated_points``.
     names: tuple[str, ...]  # Frame names of the samples, for messages.
-    misfit: str | None = None  # Reason why this batch is unpacked in a run with packed batches.
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Locations:
-    """Point and pixel of each location of the feature levels (paper, section 3.4).
-
-    >>> from fcos_lidar_jax.locations import ImageLayout, locate
-    >>> image = RangeImage(np.ones((32, 128, 9, 1)), np.zeros((32, 128, 1), int), np.int32(0))
-    >>> locate(image, ImageLayout(rows=32, columns=128, row_upscale=1)).points.shape
-    (5460, 3)
-    """
+    """Point and pixel of each location of the feature levels (paper, section 3.4)."""
 
     points: Float32[Array, "*b l 3"]  # First-round point of the location's pixel, metres; zero where empty.
     azimuth_rad: Float32[Array, "*b l"]  # Azimuth of that point; zero where empty.
@@ -164,12 +111,7 @@ class Locations:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Outputs:
-    """Raw predictions of the network at all locations.
-
-    >>> outputs = Outputs(np.zeros((5460, 11)), np.zeros((5460, 10, 10)), np.zeros((5460, 10)))
-    >>> outputs.regression[:, :3, 0].shape  # centre offsets of the first class
-    (5460, 3)
-    """
+    """Raw predictions of the network at all locations."""
 
     logits: Float32[Array, "*b l c"]  # Class logits: k classes, then the background.
     regression: Float32[Array, "*b l 10 k"]
@@ -180,14 +122,7 @@ class Outputs:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Targets:
-    """Result of the assignment of one sample.
-
-    >>> import jax.numpy as jnp
-    >>> from fcos_lidar_jax.assignment import assign
-    >>> targets = assign(jnp.array([0, 0, -1]), jnp.ones(3), jnp.array([0.9, 0.8, 0.0]), num_boxes=1)
-    >>> targets.num_positive.tolist(), targets.positive.tolist()
-    ([2], [True, True, False])
-    """
+    """Result of the assignment of one sample."""
 
     owner: Int32[Array, "*b l"]  # Box that contains the location's point, -1 where no box does.
     positive: Bool[Array, "*b l"]  # True for the K cheapest locations of each owner.
@@ -195,12 +130,7 @@ class Targets:
 
 
 class Sums(NamedTuple):
-    """The losses of a batch before the division. All fields are sums, which add up over micro-batches and devices.
-
-    >>> import jax.numpy as jnp
-    >>> Sums(losses={"boxes": {"l1": jnp.float32(3)}}, counts={"boxes": jnp.int32(2)}).means
-    {}
-    """
+    """The losses of a batch before the division: sums, which add up over micro-batches and devices."""
 
     losses: dict[str, dict[str, Array]]
     """Name of the count that divides them -> loss -> its sum, unweighted; ``LossConfig`` has the weights."""
@@ -212,12 +142,7 @@ class Sums(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Detections:
-    """Final boxes, best first, padded to a fixed count.
-
-    >>> none = Detections(np.zeros((5, 9)), np.zeros(5), np.zeros(5, int), np.zeros(5, bool), np.int32(0))
-    >>> none.boxes[none.valid].shape
-    (0, 9)
-    """
+    """Final boxes, best first, padded to a fixed count."""
 
     boxes: Float32[Array, "*b d 9"]  # Boxes, see the module docstring; zero where invalid.
     scores: Float32[Array, "*b d"]  # Class probability times predicted IoU; zero where invalid.
@@ -229,12 +154,7 @@ class Detections:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrainState:
-    """State carried from step to step: arrays only, no functions.
-
-    >>> state = TrainState(np.int32(0), {"kernel": np.ones(3)}, {}, (), None, jax.random.key(0))
-    >>> len(jax.tree.leaves(state))  # step, kernel, key
-    3
-    """
+    """State carried from step to step: arrays only, no functions."""
 
     step: Int32[Array, ""]  # Number of completed updates.
     params: Any  # Trainable arrays of the network.

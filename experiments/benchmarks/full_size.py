@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks.training_steps import training_steps
+from experiments.keyframe import read_keyframe
 from experiments.script import Options, find_real_data, run_measurement
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.database import cut_reading

@@ -41,10 +41,10 @@ from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.inference.export import export_detector, load_exported
 from fcos_lidar_jax.inference.load import load_trained
 from fcos_lidar_jax.models import build_detector
-from fcos_lidar_jax.packing import Packing, empty_packed
 from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
+from fcos_lidar_jax.types import Batch
 
 Card = Literal["h100", "a100"]
 _CARDS = {  # compute capability, cores, shared memory per core and per block, bandwidth, L2, clock, name
@@ -77,7 +77,6 @@ dnn_version_info {{ major: 9 minor: 10 }}
 runtime_version {{ major: 12 minor: 9 patch: 0 }}
 device_description_str: "{7}"
 """
-_NUM_LAGS = 410  # Distinct time lags of ten sweeps and pasted objects, with the preset ``nuscenes``.
 _NO_KERNEL = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "iota"}
 _EXCHANGES = ("all-gather", "all-to-all", "collective-permute", "reduce-scatter")
 
@@ -275,10 +274,8 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
     if program.kind == "detect":
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         return make_detect(detector), (variables, spec(n, c), spec(n, dtype=jnp.bool_)), (False,) * 3, ()
-    # The packing of the data sets' clouds: KITTI's intensities are not integers.
-    packing = Packing(1 if config.num_sweeps == 1 else _NUM_LAGS, byte_intensity=config.sensor != "kitti_hdl64e")
-    packed = empty_packed(b, packing, max_points=n, max_boxes=m, columns=c)
-    batch = jax.tree.map(lambda leaf: spec(*leaf.shape, dtype=leaf.dtype), packed)
+    clouds = spec(b, n, c), spec(b, n, dtype=jnp.bool_)
+    batch = Batch(*clouds, spec(b, m, 9), spec(b, m, dtype=jnp.int32), spec(b, m, dtype=jnp.bool_))
     return make_train_step(detector, optimizer), (state, batch), (False, True), (0,)
 
 

@@ -4,7 +4,7 @@
 
 Reads a data set in nuScenes' layout (such as one written by ``fcos-lidar synthesize``; default: the real
 scene-0523 below the environment's ``FCOS_LIDAR_REAL_DATA``), extracts a ground-truth database from it, and times
-batches prepared on demand, by two threads, by two processes, and packed for a device (a CPU here) by two threads.
+batches prepared on demand, by two threads, by two processes, and for a device (a CPU here) by two threads.
 A training step of the quickstart preset is timed for comparison. Files come from the page cache. Other programs
 increase the wall time but not the processor time: an undisturbed loader prepares about cores / (processor time per
 sample) samples per second.
@@ -39,7 +39,7 @@ from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.inference.timing import interleaved
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase, cut_reading, prepare_database
-from fcos_lidar_jax.input_pipeline.loader import make_batches, packing_for
+from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import load_sensor
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -131,11 +131,10 @@ def measure(args: Args) -> dict[str, Any]:
         record["database"] = {"objects": len(objects), "cpu_ms_a_frame": round(spent_ms / len(frames), 1)}
         load = functools.partial(throughput, frames, config, objects, args.samples)
         record["loader"] = {name: load(threads=n, workers=m) for name, (n, m) in WAYS.items()}
-        record["loader"]["packed, on the device"] = load(
+        record["loader"]["on the device"] = load(
             threads=2,
             lend=True,
             delivery=functools.partial(feed, mesh=make_mesh(jax.devices()[:1])),
-            packing=packing_for(frames, config),
         )
     return {**record, "needed_samples_per_s": _needs(args.train_step)}
 

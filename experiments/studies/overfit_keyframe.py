@@ -23,13 +23,13 @@ import jax
 import numpy as np
 
 from experiments.changes import change
+from experiments.keyframe import read_keyframe
 from experiments.runs import detections, trained
 from experiments.script import Options, real_data, run_measurement
 from fcos_lidar_jax.assignment import owners
 from fcos_lidar_jax.centerpoint import CenterPointConfig
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.data.frame import Frame, InMemoryFrames
-from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.evaluation.matching import candidate_pairs, match_frame
 from fcos_lidar_jax.evaluation.metrics import NUSCENES_METRIC
 from fcos_lidar_jax.evaluation.records import confident

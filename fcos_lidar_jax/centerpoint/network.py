@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from fcos_lidar_jax.centerpoint.config import PillarConfig
+from fcos_lidar_jax.centerpoint.pillar_config import PillarConfig
 from fcos_lidar_jax.centerpoint.pillars import cell_maxima
 from fcos_lidar_jax.centerpoint.types import CentreOutputs, Pillars
 from fcos_lidar_jax.collectives import sum_over_devices
@@ -66,11 +66,7 @@ class Backbone(nn.Module):
 
 
 def to_channels(x: Image, factor: int) -> Image:
-    """Move squares of ``factor`` x ``factor`` cells into the channels of one cell.
-
-    >>> to_channels(jnp.ones((1, 4, 4, 3)), 2).shape
-    (1, 2, 2, 12)
-    """
+    """Move squares of ``factor`` x ``factor`` cells into the channels of one cell."""
     b, h, w, c = x.shape
     x = x.reshape(b, h // factor, factor, w // factor, factor, c)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h // factor, w // factor, -1)

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from fcos_lidar_jax.centerpoint.centres import centre_targets, decode_centres, encode_centres, focal_loss
-from fcos_lidar_jax.centerpoint.config import CenterPointConfig
+from fcos_lidar_jax.centerpoint.pillar_config import PillarConfig
 from fcos_lidar_jax.centerpoint.pillars import Grid
 from fcos_lidar_jax.centerpoint.types import CentreOutputs
+from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.iou import oriented, oriented_iou_3d
 from fcos_lidar_jax.losses import l1_loss
 from fcos_lidar_jax.types import Batch, Sums
@@ -19,7 +20,14 @@ Parts = dict[str, Array]
 
 
 def sample_losses(
-    outputs: CentreOutputs, boxes: Array, labels: Array, box_valid: Array, *, config: CenterPointConfig, grid: Grid
+    outputs: CentreOutputs,
+    boxes: Array,
+    labels: Array,
+    box_valid: Array,
+    *,
+    config: Config,
+    pillars: PillarConfig,
+    grid: Grid,
 ) -> tuple[Parts, Parts]:
     """Compute targets and losses of one sample.
 
@@ -31,7 +39,7 @@ def sample_losses(
         the sums of both losses f32[g] per group of classes, and counts to sum over the batch, with the number of
         boxes i32[g] per group.
     """
-    pillars, groups = config.pillars, jnp.array(config.class_groups)
+    groups = jnp.array(pillars.class_groups(len(config.classes)))
     targets = centre_targets(
         boxes,
         labels,
@@ -59,7 +67,9 @@ def sample_losses(
     return parts, counts
 
 
-def make_sums(config: CenterPointConfig, grid: Grid) -> Callable[[Any, CentreOutputs, Any, Batch], Sums]:
+def make_sums(
+    config: Config, pillars: PillarConfig, grid: Grid
+) -> Callable[[Any, CentreOutputs, Any, Batch], Sums]:
     """Make the function from outputs and ground truth of a batch to the sums of its losses.
 
     The first and third argument, variables and pillars, have no influence.
@@ -70,9 +80,9 @@ def make_sums(config: CenterPointConfig, grid: Grid) -> Callable[[Any, CentreOut
     """
 
     def sums(_variables: Any, outputs: CentreOutputs, _pillars: Any, batch: Batch) -> Sums:
-        parts, counts = jax.vmap(lambda *sample: sample_losses(*sample, config=config, grid=grid))(
-            outputs, batch.boxes, batch.labels, batch.box_valid
-        )
+        parts, counts = jax.vmap(
+            lambda *sample: sample_losses(*sample, config=config, pillars=pillars, grid=grid)
+        )(outputs, batch.boxes, batch.labels, batch.box_valid)
         parts, counts = jax.tree.map(lambda leaf: leaf.sum(axis=0), (parts, counts))
         by_group = counts["positives"]
         positives = by_group.sum()

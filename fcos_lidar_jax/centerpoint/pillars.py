@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from fcos_lidar_jax.centerpoint.config import PillarConfig
+from fcos_lidar_jax.centerpoint.pillar_config import PillarConfig
 from fcos_lidar_jax.centerpoint.types import Pillars
 from fcos_lidar_jax.geometry import image_columns, spherical
 from fcos_lidar_jax.sensors import Sensor

@@ -9,12 +9,7 @@ from jaxtyping import Array, Float32, Int32
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pillars:
-    """A point cloud divided into pillars, the input of CenterPoint.
-
-    >>> import jax.numpy as jnp
-    >>> Pillars(jnp.zeros((5, 10)), jnp.full(5, 64), jnp.int32(0)).features.shape  # nothing in 8 x 8 pillars
-    (5, 10)
-    """
+    """A point cloud divided into pillars, the input of CenterPoint."""
 
     features: Float32[Array, "*b n 10"]
     """x, y, z, intensity, time lag, offset from the mean of the pillar's points 3, offset from the pillar's axis
@@ -26,12 +21,7 @@ class Pillars:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CentreOutputs:
-    """Raw predictions of CenterPoint on the bird's-eye-view map: rows along y, columns along x.
-
-    >>> import jax.numpy as jnp
-    >>> CentreOutputs(jnp.zeros((8, 8, 3)), jnp.zeros((8, 8, 1, 10))).heat.shape
-    (8, 8, 3)
-    """
+    """Raw predictions of CenterPoint on the bird's-eye-view map: rows along y, columns along x."""
 
     heat: Float32[Array, "*b h w k"]  # Logit of an object centre, per class.
     regression: Float32[Array, "*b h w g 10"]

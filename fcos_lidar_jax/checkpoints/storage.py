@@ -48,22 +48,12 @@ class NonFiniteStateError(ArithmeticError):
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used; the message names the folder, what was found and what was expected.
-
-    >>> issubclass(CheckpointError, ValueError)
-    True
-    """
+    """A checkpoint that cannot be used; the message names the folder, what was found and what was expected."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A trained detector. Weights of another precision, such as float16, are loaded as float32.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> Checkpoint(QUICKSTART, SHORT_RANGE, {"params": {}, "batch_stats": {}}, step=500).score is None
-    True
-    """
+    """A trained detector. Weights of another precision, such as float16, are loaded as float32."""
 
     config: Config
     sensor: Sensor
@@ -310,11 +300,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def with_later_fields(config: dict[str, Any]) -> dict[str, Any]:
-    """Add the fields that a configuration of an earlier version lacks, and drop removed fields.
-
-    >>> with_later_fields({"model": {"remat": True, "meta_kernel": False}})["model"]
-    {'remat': True, 'regression_axes': 'lidar', 'local_geometry': False, 'round_offsets': False}
-    """
+    """Add the fields that a configuration of an earlier version lacks, and drop removed fields."""
     later: dict[str, Any] = {name: config.get(name, value) for name, value in LATER_SECTIONS.items()}
     for section, fields in LATER_FIELDS.items():
         if isinstance(values := config.get(section, {}), dict):
@@ -339,10 +325,6 @@ def check_arrays(where: Path | str, expected: Any, found: Any, *, whose: str) ->
 
 
 def shipped_checkpoints() -> dict[str, Path]:
-    """Names and folders of the checkpoints that come with the package.
-
-    >>> "quickstart" in shipped_checkpoints()
-    True
-    """
+    """Names and folders of the checkpoints that come with the package."""
     folder = Path(str(files("fcos_lidar_jax") / "weights"))
     return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()} if folder.is_dir() else {}

@@ -3,14 +3,11 @@
 import dataclasses
 import time
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from fcos_lidar_jax.checkpoints.storage import shipped_checkpoints
-from fcos_lidar_jax.cli import demo_training
-from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder, option_name
+from fcos_lidar_jax.cli.checks import check_at_least, check_out_folder
 from fcos_lidar_jax.cli.scoring import Task, run_detector, write_reports, write_scores
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.data.nuscenes.reader import NuScenesFrames
@@ -40,27 +37,19 @@ class Demo:
 
     The command simulates a drive, writes it as a data set in the nuScenes layout, detects boxes in its keyframes,
     and computes the nuScenes metrics. It writes the files of `fcos-lidar evaluate`, an animation, and drive.html,
-    which plays the drive. With --train, it then trains the preset quickstart from scratch in the folder training.
-    Ctrl-C ends the training early and evaluates the result; the same command resumes.
+    which plays the drive.
     """
 
     out: Path = Path("demo_output")  # Folder for the results.
     keyframes: int = 12  # Length of the drive in keyframes, half a second apart.
     drive: int = 3  # Seed of the drive.
-    train: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False  # Also train a small detector, in minutes.
-    steps: int = 2000  # With --train: training steps.
-    test_frames: int = 40  # With --train: unseen frames to evaluate on.
-    seed: int = 0  # With --train: seed of the weights and frames.
 
 
 def run(args: Demo) -> None:
-    """Simulate, evaluate and draw; with ``--train`` also train."""
-    check_at_least(args, 1, "keyframes", "test_frames")
-    check_at_least(args, 0, "steps", "drive", "seed")
+    """Simulate, evaluate and draw."""
+    check_at_least(args, 1, "keyframes")
+    check_at_least(args, 0, "drive")
     check_out_folder(args.out)
-    for name in () if args.train else ("steps", "test_frames", "seed"):
-        if getattr(args, name) != getattr(Demo, name):
-            raise ValueError(f"{option_name(name)}: expected --train with it")
     began = time.monotonic()
     tell(f"simulating a drive of {args.keyframes} keyframes")
     detector, title = load_detector(shipped_checkpoints()[WEIGHTS]), f"{WEIGHTS} on an unseen simulated drive"
@@ -80,8 +69,6 @@ def run(args: Demo) -> None:
         f"look at {args.out / 'report.html'}, or detect in a cloud yourself:\n"
         f"  fcos-lidar detect {cloud} --checkpoint {WEIGHTS} --out boxes.json --pictures {args.out / 'detected'}"
     )
-    if args.train:
-        demo_training.run(args.out / "training", args.steps, args.test_frames, args.seed)
 
 
 def _simulate(args: Demo, detector: CloudDetector) -> NuScenesFrames:

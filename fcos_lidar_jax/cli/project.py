@@ -15,7 +15,6 @@ from fcos_lidar_jax.cli.options import option
 from fcos_lidar_jax.config import MAX_ROUNDS, Config, ProjectionConfig
 from fcos_lidar_jax.data.cloud_policy import make_cloud, no_usable_points, sensor_mismatch
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
-from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.progress import tell
@@ -63,7 +62,7 @@ def run(args: Project) -> None:
     dropped = int(image.num_dropped)
     if line := no_usable_points(args.file, cloud, dropped, sensor):
         raise ValueError(line)
-    if line := sensor_mismatch(points, sensor, usual_sensor(args.file)):
+    if line := sensor_mismatch(points, sensor):
         tell(f"warning: {args.file}: {line}")
     counts: dict[str, Any] = {"num_points": cloud.num_points, "num_dropped": dropped + cloud.num_removed}
     kept = (image.point_index >= 0).sum(axis=(0, 1)).tolist()

@@ -21,7 +21,6 @@ from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation, unusab
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
-from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
 from fcos_lidar_jax.files import line_writer
@@ -107,7 +106,6 @@ def run(args: Stream) -> None:
     detector = load_detector(args.checkpoint, backend=args.backend)
     source = args.source or args.data_root or Path()
     paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
-    usual = NUSCENES_HDL32E if kind is SCENE else usual_sensor(paths[0])
     scene_sensor = in_frame_of(sensor, NUSCENES_HDL32E) if kind is SCENE else None
     aligned = alignment_of(args, sensor, paths, scene_sensor)
     drive = _open(args, kind, detector, aligned.data)
@@ -127,9 +125,7 @@ def run(args: Stream) -> None:
         detect = functools.partial(detect_stream, detector=detector, **how)
         for found in timing.detect(_announcing(drive.sweeps, aligned), detect):
             points = found.cloud.points[found.cloud.valid]
-            if not num_points and (
-                line := sensor_mismatch(_untruncated(found.sweep, aligned), detector.sensor, usual)
-            ):
+            if not num_points and (line := sensor_mismatch(_untruncated(found.sweep, aligned), detector.sensor)):
                 tell(f"warning: {line}")
             num_points += len(points)
             unusable.append(found.unusable)

@@ -83,8 +83,6 @@ class Train:
     ] = None
     """Threads that prepare batches, per worker process if there are any."""
     workers: int = 0  # Worker processes that prepare batches; 0 for threads of the main process.
-    no_packing: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Do not pack batches for GPUs and TPUs. Results are the same, but transfers take more bytes."""
     processes: tyro.conf.OmitArgPrefixes[ProcessOptions] = dataclasses.field(default_factory=ProcessOptions)
     """Share each batch among several processes."""
 
@@ -121,7 +119,6 @@ def run(args: Train) -> None:
             tests=task.tests,
             objects=objects,
             schedule=schedule,
-            packing=False if args.no_packing else None,
             resume=resume,
             **{name: getattr(args, name) for name in ("seed", "weights", "threads", "workers")},
         )

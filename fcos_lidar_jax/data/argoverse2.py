@@ -63,7 +63,6 @@ class Argoverse2Frames(FrameSet):
     """
 
     classes = ARGOVERSE2_CLASSES
-    usual_sensor = ARGOVERSE2
 
     def __init__(
         self,

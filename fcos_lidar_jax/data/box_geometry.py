@@ -19,10 +19,6 @@ def check_boxes(boxes: np.ndarray, place: Callable[[int], str]) -> None:
     Args:
         boxes: [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``; an unknown velocity is NaN twice.
         place: row -> name of a box, for messages.
-
-    >>> check_boxes(np.array([[8, 0, 0, 4, 2, 0, 0, np.nan, np.nan]]), "box {}".format)
-    Traceback (most recent call last):
-    ValueError: box 0: h: got 0, expected a size above 0 m
     """
     finite, positive = np.isfinite(boxes), np.ones(boxes.shape, bool)
     finite[:, 7:] |= np.isnan(boxes[:, 7:]).all(axis=1, keepdims=True)
@@ -70,19 +66,12 @@ def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     Args:
         points: [n, >= 3], metres.
         box: ``x, y, z, l, w, h, yaw, ...``.
-
-    >>> inside_box(np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.array([0, 0, 0, 4, 2, 2, 0.0])).tolist()
-    [True, False]
     """
     return np.asarray(points_in_box(points[:, :3].astype(np.float64), np.asarray(box, np.float64)))
 
 
 def count_inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Points inside each upright box, boundary included, i32[m].
-
-    >>> count_inside(np.zeros((2, 3)), np.array([[0, 0, 0, 1, 1, 1, 0.3]])).tolist()
-    [2]
-    """
+    """Points inside each upright box, boundary included, i32[m]."""
     return np.array([len(rows) for rows in points_in_boxes(points, boxes)], np.int32)
 
 

@@ -29,11 +29,7 @@ def map_labels(of: Sequence[str], to: Sequence[str], class_map: ClassMap | None 
 
 
 def mapped_classes(of: Sequence[str], class_map: ClassMap) -> tuple[str, ...]:
-    """The distinct classes after a class map, in the data's order.
-
-    >>> mapped_classes(("Car", "Van", "Tram", "Misc"), {"Car": "car", "Van": "car", "Misc": None})
-    ('car', 'Tram')
-    """
+    """The distinct classes after a class map, in the data's order."""
     names = (class_map.get(name, name) for name in of)
     return tuple(dict.fromkeys(name for name in names if name is not None))
 

@@ -9,7 +9,6 @@ from jaxtyping import Array
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.point_files import check_time_lags
-from fcos_lidar_jax.presets import PRESETS
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.projection import close_to_sensor, image_cells, remove_close
 from fcos_lidar_jax.sensors import Sensor
@@ -24,7 +23,6 @@ _ORDER = "older sweeps go first, then random points"
 _BLOCK = 4096  # rows that are projected together
 _MAX_INTENSITY_READ = 255  # of all detectors
 _MIN_ROWS = 500  # too few rows say nothing about the sensor
-_MAX_COORDINATE_M = 1000.0  # a larger median is no distance in metres
 _NEAR_M = 2.0  # points on the ego vehicle say nothing about the sensor
 _MAX_BEYOND = 0.9
 _MAX_OUTSIDE = 0.3
@@ -37,15 +35,7 @@ such as the VLP-16 in place of the HDL-32E."""
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """A cloud as detectors take it, padded to ``config.max_points`` rows.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.sensors import SHORT_RANGE
-    >>> ahead = np.array([[0, 9, 0, 50], [0, np.nan, 0, 50]], np.float32)
-    >>> cloud = make_cloud(ahead, QUICKSTART, sensor=SHORT_RANGE)
-    >>> cloud.points.shape, int(cloud.valid.sum()), cloud.num_invalid
-    ((4096, 5), 1, 1)
-    """
+    """A cloud as detectors take it, padded to ``config.max_points`` rows."""
 
     points: np.ndarray
     """f32[max_points, c]: x, y, z (m), intensity (0-255), time lag (s), and the laser number for sensors that need
@@ -130,11 +120,6 @@ def write_points(parts: Sequence[np.ndarray], kept: np.ndarray, points: np.ndarr
         parts: f32[n, c] each, written one after another.
         kept: bool[n of all parts]; if everything fits, the other rows are written too, as invalid.
         points, valid: outputs f32[m, c] and bool[m].
-
-    >>> points, valid = np.zeros((2, 5), np.float32), np.zeros(2, bool)
-    >>> cloud = np.array([[1, 0, 0, 0, 0], [2, 0, 0, 0, 0.1], [3, 0, 0, 0, 0]], np.float32)
-    >>> write_points([cloud], np.ones(3, bool), points, valid), points[:, 0].tolist()
-    (1, [1.0, 3.0])
     """
     num_truncated = 0
     if len(kept) > len(points):
@@ -169,7 +154,6 @@ def no_usable_points(name: str | Path, cloud: Cloud, num_dropped: int, sensor: S
         f"{name}: none of its {cloud.num_points} points is usable ({cloud.num_invalid} not finite or beyond "
         f"physical limits, {cloud.num_close} on the ego vehicle, the others out of range or view), expected some "
         f"with {_limits(sensor)} in the field of view of {sensor.name}"
-        f"{_coordinate_hint(cloud.points[cloud.valid])}"
     )
 
 
@@ -196,9 +180,6 @@ def unusable_clouds(lines: Sequence[str], number: int, without: str = "boxes") -
 
     Raises:
         ValueError: the first line, if no cloud has usable points.
-
-    >>> unusable_clouds(["7.npy: no points in it, expected at least one"], 9)
-    '1 of 9 clouds without usable points, and so without boxes: 7.npy: no points in it, expected at least one'
     """
     if not lines:
         return None
@@ -209,12 +190,7 @@ def unusable_clouds(lines: Sequence[str], number: int, without: str = "boxes") -
 
 
 def truncation(number: int, config: Config) -> str | None:
-    """A line about the truncated points of all clouds, or None.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> truncation(7, QUICKSTART)
-    '7 points left out in total: the detector takes at most 4096 per cloud (max_points); older sweeps go first...'
-    """
+    """A line about the truncated points of all clouds, or None."""
     how = f"left out in total: the detector takes at most {config.max_points} per cloud (max_points)"
     return f"{number} points {how}; {_ORDER}" if number else None
 
@@ -233,22 +209,12 @@ def _limits(sensor: Sensor) -> str:
     return f"|x|, |y| < {sensor.limit_xy_m:g} m and {low:g} < z < {high:g} m"
 
 
-def _coordinate_hint(points: np.ndarray) -> str:
-    """The end of a message if x, y or z cannot be metres (timestamps, for example); else empty."""
-    medians = np.median(np.abs(points[:, :3]), axis=0) if len(points) else np.zeros(3)
-    if medians.max() < _MAX_COORDINATE_M:
-        return ""
-    axis = int(medians.argmax())
-    expected = "metres in the columns x, y, z, intensity, time lag, laser number"
-    return f"; the values of {'xyz'[axis]} are about {medians[axis]:.4g}, expected {expected}"
-
-
-def sensor_mismatch(points: np.ndarray, sensor: Sensor, usual: Sensor | None = None) -> str | None:
+def sensor_mismatch(points: np.ndarray, sensor: Sensor) -> str | None:
     """A warning that another sensor probably recorded a cloud, or None.
 
     Uses the current sweep: the share of points beyond the sensor's limits and outside its vertical field of view,
     points per image cell, the share of points with a neighbour in the next column and in the next row, and the
-    scale of the intensity. The warning names the sensor that usually records such data, and its presets.
+    scale of the intensity.
 
     >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E, SHORT_RANGE
     >>> from fcos_lidar_jax.simulation.frames import make_frame
@@ -259,9 +225,6 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor, usual: Sensor | None = N
     """
     points = _with_columns(points, sensor)
     points = points[usable_rows(points)]
-    about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
-    if len(points) >= _MIN_ROWS and (hint := _coordinate_hint(points)):
-        return f"points do not fit {about}{hint}; expect poor detections"
     points = points[points[:, 4] == points[:, 4].min(initial=np.inf)]
     points = points[~np.asarray(close_to_sensor(points, sensor, _NEAR_M))]
     if sensor.azimuth_limits_rad is not None:
@@ -272,16 +235,8 @@ def sensor_mismatch(points: np.ndarray, sensor: Sensor, usual: Sensor | None = N
         return None
     if not (reason := "; ".join(_mismatch(points, sensor))):
         return None
-    return f"points do not fit {about}: {reason}; expect poor detections{_fitting(sensor, usual)}"
-
-
-def _fitting(sensor: Sensor, usual: Sensor | None) -> str:
-    """The options for data that another sensor usually records, as the end of a warning; else empty."""
-    if usual is None or usual.name == sensor.name:
-        return ""
-    presets = ", ".join(name for name, config in PRESETS.items() if config.sensor == usual.name)
-    options = f"--sensor {usual.name} (train, project) or a preset ({presets})"
-    return f". Data like these are usually of {usual.name}: expected {options}"
+    about = f"sensor {sensor.name!r} ({sensor.num_rows} rows, {sensor.num_columns} columns)"
+    return f"points do not fit {about}: {reason}; expect poor detections"
 
 
 def _mismatch(points: np.ndarray, sensor: Sensor) -> Iterator[str]:

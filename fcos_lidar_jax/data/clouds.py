@@ -11,7 +11,6 @@ from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points
 from fcos_lidar_jax.data.kitti import camera_calibration, in_camera
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
-from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import read_list, read_sweeps
 from fcos_lidar_jax.sensors import Sensor
 
@@ -28,10 +27,6 @@ class CloudFiles(FrameSet):
     max_points: int = MAX_POINTS  # larger clouds are refused
     full_turn: bool = False  # keep the points of KITTI's files outside the camera image
     classes: tuple[str, ...] = ()
-
-    @property
-    def usual_sensor(self) -> Sensor | None:  # type: ignore[override]
-        return usual_sensor(self.files[0]) if self.files else None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -92,9 +87,7 @@ def find_clouds(inputs: tuple[Path, ...]) -> tuple[Path, ...]:
             continue
         files = _point_files(path.iterdir())
         if not files:
-            below = (folder for levels in ("*", "*/*") for folder in sorted(path.glob(levels)) if folder.is_dir())
-            hint = next((f"; found some in {folder}" for folder in below if _point_files(folder.glob("*"))), "")
-            raise ValueError(f"{path}: no point file in it, expected {', '.join(ENDINGS)}{hint}")
+            raise ValueError(f"{path}: no point file in it, expected {', '.join(ENDINGS)}")
         clouds += files
     return tuple(clouds)
 

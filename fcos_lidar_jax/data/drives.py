@@ -161,11 +161,7 @@ def _in_order(files: list[Path], where: Path) -> tuple[list[Path], list[int] | N
 
 
 def _in_parts(name: str) -> list[str | int]:
-    """A sort key that compares numbers in names by value.
-
-    >>> _in_parts("sweep_9.npy") < _in_parts("sweep_10.npy")
-    True
-    """
+    """A sort key that compares numbers in names by value."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 

@@ -24,7 +24,6 @@ from fcos_lidar_jax.data.sweeps import ListedSweep, read_list, read_sweeps
 from fcos_lidar_jax.fields import unknown_name
 from fcos_lidar_jax.files import read_json
 from fcos_lidar_jax.geometry import wrap_angle
-from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.sensors import PRESETS, Sensor, load_sensor
 
 _SENSOR, _CLASSES = "sensor.json", "classes.json"
@@ -156,9 +155,6 @@ class FolderFrames(FrameSet):
         records = read_json(file, _Annotation).boxes
         boxes = np.array([record.box for record in records], np.float64).reshape(-1, 9)  # null becomes NaN
         check_boxes(boxes, lambda i: f"{file}: $.boxes[{i}].box")
-        if len(large := np.flatnonzero(np.abs(boxes[:, 6]) > 2 * np.pi)):
-            found = f"{file}: $.boxes[{large[0]}].box: yaw: got {boxes[large[0], 6]:g}"
-            tell(f"warning: {found}, expected radians: are these degrees?", once="yaw")
         kept, labels = [], []
         for i, record in enumerate(records):
             label = self._translation.get(record.label, record.label)

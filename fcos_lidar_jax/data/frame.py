@@ -27,10 +27,6 @@ class Frame:
         labels: i32[m]: index into the ``classes`` of the frame set.
         num_points: i32[m]: annotated number of LiDAR points of the current sweep in each box.
         num_close: number of points on the ego vehicle that the reader removed, see :func:`drop_close`.
-
-    >>> points, boxes = np.zeros((1, 5), np.float32), np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0]], np.float32)
-    >>> Frame(points, boxes, labels=np.array([0]), num_points=np.array([1])).boxes[0, 3:6].tolist()
-    [4.0, 2.0, 2.0]
     """
 
     points: np.ndarray
@@ -45,17 +41,10 @@ class FrameSet(Protocol):
     """Frames in a fixed order: the interface of every reader for the training pipeline and the commands.
 
     Readers inherit from it and get defaults for anything that their data lack (poses, times, scenes).
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> frames: FrameSet = SimulatedFrames(TINY, 3)
-    >>> len(frames), frames.frame(0).points.shape[1], frames.classes[0]
-    (3, 5, 'car')
     """
 
     classes: tuple[str, ...]  # Class names, which labels index.
     sensor: Sensor  # Sensor that recorded the points.
-    usual_sensor: Sensor | None = None  # Preset of the sensor that records such data; None if there is none.
 
     def __len__(self) -> int: ...
 
@@ -113,11 +102,6 @@ class InMemoryFrames(FrameSet):
 
     Raises:
         ValueError: a label is not the index of a class, or the fifth column of the points is a ring.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> nothing = Frame(np.zeros((0, 5)), np.zeros((0, 9)), np.zeros(0, int), np.zeros(0, int))
-    >>> len(InMemoryFrames((nothing,), TINY, ("car",)))
-    1
     """
 
     frames: tuple[Frame, ...]
@@ -146,12 +130,7 @@ class InMemoryFrames(FrameSet):
 
 
 def check_frames(frames: Any) -> None:
-    """Refuse what is not a set of frames, such as the folder of a data set.
-
-    >>> check_frames("data/nuscenes")
-    Traceback (most recent call last):
-    ValueError: frames: got 'str', expected a set of frames, as open_frames returns
-    """
+    """Refuse what is not a set of frames, such as the folder of a data set."""
     are_frames = hasattr(frames, "classes") and hasattr(frames, "frame")
     check(are_frames, "frames", type(frames).__name__, "a set of frames, as open_frames returns")
 
@@ -171,10 +150,6 @@ class WrappedFrames(FrameSet):
 
     def _source(self, index: int) -> int:
         return index
-
-    @property
-    def usual_sensor(self) -> Sensor | None:  # type: ignore[override]
-        return self.frames.usual_sensor
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -212,13 +187,7 @@ class WrappedFrames(FrameSet):
 
 @dataclasses.dataclass(frozen=True)
 class SelectedFrames(WrappedFrames):
-    """A selection of another set's frames, in any order.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-    >>> SelectedFrames(SimulatedFrames(TINY, 5), (4, 2)).name(1)
-    'seed 2'
-    """
+    """A selection of another set's frames, in any order."""
 
     indices: tuple[int, ...]
 
@@ -252,14 +221,7 @@ def size_and_time(file: Path) -> tuple[int, ...]:
 
 
 def drop_close(points: np.ndarray, sensor: Sensor, reading: CloudReading) -> tuple[np.ndarray, int]:
-    """Remove the points on the ego vehicle from f32[n, c]; also returns their number.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> points = np.array([[9, 0, 0, 50, 0], [0.5, 0, 0, 9, 0]], np.float32)
-    >>> far, num_close = drop_close(points, TINY, CloudReading(remove_close="all"))
-    >>> far[:, 0].tolist(), num_close
-    ([9.0], 1)
-    """
+    """Remove the points on the ego vehicle from f32[n, c]; also returns their number."""
     kept = np.asarray(remove_close(points, np.ones(len(points), bool), sensor, reading))
     return points[kept], len(points) - int(kept.sum())
 

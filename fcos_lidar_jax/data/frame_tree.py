@@ -12,11 +12,7 @@ _MAX_LISTED = 20  # frames listed in a message
 
 
 def printable(text: str) -> str:
-    """A recording's text for one line of a message: at most 500 printable characters.
-
-    >>> printable("/points"), printable("a\\nb")
-    ('/points', "'a\\\\nb'")
-    """
+    """A recording's text for one line of a message: at most 500 printable characters."""
     text = text if text.isprintable() else repr(text)
     return text if len(text) <= 500 else text[:500] + "..."
 

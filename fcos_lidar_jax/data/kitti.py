@@ -66,7 +66,6 @@ class KittiFrames(FrameSet):
     """
 
     classes = CLASSES
-    usual_sensor = KITTI_HDL64E
 
     def __init__(
         self,
@@ -174,9 +173,6 @@ def in_camera(file: Path, points: np.ndarray) -> np.ndarray:
 
     Files elsewhere, or without ``calib/NAME.txt`` beside the folder, keep all points. Otherwise a note is
     printed, once per folder.
-
-    >>> in_camera(Path("street.bin"), np.zeros((9, 5))).shape
-    (9, 5)
     """
     calibration = camera_calibration(file)
     if calibration is None:

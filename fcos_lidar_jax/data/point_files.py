@@ -21,15 +21,13 @@ MAX_POINTS = 10_000_000  # default limit of a cloud, far above any LiDAR's
 BYTES_PER_POINT = 64  # limit of a cloud's size, as a file and unpacked
 _HEADER_BYTES = 2**20
 _RAW_DTYPES = ("float16", "float32", "float64")
-_OTHER_LAYOUTS = "only detect, stream and project read other layouts, by --columns and --dtype"
 
 # Criteria for whether a raw file is read in the layout in which it was written.
 _REACH_M = 300.0  # no supported LiDAR sees farther
 _HEIGHT_M = (-15.0, 40.0)  # from ditches to bridges; other columns' values lie outside
 _FINEST_M = 1e-6  # finer than any LiDAR resolves: text, or another number type
-_MARGIN = 0.15  # by how much another layout must fit better before a file is refused
+_MIN_PLAUSIBLE = 0.8  # share of rows; a right layout reaches 0.99, four in place of five columns 0.6
 _INSPECTED_VALUES = 240_000  # a multiple of every number of columns
-_MIN_VALUES = 200  # with fewer values the contrast of the columns is chance
 
 
 def read_points(
@@ -48,7 +46,7 @@ def read_points(
     to 6. ``.pcd``: by its header. ``.feather`` (Argoverse 2): columns x, y, z, intensity, laser_number.
 
     The size of a raw file cannot distinguish four from five columns, so the file is also refused if its values do
-    not look like metres, or if another layout fits them clearly better.
+    not look like metres.
 
     Args:
         sensor: scales the intensity, except in ``.pcd.bin``, and determines whether laser numbers are needed.
@@ -74,9 +72,9 @@ def read_points(
     """
     path = local_path(path)
     kind = _kind(path, raw=columns is not None or dtype is not None)
-    check(columns in (None, *_RAW_COLUMNS), f"{path}: columns", columns, "3, 4, 5 or 6")
-    check(dtype in (None, *_RAW_DTYPES), f"{path}: dtype", dtype, ", ".join(_RAW_DTYPES))
-    if not kind.endswith(".bin") and (columns is not None or dtype is not None):
+    if kind.endswith(".bin"):
+        return _read_raw(path, sensor, kind, columns, dtype, max_points)
+    if columns is not None or dtype is not None:
         raise ValueError(f"{path}: columns and dtype are for raw .bin files, a {kind} file says its own")
     if kind == ".feather":
         names = ("x", "y", "z", "intensity", "laser_number")
@@ -87,20 +85,9 @@ def read_points(
         try:
             table = parse_pcd(content, max_points=max_points, max_bytes=max_points * BYTES_PER_POINT)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(f"{path}: not a readable .pcd file: {error}") from None
         return assemble_points(path, sensor, table)
-    if kind in (".npy", ".npz"):
-        return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
-    if not kind.endswith(".bin"):
-        raise NotImplementedError(f"{kind} is in ENDINGS, but read_points does not read it")
-    columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
-    if (number := len(content) // (columns * np.dtype(dtype).itemsize)) > max_points:
-        raise ValueError(f"{path}: got {number} points, expected at most {max_points}")
-    rows = _read_raw(path, content, columns, dtype)
-    if kind != ".pcd.bin":
-        return points_from_array(rows, sensor, str(path))
-    sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # the format's intensities are already 0-255
-    return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
+    return points_from_array(_read_numpy(path, content, kind, max_points), sensor, str(path))
 
 
 def points_from_array(array: ArrayLike, sensor: Sensor, where: str = "points") -> np.ndarray:
@@ -222,79 +209,38 @@ def _kind(path: Path, *, raw: bool) -> str:
     raise ValueError(f"{path}: unknown extension {path.suffix!r}, expected {expected}")
 
 
-def _read_raw(path: Path, content: bytes, columns: int, dtype: str) -> np.ndarray:
-    better = _better_layout(content, columns, dtype)
-    hint = "" if better is None else f", {better[0]} columns would fit"
-    hint += "" if better is None or better[1] == dtype else f" as {better[1]}"
-    size, row = len(content), columns * np.dtype(dtype).itemsize
-    if size % row:
-        layout = f"{row} ({columns} {dtype} values per point)"
-        cause = f"truncated, or another layout{hint}: copy it again, or convert it; {_OTHER_LAYOUTS}"
-        raise ValueError(f"{path}: got {size} bytes, not a multiple of {layout}: {cause}")
-    if better is not None or _plausible_share(content, columns, dtype) < 0.5:
-        found = hint or f" (x, y, z are about {_magnitudes(content, columns, dtype)})"
-        raise ValueError(
-            f"{path}: read with {columns} {dtype} columns most values are not plausible metres{found}, "
-            f"expected metres; {_OTHER_LAYOUTS}"
-        )
-    return np.frombuffer(content, dtype).reshape(-1, columns)
+def _read_raw(
+    path: Path, sensor: Sensor, kind: str, columns: int | None, dtype: str | None, max_points: int
+) -> np.ndarray:
+    columns, dtype = columns or (5 if kind == ".pcd.bin" else 4), dtype or "float32"
+    check(columns in _RAW_COLUMNS, f"{path}: columns", columns, "3, 4, 5 or 6")
+    check(dtype in _RAW_DTYPES, f"{path}: dtype", dtype, ", ".join(_RAW_DTYPES))
+    content, row = _read_whole(path, max_points), columns * np.dtype(dtype).itemsize
+    check(len(content) // row <= max_points, f"{path}: points", len(content) // row, f"at most {max_points}")
+    layout = f"{columns} {dtype} values per point"
+    other = "detect, stream and project read other layouts by --columns and --dtype"
+    if (size := len(content)) % row:
+        raise ValueError(f"{path}: got {size} bytes, not a multiple of {row} ({layout}): truncated? {other}")
+    rows = np.frombuffer(content, dtype).reshape(-1, columns)
+    if _plausible_share(rows[: _INSPECTED_VALUES // columns]) < _MIN_PLAUSIBLE:
+        raise ValueError(f"{path}: read with {layout}, most rows are not plausible metres; {other}")
+    if kind != ".pcd.bin":
+        return points_from_array(rows, sensor, str(path))
+    sensor = dataclasses.replace(sensor, intensity_scale=1.0)  # the format's intensities are already 0-255
+    return assemble_points(path, sensor, dict(zip(("x", "y", "z", "intensity", "laser"), rows.T, strict=False)))
 
 
-def _better_layout(content: bytes, columns: int, dtype: str) -> tuple[int, str] | None:
-    """Columns and number type that fit the content clearly better than the given ones."""
-    layouts = [(c, d) for d in _RAW_DTYPES for c in _RAW_COLUMNS if len(content) % (c * np.dtype(d).itemsize) == 0]
-    divides, share, contrast = (columns, dtype) in layouts, 0.0, 0.0
-    if divides:
-        share, contrast = _plausible_share(content, columns, dtype), _column_contrast(content, columns, dtype)
-    better = {}
-    for layout in layouts:
-        other_share = _plausible_share(content, *layout)
-        if other_share < 0.9:
-            continue
-        other_contrast = _column_contrast(content, *layout)
-        clearer = other_contrast > contrast + _MARGIN
-        # Halves of misread numbers also stand out as columns, so another number type must give better metres.
-        if other_share > share + _MARGIN if divides and not (clearer and layout[1] == dtype) else clearer:
-            better[layout] = other_share + other_contrast
-    return max(better, key=better.__getitem__, default=None)
-
-
-def _inspected(content: bytes, columns: int, dtype: str) -> np.ndarray:
-    number = min(len(content) // np.dtype(dtype).itemsize, _INSPECTED_VALUES)
-    with np.errstate(invalid="ignore"):  # misread numbers may be NaNs that signal
-        return np.frombuffer(content, dtype, number).astype(np.float64).reshape(-1, columns)
-
-
-def _magnitudes(content: bytes, columns: int, dtype: str) -> str:
-    xyz = np.abs(_inspected(content, columns, dtype)[:, :3])
-    return ", ".join(f"{value:.4g}" for value in np.median(xyz[np.isfinite(xyz).all(axis=1)], axis=0))
-
-
-def _plausible_share(content: bytes, columns: int, dtype: str) -> float:
+def _plausible_share(rows: np.ndarray) -> float:
     """Share of the finite rows with plausible metres and intensity."""
-    rows = _inspected(content, columns, dtype)
+    with np.errstate(invalid="ignore"):  # misread numbers may be NaNs that signal
+        rows = rows.astype(np.float64)
     rows = rows[np.isfinite(rows).all(axis=1)]
-    if not len(rows):
-        return 1.0
     xyz = np.abs(rows[:, :3])
     good = (xyz < _REACH_M).all(axis=1) & ((xyz == 0) | (xyz > _FINEST_M)).all(axis=1)
     good &= (rows[:, 2] > _HEIGHT_M[0]) & (rows[:, 2] < _HEIGHT_M[1])
-    if columns > 3:
+    if rows.shape[1] > 3:
         good &= (rows[:, 3] >= 0) & (rows[:, 3] < 2**16)
-    return float(good.mean())
-
-
-def _column_contrast(content: bytes, columns: int, dtype: str) -> float:
-    """Share of the variance of the values, or of their magnitudes, that lies between columns.
-
-    Coordinates, intensity and ring each have their own mean or spread. A wrong number of columns mixes all of them
-    in every column: a share of 0.3 or more drops to 0.00.
-    """
-    rows = _inspected(content, columns, dtype)
-    if rows.size < _MIN_VALUES:
-        return 0.0
-    rows = np.arcsinh(np.where(np.isfinite(rows), rows, 0))
-    return max(float(v.mean(axis=0).var() / max(v.var(), 1e-12)) for v in (rows, np.abs(rows)))
+    return float(good.mean()) if len(rows) else 1.0
 
 
 def _read_numpy(path: Path, content: bytes, kind: str, max_points: int) -> np.ndarray:

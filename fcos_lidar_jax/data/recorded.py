@@ -18,11 +18,7 @@ RECORDED_BY = {
 
 
 def usual_sensor(path: Path) -> Sensor | None:
-    """The sensor of a point file, or of a recording in a folder, of a known data set.
-
-    >>> usual_sensor(Path("KITTI/training/velodyne/000000.bin")).name, usual_sensor(Path("000000.bin"))
-    ('kitti_hdl64e', None)
-    """
+    """The sensor of a point file, or of a recording in a folder, of a known data set."""
     path = Path(os.path.abspath(path))
     return next((sensor for end, sensor in RECORDED_BY.items() if path.match(end) or any(path.glob(end))), None)
 

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.drives import Drive, OutsidePosesError, PoseRow, PoseTrack, make_track, read_tum
+from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.frame_tree import FrameTree, printable
-from fcos_lidar_jax.data.point_cloud2 import parse_point_cloud2
-from fcos_lidar_jax.data.point_files import MAX_POINTS
+from fcos_lidar_jax.data.pcd import find_columns
+from fcos_lidar_jax.data.point_files import MAX_POINTS, assemble_points
 from fcos_lidar_jax.data.sweeps import Sweep
 from fcos_lidar_jax.sensors import Sensor
 
@@ -24,17 +25,15 @@ _CLOUD = ("sensor_msgs/msg/PointCloud2",)
 _POSE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _MAX_LISTED = 20  # topics listed in a message
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Datatype of a field -> NumPy's type."""
 
 _PoseAt = Callable[[str, int, str], np.ndarray]
 """(frame of a cloud, microseconds, name of the cloud for messages) -> sensor to world, f64[4, 4]."""
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder with ``metadata.yaml``.
-
-    >>> is_ros_bag(Path("street.bag")), is_ros_bag(Path("street"))
-    (True, False)
-    """
+    """Whether a path is a recording: ``.bag``, ``.mcap``, ``.db3``, or a folder with ``metadata.yaml``."""
     return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
@@ -74,7 +73,7 @@ def ros_bag_drive(
                 except OutsidePosesError as error:
                     outside.append(error)
                     continue
-                points = parse_point_cloud2(cloud, where, sensor, max_points=max_points)
+                points = _parse_cloud(cloud, where, sensor, max_points=max_points)
                 yield Sweep(points, pose, time_us, where)
         if number == 0:
             raise ValueError(f"{path}: {printable(clouds)}: no cloud in it, expected at least one")
@@ -230,3 +229,46 @@ def _read_transforms(bag: _Bag) -> FrameTree:
 
 def _numbers(rotation: Any, translation: Any) -> PoseRow:
     return rotation.w, rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z
+
+
+def _parse_cloud(cloud: Any, where: str, sensor: Sensor, *, max_points: int) -> np.ndarray:
+    """The points of a PointCloud2 message, in the columns of :func:`~fcos_lidar_jax.data.point_files.read_points`.
+
+    ``cloud`` has the message's fields, with ``data`` u8[n]. Clouds of more than ``max_points`` are refused before
+    they take memory. ``where`` names the message in errors.
+    """
+    width, height, step, pitch = cloud.width, cloud.height, cloud.point_step, cloud.row_step
+    if width * height > max_points:
+        raise ValueError(f"{where}: got {width} x {height} points, expected at most {max_points}")
+    pitch = max(pitch, width * step) if height <= 1 else pitch  # some drivers leave it 0 for a single row
+    if not width * height:
+        return no_points(sensor)
+    if pitch < width * step or len(cloud.data) < (height - 1) * pitch + width * step:
+        found = f"{len(cloud.data)} bytes, and row_step {pitch}"
+        raise ValueError(f"{where}: data: got {found}, expected {height} rows of {width} points of {step} bytes")
+    columns = {}
+    for column, dtype, offset in _columns_of(cloud, where):
+        values = np.ndarray((height, width), dtype, cloud.data.data, offset, (pitch, step))
+        columns[column] = values.reshape(-1)
+    return assemble_points(where, sensor, columns)
+
+
+def _columns_of(cloud: Any, where: str) -> list[tuple[str, np.dtype, int]]:
+    """The message's columns, with type and offset within a point."""
+    columns, names = [], [field.name for field in cloud.fields]
+    places = find_columns(names)
+    if missing := [axis for axis in "xyz" if axis not in places]:
+        listed = ", ".join(map(repr, names))[:500] or "none"
+        raise ValueError(f"{where}: fields: got {listed}, expected one named {missing[0]}")
+    places.pop("time_lag", None)  # messages hold single sweeps
+    for column, place in places.items():
+        field, end = cloud.fields[place], 0
+        if field.datatype in _NUMBERS and field.count <= 1:
+            dtype = np.dtype((">" if cloud.is_bigendian else "<") + _NUMBERS[field.datatype])
+            columns.append((column, dtype, field.offset))
+            end = field.offset + dtype.itemsize
+        if not 0 < end <= cloud.point_step:
+            got = f"{field.count} of datatype {field.datatype} at offset {field.offset}"
+            expected = f"one number of datatype 1 to 8 within the {cloud.point_step} bytes of a point"
+            raise ValueError(f"{where}: field {names[place]}: got {got}, expected {expected}")
+    return columns

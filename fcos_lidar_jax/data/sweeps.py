@@ -128,11 +128,7 @@ def read_entries(path: Path) -> list[ListedSweep]:
 
 
 def is_rotation(matrix: np.ndarray) -> bool:
-    """Whether the rows of a 3x3 matrix are orthonormal, to 1e-3, and right-handed.
-
-    >>> is_rotation(np.eye(3)), is_rotation(np.diag([1, 1, -1.0]))
-    (True, False)
-    """
+    """Whether the rows of a 3x3 matrix are orthonormal, to 1e-3, and right-handed."""
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(matrix) > 0)
 
 
@@ -143,10 +139,6 @@ def check_poses(rotation: np.ndarray, translation: np.ndarray, place: Callable[[
         rotation: f64[n, 4], quaternions w, x, y, z.
         translation: f64[n, 3], metres.
         place: row -> name of a pose, for messages.
-
-    >>> check_poses(np.array([[2.0, 0, 0, 0]]), np.zeros((1, 3)), "pose {}".format)
-    Traceback (most recent call last):
-    ValueError: pose 0: rotation: got [2.0, 0.0, 0.0, 0.0], expected a unit quaternion w, x, y, z
     """
     near = (np.abs(translation) <= FARTHEST_M).all(axis=1)
     with np.errstate(over="ignore"):  # lengths may overflow
@@ -161,22 +153,14 @@ def check_poses(rotation: np.ndarray, translation: np.ndarray, place: Callable[[
 
 
 def about_z(yaw_rad: float) -> np.ndarray:
-    """A pose f64[4, 4] that rotates about z, counter-clockwise seen from above.
-
-    >>> about_z(np.pi / 2)[:2, :2].round().tolist()
-    [[0.0, -1.0], [1.0, 0.0]]
-    """
+    """A pose f64[4, 4] that rotates about z, counter-clockwise seen from above."""
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
     return pose
 
 
 def turned(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Rotate points f32[n, c] by a pose f64[4, 4] without its translation; other columns stay.
-
-    >>> turned(np.array([[1, 0, 5, 9]], np.float32), about_z(np.pi / 2)).round(3).tolist()
-    [[0.0, 1.0, 5.0, 9.0]]
-    """
+    """Rotate points f32[n, c] by a pose f64[4, 4] without its translation; other columns stay."""
     moved = np.array(points)
     with np.errstate(over="ignore", invalid="ignore"):  # the cloud policy removes rows that are not finite
         moved[:, :3] = moved[:, :3] @ pose[:3, :3].T

@@ -28,11 +28,7 @@ def read_lines(file: Path, what: str = "text") -> list[tuple[str, list[str]]]:
 
 
 def read_number(word: str, where: str, *, largest: float = _LARGEST) -> float:
-    """A finite number of at most ``largest`` in magnitude.
-
-    >>> read_number("1e3", "a.txt: line 1: x")
-    1000.0
-    """
+    """A finite number of at most ``largest`` in magnitude."""
     try:
         value = float(word)
     except ValueError:

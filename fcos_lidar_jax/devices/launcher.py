@@ -22,11 +22,6 @@ def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
 
     Raises:
         ValueError: names a variable with an invalid value.
-
-    >>> local_device_ids({"OMPI_COMM_WORLD_LOCAL_SIZE": "8", "OMPI_COMM_WORLD_LOCAL_RANK": "3"})
-    (3,)
-    >>> local_device_ids({"OMPI_COMM_WORLD_LOCAL_SIZE": "1", "OMPI_COMM_WORLD_LOCAL_RANK": "0"})
-    ()
     """
     ids = environment.get("JAX_LOCAL_DEVICE_IDS", "")
     if ids and not all(part.strip().isdecimal() for part in ids.split(",")):

@@ -18,7 +18,6 @@ from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, no_usable_points
 from fcos_lidar_jax.data.clouds import read_cloud
 from fcos_lidar_jax.data.frame import drop_close
 from fcos_lidar_jax.data.point_files import points_from_array
-from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
 from fcos_lidar_jax.inference.alignment import align
@@ -116,8 +115,7 @@ class CloudDetector(abc.ABC):
             rows, num_close = drop_close(_scaled_once(points, data), data, reading)
         aligned.tell_notes()
         rows = aligned.points(rows)
-        usual = usual_sensor(paths[0]) if paths else None
-        if line := sensor_mismatch(rows, self.sensor, usual):
+        if line := sensor_mismatch(rows, self.sensor):
             warnings.warn(line, stacklevel=2)
         cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
         if line := truncation(cloud.num_truncated, self.config):

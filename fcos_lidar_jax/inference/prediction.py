@@ -152,7 +152,7 @@ def _tell_notes(aligned: Alignment, frames: FrameSet, read: Iterable[tuple[Frame
     if line := aligned.describe():
         tell(line)
     for frame, _ in itertools.islice(read, 1):
-        if line := sensor_mismatch(aligned.points(frame.points), aligned.detector, frames.usual_sensor):
+        if line := sensor_mismatch(aligned.points(frame.points), aligned.detector):
             tell(f"warning: {line}")
 
 

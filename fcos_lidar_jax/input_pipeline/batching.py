@@ -16,11 +16,7 @@ _NUM_INSPECTED = 20  # frames in which check_counts looks for points
 
 
 def empty_batch(size: int, *, max_points: int, max_boxes: int, columns: int) -> Batch:
-    """A batch of zeroed NumPy arrays, without valid rows.
-
-    >>> empty_batch(2, max_points=8, max_boxes=4, columns=5).points.shape
-    (2, 8, 5)
-    """
+    """A batch of zeroed NumPy arrays, without valid rows."""
     arrays: Any = (
         np.zeros((size, max_points, columns), np.float32),
         np.zeros((size, max_points), bool),

@@ -11,7 +11,7 @@ import multiprocessing
 import re
 import signal
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -205,11 +205,7 @@ def prepare_database(
     check(workers >= 1, "workers", workers, "at least 1")
     shards, source, columns = shards_by_scene(frames), frames.fingerprint(), frames.sensor.point_columns
     folder.mkdir(parents=True, exist_ok=True)
-    for file in folder.iterdir():  # partial files of a killed run, and shards of scenes that are gone
-        shard = re.sub(r"\.(points\.f32|objects\.npz)$", "", file.name)
-        left_over = re.fullmatch(r"\.[0-9a-f]{12}\.(f32|npz|json)", file.name)
-        if left_over or (shard != file.name and shard not in shards):
-            file.unlink()
+    _remove_leftovers(folder, shards)
     jobs, done = [], 0
     for name, indices in shards.items():
         follows_from = _FORMAT, _VERSION, tuple(frames.classes), source, min_points, name, indices
@@ -228,19 +224,32 @@ def prepare_database(
         done += count
         report(done, len(frames))
     tables = {name: _read_shard(folder, name, columns) for name in shards}
+    _tell_found(tables, len(frames), min_points)
+    entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
+    manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, num_sweeps, columns, entries)
+    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
+    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
+    return open_database(folder, fingerprint=source)
+
+
+def _remove_leftovers(folder: Path, shards: Collection[str]) -> None:
+    """Remove partial files of a killed run, and shards of scenes that are gone."""
+    for file in folder.iterdir():
+        shard = re.sub(r"\.(points\.f32|objects\.npz)$", "", file.name)
+        left_over = re.fullmatch(r"\.[0-9a-f]{12}\.(f32|npz|json)", file.name)
+        if left_over or (shard != file.name and shard not in shards):
+            file.unlink()
+
+
+def _tell_found(tables: dict[str, _Table], num_frames: int, min_points: int) -> None:
     unusable = [line for table in tables.values() for line in table.unusable]
-    if line := unusable_clouds(unusable, len(frames), without="objects"):
+    if line := unusable_clouds(unusable, num_frames, without="objects"):
         tell(f"note: {line}")
     num_boxes, num_empty = sum((table.boxes for table in tables.values()), np.zeros(2, np.int64))
     tell(f"{num_boxes} boxes, {sum(len(t.rows) for t in tables.values())} with at least {min_points} points")
     if num_empty > num_boxes / 2:
         found = f"{num_empty} of {num_boxes} boxes contain no point, expected few"
         tell(f"warning: {found}: are points and boxes in the same frame?")
-    entries = [Shard(name, len(t.rows), t.num_points, t.blake2b) for name, t in tables.items()]
-    manifest = Manifest(_FORMAT, _VERSION, source, list(frames.classes), min_points, num_sweeps, columns, entries)
-    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
-    atomic_write(folder / _MANIFEST, lambda path: path.write_bytes(text))
-    return open_database(folder, fingerprint=source)
 
 
 def shards_by_scene(frames: FrameSet) -> dict[str, list[int]]:
@@ -362,10 +371,8 @@ def _read_shard(folder: Path, name: str, columns: int, *, expected: str | None =
         rows, recipe, unusable, boxes = arrays["rows"], str(arrays["recipe"]), arrays["unusable"], arrays["boxes"]
     except ValueError as error:
         raise ValueError(f"{file}: not a table of objects: {error}") from None
-    if rows.dtype != _ROW or rows.ndim != 1:
-        raise ValueError(f"{file}: got columns {rows.dtype.names}, expected {_ROW.names}; {_REBUILD}")
-    if boxes.dtype != np.int64 or boxes.shape != (2,):
-        raise ValueError(f"{file}: boxes: got {boxes.dtype} {boxes.shape}, expected two numbers; {_REBUILD}")
+    if (rows.dtype, rows.ndim, boxes.dtype, boxes.shape) != (_ROW, 1, np.int64, (2,)):
+        raise ValueError(f"{file}: not a table of objects; {_REBUILD}")
     ends = rows["count"].cumsum(dtype=np.int64)
     newest = rows["newest"]
     placed = (rows["count"] >= 0) & (rows["start"] == ends - rows["count"]) & (rows["label"] >= 0)

@@ -20,21 +20,17 @@ import numpy as np
 
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.box_geometry import check_boxes
-from fcos_lidar_jax.data.cloud_policy import usable_rows
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row, spread_indices
+from fcos_lidar_jax.input_pipeline.batching import empty_batch, fill_row
 from fcos_lidar_jax.input_pipeline.copy_paste import Paste, make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.packing import MisfitError, Packing, choose_packing, empty_packed, pack, pack_row
-from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.types import Batch, HostBatch
 from fcos_lidar_jax.workers import end_with_parent
 
 _MAX_COLUMNS = 6
 _CLASS_BALANCE = 0xCB65  # separates these random numbers from others of the same seed
 _MAX_THREADS = 16  # each holds a large batch
-_NUM_INSPECTED = 5  # frames from which the packing is chosen
 
 
 class SampleOrder:
@@ -88,45 +84,13 @@ class _BatchOf:
     rows: range  # this process's rows of the global batch
     fade_step: int  # first step without pasted objects
     paste: Paste | None
-    packing: Packing | None
-    alone: bool  # no other process runs the program
-    misfits: list[str] = dataclasses.field(default_factory=list)  # samples that did not fit the packing
 
     def __call__(self, step: int) -> HostBatch:
-        if self.packing is None:
-            return self._plain(step)
-        # Packing sample by sample is faster, but a misfit is prepared twice. After the first, pack whole batches.
-        plain = self._plain(step) if self.misfits else None
-        try:
-            if plain is None:
-                return self._packed(step, self.packing)
-            assert isinstance(plain.batch, Batch)
-            return dataclasses.replace(plain, batch=pack(plain.batch, self.packing))
-        except MisfitError as error:
-            name = self._names(step)[error.row]
-            misfit = f"frame {name!r}: {error}, as in the frames inspected first"
-        if not self.alone:
-            raise ValueError(
-                f"{misfit}; several processes pack all batches alike: use --no-packing, in Python packing=False"
-            )
-        self.misfits.append(misfit)
-        return dataclasses.replace(plain or self._plain(step), misfit=misfit)
-
-    def _plain(self, step: int) -> HostBatch:
-        batch, counts = empty_batch(len(self.rows), **self._sizes()), Counter[str]()
+        config, columns = self.config, self.frames.sensor.point_columns
+        sizes = {"max_points": config.max_points, "max_boxes": config.max_boxes, "columns": columns}
+        batch, counts = empty_batch(len(self.rows), **sizes), Counter[str]()
         for row, position in enumerate(self._positions(step)):
             counts.update(self._fill(batch, row, step, position))
-        return HostBatch(batch, dict(counts), self._names(step))
-
-    def _packed(self, step: int, packing: Packing) -> HostBatch:
-        batch, counts = empty_packed(len(self.rows), packing, **self._sizes()), Counter[str]()
-        # Reused for all samples, so that it stays in the cache. Only valid rows of its points are read.
-        sample: Any = empty_batch(1, **self._sizes())
-        for row, position in enumerate(self._positions(step)):
-            for array in (sample.valid, sample.boxes, sample.labels, sample.box_valid):
-                array[:] = 0
-            counts.update(self._fill(sample, 0, step, position))
-            pack_row(batch, row, sample)
         return HostBatch(batch, dict(counts), self._names(step))
 
     def _fill(self, batch: Batch, row: int, step: int, position: int) -> dict[str, int]:
@@ -141,10 +105,6 @@ class _BatchOf:
             parts.append(pasted)
             num_pasted = len(pasted.boxes)
         return {"pasted_objects": num_pasted, **fill_row(batch, row, parts, removed)}
-
-    def _sizes(self) -> dict[str, int]:
-        columns = self.frames.sensor.point_columns
-        return {"max_points": self.config.max_points, "max_boxes": self.config.max_boxes, "columns": columns}
 
     def _positions(self, step: int) -> list[int]:
         return [step * self.config.optimizer.batch_size + row for row in self.rows]
@@ -166,7 +126,6 @@ def make_batches(
     num_processes: int = 1,
     threads: int | None = None,
     workers: int = 0,
-    packing: Packing | None = None,
     lend: bool = False,
     order: SampleOrder | None = None,
 ) -> Iterator[Iterator[HostBatch]]:
@@ -182,18 +141,13 @@ def make_batches(
         num_processes: of n processes, process i gets the rows i * B / n to (i + 1) * B / n of each batch.
         threads: threads per process that prepare batches, 0 to prepare on demand; default: see
             :func:`default_threads`. At most one batch more than threads is in progress or waiting.
-        packing: packing of the batches, see :func:`packing_for`; None for plain batches. A batch that does not fit
-            stays plain, with one line on standard error for the first.
         lend: leave batches of workers in shared memory instead of copying them. Do not keep their arrays then:
             the workers need the memory, and it must be released before the process ends.
 
     Yields:
-        an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows. It refuses unreadable
-        frames and, with several processes, which must all run one program, batches that do not fit the packing.
+        an iterator over :class:`fcos_lidar_jax.types.HostBatch` with this process's rows; it raises the errors of
+        unreadable frames.
     """
-    import grain
-    from absl import flags
-
     check(0 <= first_step <= num_steps, "first_step", first_step, f"0 to {num_steps}")
     threads = default_threads(workers) if threads is None else threads
     size = config.optimizer.batch_size
@@ -210,9 +164,18 @@ def make_batches(
         rows=range(process_index * size // num_processes, (process_index + 1) * size // num_processes),
         fade_step=num_steps - config.fade_epochs * -(-order.epoch_size // size),
         paste=make_paste(objects, config) if objects is not None and config.copy_paste is not None else None,
-        packing=packing,
-        alone=num_processes == 1,
     )
+    prepared = _prepared(batch_of, first_step, num_steps, threads, workers)
+    owned = _OwnedBatches(prepared, copied=workers > 0 and not lend)
+    with contextlib.closing(prepared), contextlib.closing(owned) as batches:
+        yield batches
+
+
+def _prepared(batch_of: _BatchOf, first_step: int, num_steps: int, threads: int, workers: int) -> Any:
+    """Grain's iterator over the batches, prepared ahead by threads, in this process or in workers."""
+    import grain
+    from absl import flags
+
     steps = grain.MapDataset.range(first_step, num_steps).map(batch_of)
     # Batches are large, so that only one waits beside the batches in progress.
     stream = steps.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads + 1))
@@ -222,10 +185,7 @@ def make_batches(
         stream = stream.mp_prefetch(
             grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=1), _leave_signals
         )
-    prepared: Any = iter(stream)
-    owned = _OwnedBatches(prepared, copied=workers > 0 and not lend)
-    with contextlib.closing(prepared), contextlib.closing(owned) as batches:
-        yield batches
+    return iter(stream)
 
 
 def default_threads(workers: int = 0) -> int:
@@ -233,23 +193,10 @@ def default_threads(workers: int = 0) -> int:
 
     All processes together get as many threads as this process may use cores, minus one for the main thread if
     there are more than two; at least 1 each and at most 16.
-
-    >>> 1 <= default_threads() <= 16
-    True
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     free = cores - 1 if cores > 2 else cores
     return max(min(free, _MAX_THREADS) // max(workers, 1), 1)
-
-
-def packing_for(frames: FrameSet, config: Config) -> Packing:
-    """Choose the packing of a run's batches from five frames, spread evenly over the set.
-
-    The result is the same in every process.
-    """
-    clouds = (frames.frame(index).points for index in spread_indices(len(frames), _NUM_INSPECTED))
-    usable = (points[usable_rows(points)] for points in clouds)
-    return choose_packing(usable, num_sweeps=config.num_sweeps, num_pasted=sum(config.paste_targets))
 
 
 def check_loader_options(config: Config, *, threads: int | None, workers: int, num_processes: int = 1) -> None:
@@ -283,23 +230,19 @@ def _check_shared_memory(config: Config, workers: int, num_processes: int) -> No
 
 
 class _OwnedBatches:
-    """Copies batches out of the workers' shared memory, and reports the first that does not fit the packing.
+    """Copies batches out of the workers' shared memory.
 
     Not a generator, because it is closed while a thread may still be waiting in it for a batch.
     """
 
     def __init__(self, batches: Iterator[HostBatch], *, copied: bool) -> None:
         self._batches, self._copied = batches, copied
-        self._told = False
 
     def __iter__(self) -> Iterator[HostBatch]:
         return self
 
     def __next__(self) -> HostBatch:
         host = next(self._batches)
-        if host.misfit is not None and not self._told:
-            tell(f"{host.misfit}: such batches stay unpacked, which compiles the step once more")
-            self._told = True
         return dataclasses.replace(host, batch=jax.tree.map(np.array, host.batch)) if self._copied else host
 
     def close(self) -> None:

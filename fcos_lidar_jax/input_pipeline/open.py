@@ -149,28 +149,14 @@ def find_data_set(root: str | Path | None, format: str | None = None, version: s
 
 
 def _recognise(root: Path) -> Reader:
-    matching = _matching(root)
+    matching = [reader for reader in READERS if any(any(root.glob(mark)) for mark in reader.marks)]
     if len(matching) > 1:
         names = " and ".join(reader.name for reader in matching)
         raise ValueError(f"{root}: looks like {names}, expected one format: name it")
     if not matching:
         marks = ", ".join(f"{' or '.join(reader.marks)} ({reader.name})" for reader in READERS if reader.marks)
-        whole = root.resolve()
-        above = [(folder, _matching(folder, part=whole)) for folder in whole.parents[:2]]
-        below = [(folder, _matching(folder)) for folder in sorted(root.glob("*")) if folder.is_dir()]
-        found = ((folder, readers[0].name) for folder, readers in above + below if len(readers) == 1)
-        hint = next((f"; found {name} in {folder}" for folder, name in found), "")
-        raise ValueError(f"{root}: no known data set, expected one of {marks}{hint}")
+        raise ValueError(f"{root}: no known data set, expected one of {marks}")
     return matching[0]
-
-
-def _matching(root: Path, *, part: Path | None = None) -> list[Reader]:
-    """Readers whose marks are in a folder; with ``part``, only marks inside it or around it."""
-
-    def counts(mark: Path) -> bool:
-        return part is None or mark.is_relative_to(part) or part.is_relative_to(mark)
-
-    return [reader for reader in READERS if any(counts(path) for mark in reader.marks for path in root.glob(mark))]
 
 
 def _refuse(data: DataSet, **options: object) -> None:
@@ -271,17 +257,8 @@ def open_frames(
     if num_sweeps is not None:
         reading = dataclasses.replace(reading, num_sweeps=num_sweeps)
     options = {name: value for name, value in given.items() if name in data.reader.options}
-    recorded = data.reader.sensor
-    if sensor is not None and recorded is not None:
-        given_sensor, sensor, told = sensor, in_frame_of(sensor, recorded), list[str]()
-        if intensity_scale is None and sensor.intensity_scale != given_sensor.intensity_scale:
-            told.append(f"intensities are scaled by {sensor.intensity_scale:g}")
-        if sensor.origin_m != given_sensor.origin_m:
-            told.append(f"the LiDAR is at {sensor.origin_m} m")
-        if told:
-            tell(f"{data.root}: {' and '.join(told)}, as for all data of format {data.reader.name}", once=True)
     open_with = functools.partial(data.reader.open, data, split=split, reading=reading, **options)
-    sensor = sensor or recorded
+    sensor = _recording_sensor(data, sensor, intensity_scale)
     if intensity_scale is not None:
         sensor = sensor or open_with(sensor=None).sensor  # only the frames know the sensor of a folder
         sensor = dataclasses.replace(sensor, intensity_scale=intensity_scale)
@@ -289,3 +266,18 @@ def open_frames(
     if class_map is None:
         return frames
     return MappedFrames(frames, mapped_classes(frames.classes, class_map), class_map)
+
+
+def _recording_sensor(data: DataSet, sensor: Sensor | None, intensity_scale: float | None) -> Sensor | None:
+    """The range image of ``sensor`` in the frame of the sensor that recorded the data, if the format has one."""
+    recorded = data.reader.sensor
+    if sensor is None or recorded is None:
+        return sensor or recorded
+    combined, told = in_frame_of(sensor, recorded), list[str]()
+    if intensity_scale is None and combined.intensity_scale != sensor.intensity_scale:
+        told.append(f"intensities are scaled by {combined.intensity_scale:g}")
+    if combined.origin_m != sensor.origin_m:
+        told.append(f"the LiDAR is at {combined.origin_m} m")
+    if told:
+        tell(f"{data.root}: {' and '.join(told)}, as for all data of format {data.reader.name}", once=True)
+    return combined

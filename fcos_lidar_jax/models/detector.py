@@ -111,9 +111,6 @@ def network_input(features: Float32[Array, "b h w 9 r"], config: ModelConfig, la
 
     Empty slots stay zero in all nine channels. The ``9 r`` channels of the result are ordered by type, then by
     round (paper, figure 2).
-
-    >>> network_input(jnp.zeros((1, 16, 256, 9, 2)), ModelConfig(), ImageLayout(16, 256, 2)).shape
-    (1, 32, 256, 18)
     """
     mean = jnp.array(config.channel_mean, jnp.float32)[:, None]
     scale = jnp.array(config.channel_scale, jnp.float32)[:, None]
@@ -166,10 +163,6 @@ def _build(config: Config, sensor: Sensor) -> Detector:
 
 
 def count_parameters(params: Any) -> dict[str, int]:
-    """Count the parameters of each part of the network, and in total.
-
-    >>> count_parameters({"stem": {"kernel": jnp.ones((3, 4))}, "fpn": {"bias": jnp.ones(2)}})
-    {'stem': 12, 'fpn': 2, 'total': 14}
-    """
+    """Count the parameters of each part of the network, and in total."""
     parts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in params.items()}
     return {**parts, "total": sum(parts.values())}

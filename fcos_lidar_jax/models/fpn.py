@@ -8,11 +8,7 @@ from fcos_lidar_jax.models.layers import Conv, Image
 
 
 def double(x: Image) -> Image:
-    """Upsample by two with nearest neighbours.
-
-    >>> double(jnp.ones((1, 2, 3, 4))).shape
-    (1, 4, 6, 4)
-    """
+    """Upsample by two with nearest neighbours."""
     b, h, w, c = x.shape
     return jnp.broadcast_to(x[:, :, None, :, None], (b, h, 2, w, 2, c)).reshape(b, 2 * h, 2 * w, c)
 

@@ -89,11 +89,7 @@ def at_least_float32(x: Array) -> Array:
 
 
 def pieces(sizes: Sequence[int]) -> list[slice]:
-    """Make consecutive slices of the given sizes.
-
-    >>> pieces([2, 3])
-    [slice(0, 2, None), slice(2, 5, None)]
-    """
+    """Make consecutive slices of the given sizes."""
     return [slice(a, b) for a, b in itertools.pairwise(itertools.accumulate(sizes, initial=0))]
 
 

@@ -26,11 +26,7 @@ OWN = tuple(map(CHANNELS.index, ("z", "range", "inclination", "intensity", "exis
 
 
 def window() -> list[tuple[int, int]]:
-    """List row and column of each neighbour in the window, in the order of the channels.
-
-    >>> len(window()), window()[0]
-    (20, (0, 0))
-    """
+    """List row and column of each neighbour in the window, in the order of the channels."""
     cells = itertools.product(range(2 * ROWS + 1), range(2 * COLUMNS + 1))
     return [cell for cell in cells if cell != (ROWS, COLUMNS)]
 
@@ -124,9 +120,6 @@ def own_numbers(image: Image) -> Image:
     """Select height, range, inclination, intensity and existence of each pixel's first-round point.
 
     Channels that depend on the azimuth are left out: an object looks the same in every direction from the sensor.
-
-    >>> own_numbers(jnp.arange(18.0).reshape(1, 1, 1, 18))[0, 0, 0].tolist()  # two rounds
-    [4.0, 6.0, 10.0, 12.0, 14.0]
     """
     return image[..., :: image.shape[-1] // 9][..., np.array(OWN)]
 

@@ -67,11 +67,7 @@ def add_refinement(detector: "Detector") -> "Detector":
 
 
 def without_second_look(variables: dict[str, Any]) -> dict[str, Any]:
-    """Variables of a detector without those of the second look.
-
-    >>> without_second_look({"params": {"heads": 1, "refinement": 2}, "batch_stats": {}})
-    {'params': {'heads': 1}, 'batch_stats': {}}
-    """
+    """Variables of a detector without those of the second look."""
     return variables | {
         "params": {name: part for name, part in variables["params"].items() if name != SECOND_LOOK}
     }
@@ -84,11 +80,7 @@ def make_network(config: Config) -> SecondLook:
 
 
 def trainable(params: dict[str, Any], config: Config) -> dict[str, Any]:
-    """The part of the parameters that a training changes: all, or those of the second look only.
-
-    >>> trainable({"heads": 1, "refinement": 2}, Config())
-    {'heads': 1, 'refinement': 2}
-    """
+    """The part of the parameters that a training changes: all, or those of the second look only."""
     frozen = config.refinement is not None and config.refinement.freeze_detector
     return {SECOND_LOOK: params[SECOND_LOOK]} if frozen else params
 
@@ -97,9 +89,6 @@ def proposal_inference(config: Config) -> InferenceConfig:
     """Post-processing before the second look, which looks at the best boxes of all classes.
 
     The numbers and classes of ``config.inference`` apply to the boxes after it.
-
-    >>> proposal_inference(Config()) == Config().inference
-    True
     """
     if config.refinement is None:
         return config.inference

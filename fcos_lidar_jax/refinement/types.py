@@ -9,13 +9,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Crops:
-    """Points of enlarged boxes, at most p of each.
-
-    >>> import numpy as np
-    >>> slots = np.full((64, 128), -1)
-    >>> bool(Crops(np.zeros((64, 128, 5)), slots, np.zeros(64, int)).valid.any())
-    False
-    """
+    """Points of enlarged boxes, at most p of each."""
 
     points: Float32[Array, "*b m p 5"]
     """x, y, z from the centre of the box (metres; x along the heading, y to the left), intensity (0-255), time lag
@@ -32,13 +26,7 @@ class Crops:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RefinementTargets:
-    """Targets of the boxes of one cloud.
-
-    >>> import numpy as np
-    >>> none = RefinementTargets(np.full(64, 10), np.zeros((64, 8)), np.zeros(64, bool), np.ones(64))
-    >>> int((none.label < 10).sum())  # objects that a box stands for
-    0
-    """
+    """Targets of the boxes of one cloud."""
 
     label: Int32[Array, "*b m"]  # Class of the object that the box stands for, the number of classes for none.
     residual: Float32[Array, "*b m 8"]

@@ -16,11 +16,7 @@ Record = dict[str, float | list[float]]
 
 
 class NonFiniteLossError(ArithmeticError):
-    """A loss or gradient is not finite; the message names the step, the losses and the samples.
-
-    >>> issubclass(NonFiniteLossError, ArithmeticError)
-    True
-    """
+    """A loss or gradient is not finite; the message names the step, the losses and the samples."""
 
 
 def fit(
@@ -62,30 +58,7 @@ def fit(
     3
     """
     done = int(state.step)
-    progress = Progress("steps", num_steps, every_s=log_every_s)
-    unread: tuple[int, HostBatch, dict[str, jax.Array], float] | None = None
-    before = time.monotonic()
-
-    def read() -> None:
-        nonlocal unread, before
-        if unread is None:
-            return
-        number, host, metrics, waited = unread
-        unread = None
-        record: Record = {name: np.asarray(value).tolist() for name, value in metrics.items()}
-        now = time.monotonic()
-        record |= {"seconds": now - before, "waiting_seconds": waited, **host.counts}
-        for what in ("points", "boxes"):
-            if lost := host.counts.get(count := f"truncated_{what}"):
-                told = f"step {number}: {lost} {what} left out, since samples have more than max_{what}"
-                tell(f"note: {told}; the metrics of each step count them as {count}", once=count)
-        before = now
-        _check_finite(number, record, host.names)
-        iou = f"  IoU {record['positive_iou']:.2f}" if "positive_iou" in record else ""
-        progress.show(number, f"loss {record['loss/total']:.3f}{iou}")
-        if report is not None:
-            report(number, record)
-
+    reader = _Reader(Progress("steps", num_steps, every_s=log_every_s), report)
     iterator = iter(batches)
     while done < num_steps:
         began = time.monotonic()
@@ -94,17 +67,44 @@ def fit(
         state, metrics = step(state, host.batch)
         host = dataclasses.replace(host, batch=None)  # frees the memory for the next batch
         done += 1
-        read()
-        unread = done, host, metrics, waited
+        reader.read()
+        reader.unread = done, host, metrics, waited
         stop, pausing = stopping(done), pause_at(done)
         if stop or pausing or done == num_steps:
-            read()
+            reader.read()
         if pause is not None and pausing:
             pause(done, state)
-            before = time.monotonic()
+            reader.before = time.monotonic()
         if stop:
             break
     return state
+
+
+class _Reader:
+    """Reads the metrics of the last step, once they are asked for, and reports them."""
+
+    def __init__(self, progress: Progress, report: Callable[[int, Record], None] | None) -> None:
+        self.progress, self.report, self.before = progress, report, time.monotonic()
+        self.unread: tuple[int, HostBatch, dict[str, jax.Array], float] | None = None
+
+    def read(self) -> None:
+        if self.unread is None:
+            return
+        number, host, metrics, waited = self.unread
+        self.unread = None
+        record: Record = {name: np.asarray(value).tolist() for name, value in metrics.items()}
+        now = time.monotonic()
+        record |= {"seconds": now - self.before, "waiting_seconds": waited, **host.counts}
+        for what in ("points", "boxes"):
+            if lost := host.counts.get(count := f"truncated_{what}"):
+                told = f"step {number}: {lost} {what} left out, since samples have more than max_{what}"
+                tell(f"note: {told}; the metrics of each step count them as {count}", once=count)
+        self.before = now
+        _check_finite(number, record, host.names)
+        iou = f"  IoU {record['positive_iou']:.2f}" if "positive_iou" in record else ""
+        self.progress.show(number, f"loss {record['loss/total']:.3f}{iou}")
+        if self.report is not None:
+            self.report(number, record)
 
 
 def _check_finite(number: int, record: Record, names: Sequence[str]) -> None:

@@ -42,12 +42,7 @@ def momentum_schedule(config: OptimizerConfig, num_steps: int) -> optax.Schedule
 
 
 def make_optimizer(config: OptimizerConfig, num_steps: int) -> optax.GradientTransformation:
-    """Global-norm clipping, then AdamW with weight decay on all parameters, for a run of ``num_steps`` updates.
-
-    >>> state = make_optimizer(OptimizerConfig(), 10).init({"w": jnp.ones(2)})
-    >>> sorted(current_hyperparameters(state))
-    ['b1', 'learning_rate']
-    """
+    """Global-norm clipping, then AdamW with weight decay on all parameters, for a run of ``num_steps`` updates."""
     adamw = optax.inject_hyperparams(optax.adamw, static_args=_FIXED, hyperparam_dtype=jnp.float32)
     chain = optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),

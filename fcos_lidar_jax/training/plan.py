@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from fcos_lidar_jax.augment import check_augmentation
 from fcos_lidar_jax.checkpoints.retention import CHECKPOINTS, Checkpoints, find_checkpoint
 from fcos_lidar_jax.checkpoints.storage import CheckpointError, check_arrays, read_checkpoint
 from fcos_lidar_jax.config import Config, config_to_json
+from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.mesh import check_batch_size
@@ -25,12 +26,12 @@ from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.input_pipeline.batching import check_counts, spread_indices
 from fcos_lidar_jax.input_pipeline.copy_paste import make_paste
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
-from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options, packing_for
+from fcos_lidar_jax.input_pipeline.loader import SampleOrder, check_loader_options
 from fcos_lidar_jax.models import Detector, Variables, build_detector
-from fcos_lidar_jax.packing import Packing
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.refinement import SECOND_LOOK, without_second_look
 from fcos_lidar_jax.sensors import sensor_to_json, turn_between
+from fcos_lidar_jax.training.loop import Record
 from fcos_lidar_jax.training.metrics_log import METRICS, evaluated_steps
 from fcos_lidar_jax.training.optimizer import make_optimizer
 from fcos_lidar_jax.training.step import make_state
@@ -39,6 +40,9 @@ NUM_SEEDS = 2**32  # JAX uses 32 bits of a seed, so larger seeds would repeat sm
 _MIN_EVALUATE_EVERY = 100
 """An evaluation of a whole split can take longer than so few steps, which hardly change the scores."""
 RUN_SPEC = "run.json"  # file with the specification of a run in its folder
+
+Hook = Callable[[int, Record], None]
+"""Called with the number of steps and the metrics of the last one, or the scores of the evaluation after it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,9 +54,6 @@ class Schedule:
         evaluate_every: steps between evaluations, each of which also saves a checkpoint; by default a tenth of the
             run, but at least 100. The last step is always evaluated.
         keep: number of newest checkpoints to keep, in addition to the best.
-
-    >>> Schedule(save_every=100).keep
-    2
     """
 
     save_every: int | None = None
@@ -67,118 +68,139 @@ class Schedule:
 
 
 @dataclasses.dataclass(frozen=True)
+class RunSpec:
+    """What to train on what, and where: the arguments of :func:`train`, checked.
+
+    Attributes:
+        config: the detector and its training.
+        frames: training frames; classes are matched to ``config.classes`` by name, and the detector is built for
+            their sensor.
+        out: folder of the run.
+        steps: number of updates of the whole run.
+        seed: seed of weights, order, pasted objects and augmentation.
+        tests: frames to evaluate on during training.
+        objects: ground-truth database for copy-paste; required unless ``config.copy_paste`` is None.
+        resume: resume the same run from the newest intact checkpoint in the folder.
+        weights: initial weights, as a checkpoint or arrays; random by default.
+        devices: devices that share each batch; by default all.
+        hooks: functions ``(number of steps, values)`` to call in every process: after every step with its metrics,
+            and after every evaluation with the scores ``test/mAP`` and ``test/AP/CLASS``.
+        schedule: when to save and evaluate.
+        threads: number of threads that prepare batches; by default as many as
+            ``input_pipeline.loader.default_threads`` returns.
+        workers: number of additional processes that prepare batches.
+    """
+
+    config: Config
+    frames: FrameSet
+    out: Path
+    _: dataclasses.KW_ONLY
+    steps: int
+    seed: int = 0
+    tests: FrameSet | None = None
+    objects: GroundTruthDatabase | None = None
+    resume: bool = False
+    weights: str | Path | Variables | None = None
+    devices: Sequence[Any] | None = None
+    hooks: Sequence[Hook] = ()
+    schedule: Schedule = Schedule()
+    threads: int | None = None
+    workers: int = 0
+
+    def __post_init__(self) -> None:
+        config, steps, seed = self.config, self.steps, self.seed
+        check(isinstance(config, Config), "config", config, "a Config, such as presets.COMPACT")
+        check(isinstance(self.schedule, Schedule), "schedule", self.schedule, "a Schedule")
+        check(type(steps) is int and 1 <= steps < 2**31, "steps", steps, f"an integer from 1 to {2**31 - 1}")
+        check(type(seed) is int and 0 <= seed < NUM_SEEDS, "seed", seed, f"an integer from 0 to {NUM_SEEDS - 1}")
+        object.__setattr__(self, "out", local_path(self.out))
+        object.__setattr__(self, "frames", MappedFrames(self.frames, config.classes))
+        if self.tests is not None:
+            object.__setattr__(self, "tests", MappedFrames(self.tests, config.classes))
+
+    def evaluates_at(self, step: int) -> bool:
+        every = self.schedule.evaluate_every or max(-(-self.steps // 10), _MIN_EVALUATE_EVERY)
+        return self.tests is not None and (step % every == 0 or step == self.steps)
+
+    def saves_at(self, step: int) -> bool:
+        return step % (self.schedule.save_every or -(-self.steps // 50)) == 0 or self.evaluates_at(step)
+
+
+@dataclasses.dataclass(frozen=True)
 class Run:
     """Everything that is constant during a run."""
 
-    folder: Path
+    spec: RunSpec
+    record: dict[str, Any]  # content of ``run.json``: a run resumes only with the same
     detector: Detector
     optimizer: Any  # pair of functions from optax
-    schedule: Schedule
-    num_steps: int
-    seed: int
-    frames: FrameSet
     order: SampleOrder
-    tests: FrameSet | None
-    devices: Sequence[Any] | None
-    spec: dict[str, Any]
     weights: Variables | None  # initial weights
-    packing: Packing | None
     warnings: tuple[str, ...]
 
     def evaluation_pending(self, step: int) -> bool:
         """Whether a run was stopped before the evaluation after a step was recorded."""
-        return step > 0 and self.evaluates_at(step) and step not in evaluated_steps(self.folder)
+        return step > 0 and self.spec.evaluates_at(step) and step not in evaluated_steps(self.spec.out)
 
     @property
     def checkpoints(self) -> Checkpoints:
-        return Checkpoints(self.folder / CHECKPOINTS, keep=self.schedule.keep)
-
-    def evaluates_at(self, step: int) -> bool:
-        every = self.schedule.evaluate_every or max(-(-self.num_steps // 10), _MIN_EVALUATE_EVERY)
-        return self.tests is not None and (step % every == 0 or step == self.num_steps)
-
-    def saves_at(self, step: int) -> bool:
-        return step % (self.schedule.save_every or -(-self.num_steps // 50)) == 0 or self.evaluates_at(step)
+        return Checkpoints(self.spec.out / CHECKPOINTS, keep=self.spec.schedule.keep)
 
 
-def plan_run(
-    config: Config,
-    frames: FrameSet,
-    out: Path,
-    mesh: Mesh,
-    *,
-    steps: int,
-    seed: int,
-    tests: FrameSet | None,
-    objects: GroundTruthDatabase | None,
-    resume: bool,
-    weights: str | Path | Variables | None,
-    devices: Sequence[Any] | None,
-    schedule: Schedule,
-    threads: int | None,
-    workers: int,
-    packing: bool | None,
-) -> Run:
-    """Plan a run; arguments as for :func:`fcos_lidar_jax.training.train`, with labels by ``config.classes``."""
-    check(type(steps) is int and 1 <= steps < 2**31, "steps", steps, f"an integer from 1 to {2**31 - 1}")
-    check(type(seed) is int and 0 <= seed < NUM_SEEDS, "seed", seed, f"an integer from 0 to {NUM_SEEDS - 1}")
-    order = SampleOrder(frames, config, seed=seed)
-    epoch_steps = -(-order.epoch_size // config.optimizer.batch_size)
-    if config.copy_paste is not None and config.fade_epochs * epoch_steps >= steps:
-        raise ValueError(
-            f"fade_epochs: got {config.fade_epochs}, of {epoch_steps} steps each, expected less than the run's "
-            f"{steps} steps: nothing would be pasted"
-        )
+def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
+    """Plan a run, and refuse one that cannot be trained."""
+    config, frames = spec.config, spec.frames
+    order = SampleOrder(frames, config, seed=spec.seed)
     check_counts(frames)
     check_batch_size(config.optimizer.batch_size, mesh)
-    check_loader_options(config, threads=threads, workers=workers, num_processes=jax.process_count())
-    if config.copy_paste is not None and objects is None:
-        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
+    options = {"threads": spec.threads, "workers": spec.workers, "num_processes": jax.process_count()}
+    check_loader_options(config, **options)
+    if config.copy_paste is not None:
+        _check_pasting(spec, -(-order.epoch_size // config.optimizer.batch_size))
     if config.augment is not None:
         check_augmentation(config.augment, frames.sensor)
-    detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, steps)
-    jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(seed))
-    begun = resume and Checkpoints(out / CHECKPOINTS).paths()
-    initial = None if begun else _initial_weights(detector, weights)
-    # A run resumes only with the same specification.
-    spec = {
-        "config": config_to_json(config),
-        "sensor": sensor_to_json(frames.sensor),
-        "steps": steps,
-        "seed": seed,
-        "frames": len(frames),
-        "data": frames.fingerprint(),
+    detector, optimizer = build_detector(config, frames.sensor), make_optimizer(config.optimizer, spec.steps)
+    jax.eval_shape(lambda key: make_state(detector, optimizer, key), jax.random.key(spec.seed))
+    begun = spec.resume and Checkpoints(spec.out / CHECKPOINTS).paths()
+    weights = None if begun else _initial_weights(detector, spec.weights)
+    warnings = tuple(_warnings(frames, config))
+    return Run(spec, _record(spec, detector, weights), detector, optimizer, order, weights, warnings)
+
+
+def _check_pasting(spec: RunSpec, epoch_steps: int) -> None:
+    config = spec.config
+    if config.fade_epochs * epoch_steps >= spec.steps:
+        raise ValueError(
+            f"fade_epochs: got {config.fade_epochs}, of {epoch_steps} steps each, expected less than the run's "
+            f"{spec.steps} steps: nothing would be pasted"
+        )
+    if spec.objects is None:
+        raise ValueError("copy_paste: got no ground-truth database, expected one, or None in the configuration")
+    make_paste(spec.objects, config)
+
+
+def _record(spec: RunSpec, detector: Detector, weights: Variables | None) -> dict[str, Any]:
+    objects, tests = spec.objects, spec.tests
+    record = {
+        "config": config_to_json(spec.config),
+        "sensor": sensor_to_json(spec.frames.sensor),
+        "steps": spec.steps,
+        "seed": spec.seed,
+        "frames": len(spec.frames),
+        "data": spec.frames.fingerprint(),
         "tests": None if tests is None else tests.fingerprint(),
         "objects": None if objects is None else objects.manifest.source,
         "ground_truth_database": None if objects is None else objects.fingerprint(),
-        "weights": str(weights) if isinstance(weights, str | Path) else None,
-        "weights_hash": None if initial is None else TrainedDetector(detector, initial).fingerprint,
+        "weights": str(spec.weights) if isinstance(spec.weights, str | Path) else None,
+        "weights_hash": None if weights is None else TrainedDetector(detector, weights).fingerprint,
     }
-    if config.copy_paste is not None and objects is not None:
-        make_paste(objects, config)
-    on_cpus = mesh.devices.flat[0].platform == "cpu"
-    return Run(
-        folder=out,
-        detector=detector,
-        optimizer=optimizer,
-        schedule=schedule,
-        num_steps=steps,
-        seed=seed,
-        frames=frames,
-        order=order,
-        tests=tests,
-        devices=devices,
-        spec=json.loads(json.dumps(spec)),
-        weights=initial,
-        packing=packing_for(frames, config) if packing or (packing is None and not on_cpus) else None,
-        warnings=tuple(_warnings(frames, config)),
-    )
+    return json.loads(json.dumps(record))
 
 
 def _warnings(frames: FrameSet, config: Config) -> Iterator[str]:
     clouds = {index: frames.frame(index).points for index in spread_indices(len(frames), 5)}
     for index, points in clouds.items():
-        if mismatch := sensor_mismatch(points, frames.sensor, frames.usual_sensor):
+        if mismatch := sensor_mismatch(points, frames.sensor):
             yield f"{frames.name(index)}: {mismatch}"
             break
     if config.num_sweeps > 1 and all(len(np.unique(points[:, 4])) <= 1 for points in clouds.values()):

@@ -5,7 +5,6 @@ the best of the ``checkpoints/``, ``pictures/`` of test frames, and the curves `
 """
 
 import contextlib
-import dataclasses
 import json
 import math
 import signal
@@ -17,72 +16,35 @@ import jax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
-from fcos_lidar_jax.checkpoints.preemption import stop_requests
+from fcos_lidar_jax.checkpoints.preemption import StopRequest, stop_requests
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, NonFiniteStateError
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.class_mapping import MappedFrames
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import jit_step, make_mesh, replicate
-from fcos_lidar_jax.fields import check
-from fcos_lidar_jax.files import atomic_write, checksum, folder_lock, local_path
+from fcos_lidar_jax.files import atomic_write, checksum, folder_lock
 from fcos_lidar_jax.inference.detector import TrainedDetector
 from fcos_lidar_jax.inference.prediction import evaluate, predict
-from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
 from fcos_lidar_jax.input_pipeline.loader import make_batches
 from fcos_lidar_jax.models import Variables
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.training.loop import NonFiniteLossError, Record, fit
 from fcos_lidar_jax.training.metrics_log import MetricsLog, evaluated_steps, last_step
 from fcos_lidar_jax.training.pictures import draw_metrics, draw_predictions
-from fcos_lidar_jax.training.plan import RUN_SPEC, Run, Schedule, check_run, plan_run
+from fcos_lidar_jax.training.plan import RUN_SPEC, Hook, Run, RunSpec, check_run, plan_run
 from fcos_lidar_jax.training.step import detection_variables, make_state, make_train_step
 from fcos_lidar_jax.types import HostBatch, TrainState
 
 _NUM_PICTURES = 2  # number of test frames drawn at an evaluation
 
-Hook = Callable[[int, Record], None]
-"""Called with the number of steps and the metrics of the last one, or the scores of the evaluation after it."""
 
-
-def train(
-    config: Config,
-    frames: FrameSet,
-    out: str | Path,
-    *,
-    steps: int,
-    seed: int = 0,
-    tests: FrameSet | None = None,
-    objects: GroundTruthDatabase | None = None,
-    resume: bool = False,
-    weights: str | Path | Variables | None = None,
-    devices: Sequence[Any] | None = None,
-    hooks: Sequence[Hook] = (),
-    schedule: Schedule = Schedule(),
-    threads: int | None = None,
-    workers: int = 0,
-    packing: bool | None = None,
-) -> TrainState:
+def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> TrainState:
     """Train a detector and return the last state; Ctrl-C and SIGTERM save a checkpoint and stop.
 
     Args:
-        frames: training frames; classes are matched to ``config.classes`` by name, and the detector is built for
-            their sensor.
-        steps: number of updates of the whole run.
-        seed: seed of weights, order, pasted objects and augmentation.
-        tests: frames to evaluate on during training.
-        objects: ground-truth database for copy-paste; required unless ``config.copy_paste`` is None.
-        resume: resume the same run from the newest intact checkpoint in the folder.
-        weights: initial weights, as a checkpoint or arrays; random by default.
-        devices: devices that share each batch; by default all.
-        hooks: functions ``(number of steps, values)`` to call in every process: after every step with its metrics,
-            and after every evaluation with the scores ``test/mAP`` and ``test/AP/CLASS``.
-        schedule: when to save and evaluate.
-        threads, workers: number of threads and additional processes that prepare batches; by default as many
-            threads as ``input_pipeline.loader.default_threads`` returns, and no processes.
-        packing: transfer batches to the devices in fewer bytes, with the same results, see
-            :mod:`fcos_lidar_jax.packing`; by default unless the devices are CPUs.
+        config, frames, out, options: the fields of :class:`~fcos_lidar_jax.training.RunSpec`; ``steps`` is
+            required.
 
     Raises:
         ValueError: the folder holds another run, no class is shared, the devices cannot share the batch, steps or
@@ -92,92 +54,73 @@ def train(
         NonFiniteLossError, NonFiniteStateError: a value is not finite; earlier checkpoints remain.
         KeyboardInterrupt: after Ctrl-C, once the state is saved.
         SystemExit: after SIGTERM, once the state is saved; both also if the signal came during the last step.
-
-    >>> from fcos_lidar_jax.presets import QUICKSTART
-    >>> from fcos_lidar_jax.simulation.frame_set import fresh_streets
-    >>> config, frames = fresh_streets(QUICKSTART, steps=500)
-    >>> train(dataclasses.replace(config, classes=("boat",)), frames, "run", steps=500)
-    Traceback (most recent call last):
-    ValueError: ...
     """
-    check(isinstance(config, Config), "config", config, "a Config, such as presets.COMPACT")
-    check(isinstance(schedule, Schedule), "schedule", schedule, "a Schedule")
-    mesh = make_mesh(devices)
-    is_main_process, several = jax.process_index() == 0, jax.process_count() > 1
     with agreed("cannot train"):
-        run = plan_run(
-            config,
-            MappedFrames(frames, config.classes),
-            local_path(out),
-            mesh,
-            steps=steps,
-            seed=seed,
-            tests=None if tests is None else MappedFrames(tests, config.classes),
-            objects=objects,
-            resume=resume,
-            weights=weights,
-            devices=devices,
-            schedule=schedule,
-            threads=threads,
-            workers=workers,
-            packing=packing,
-        )
-    packed = None if run.packing is None else dataclasses.asdict(run.packing)
-    program = json.dumps([run.spec, packed], sort_keys=True)
-    check_same(checksum(program.encode()), "configuration, data or packing")
+        spec = RunSpec(config, frames, Path(out), **options)
+        mesh = make_mesh(spec.devices)
+        run = plan_run(spec, mesh)
+    check_same(checksum(json.dumps(run.record, sort_keys=True).encode()), "configuration or data")
+    is_main_process = jax.process_index() == 0
     with contextlib.ExitStack() as held:
         with agreed("cannot train"):
             if is_main_process:
-                held.enter_context(run_folder(run.folder, run.spec, resume=resume))
+                held.enter_context(run_folder(spec.out, run.record, resume=spec.resume))
         with agreed("cannot train"):
-            start = _start(run, resume=resume)
+            start = _start(run)
             first = int(start.step)
             pending = run.evaluation_pending(first)
         # Processes that see other checkpoints, as in folders of their own, would train different networks.
         check_same(checksum(f"{first} {pending}".encode()), "checkpoint to resume from")
-        if first == steps and not pending:
-            tell(f"{run.folder}: the run is complete, with {first} steps")
+        if first == spec.steps and not pending:
+            tell(f"{spec.out}: the run is complete, with {first} steps")
             return start
-        log = MetricsLog(run.folder, first_step=first) if is_main_process else None
+        log = MetricsLog(spec.out, first_step=first) if is_main_process else None
         if log is not None:
             held.callback(log.close)
-        for line in run.warnings:
-            tell(f"warning: {line}")
-        if resume:
-            tell(f"{run.folder}: resuming after step {first}")
-        tell("compiling the training step: a minute or more on a CPU")
-        batches = make_batches(
-            run.frames,
-            config,
-            seed=seed,
-            num_steps=steps,
-            first_step=first,
-            objects=objects,
-            process_index=jax.process_index(),
-            num_processes=jax.process_count(),
-            threads=threads,
-            workers=workers,
-            packing=run.packing,
-            lend=True,
-            order=run.order,
-        )
-        asked = stop_requests("stopping after this step or evaluation, which is saved", active=not several)
-        with asked as request, batches as prepared, feed(prepared, mesh) as stream:
-
-            def stopping(done: int) -> bool:
-                if several:  # all stop after the same step, whichever of them received the signal
-                    return multihost_utils.reached_preemption_sync_point(done)
-                return request.signal is not None
-
-            state = _take_steps(run, mesh, start, stream, pending, log, hooks, stopping)
+        state, request = _train(run, mesh, start, pending, log)
         if is_main_process:
-            draw_metrics(run.folder)
-    if (done := int(state.step)) < steps or request.signal is not None:
+            draw_metrics(spec.out)
+    if (done := int(state.step)) < spec.steps or request.signal is not None:
         tell(f"stopped after step {done}, which is saved")
         if request.signal == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + signal.SIGTERM)
     return state
+
+
+def _train(
+    run: Run, mesh: Mesh, start: TrainState, pending: bool, log: MetricsLog | None
+) -> tuple[TrainState, StopRequest]:
+    """Train from a state to the end, or until a signal asks to stop; also returns the request."""
+    spec, several = run.spec, jax.process_count() > 1
+    for line in run.warnings:
+        tell(f"warning: {line}")
+    if spec.resume:
+        tell(f"{spec.out}: resuming after step {int(start.step)}")
+    tell("compiling the training step: a minute or more on a CPU")
+    batches = make_batches(
+        spec.frames,
+        spec.config,
+        seed=spec.seed,
+        num_steps=spec.steps,
+        first_step=int(start.step),
+        objects=spec.objects,
+        process_index=jax.process_index(),
+        num_processes=jax.process_count(),
+        threads=spec.threads,
+        workers=spec.workers,
+        lend=True,
+        order=run.order,
+    )
+    asked = stop_requests("stopping after this step or evaluation, which is saved", active=not several)
+    with asked as request, batches as prepared, feed(prepared, mesh) as stream:
+
+        def stopping(done: int) -> bool:
+            if several:  # all stop after the same step, whichever of them received the signal
+                return multihost_utils.reached_preemption_sync_point(done)
+            return request.signal is not None
+
+        return _take_steps(run, mesh, start, stream, pending, log, stopping), request
 
 
 def _take_steps(
@@ -187,27 +130,27 @@ def _take_steps(
     batches: Iterable[HostBatch],
     pending: bool,
     log: MetricsLog | None,
-    hooks: Sequence[Hook],
     stopping: Callable[[int], bool],
 ) -> TrainState:
     """Take the remaining steps of a run and return the last state; the process with a log saves and records.
 
     ``pending`` tells whether the evaluation of the first state is missing.
     """
-    batch_size, stop = run.detector.config.optimizer.batch_size, False
+    spec, stop = run.spec, False
+    batch_size = spec.config.optimizer.batch_size
 
     def report(number: int, record: Record) -> None:
         if log is not None:
             samples = batch_size / max(float(record["seconds"]), 1e-9)  # type: ignore[arg-type]
             log.write(number, record | {"samples_per_second": samples})
-        _call(hooks, number, record)
+        _call(spec.hooks, number, record)
 
     def pause(number: int, state: TrainState) -> None:
         if log is not None:
             log.flush()
             _save(run, state)  # before the evaluation, which may take long
-        if run.evaluates_at(number) and not (stop and number < run.num_steps):  # resuming evaluates
-            _call(hooks, number, _evaluate(run, number, state, log))
+        if spec.evaluates_at(number) and not (stop and number < spec.steps):  # resuming evaluates
+            _call(spec.hooks, number, _evaluate(run, number, state, log))
 
     def stops(number: int) -> bool:
         nonlocal stop
@@ -217,19 +160,19 @@ def _take_steps(
     try:
         state = replicate(start, mesh)
         if pending:
-            _call(hooks, int(start.step), _evaluate(run, int(start.step), state, log))
+            _call(spec.hooks, int(start.step), _evaluate(run, int(start.step), state, log))
         state = fit(
             jit_step(make_train_step(run.detector, run.optimizer), mesh),
             state,
             batches,
-            num_steps=run.num_steps,
+            num_steps=spec.steps,
             report=report,
-            pause_at=run.saves_at,
+            pause_at=spec.saves_at,
             pause=pause,
             stopping=stops,
             log_every_s=math.inf if log is None else 10.0,
         )
-        if log is not None and not run.saves_at(int(state.step)):
+        if log is not None and not spec.saves_at(int(state.step)):
             _save(run, state)
         return state
     except (NonFiniteLossError, NonFiniteStateError) as error:
@@ -258,17 +201,17 @@ def run_folder(folder: Path, spec: dict[str, Any] | None = None, *, resume: bool
         yield
 
 
-def _start(run: Run, *, resume: bool) -> TrainState:
+def _start(run: Run) -> TrainState:
     """The state of the newest checkpoint, or a new state with initial weights."""
-    key = jax.random.key(run.seed)
-    if resume:
+    spec, key = run.spec, jax.random.key(run.spec.seed)
+    if spec.resume:
         like = jax.eval_shape(lambda k: make_state(run.detector, run.optimizer, k), key)
         if (newest := run.checkpoints.newest(like)) is not None:
             return newest[1]
         # Only a run that was killed before its first checkpoint begins again; the metrics of others would be lost.
         # A recorded evaluation comes after a checkpoint.
-        first = next(filter(run.saves_at, range(1, run.num_steps)), run.num_steps)
-        if (done := last_step(run.folder)) > first or evaluated_steps(run.folder):
+        first = next(filter(spec.saves_at, range(1, spec.steps)), spec.steps)
+        if (done := last_step(spec.out)) > first or evaluated_steps(spec.out):
             found = f"found none, but metrics of {done} steps, and this schedule saves step {first}"
             expected = "the checkpoints of the run, or the schedule that it began with"
             raise ValueError(f"{run.checkpoints.folder}: {found}: expected {expected}")
@@ -277,18 +220,19 @@ def _start(run: Run, *, resume: bool) -> TrainState:
 
 def _evaluate(run: Run, number: int, state: TrainState, log: MetricsLog | None) -> Record:
     """Evaluate on the test frames in all processes and return the scores; the main process draws and records."""
-    assert run.tests is not None
+    tests, devices = run.spec.tests, run.spec.devices
+    assert tests is not None
     trained = TrainedDetector(run.detector, _local_variables(state))
-    summary = evaluate(trained, run.tests, devices=run.devices).summary
+    summary = evaluate(trained, tests, devices=devices).summary
     score = summary["mean_ap"]
     scores: Record = {"test/mAP": score}
     scores |= {f"test/AP/{name}": value for name, value in summary["mean_dist_aps"].items()}
-    first = range(min(_NUM_PICTURES, len(run.tests)))
-    examples = list(predict(trained, run.tests, indices=first, devices=run.devices))
+    first = range(min(_NUM_PICTURES, len(tests)))
+    examples = list(predict(trained, tests, indices=first, devices=devices))
     if log is not None:
         tell(f"step {number}: mAP by centre distance {score:.3f}")
         prefix, title = f"step_{number:06d}_frame", f"step {number}, test frame"
-        pictures = draw_predictions(run.folder / "pictures", examples, run.tests, prefix=prefix, title=title)
+        pictures = draw_predictions(run.spec.out / "pictures", examples, tests, prefix=prefix, title=title)
         log.write_pictures(number, pictures)
         if not math.isnan(score):
             run.checkpoints.record_score(number, score)
@@ -297,7 +241,7 @@ def _evaluate(run: Run, number: int, state: TrainState, log: MetricsLog | None) 
 
 
 def _save(run: Run, state: TrainState) -> None:
-    data = json.dumps({name: run.spec[name] for name in ("data", "frames", "weights")}, sort_keys=True)
+    data = json.dumps({name: run.record[name] for name in ("data", "frames", "weights")}, sort_keys=True)
     config, sensor = run.detector.config, run.detector.sensor
     checkpoint = Checkpoint(config, sensor, _local_variables(state), int(state.step), data)
     run.checkpoints.save(checkpoint, state)

@@ -15,13 +15,12 @@ from fcos_lidar_jax.augment import augment, sample_key
 from fcos_lidar_jax.collectives import device_index, sum_over_devices, varying
 from fcos_lidar_jax.fields import check
 from fcos_lidar_jax.models import Detector, Variables
-from fcos_lidar_jax.packing import unpack
 from fcos_lidar_jax.refinement import trainable
 from fcos_lidar_jax.training.objective import Metrics, batch_metrics, make_objective
 from fcos_lidar_jax.training.optimizer import current_hyperparameters
-from fcos_lidar_jax.types import Batch, PackedBatch, Sums, TrainState, check_rows
+from fcos_lidar_jax.types import Batch, Sums, TrainState, check_rows
 
-TrainStep = Callable[[TrainState, Batch | PackedBatch], tuple[TrainState, Metrics]]
+TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
 def make_state(
@@ -36,14 +35,6 @@ def make_state(
     Args:
         key: random key of the run.
         variables: initial ``params`` and ``batch_stats``; random by default.
-
-    >>> from fcos_lidar_jax.inference import load_trained
-    >>> from fcos_lidar_jax.training import make_optimizer
-    >>> detector = load_trained("quickstart").model
-    >>> optimizer = make_optimizer(detector.config.optimizer, 100)
-    >>> state = jax.eval_shape(functools.partial(make_state, detector, optimizer), jax.random.key(0))
-    >>> sorted(state.params)
-    ['backbone', 'fpn', 'heads', 'stem']
     """
     check(not isinstance(key, int), "key", key, f"a random key, such as jax.random.key({key})")
     variables = detector.init(key) if variables is None else variables
@@ -137,7 +128,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
     """Make a training step: augment unless ``config.augment`` is None, predict, differentiate, update.
 
     Returns:
-        pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller. A packed batch is unpacked first.
+        pure ``(state, batch) -> (state, metrics)``, to be jitted by the caller.
         Metrics are scalars except ``positives_per_level`` i32[6]. Raises a ValueError at trace time if the arrays
         of the batch have different numbers of samples or boxes.
 
@@ -166,8 +157,7 @@ def make_train_step(detector: Detector, optimizer: optax.GradientTransformation)
         points, boxes = jax.vmap(augment_one)(keys, batch.points, batch.boxes)
         return dataclasses.replace(batch, points=points, boxes=boxes)
 
-    def step(state: TrainState, batch: Batch | PackedBatch) -> tuple[TrainState, Metrics]:
-        batch = unpack(batch)
+    def step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         _check_batch(batch)
         batch = augmented(state, batch)
         grads, batch_stats, metrics = gradient(state.params, state.batch_stats, batch)
@@ -195,10 +185,5 @@ def _check_batch(batch: Batch) -> None:
 
 
 def detection_variables(state: TrainState) -> dict[str, Any]:
-    """Variables for detection: batch statistics, and the running mean of the weights if there is one.
-
-    >>> state = TrainState(jnp.int32(9), {"w": 3.0}, {"mean": 0.0}, (), {"w": 2.0}, jax.random.key(0))
-    >>> detection_variables(state)
-    {'params': {'w': 2.0}, 'batch_stats': {'mean': 0.0}}
-    """
+    """Variables for detection: batch statistics, and the running mean of the weights if there is one."""
     return {"params": state.params if state.ema is None else state.ema, "batch_stats": state.batch_stats}

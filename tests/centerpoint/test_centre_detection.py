@@ -40,7 +40,7 @@ def outputs():
 @pytest.mark.parametrize("form", ["eager", "jit", "vmap"])
 def test_candidates_are_the_best_pairs_of_cell_and_class(outputs, form):
     def find(o):
-        return centre_candidates(o, config=SMALL, grid=GRID)
+        return centre_candidates(o, config=SMALL, pillars=SMALL.pillars, grid=GRID)
 
     if form == "vmap":
         two = jax.tree.map(lambda leaf: jnp.stack([leaf[::-1], leaf]), outputs)
@@ -60,7 +60,7 @@ def test_candidates_are_the_best_pairs_of_cell_and_class(outputs, form):
 
 
 def test_boxes_equal_class_wise_suppression(outputs):
-    candidates = centre_candidates(outputs, config=SMALL, grid=GRID)
+    candidates = centre_candidates(outputs, config=SMALL, pillars=SMALL.pillars, grid=GRID)
     boxes, scores, labels, used = suppress(*candidates, SMALL.inference)
     kept = oracles.nms(
         *(np.asarray(c) for c in (candidates[0], candidates[1], candidates[3], candidates[2])), 0.2, 20

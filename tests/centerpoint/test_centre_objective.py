@@ -46,7 +46,7 @@ def test_sums_equal_a_loop_over_boxes(config):
     boxes, labels, valid = ground_truth()
     boxes = boxes.at[::2, 7:].set(jnp.nan)
     predicted = outputs(config)
-    losses_of = jax.jit(functools.partial(sample_losses, config=config, grid=GRID))
+    losses_of = jax.jit(functools.partial(sample_losses, config=config, pillars=config.pillars, grid=GRID))
     parts, counts = losses_of(predicted, boxes, labels, valid)
     options = {"num_classes": 10, "min_overlap": PILLARS.min_overlap, "min_radius": PILLARS.min_radius}
     targets = centre_targets(boxes, labels, valid, grid=GRID, **options)
@@ -75,7 +75,7 @@ def test_every_group_is_divided_by_its_own_boxes():
     metrics = batch_metrics(of_batch, GROUPED.loss)
     pillars = jax.vmap(detector.prepare)(batch.points, batch.valid)
     found, _ = jax.jit(functools.partial(detector.apply, train=True))(variables, pillars)
-    losses_of = jax.jit(functools.partial(sample_losses, config=GROUPED, grid=GRID))
+    losses_of = jax.jit(functools.partial(sample_losses, config=GROUPED, pillars=GROUPED.pillars, grid=GRID))
     sums, boxes = {"classification": np.zeros(6), "l1": np.zeros(6)}, np.zeros(6)
     for i in range(2):
         truth = (jnp.asarray(leaf[i]) for leaf in (batch.boxes, batch.labels, batch.box_valid))
@@ -128,7 +128,7 @@ def test_an_exact_prediction_costs_nothing_but_confidence_and_overlaps_fully():
     exact = CentreOutputs(
         jnp.array(heat).reshape(side, side, 10), jnp.array(regression).reshape(side, side, 1, 10)
     )
-    parts, counts = sample_losses(exact, boxes, labels, alone, config=CONFIG, grid=GRID)
+    parts, counts = sample_losses(exact, boxes, labels, alone, config=CONFIG, pillars=CONFIG.pillars, grid=GRID)
     assert float(parts["classification"].sum()) < 1e-4
     assert float(parts["l1"].sum()) < 1e-3
     assert float(counts["iou_sum"]) == pytest.approx(len(chosen), rel=1e-3)

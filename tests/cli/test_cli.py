@@ -19,11 +19,10 @@ from tiny_run import TINY_CONFIG, bits, untrained
 from fcos_lidar_jax import __version__
 from fcos_lidar_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.cli import demo, demo_training, main
+from fcos_lidar_jax.cli import demo, main
 from fcos_lidar_jax.cli import detect as detect_command
 from fcos_lidar_jax.cli.commands import _COMMANDS
 from fcos_lidar_jax.files import file_lock
-from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -56,8 +55,6 @@ def home(tmp_path_factory):
     np.save(folder / "flat.npy", np.zeros(4, np.float32))
     np.save(folder / "future.npy", np.full((4, 5), -1.0, np.float32))
     (folder / "nothing").mkdir()
-    (folder / "top" / "training" / "velodyne").mkdir(parents=True)
-    np.save(folder / "top" / "training" / "velodyne" / "0.npy", points)
     (folder / "link.json").symlink_to("good.npy")
     (folder / "empty.bin").write_bytes(b"")
     (folder / "cut.pcd.bin").write_bytes(points.tobytes()[:-3])
@@ -314,8 +311,6 @@ def test_project_writes_index_features_counts_and_picture(home, tmp_path, capsys
 BAD = mistakes(r"""
 detect HOME/none.npy => none.npy: no such file
 detect HOME/nothing => nothing: no point file in it, expected [^;]*$
-detect HOME/top => top: no point file in it, expected .*; found some in .*/top/training/velodyne$
-detect HOME/top/training => training: no point file in it, expected .*; found some in .*/top/training/velodyne$
 detect HOME/empty.bin => empty.bin: empty file
 detect HOME/cut.pcd.bin => cut.pcd.bin: .* not a multiple of 20
 detect HOME/good.npy --yaw-deg nan => --yaw-deg: got nan, expected an angle in degrees
@@ -323,7 +318,7 @@ detect HOME/text.txt => unknown extension '.txt'
 detect HOME/pickled.npy => pickled.npy: not a readable .npy
 detect HOME/flat.npy => flat.npy: shape
 detect HOME/future.npy => future.npy: time_lag
-detect HOME/broken.pcd => broken.pcd: not a PCD file
+detect HOME/broken.pcd => broken.pcd: not a readable .pcd file
 detect HOME/away.npy => away.npy: none of its .* points is usable
 detect HOME/no_rows.npy => no_rows.npy: no points in it, expected at least one
 detect HOME/all_nan.npy => all_nan.npy: none .*\(5 not finite
@@ -368,8 +363,6 @@ project HOME/good.npy --out OUT --png OUT => --png: .*out: the same file as .*ou
 project HOME/good.npy --png HOME/good.npy => --png: .*the same file as
 project HOME/good.npy --max-file-points 10 => points, expected at most 10$
 demo --out HOME/good.npy => --out: .*: found a file
-demo --steps -1 => --steps: got -1
-demo --steps 5 => --steps: expected --train with it
 demo --keyframes 0 => --keyframes: got 0
 """)
 
@@ -383,7 +376,7 @@ def test_mistakes_get_one_line_and_leave_nothing(home, tmp_path, capsys, line, m
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("line", ["detct", "detect --checkpiont x", "project", "demo --steps many"])
+@pytest.mark.parametrize("line", ["detct", "detect --checkpiont x", "project", "demo --drive many"])
 def test_usage_errors_exit_with_2(line):
     with pytest.raises(SystemExit) as stopped:
         main(line.split())
@@ -426,14 +419,12 @@ def test_help_describes_every_option(name, capsys):
 
 @pytest.fixture(scope="module")
 def drive(home):
-    """The results of a demo of three keyframes and two training steps, with a network that compiles in seconds."""
-    small = {"model": TINY_CONFIG.model, "inference": TINY_CONFIG.inference}
+    """The results of a demo of three keyframes, with a network that compiles in seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "shipped_checkpoints", lambda: {demo.WEIGHTS: home / "checkpoint"})
-        patch.setattr(demo_training, "QUICKSTART", dataclasses.replace(QUICKSTART, **small))
         patch.chdir(home)
         (home / demo.WEIGHTS).mkdir()  # a folder of this name does not matter
-        command("demo --keyframes 3 --train --steps 2 --test-frames 3 --out", home / "demo")
+        command("demo --keyframes 3 --out", home / "demo")
     return home / "demo"
 
 
@@ -464,20 +455,6 @@ def test_demo_draws_an_animation_and_reports(drive):
     assert all(frame["pose"] and frame["num_points"] > 500 for frame in frames)
     assert sum(len(frame["truth"]) for frame in frames) > 0
     assert "://" not in report  # no outside address; base64 has no colon
-
-
-def test_demo_trains_from_nothing_to_report(drive, tmp_path):
-    out, boxes = drive / "training", tmp_path / "boxes.json"
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["training"]["steps"] == 2
-    for model in ("shipped", "before", "after"):
-        assert {*metrics[model]["label_aps"], *metrics[model]["absent_classes"]} == set(QUICKSTART.classes)
-    report = (out / "report.html").read_text()
-    assert report.count("data:image/png;base64,") == 9
-    assert "://" not in report  # no outside address; base64 has no colon
-    unseen = out / "unseen" / "frame_000.npy"
-    command("detect", unseen, "--checkpoint", out / "run", "--out", boxes)
-    assert files_of(boxes)[0]["num_points"] == len(np.load(unseen))
 
 
 def test_a_checkpoint_replaces_another_completely(home, tmp_path):

@@ -159,9 +159,6 @@ def test_a_line_tells_a_cloud_without_usable_points_with_the_counts():
     assert "(20 not finite or beyond physical limits, 30 on the ego vehicle" in line
     line = no_usable_points("a.bin", cloud_of(points[:0]), 0, TINY)
     assert line == "a.bin: no points in it, expected at least one"
-    points[:, 0] = 1.533e9  # the time, as the first column
-    line = no_usable_points("a.bin", cloud_of(points), 130, TINY)
-    assert "of tiny; the values of x are about 1.533e+09, expected metres in the columns x, y" in line
 
 
 def test_a_cloud_of_a_reader_is_usable_with_one_point_in_the_range_image():
@@ -227,19 +224,13 @@ def test_the_warning_describes_the_mismatch(clouds):
     hdl32e = clouds["nuscenes_hdl32e"]
     millimetres = hdl32e * np.array([1000, 1000, 1000, 1, 1], np.float32)
     shares = hdl32e * np.array([1, 1, 1, 1 / 255, 1], np.float32)
-    timed = np.column_stack([np.full(len(hdl32e), 1.533e9), hdl32e[:, :3], hdl32e[:, 3] / 255])
     for points, sensor, finding in (
         (hdl32e, "short_range", r"\d\.\d points per cell"),
         (clouds["kitti_hdl64e"], "nuscenes_hdl32e", r"\d\.\d points per cell"),
         (hdl32e, "kitti_hdl64e", "0% of the points have a neighbour in the next row|next column"),
         (hdl32e, "waymo_top", "outside its vertical field of view"),
         (hdl32e + np.array([0, 0, 100, 0, 0]), "nuscenes_hdl32e", "beyond its limits, .* < 54 m"),
-        (
-            millimetres,
-            "nuscenes_hdl32e",
-            r"the values of [xy] are about \d+, expected metres in the columns x, y, z",
-        ),
-        (timed, "nuscenes_hdl32e", r"the values of x are about 1.533e\+09, expected metres in the columns x, y"),
+        (millimetres, "nuscenes_hdl32e", "of the points lie beyond its limits"),
         (shares, "nuscenes_hdl32e", r"expected 0 to 255: multiply them by 255 \(--intensity-scale 255, or "),
         (hdl32e[:, :3], "nuscenes_hdl32e", "no intensity is above 1, expected 0 to 255;"),
         (hdl32e * np.array([1, 1, 1, 255, 1]), "nuscenes_hdl32e", "most intensities are above 255, expected 0 to"),

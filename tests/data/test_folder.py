@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from fcos_lidar_jax import progress
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import WHOLE_SWEEP, CloudReading
 from fcos_lidar_jax.data.box_geometry import LIMITS
@@ -79,17 +78,6 @@ def test_labels_are_translated_or_dropped(root):
     boxes = frames.frame(1).boxes
     assert np.isnan(boxes[:, 7:]).all()
     np.testing.assert_allclose(boxes[:, 6], 0.25, atol=1e-6)
-
-
-def test_angles_that_look_like_degrees_give_one_warning(root, capsys):
-    for yaw, warned in ((6.2, False), (90, True)):
-        turned = {"label": "car", "box": [*CAR["box"][:6], yaw, 0, 0]}
-        write(root / "boxes" / "b.json", {"boxes": [CAR, turned, turned]})
-        progress._told.clear()
-        for _ in range(2):
-            assert FolderFrames(root).frame(1).boxes[1, 6] == pytest.approx(np.angle(np.exp(1j * yaw)), abs=1e-5)
-        line = f"{root}/boxes/b.json: $.boxes[1].box: yaw: got 90, expected radians: are these degrees?\n"
-        assert capsys.readouterr().err == (f"warning: {line}" if warned else "")
 
 
 def test_classes_are_the_labels_of_all_frames_unless_listed(root):

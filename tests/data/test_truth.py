@@ -24,8 +24,6 @@ from fcos_lidar_jax.data.frame import (
     FrameSet,
     InMemoryFrames,
     SelectedFrames,
-    no_points,
-    without_points,
 )
 from fcos_lidar_jax.input_pipeline.open import Format, open_frames
 from fcos_lidar_jax.sensors import ARGOVERSE2, TINY
@@ -148,10 +146,3 @@ def test_the_truth_of_a_cached_frame_does_not_unpack_the_points(tmp_path, monkey
     assert_truth(frames.truth(0), frames.frames.frame(0))
     np.testing.assert_array_equal(frames.labels(0), frames.frames.labels(0))
     assert set(read) == {"boxes", "labels", "num_points"}
-
-
-def test_points_can_be_dropped_from_a_frame():
-    frame = dataclasses.replace(toy_frame(0, columns=6), num_close=3)
-    assert_truth(without_points(frame), frame)
-    assert no_points(ARGOVERSE2).shape == (0, 6)
-    assert no_points(TINY).dtype == np.float32

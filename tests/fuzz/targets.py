@@ -22,6 +22,7 @@ from made_nuscenes import write as write_nuscenes
 from toy_frames import ToyFrames
 
 from experiments.cached import CachedFrames
+from experiments.keyframe import read_keyframe
 from fcos_lidar_jax.checkpoints.storage import read_description
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.cli.data import read_class_map
@@ -33,7 +34,6 @@ from fcos_lidar_jax.data.cloud_policy import make_cloud
 from fcos_lidar_jax.data.drives import read_tum
 from fcos_lidar_jax.data.folder import FolderFrames
 from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close
-from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.data.kitti import KittiFrames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.index import open_index, save_index
@@ -74,6 +74,15 @@ POINTS = np.column_stack([_RNG.uniform(-20, 20, (60, 2)), _RNG.uniform(-2, 1, 60
 POSE = np.eye(4).tolist()
 SPEC = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=False, version="v")
 
+NAMES = (
+    *("raw points", "raw points of KITTI", "npy", "npz", "pcd", "feather", "Argoverse 2", "KITTI"),
+    *("folder", "nuScenes", "nuScenes index", "list of sweeps", "keyframe", "sensor", "poses"),
+    *("recordings of ROS", "class map", "results", "ground truth", "detections", "run.json"),
+    *("metrics.jsonl", "resume log", "checkpoint.json", "exported detector", "ground-truth database"),
+    *("cached frames", "records of synthesize"),
+)
+"""Of all targets, in the order of :func:`make_targets`."""
+
 Files = Mapping[str, bytes]
 Read = Callable[[Path, str], None]
 """Reads a folder, given the name of the changed file in it; raises InvalidError for an invalid result."""
@@ -93,7 +102,6 @@ class Target:
     changed: tuple[str, ...] = ()  # files to mutate; () for all
     mutate: Callable[[str, bytes, Random], bytes] = mutate
     seal: Callable[[Path, str], None] | None = None  # corrects checksums, for half of the inputs
-    share: float = 1.0  # of the inputs, relative to the others
     alone: bool = False  # messages must name the file, not only the folder
 
     @property
@@ -463,7 +471,6 @@ def make_targets() -> list[Target]:
     drive = _files(_argoverse2_files)
     tables = _files(lambda folder: write_nuscenes(folder, *make_tables(1)))
     index = _files(_index_files)
-    _column_checksums()  # once for all processes
     synthesized = _files(_synthesize)
     listed = [{"file": f"{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("a", 5))]
     boxes = [
@@ -488,15 +495,15 @@ def make_targets() -> list[Target]:
     return [
         file_target("raw points", raw, _cloud(NUSCENES_HDL32E, **layouts)),
         file_target("raw points of KITTI", {"a.bin": _raw("f4", POINTS[:, 3] / 100)}, _cloud(KITTI_HDL64E)),
-        file_target("npy", arrays, _cloud(NUSCENES_HDL32E), share=2),
-        file_target("npz", archives, _cloud(NUSCENES_HDL32E), share=2),
-        file_target("pcd", _pcd_files(), _cloud(NUSCENES_HDL32E), share=4),
-        file_target("feather", {"a.feather": next(iter(sweep.values()))}, _cloud(ARGOVERSE2), share=2),
-        Target("Argoverse 2", drive, _read_argoverse2, share=0.5),
+        file_target("npy", arrays, _cloud(NUSCENES_HDL32E)),
+        file_target("npz", archives, _cloud(NUSCENES_HDL32E)),
+        file_target("pcd", _pcd_files(), _cloud(NUSCENES_HDL32E)),
+        file_target("feather", {"a.feather": next(iter(sweep.values()))}, _cloud(ARGOVERSE2)),
+        Target("Argoverse 2", drive, _read_argoverse2),
         Target("KITTI", _kitti_files(), lambda folder, _: check_first(KittiFrames(folder, "train"))),
         Target("folder", _folder_files(), _read_folder),
-        Target("nuScenes", tables, _read_nuscenes, share=0.5),
-        Target("nuScenes index", index, _read_index, tuple(is_column), share=0.5),
+        Target("nuScenes", tables, _read_nuscenes),
+        Target("nuScenes index", index, _read_index, tuple(is_column)),
         Target("list of sweeps", {"a.json": _json(listed), "a.npy": arrays["a.npy"]}, _read_sweeps, ("a.json",)),
         Target(
             "keyframe",
@@ -505,7 +512,7 @@ def make_targets() -> list[Target]:
         ),
         file_target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor),
         file_target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),
-        Target("recordings of ROS", _files(_recordings), _read_recording, share=0.25),  # 25 ms each
+        Target("recordings of ROS", _files(_recordings), _read_recording),
         file_target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map),
         file_target(
             "results",
@@ -540,7 +547,6 @@ def make_targets() -> list[Target]:
             _files(lambda folder: CachedFrames(FRAMES, folder).frame(0)),
             _read_cached,
             mutate=lambda _, content, rng: mutate_bytes(content, rng),
-            share=0.5,
         ),
         Target("records of synthesize", synthesized, _synthesize, records),
     ]

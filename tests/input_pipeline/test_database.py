@@ -282,13 +282,6 @@ def test_a_build_from_other_data_replaces_the_old_shards(tmp_path):
     assert len(contents(tmp_path / "a")) == 5
 
 
-def test_building_again_changes_no_file(tmp_path):
-    build(tmp_path)
-    before = stamps(tmp_path)
-    build(tmp_path)
-    assert stamps(tmp_path) == before
-
-
 def flip(file, position):
     data = bytearray(file.read_bytes())
     data[position] ^= 1

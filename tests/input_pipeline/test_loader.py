@@ -28,13 +28,10 @@ from fcos_lidar_jax.input_pipeline.loader import (
     check_loader_options,
     default_threads,
     make_batches,
-    packing_for,
     steps_per_epoch,
 )
-from fcos_lidar_jax.packing import Packing, unpack
 from fcos_lidar_jax.presets import NUSCENES, NUSCENES_SINGLE, QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2
-from fcos_lidar_jax.types import Batch, PackedBatch
 
 CONFIG = dataclasses.replace(
     QUICKSTART,
@@ -102,85 +99,6 @@ def test_the_rows_of_all_processes_form_the_global_batch(objects, alone, num_pro
         for a, b in zip(jax.tree.leaves(joined), jax.tree.leaves(batch.batch), strict=True):
             np.testing.assert_array_equal(a, b)
         assert batch.counts == {name: sum(p[step].counts[name] for p in parts) for name in batch.counts}
-
-
-def in_front(batch):
-    """Move the valid rows of every cloud to the front, in their order, and zero the rest."""
-    points, valid = np.zeros_like(batch.points), np.zeros_like(batch.valid)
-    for row, number in enumerate(batch.valid.sum(axis=1)):
-        points[row, :number] = [p for p, yes in zip(batch.points[row], batch.valid[row], strict=True) if yes]
-        valid[row, :number] = True
-    return dataclasses.replace(batch, points=points, valid=valid)
-
-
-def unpacked(host):
-    assert isinstance(host.batch, PackedBatch)
-    return dataclasses.replace(host, batch=jax.tree.map(np.array, unpack(host.batch)))
-
-
-@pytest.mark.parametrize("how", [{}, {"threads": 3}, {"workers": 2, "first_step": 1}])
-def test_packed_batches_contain_the_valid_rows_of_the_plain_ones(objects, alone, how):
-    packing = packing_for(ToyFrames(), CONFIG)
-    assert packing == Packing(3 * (1 + sum(CONFIG.paste_targets)), byte_intensity=False)
-    found = [unpacked(host) for host in run(config=CONFIG, objects=objects, packing=packing, **how)]
-    plain = [dataclasses.replace(host, batch=in_front(host.batch)) for host in alone]
-    assert any((host.batch.valid != other.batch.valid).any() for host, other in zip(alone, plain, strict=True))
-    assert_same(found, plain[how.get("first_step", 0) :])
-
-
-def frames_of_whole_intensities(odd):
-    """Frames of which one has an intensity that is no whole number."""
-    frames = [toy_frame(index) for index in range(8)]
-    for index, frame in enumerate(frames):
-        frame.points[:, 3] = np.round(frame.points[:, 3])
-        frame.points[7, 3] = 12.5 if index == odd else 12
-    return ListedFrames(tuple(frames))
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_a_batch_that_does_not_fit_the_packing_stays_plain_with_one_warning(capfd, workers):
-    frames = frames_of_whole_intensities(odd=1)
-    packing = packing_for(frames, PLAIN)
-    assert packing == Packing(num_lags=3)  # frame 1 is not among the inspected frames
-    found = run(frames, packing=packing, workers=workers)
-    odd = ["frame 1" in host.names for host in found]
-    assert [isinstance(host.batch, Batch) for host in found] == odd
-    assert 1 < sum(odd) < len(odd)
-    told = "frame 'frame 1': intensity: got 12.5, expected whole numbers from 0 to 255, as in the frames inspected"
-    (line,) = [line for line in capfd.readouterr().err.splitlines() if "frame" in line]
-    assert line.startswith(told)
-    plain = [dataclasses.replace(host, misfit=None) if out else unpacked(host) for host, out in zip(found, odd)]  # noqa: B905
-    assert_same(plain, run(frames))
-
-
-def test_several_processes_refuse_a_batch_that_does_not_fit_the_packing():
-    frames = frames_of_whole_intensities(odd=1)
-    parts = [
-        {"num_processes": 2, "process_index": index, "packing": packing_for(frames, PLAIN)} for index in (0, 1)
-    ]
-    with refused("frame 'frame 1': intensity: got 12.5, expected whole", ": use --no-packing, in Python pack"):
-        [run(frames, **part) for part in parts]
-
-
-class CountedFrames(ListedFrames):
-    """Frames that record every reading in ``READ``."""
-
-    def frame(self, index):
-        READ.append(index)
-        return super().frame(index)
-
-
-READ: list[int] = []
-
-
-def test_only_the_first_misfit_is_prepared_twice(capfd):
-    frames = CountedFrames(frames_of_whole_intensities(odd=1).frames)
-    packing = packing_for(frames, PLAIN)
-    READ.clear()
-    found = run(frames, packing=packing)
-    misfits = sum(host.misfit is not None for host in found)
-    assert 1 < misfits < len(found)
-    assert 4 * len(found) < len(READ) <= 4 * (len(found) + 1)
 
 
 @pytest.mark.parametrize(
@@ -362,14 +280,13 @@ def test_too_little_shared_memory_is_refused(monkeypatch):
 
 
 @pytest.mark.real_data
-@pytest.mark.parametrize(("preset", "row_bytes"), [(NUSCENES, 15), (NUSCENES_SINGLE, 14)])
-def test_real_samples_fit_the_presets_and_their_packing(real_data, tmp_path, preset, row_bytes):
+@pytest.mark.parametrize("preset", [NUSCENES, NUSCENES_SINGLE])
+def test_real_samples_fit_the_presets(real_data, tmp_path, preset):
     data = NuScenes(real_data / "nuscenes_scene0523", "v1.0-scene0523")
     frames = NuScenesFrames(data, tuple(data.split("scene0523")[-6:]), cut_reading(preset.num_sweeps))
     options = {"objects": prepare_database(frames, tmp_path), "count": 2}
     config = dataclasses.replace(preset, optimizer=dataclasses.replace(preset.optimizer, batch_size=3))
-    plain = run(frames, config, **options)
-    for batch in plain:
+    for batch in run(frames, config, **options):
         assert batch.counts["truncated_points"] == batch.counts["truncated_boxes"] == 0
         assert batch.counts["pasted_objects"] > 3
         points, valid = batch.batch.points, batch.batch.valid
@@ -378,10 +295,6 @@ def test_real_samples_fit_the_presets_and_their_packing(real_data, tmp_path, pre
         lags = [len(np.unique(cloud[row][:, 4])) for cloud, row in zip(points, valid, strict=True)]
         assert all(lag >= preset.num_sweeps for lag in lags)
         assert preset.num_sweeps > 1 or lags == [1, 1, 1]
-    packing = packing_for(frames, config)
-    assert (packing.byte_intensity, packing.row_bytes) == (True, row_bytes)
-    found = [unpacked(host) for host in run(frames, config, packing=packing, **options)]
-    assert_same(found, [dataclasses.replace(host, batch=in_front(host.batch)) for host in plain])
 
 
 @dataclasses.dataclass(frozen=True)

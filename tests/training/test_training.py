@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from tiny_run import TINY_CONFIG, bits
+from tiny_run import TINY_CONFIG
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.coding import encode
@@ -21,7 +21,6 @@ from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.locations import image_layout, locate, location_cells
 from fcos_lidar_jax.models import Detector, build_detector, objective
 from fcos_lidar_jax.models.objective import location_owners, make_sums, sample_losses
-from fcos_lidar_jax.packing import Packing, pack
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import TINY
@@ -141,25 +140,6 @@ def test_a_step_refuses_a_batch_whose_arrays_do_not_fit_each_other(trainer, name
     batch = dataclasses.replace(batch, **{name: np.zeros(shape, getattr(batch, name).dtype)})
     with pytest.raises(ValueError, match=f"^{message}"):
         jax.eval_shape(step, state, batch)
-
-
-def test_a_step_on_a_packed_batch_is_bit_identical():
-    """To a step on a plain batch with its valid rows in front; in any order, the metrics are bit-identical.
-
-    A time lag and an unrounded intensity per point; ``test_run.py`` has the packing of the run's own clouds.
-    """
-    config = dataclasses.replace(TINY_CONFIG, augment=QUICKSTART.augment)
-    detector, optimizer = build_detector(config, TINY), make_optimizer(config.optimizer, STEPS)
-    state, step = make_state(detector, optimizer, jax.random.key(0)), jax.jit(make_train_step(detector, optimizer))
-    scene = frame(3)
-    scattered = make_batch([scene], **SIZES)
-    scattered.valid[0, np.random.default_rng(0).choice(len(scene.points), 200, replace=False)] = False
-    kept = dataclasses.replace(scene, points=scene.points[scattered.valid[0, : len(scene.points)]])
-    plain = make_batch([kept], **SIZES)
-    after, metrics = step(state, pack(scattered, Packing(0, False)))
-    assert bits((after, metrics)) == bits(step(state, plain))
-    assert float(metrics["positives"]) > 0
-    assert bits(metrics) == bits(step(state, scattered)[1])
 
 
 def test_the_owner_of_a_location_is_the_owner_of_its_first_round_point():

@@ -72,11 +72,7 @@ def save_index(index: Index, folder: str | Path, *, tables: str | Path) -> None:
 
 
 def default_index(root: str | Path, version: str) -> Path:
-    """The default folder of ``prepare``'s output: the index of a version of nuScenes, and the cut objects.
-
-    >>> default_index("nuscenes", "v1.0-mini").as_posix(), default_index("kitti", "").as_posix()
-    ('nuscenes/.fcos_lidar/v1.0-mini', 'kitti/.fcos_lidar')
-    """
+    """The default folder of ``prepare``'s output: the index of a version of nuScenes, and the cut objects."""
     return Path(root) / ".fcos_lidar" / version
 
 
@@ -122,10 +118,8 @@ def _read_manifest(file: Path) -> _Manifest:
         manifest = read_json(file, _Manifest, what="a finished index")
     except ValueError as error:
         raise ValueError(f"{error}: run prepare again") from None
-    if manifest.format != _FORMAT:
-        raise ValueError(f"{file}: format: expected {_FORMAT!r}")
-    if (version := manifest.format_version) != _FORMAT_VERSION:
-        raise ValueError(f"{file}: format_version: got {version}, expected {_FORMAT_VERSION}: run prepare again")
+    if (found := (manifest.format, manifest.format_version)) != (_FORMAT, _FORMAT_VERSION):
+        raise ValueError(f"{file}: format: got {found}, expected {(_FORMAT, _FORMAT_VERSION)}: run prepare again")
     return manifest
 
 

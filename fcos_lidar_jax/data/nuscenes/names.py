@@ -31,10 +31,6 @@ BICYCLE_RACK = "static_object.bicycle_rack"  # the evaluation ignores boxes in a
 
 
 def label_of(category: str) -> int:
-    """Index of a category's class, -1 for background.
-
-    >>> label_of("vehicle.bus.rigid"), label_of("animal")
-    (2, -1)
-    """
+    """Index of a category's class, -1 for background."""
     name = CATEGORY_TO_CLASS.get(category)
     return -1 if name is None else NUSCENES_CLASSES.index(name)

@@ -27,12 +27,7 @@ _COLUMNS = 5  # x, y, z, intensity, ring: float32 each
 
 @dataclasses.dataclass(frozen=True)
 class Boxes:
-    """The boxes of one keyframe in its LiDAR frame, only the ten classes, unpadded.
-
-    >>> one = Boxes(np.zeros((1, 9)), np.zeros(1, int), np.ones(1, int), attributes=("",), tokens=("a1",))
-    >>> one.boxes.shape, NUSCENES_CLASSES[one.labels[0]]
-    ((1, 9), 'car')
-    """
+    """The boxes of one keyframe in its LiDAR frame, only the ten classes, unpadded."""
 
     boxes: np.ndarray  # f32[m, 9]: x, y, z, l, w, h, yaw, vx, vy; NaN for unknown velocities
     labels: np.ndarray  # i32[m]: index into NUSCENES_CLASSES
@@ -286,7 +281,6 @@ class NuScenesFrames(FrameSet):
     reading: CloudReading = CloudReading()
     sensor: Sensor = NUSCENES_HDL32E
     classes = NUSCENES_CLASSES
-    usual_sensor = NUSCENES_HDL32E
 
     def __len__(self) -> int:
         return len(self.tokens)

@@ -10,11 +10,7 @@ from fcos_lidar_jax.data.splits import SPLITS, own_splits
 
 @functools.cache
 def official_splits() -> dict[str, list[str]]:
-    """The official splits, by name.
-
-    >>> {name: len(scenes) for name, scenes in official_splits().items()}
-    {'train': 700, 'val': 150, 'test': 150, 'mini_train': 8, 'mini_val': 2}
-    """
+    """The official splits, by name."""
     splits = tomllib.loads(Path(__file__).with_name("splits.toml").read_text(encoding="utf-8"))
     return {name: [scene for span in text.split() for scene in _scenes(span)] for name, text in splits.items()}
 

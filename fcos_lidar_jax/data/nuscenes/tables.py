@@ -135,7 +135,7 @@ def read_table(folder: Path, kind: type[R], *, piece_bytes: int = _PIECE_BYTES) 
         num_rows = 0
         for first, last in _pieces(text, piece_bytes):
             piece = (b"" if first == 0 else b"[") + text[first:last] + (b"" if last == len(text) else b"]")
-            rows = _decode(path, decoder, piece, num_rows, first - (first > 0))
+            rows = _decode(path, decoder, piece, num_rows)
             num_rows += len(rows)
             yield rows
 
@@ -152,27 +152,12 @@ def _pieces(text: mmap.mmap, size: int) -> Iterator[tuple[int, int]]:
     yield first, len(text)
 
 
-def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, first_row: int, offset: int) -> list:
-    """A piece's rows; errors name their place in the whole file."""
+def _decode(path: Path, decoder: msgspec.json.Decoder, piece: bytes, first_row: int) -> list:
     try:
         return decoder.decode(piece)
     except msgspec.ValidationError as error:
         text, _, place = str(error).rpartition(" - at `")
         place = re.sub(r"\$\[(\d+)\]", lambda match: f"$[{int(match[1]) + first_row}]", place.rstrip("`"))
         raise ValueError(f"{path}: {place or '$'}: {text or error}") from None
-    except msgspec.DecodeError as error:
-        at = re.search(r"byte (\d+)", str(error))
-        place = int(at[1]) if at else len(piece)
-        what = re.sub(r" ?\(byte \d+\)", "", str(error))
-        raise ValueError(f"{path}: byte {place + offset}{_record_at(piece, place)}: not JSON: {what}") from None
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: not JSON: {error}") from None
-
-
-def _record_at(piece: bytes, place: int) -> str:
-    """The record and field of a byte, if the preceding text identifies them."""
-    row = piece[piece.rfind(b"{", 0, place) + 1 : place]
-    tokens = re.findall(rb'"token"\s*:\s*"([^"]*)"', row)
-    fields = re.findall(rb'"(\w+)"\s*:', row)
-    names = [f"record {t.decode(errors='replace')}" for t in tokens] + [f.decode() for f in fields[-1:]]
-    return f" ({', '.join(names)})" if names else ""
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: from row {first_row} on: not JSON: {error}") from None

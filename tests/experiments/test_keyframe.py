@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from experiments.keyframe import read_keyframe
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside
-from fcos_lidar_jax.data.keyframe import read_keyframe
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
 
