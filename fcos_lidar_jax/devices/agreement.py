@@ -19,9 +19,6 @@ def agreed(failed: str) -> Iterator[None]:
 
     Raises:
         OSError: another process failed. The failing process raises its own error.
-
-    >>> with agreed("cannot read"):
-    ...     value = 1
     """
     error: BaseException | None = None
     try:
@@ -45,8 +42,6 @@ def check_same(checksum: str, what: str) -> None:
 
     Raises:
         ValueError: on all processes; names the first process that differs from process 0.
-
-    >>> check_same("cae66941", "frames")
     """
     if jax.process_count() == 1:
         return

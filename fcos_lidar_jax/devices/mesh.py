@@ -21,11 +21,7 @@ _AXIS = "data"
 
 
 def make_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """Create a mesh with one axis, by default over all devices of all processes.
-
-    >>> make_mesh().axis_names
-    ('data',)
-    """
+    """Create a mesh with one axis, by default over all devices of all processes."""
     devices = jax.devices() if devices is None else devices
     return jax.make_mesh((len(devices),), (_AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
@@ -34,9 +30,6 @@ def replicate(tree: Tree, mesh: Mesh) -> Tree:
     """Copy arrays to every device; all processes must pass the same values.
 
     The arguments stay valid when the copies are donated.
-
-    >>> replicate({"kernel": np.ones(3)}, make_mesh())["kernel"].is_fully_replicated
-    True
     """
     everywhere = NamedSharding(mesh, PartitionSpec())
 
@@ -55,9 +48,6 @@ def shard_batch(batch: Tree, mesh: Mesh) -> Tree:
 
     Raises:
         ValueError: the devices of this process cannot share the rows evenly.
-
-    >>> shard_batch(np.zeros((4, 3)), make_mesh(jax.devices()[:1])).shape
-    (4, 3)
     """
     sharding, number = NamedSharding(mesh, PartitionSpec(_AXIS)), len(mesh.local_devices)
 
