@@ -3,6 +3,7 @@
 import json
 import mmap
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -17,7 +18,6 @@ from fcos_lidar_jax.files import atomic_write
 
 _NOT_FINITE = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|(NaN|-?Infinity)')
 """Also matches strings, so that their contents are not replaced."""
-_KEY = re.compile(rb'\s*[{,]\s*("(?:[^"\\]|\\.)*")\s*:\s*')
 
 Text = bytes | mmap.mmap | msgspec.Raw
 Vector = tuple[float, float, float]
@@ -57,21 +57,22 @@ def decode_json(text: Text, kind: Any, source: str) -> Any:
 
     Accepts NaN and infinities, which Python writes although JSON excludes them: NaN is read as ``null``, and
     infinities are rejected where the type expects a number.
-
-    >>> decode_json(b'{"a": NaN}', dict[str, float | None], "here")
-    {'a': None}
     """
     try:
         try:
-            return msgspec.json.decode(text, type=kind)
+            return msgspec.json.decode(text, type=kind, dec_hook=_make)
         except msgspec.ValidationError:
             raise
         except msgspec.DecodeError:
-            return msgspec.json.decode(_plain_json(text), type=kind)
+            return msgspec.json.decode(_plain_json(text), type=kind, dec_hook=_make)
     except msgspec.ValidationError as error:
         raise ValueError(f"{source}: {_explain(error)}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{source}: not JSON: {error}") from None
+
+
+def _make(kind: Any, value: Any) -> Any:
+    return kind(value)
 
 
 def _plain_json(text: Text) -> bytes:
@@ -83,29 +84,25 @@ def _plain_json(text: Text) -> bytes:
     return _NOT_FINITE.sub(plain, bytes(text))
 
 
+class _Token:
+    """A key that is equal only to itself, so that a dictionary keeps repeated keys."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
 def decode_samples(samples: msgspec.Raw, kind: Any, source: str, *, field: str = "") -> Iterator[tuple[str, Any]]:
     """Iterate over sample tokens and their entries, decoded as objects of a type; a token must not occur twice.
 
     ``samples`` is the JSON object of all samples, which the file has in ``field``; ``""`` for the whole file.
     """
     whole = f"{source}: {field}" if field else source
-    entries = decode_json(samples, dict[str, msgspec.Raw], whole)
-    # Of a repeated key only the last value remains. The text between two values then contains the dropped value.
-    text, start, end = memoryview(samples), _address(samples), 0
-    for entry in sorted(entries.values(), key=_address):
-        first = _address(entry) - start
-        between = bytes(text[end:first])
-        key = _KEY.match(between)
-        if key is not None and key.end() != len(between):
-            raise ValueError(f"{whole}: sample {json.loads(key[1])}: occurs twice")
-        end = first + len(memoryview(entry))
+    entries = decode_json(samples, dict[_Token, msgspec.Raw], whole)
+    for token, count in Counter(token.name for token in entries).items():
+        if count > 1:
+            raise ValueError(f"{whole}: sample {token}: occurs twice")
     for token, entry in entries.items():
-        yield token, decode_json(entry, kind, f"{source}: sample {token}")
-
-
-def _address(raw: msgspec.Raw) -> int:
-    """Memory address of the text. Entries are views of the whole text."""
-    return np.frombuffer(raw, np.uint8).ctypes.data
+        yield token.name, decode_json(entry, kind, f"{source}: sample {token.name}")
 
 
 def _explain(error: msgspec.ValidationError) -> str:
