@@ -1,4 +1,4 @@
-"""The documents do what they say: code runs, commands exist, every public function has an example."""
+"""The documents do what they say: code runs, commands exist."""
 
 import ast
 import builtins
@@ -88,13 +88,6 @@ def public(module) -> dict[str, object]:
         for n, v in members.items()
         if inspect.isclass(v) or inspect.isfunction(inspect.unwrap(v))
     }
-
-
-def test_every_public_function_and_class_has_an_example():
-    listed = referred()
-    missing = [name for name, value in listed.items() if ">>>" not in (value.__doc__ or "")]
-    assert len(listed) > 100
-    assert missing == []
 
 
 @pytest.mark.parametrize("kind", [Frame, Batch, Detector, Schedule])
