@@ -1,4 +1,4 @@
-"""Jobs in worker processes."""
+"""Jobs in worker processes that fail; tests/simulation/test_nuscenes_export.py asks for their results."""
 
 import multiprocessing
 import os
@@ -10,14 +10,9 @@ from fcos_lidar_jax.workers import run_jobs
 
 
 def sleep(shared: float, job: int) -> int:
-    """Squares a job after as many times the shared time; a negative job ends its process."""
+    """A negative job ends its process."""
     time.sleep(shared * job) if job >= 0 else os._exit(1)
-    return job * job
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_every_job_returns_its_result(workers):
-    assert sorted(run_jobs(sleep, 0.0, [3, 1, 2], workers)) == [1, 4, 9]
+    return job
 
 
 def test_a_dead_worker_gets_one_line_and_leaving_early_ends_the_others():
