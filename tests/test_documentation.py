@@ -1,4 +1,4 @@
-"""The documents do what they say: code runs, commands exist, every public function has an example."""
+"""The documents do what they say: code runs, commands exist."""
 
 import ast
 import builtins

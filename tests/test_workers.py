@@ -1,30 +1,24 @@
-"""Check that worker processes exit when their parent is killed."""
+"""Jobs in worker processes that fail; tests/simulation/test_nuscenes_export.py asks for their results."""
 
-import signal
+import multiprocessing
+import os
 import time
 
-from commands import run_python
+import pytest
 
-SCRIPT = """
-import multiprocessing, os, signal, time
-from fcos_lidar_jax.workers import end_with_parent
-def work(ready):
-    end_with_parent()
-    ready.set()
-    time.sleep(60)
-if __name__ == "__main__":
-    context = multiprocessing.get_context("spawn")
-    ready = context.Event()
-    context.Process(target=work, args=(ready,)).start()
-    ready.wait()
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
+from fcos_lidar_jax.workers import run_jobs
 
 
-def test_a_worker_exits_when_its_parent_is_killed(tmp_path):
-    script = tmp_path / "parent.py"
-    script.write_text(SCRIPT)
-    began = time.monotonic()
-    done = run_python(script)  # returns only when the worker has closed the outputs, too
-    assert done.returncode == -signal.SIGKILL
-    assert time.monotonic() - began < 50
+def sleep(shared: float, job: int) -> int:
+    """A negative job ends its process."""
+    time.sleep(shared * job) if job >= 0 else os._exit(1)
+    return job
+
+
+def test_a_dead_worker_gets_one_line_and_leaving_early_ends_the_others():
+    with pytest.raises(OSError, match="a worker process died, possibly out of memory: try fewer workers"):
+        list(run_jobs(sleep, 0.0, [1, -1], 2))
+    results = run_jobs(sleep, 60.0, [0, 10], 2)
+    assert next(results) == 0
+    results.close()
+    assert multiprocessing.active_children() == []

@@ -13,15 +13,12 @@ from jax.sharding import Mesh
 from fcos_lidar_jax.devices.mesh import shard_batch
 from fcos_lidar_jax.types import HostBatch
 
-_ALIGNMENT = 64  # bytes; JAX copies arrays at other addresses again
-
 
 @contextlib.contextmanager
 def feed(batches: Iterable[HostBatch], mesh: Mesh, *, ahead: int = 2) -> Iterator[Iterator[HostBatch]]:
     """Split batches over the devices of a mesh, in order, in a background thread.
 
-    A batch is not read after the next one has been requested, so its memory may be reused. On accelerators, the
-    transfer is the only copy. On a CPU, where JAX would keep using the memory, the batch is copied once.
+    A batch is not read after the next one has been requested, so its memory may be reused.
 
     Args:
         batches: NumPy arrays with the rows of this process; only the thread may iterate over them.
@@ -75,14 +72,5 @@ def feed(batches: Iterable[HostBatch], mesh: Mesh, *, ahead: int = 2) -> Iterato
 def _transferred(host: HostBatch, mesh: Mesh) -> HostBatch:
     batch = host.batch
     if mesh.devices.flat[0].platform == "cpu":
-        batch = jax.tree.map(_aligned_copy, batch)
+        batch = jax.tree.map(np.array, batch)  # JAX would keep using the memory
     return dataclasses.replace(host, batch=jax.block_until_ready(shard_batch(batch, mesh)))
-
-
-def _aligned_copy(array: np.ndarray) -> np.ndarray:
-    """A copy that JAX uses on a CPU device without copying again."""
-    memory = np.empty(array.nbytes + _ALIGNMENT, np.uint8)
-    start = -memory.ctypes.data % _ALIGNMENT
-    copy = memory[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
-    np.copyto(copy, array)
-    return copy

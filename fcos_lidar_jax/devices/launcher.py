@@ -1,6 +1,5 @@
 """GPUs of a process, from the variables of its launcher: Slurm or Open MPI."""
 
-import re
 from collections.abc import Mapping
 
 _SLURM = ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_NTASKS", "SLURM_PROCID", "SLURM_LOCALID")
@@ -21,12 +20,15 @@ def local_device_ids(environment: Mapping[str, str]) -> tuple[int, ...] | None:
         by neither Slurm nor Open MPI, or if ``JAX_LOCAL_DEVICE_IDS`` is set.
 
     Raises:
-        ValueError: names a variable with an invalid value.
+        ValueError: the launcher's variables cannot be read.
     """
-    ids = environment.get("JAX_LOCAL_DEVICE_IDS", "")
-    if ids and not all(part.strip().isdecimal() for part in ids.split(",")):
-        raise ValueError(f"JAX_LOCAL_DEVICE_IDS: got {ids!r}, expected numbers of GPUs, as 0 or 0,1")
-    local = None if ids else _local_rank(environment)
+    if environment.get("JAX_LOCAL_DEVICE_IDS"):
+        return None
+    try:
+        local = _local_rank(environment)
+    except (LookupError, ValueError) as error:
+        problem = f"cannot be read: {error}: set JAX_LOCAL_DEVICE_IDS to the GPUs of this process"
+        raise ValueError(f"variables of Slurm or Open MPI: {problem}") from None
     if local is None:
         return None
     rank, size = local
@@ -41,13 +43,12 @@ def _local_rank(environment: Mapping[str, str]) -> tuple[int, int] | None:
     """Rank on the machine, and number of processes there (0 if unknown); Open MPI has priority, as in JAX."""
     if "OMPI_COMM_WORLD_LOCAL_SIZE" in environment:
         names = "OMPI_COMM_WORLD_LOCAL_RANK", "OMPI_COMM_WORLD_LOCAL_SIZE"
-        rank, size = (_number(environment, name) for name in names)
+        rank, size = (int(environment[name]) for name in names)
         return rank, size
     if not all(name in environment for name in _SLURM):
         return None
     name = next((name for name in _TASKS if name in environment), None)
-    rank = _number(environment, "SLURM_LOCALID")
-    return rank, 0 if name is None else _tasks_of_node(environment, name)
+    return int(environment["SLURM_LOCALID"]), 0 if name is None else _tasks_of_node(environment, name)
 
 
 def _sees_only_its_own(environment: Mapping[str, str]) -> bool:
@@ -60,19 +61,8 @@ def _sees_only_its_own(environment: Mapping[str, str]) -> bool:
 
 def _tasks_of_node(environment: Mapping[str, str], name: str) -> int:
     """Number of Slurm's tasks on this node, from ``8`` for all nodes, or ``2(x3),1`` node by node."""
-    parts = [re.fullmatch(r"(\d+)(?:\(x(\d+)\))?", part) for part in environment[name].split(",")]
-    counts = [int(part[1]) for part in parts if part for _ in range(int(part[2] or 1))]
-    if not all(parts) or not counts:
-        raise ValueError(f"{name}: got {environment[name]!r}, expected tasks per node, as 8 or 2(x3),1")
-    if len(set(counts)) == 1:
-        return counts[0]
-    node = _number(environment, "SLURM_NODEID")
-    if node >= len(counts):
-        raise ValueError(f"SLURM_NODEID: got {node}, expected less than the {len(counts)} nodes of {name}")
-    return counts[node]
-
-
-def _number(environment: Mapping[str, str], name: str) -> int:
-    if not (text := environment.get(name, "")).isdecimal():
-        raise ValueError(f"{name}: got {text!r}, expected a whole number")
-    return int(text)
+    counts: list[int] = []
+    for part in environment[name].split(","):
+        tasks, _, nodes = part.removesuffix(")").partition("(x")
+        counts += [int(tasks)] * int(nodes or 1)
+    return counts[0] if len(set(counts)) == 1 else counts[int(environment["SLURM_NODEID"])]

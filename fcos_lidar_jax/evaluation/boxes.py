@@ -58,12 +58,7 @@ _WHOLE = {"sample": np.int32, "label": np.int16, "attribute": np.int8, "num_poin
 
 
 def make_columns(**columns: Any) -> BoxColumns:
-    """Create columns with the right types. A scalar fills all rows; unknown fields may be left out.
-
-    >>> no_box = np.zeros((0, 3))
-    >>> len(make_columns(sample=0, label=0, translation=no_box, size=no_box, yaw=0.0, velocity=no_box[:, :2]))
-    0
-    """
+    """Create columns with the right types. A scalar fills all rows; unknown fields may be left out."""
     arrays = {name: np.asarray(v, _WHOLE.get(name, np.float64)) for name, v in {**_UNKNOWN, **columns}.items()}
     rows = len(arrays["translation"])
     return BoxColumns(**{name: array if array.ndim else np.full(rows, array) for name, array in arrays.items()})
@@ -93,9 +88,6 @@ class GroundTruth:
 def heading_yaw(rotation: np.ndarray) -> np.ndarray:
     """Direction of the x axis in the ground plane, f64[n], after rotations f64[n, 4]: w, x, y, z of any positive
     norm.
-
-    >>> heading_yaw(np.array([[2.0, 0, 0, 2]])).round(4).tolist()
-    [1.5708]
     """
     w, x, y, z = rotation.T
     return np.arctan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)

@@ -31,13 +31,7 @@ def candidate_pairs(
     *,
     max_distance_m: float,
 ) -> Pairs:
-    """Find all pairs within a group, such as a class in a sample, whose centres are nearer than a distance.
-
-    >>> one = np.zeros(1, int)
-    >>> pairs = candidate_pairs(one, np.zeros((1, 2)), one, np.ones((1, 2)), max_distance_m=2)
-    >>> pairs.distance_m.round(3).tolist()
-    [1.414]
-    """
+    """Find all pairs within a group, such as a class in a sample, whose centres are nearer than a distance."""
     by_group = np.argsort(true_group, kind="stable")
     grouped = true_group[by_group]
     first = np.searchsorted(grouped, group)
@@ -60,11 +54,7 @@ def candidate_pairs(
 
 
 def greedy(pairs: Pairs, num_detections: int, num_truths: int) -> Int[np.ndarray, "d"]:
-    """Match each detection, in order of priority, to its nearest free truth; -1 for detections without a match.
-
-    >>> greedy(Pairs(np.array([0, 1, 1]), np.array([1, 1, 0]), np.array([0.2, 0.1, 0.3])), 2, 2).tolist()
-    [1, 0]
-    """
+    """Match each detection, in order of priority, to its nearest free truth; -1 for detections without a match."""
     partner, taken = [-1] * num_detections, bytearray(num_truths)
     for detection, truth in zip(pairs.detection.tolist(), pairs.truth.tolist(), strict=True):
         if partner[detection] < 0 and not taken[truth]:
@@ -88,9 +78,6 @@ def heading_error(
 
     The period is the rotation that maps a box onto itself: 2 pi in general, pi for classes with half-turn
     symmetry, and 0 for classes without a heading, whose error is 0.
-
-    >>> heading_error(np.array([3.2]), np.zeros(1), np.array([np.pi])).round(3).tolist()
-    [0.058]
     """
     turn = np.where(period_rad > 0, period_rad, 1.0)
     difference = np.abs((true_rad - predicted_rad + turn / 2) % turn - turn / 2)
@@ -116,11 +103,6 @@ def match_frame(
         max_distance_m: exclusive upper limit of the distance of a hit in the ground plane.
         max_heading_error_rad: inclusive upper limit of the yaw error of a hit.
         heading_period_rad: period per class, see :func:`heading_error`; by default 2 pi for all classes.
-
-    >>> one = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0.0]])
-    >>> car = np.array([0])
-    >>> match_frame(one, car, np.array([0.9]), one, car, max_distance_m=0.5).truth.tolist()
-    [0]
     """
     order = np.argsort(-scores, kind="stable")
     boxes, labels = boxes[order].astype(np.float64), labels[order]

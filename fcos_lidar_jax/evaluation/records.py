@@ -18,12 +18,7 @@ TrueBoxes = tuple[np.ndarray, np.ndarray]
 
 
 def as_records(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Detections of one cloud, of NumPy arrays, as JSON objects, best first.
-
-    >>> one = np.ones(1, np.float32)
-    >>> as_records(Detections(np.ones((1, 9)), one, one.astype(int), one > 0, one), ("car", "tram"))[0]["label"]
-    'tram'
-    """
+    """Detections of one cloud, of NumPy arrays, as JSON objects, best first."""
     return [
         {"label": classes[label], "score": float(score), "box": [float(v) for v in box]}
         for box, label, score in zip(*confident(found, 0.0), strict=True)
@@ -58,13 +53,7 @@ def select(
     min_score: float | None = None,
     labels: Sequence[str] | None = None,
 ) -> Detections:
-    """Turn detections of one cloud below a score, or of other classes than ``labels``, into padding.
-
-    >>> scores, labels = np.array([0.6, 0.4]), np.array([0, 1])
-    >>> found = Detections(np.ones((2, 9)), scores, labels, scores > 0, np.zeros(0))
-    >>> select(found, ("car", "tram"), labels=["tram"]).valid.tolist()
-    [False, True]
-    """
+    """Turn detections of one cloud below a score, or of other classes than ``labels``, into padding."""
     kept = np.asarray(found.valid) & (np.asarray(found.scores) >= (min_score or 0.0))
     if labels:
         kept &= np.isin(np.asarray(found.labels), [classes.index(name) for name in labels])

@@ -59,12 +59,7 @@ class SimulatedFrames(FrameSet):
 
 
 def city_frames(sensor: Sensor, number: int, first_seed: int = 0, *, streets: Streets = CITY) -> SimulatedFrames:
-    """Training frames for a long-range sensor: varied streets with objects in the whole field of view.
-
-    >>> from fcos_lidar_jax.sensors import NUSCENES_HDL32E
-    >>> city_frames(NUSCENES_HDL32E, 10).reach_m
-    54.0
-    """
+    """Training frames for a long-range sensor: varied streets with objects in the whole field of view."""
     extent = {"num_objects": 60, "reach_m": sensor.limit_xy_m, "min_points": 1}
     return SimulatedFrames(sensor, number, first_seed, **extent, streets=streets)
 
@@ -104,10 +99,5 @@ def fresh_streets(config: Config, *, steps: int, seed: int = 0) -> tuple[Config,
 
 
 def unseen_frames(sensor: Sensor, number: int) -> SimulatedFrames:
-    """Frames of streets that :func:`fresh_streets` never uses.
-
-    >>> from fcos_lidar_jax.sensors import TINY
-    >>> unseen_frames(TINY, 3).first_seed
-    1000000
-    """
+    """Frames of streets that :func:`fresh_streets` never uses."""
     return SimulatedFrames(sensor, number, UNSEEN_SEED)

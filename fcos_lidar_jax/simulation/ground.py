@@ -1,16 +1,44 @@
-"""Ground of sloping planes with two streets, even or uneven."""
+"""Ground of sloping planes with two streets, even or uneven, and random fields for undulations and shading."""
 
 import dataclasses
 
 import numpy as np
-
-from fcos_lidar_jax.simulation.relief import Relief
 
 LANE_M = 3.5
 _MARK_HALF_M = 0.08
 _DIRECTIONS = 720  # number of profiles of uneven ground around the sensor
 _PROFILE_M = np.geomspace(1.0, 120.0, 144)  # distances from the sensor at which a profile is sampled
 _BISECTIONS = 5  # bisections of the profile segment that contains a hit
+_CELLS = 256  # size of a relief's grid
+_CELL_M = 0.5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Relief:
+    """A smooth periodic field with mean 0, bilinear between the points of a grid: undulations or shading."""
+
+    values: np.ndarray  # f32[n, n], x first
+
+    def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Values at positions in metres, f32[...]."""
+        n = len(self.values)
+        u, v = np.asarray(x, np.float32) / np.float32(_CELL_M), np.asarray(y, np.float32) / np.float32(_CELL_M)
+        i, j = np.floor(u), np.floor(v)
+        u, v, i, j = u - i, v - j, i.astype(np.int32), j.astype(np.int32)
+        flat = self.values.ravel()
+        i0, i1, j0, j1 = i % n * n, (i + 1) % n * n, j % n, (j + 1) % n
+        low = flat.take(i0 + j0) * (1 - v) + flat.take(i0 + j1) * v
+        high = flat.take(i1 + j0) * (1 - v) + flat.take(i1 + j1) * v
+        return low * (1 - u) + high * u
+
+
+def sample_relief(rng: np.random.Generator, deviation: float, power: float) -> Relief:
+    """Sample a field with a given standard deviation; amplitudes grow with wavelength to the ``power``."""
+    frequency = np.hypot(np.fft.fftfreq(_CELLS)[:, None], np.fft.rfftfreq(_CELLS))
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.standard_normal((_CELLS, _CELLS))) * np.maximum(frequency, 3 / _CELLS) ** -power
+    values = np.fft.irfft2(spectrum, (_CELLS, _CELLS))
+    return Relief((deviation * values / values.std()).astype(np.float32))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,3 +170,55 @@ class Ground:
         zebra &= np.abs(offset - self.crossing_half_width - 3) < 1.5
         bright = np.where(marked | zebra, 0.35, shade)
         return bright if self.shading is None else bright * np.exp(self.shading.at(x, y))
+
+
+@dataclasses.dataclass(frozen=True)
+class Side:
+    """A section of one side of a street."""
+
+    ground: Ground
+    along: int  # 0 main street, 1 crossing street
+    side: int  # 1 to the left of the street's direction, -1 to the right
+    span: tuple[float, float]  # metres along the street
+
+    @property
+    def edge_m(self) -> float:
+        """Distance of the kerb from the middle of the street."""
+        return self.ground.crossing_half_width if self.along else self.ground.half_width
+
+    @property
+    def back_m(self) -> float:
+        """Distance of the back of the pavement from the middle of the street."""
+        return self.edge_m + self.ground.pavement
+
+    @property
+    def length_m(self) -> float:
+        return self.span[1] - self.span[0]
+
+    @property
+    def yaw(self) -> float:
+        return np.pi / 2 * self.along
+
+    @property
+    def facing(self) -> float:
+        """Direction from the side to the street, radians."""
+        return (1 + self.side) * np.pi / 2 if self.along else -self.side * np.pi / 2
+
+    def free(
+        self, s: np.ndarray, away: np.ndarray | float, clear: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions ``x, y`` at ``s`` along and ``away`` from the middle of the street; and their indices.
+
+        Positions on carriageways or closer to them than ``clear`` are omitted.
+        """
+        beside = self.side * away + np.zeros(len(s))
+        x, y = (self.ground.crossing_x + beside, s) if self.along else (s, beside)
+        free = np.flatnonzero(~self.ground.on_road(x, y, clear))
+        return x[free], y[free], free
+
+    def positions(
+        self, s: np.ndarray, away: np.ndarray | float, clear: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Like :meth:`free`, on the ground: positions f64[k, 3], and their indices."""
+        x, y, free = self.free(s, away, clear)
+        return np.stack([x, y, self.ground.height(x, y)], axis=1), free

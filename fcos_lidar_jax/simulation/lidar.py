@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 from fcos_lidar_jax.geometry import wrap_angle
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.simulation.raycast import Fan, cast
+from fcos_lidar_jax.simulation.raycast import Fan, Hits, cast
 from fcos_lidar_jax.simulation.solids import BOX, EGO, make_solids, place_solids
 from fcos_lidar_jax.simulation.streets import PLAIN, Streets
 from fcos_lidar_jax.simulation.world import World
@@ -136,38 +136,9 @@ def _scan_sector(
     pose = sensor_pose(world, mount, time_s)
     rotation, eye = pose[:3, :3], pose[:3, 3] + pose[:3, :3] @ np.array(sensor.origin_m)
     farthest = min(_FARTHEST_M, 2 * sensor.limit_xy_m)
-    solids = world.solids(time_s)
-    if not streets.ego_outline:
-        solids = np.concatenate([solids, _ego_solids(rotation, eye)])
-    solids = _in_view(solids, fan, rotation, eye, farthest)
-    hits = cast(fan, rotation, eye, solids, world.ground, rng)
+    solids, hits = _first_hits(world, rings, fan, rotation, eye, farthest, time_s, rng)
     range_m, shape = hits.range_m, (fan.num_columns, sensor.num_rows)
-    if streets.ego_outline:
-        blocked = _behind_ego(fan)
-        range_m[blocked], hits.solid[blocked] = np.inf, -1
-        if streets.ego_edges:
-            edge, edge_range_m = _ego_edges(fan, blocked, rings.edges_m)
-            edge &= rng.random(len(edge)) < _EDGE_RETURNS
-            range_m[edge] = edge_range_m[edge]
-    albedo = np.append(solids["albedo"], 0.0).astype(np.float32)[hits.solid]
-    ground = np.flatnonzero((hits.solid < 0) & np.isfinite(range_m))
-    towards = rotation.astype(np.float32) @ fan.directions
-    place = eye[:2, None] + towards[:2, ground] * range_m[ground]
-    albedo[ground] = world.ground.albedo(*place)
-    if streets.roughness_m:
-        on_street = world.ground.on_road(place[0], place[1], world.ground.pavement)
-        beside = np.where(on_street, 1, _ROUGH_BESIDE)
-        rough = streets.roughness_m * beside * rng.standard_normal(len(ground))
-        range_m[ground] += rough / np.maximum(hits.cosine[ground], 0.1)
-    if world.ground.shading is not None:
-        struck = np.flatnonzero(hits.solid >= 0)
-        x, y, z = eye[:, None] + towards[:, struck] * range_m[struck]
-        albedo[struck] *= np.exp(world.ground.shading.at(x + z, y + z))
-    away = np.float32(0)
-    if streets.gloss:
-        gloss = np.append(solids["gloss"], 0.0).astype(np.float32)[hits.solid]
-        away = np.minimum(gloss * (_AHEAD_LOSS + (1 - _AHEAD_LOSS) * (1 - hits.cosine)), np.float32(_MOST_LOST))
-        albedo *= 1 - away
+    albedo, away = _reflect(world, rotation.astype(np.float32) @ fan.directions, eye, solids, hits, rng)
     # Nearly all strong rays return, but only some faint ones (far away or at a grazing angle).
     strength = albedo * hits.cosine / np.maximum(range_m / 100, np.float32(1e-3)) ** 2
     chance = (1 - away) * (1 - _LOST) * -np.expm1(-strength / rings.faint)
@@ -194,6 +165,60 @@ def _scan_sector(
     owner = solids["owner"][hits.solid[hits.solid >= 0]]
     seen = np.bincount(owner[owner >= 0], minlength=num_objects)
     return points.reshape(-1, 5), returned.reshape(shape)[:, ::-1].ravel(), reachable, seen
+
+
+def _first_hits(
+    world: World,
+    rings: _Rings,
+    fan: Fan,
+    rotation: np.ndarray,
+    eye: np.ndarray,
+    farthest: float,
+    time_s: float,
+    rng: Generator,
+) -> tuple[np.ndarray, Hits]:
+    """Solids in view, and the first hits of all rays on them, the ground and the ego vehicle."""
+    solids = world.solids(time_s)
+    if not world.streets.ego_outline:
+        solids = np.concatenate([solids, _ego_solids(rotation, eye)])
+    solids = _in_view(solids, fan, rotation, eye, farthest)
+    hits = cast(fan, rotation, eye, solids, world.ground, rng)
+    if world.streets.ego_outline:
+        blocked = _behind_ego(fan)
+        hits.range_m[blocked], hits.solid[blocked] = np.inf, -1
+        if world.streets.ego_edges:
+            edge, edge_range_m = _ego_edges(fan, blocked, rings.edges_m)
+            edge &= rng.random(len(edge)) < _EDGE_RETURNS
+            hits.range_m[edge] = edge_range_m[edge]
+    return solids, hits
+
+
+def _reflect(
+    world: World, towards: np.ndarray, eye: np.ndarray, solids: np.ndarray, hits: Hits, rng: Generator
+) -> tuple[np.ndarray, np.ndarray | np.float32]:
+    """Albedo at the hits, and the share of the light that gloss reflects away; roughens the ground in place.
+
+    ``towards`` are the directions of the rays f32[3, w * h] in the world.
+    """
+    streets, range_m = world.streets, hits.range_m
+    albedo = np.append(solids["albedo"], 0.0).astype(np.float32)[hits.solid]
+    ground = np.flatnonzero((hits.solid < 0) & np.isfinite(range_m))
+    place = eye[:2, None] + towards[:2, ground] * range_m[ground]
+    albedo[ground] = world.ground.albedo(*place)
+    if streets.roughness_m:
+        on_street = world.ground.on_road(place[0], place[1], world.ground.pavement)
+        beside = np.where(on_street, 1, _ROUGH_BESIDE)
+        rough = streets.roughness_m * beside * rng.standard_normal(len(ground))
+        range_m[ground] += rough / np.maximum(hits.cosine[ground], 0.1)
+    if world.ground.shading is not None:
+        struck = np.flatnonzero(hits.solid >= 0)
+        x, y, z = eye[:, None] + towards[:, struck] * range_m[struck]
+        albedo[struck] *= np.exp(world.ground.shading.at(x + z, y + z))
+    if not streets.gloss:
+        return albedo, np.float32(0)
+    gloss = np.append(solids["gloss"], 0.0).astype(np.float32)[hits.solid]
+    away = np.minimum(gloss * (_AHEAD_LOSS + (1 - _AHEAD_LOSS) * (1 - hits.cosine)), np.float32(_MOST_LOST))
+    return albedo * (1 - away), away
 
 
 def _measure(

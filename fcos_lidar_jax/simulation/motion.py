@@ -25,11 +25,7 @@ def make_motion(**fields: float) -> np.ndarray:
 
 
 def travelled(motion: np.ndarray, time_s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Distance travelled in metres and speed at a non-negative time.
-
-    >>> [v.tolist() for v in travelled(make_motion(speed=4, acceleration=-2), 10.0)]
-    [[4.0], [0.0]]
-    """
+    """Distance travelled in metres and speed at a non-negative time."""
     speed, change = motion["speed"], motion["acceleration"]
     rest = np.where(change < 0, speed / np.maximum(-change, 1e-9), np.inf)
     t = np.minimum(time_s, rest)
@@ -37,11 +33,7 @@ def travelled(motion: np.ndarray, time_s: np.ndarray | float) -> tuple[np.ndarra
 
 
 def pose_at(motion: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
-    """Positions and headings ``x, y, yaw``, f64[..., 3]. Motions [...] and times broadcast.
-
-    >>> pose_at(make_motion(speed=1, curvature=1, turn=np.pi / 2), np.pi / 2 + 3).round(6).tolist()
-    [[1.0, 4.0, 1.570796]]
-    """
+    """Positions and headings ``x, y, yaw``, f64[..., 3]. Motions [...] and times broadcast."""
     distance, _ = travelled(motion, time_s)
     curvature = motion["curvature"]
     bends = curvature != 0

@@ -38,11 +38,7 @@ _MOVING_MPS = 0.2
 
 
 def token(*name: object) -> str:
-    """Derive 32 hexadecimal digits from a name.
-
-    >>> token("sample", 0, 1)
-    '19be9df9c5a728e4f1980077f6da86b8'
-    """
+    """Derive 32 hexadecimal digits from a name."""
     return hashlib.blake2b("/".join(map(str, name)).encode(), digest_size=16).hexdigest()
 
 
@@ -182,11 +178,7 @@ def object_rows(
 
 
 def attribute_of(name: str, speed_mps: float, *, rider: bool, parked: bool) -> str | None:
-    """Attribute of an object, None for traffic cones and barriers.
-
-    >>> attribute_of("car", 3.0, rider=False, parked=False)
-    'vehicle.moving'
-    """
+    """Attribute of an object, None for traffic cones and barriers."""
     moves = speed_mps > _MOVING_MPS
     if name in ("traffic_cone", "barrier"):
         return None

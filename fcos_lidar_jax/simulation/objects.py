@@ -110,10 +110,6 @@ def object_solids(model: ObjectModel, size_m: np.ndarray, paint: float) -> np.nd
 
     Args:
         size_m: f64[3], length, width, height of the annotated box.
-
-    >>> cone = OBJECT_MODELS["traffic_cone"][0]
-    >>> object_solids(cone, np.array([0.48, 0.48, 0.84]), 0.4)["half"][0].round(3).tolist()
-    [0.2, 0.2, 0.02]
     """
     solids = model.solids.copy()
     scale = np.asarray(size_m) - (2 * _MARGIN_M, 2 * _MARGIN_M, _MARGIN_M)

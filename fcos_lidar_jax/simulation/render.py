@@ -58,7 +58,8 @@ def render_scene(spec: DatasetSpec, index: int, root: Path, advance: Callable[[]
         time_s = number * SWEEP_S
         noise = np.random.default_rng([spec.seed, index, number])
         sweep = scan(world, spec.sensor, sensor_to_ego, time_s, noise, rolling_shutter=spec.rolling_shutter)
-        _write_points(root / tables.sweep_file(spec.seed, index, number), sweep.points)
+        with naming(file := root / tables.sweep_file(spec.seed, index, number)):
+            file.write_bytes(sweep.points.tobytes())
         egos.append(pose_fields(street_to_global @ world.ego_pose(time_s)))
         if number % SWEEPS_PER_KEYFRAME == 0:
             boxes.append(_global_boxes(world, street_to_global, time_s))
@@ -96,15 +97,6 @@ def _sample_placement(rng: np.random.Generator) -> np.ndarray:
 
 def _pose(row: Row) -> np.ndarray:
     return pose_matrix(np.array(row["rotation"]), np.array(row["translation"]))
-
-
-def _write_points(path: Path, points: np.ndarray) -> None:
-    try:
-        with naming(path):
-            path.write_bytes(points.tobytes())
-    except OSError:
-        path.unlink(missing_ok=True)  # leaves no partial file
-        raise
 
 
 def _global_boxes(world: World, street_to_global: np.ndarray, time_s: float) -> np.ndarray:

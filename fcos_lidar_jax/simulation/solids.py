@@ -32,9 +32,6 @@ def make_solids(kind: int, center: object, half: object, **fields: object) -> np
     """Create solids [s] of one kind. All fields broadcast; ``center`` and ``half`` are [..., 3].
 
     The defaults of the other fields describe upright, untapered, opaque scenery with albedo 0.3.
-
-    >>> make_solids(BALL, [[0, 0, 1], [4, 0, 1]], 0.5, albedo=0.1)["half"].tolist()
-    [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
     """
     center = np.atleast_2d(np.asarray(center, np.float64))
     solids = np.zeros(len(center), SOLID)
@@ -58,10 +55,6 @@ def place_solids(solids: np.ndarray, pose: np.ndarray) -> np.ndarray:
     Args:
         solids: [s].
         pose: f64[s, 4], ``x, y, z, yaw`` of the frame of each solid, or [4] for a common frame.
-
-    >>> ball = make_solids(BALL, [1, 0, 0], 1.0)
-    >>> place_solids(ball, np.array([5, 0, 0, np.pi / 2]))["center"].round(6).tolist()
-    [[5.0, 1.0, 0.0]]
     """
     pose = np.broadcast_to(pose, (len(solids), 4))
     placed = solids.copy()
@@ -73,11 +66,7 @@ def place_solids(solids: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def corners(solids: np.ndarray) -> np.ndarray:
-    """Corners of a cuboid that encloses each solid, including lean and taper, f64[s, 8, 3].
-
-    >>> corners(make_solids(BOX, [0, 0, 0], [1, 1, 1], lean=0.5))[0, :, 0].max().item()
-    1.5
-    """
+    """Corners of a cuboid that encloses each solid, including lean and taper, f64[s, 8, 3]."""
     half = solids["half"].copy()
     half[:, 0] += np.abs(solids["lean"]) * half[:, 2]
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
@@ -87,11 +76,7 @@ def corners(solids: np.ndarray) -> np.ndarray:
 
 
 def unit_map(solids: np.ndarray) -> np.ndarray:
-    """Matrices f64[s, 3, 3] from offsets to the centre in world axes to the axes of the unit shape.
-
-    >>> unit_map(make_solids(BOX, [0, 0, 0], [2, 1, 1]))[0].diagonal().tolist()
-    [0.5, 1.0, 1.0]
-    """
+    """Matrices f64[s, 3, 3] from offsets to the centre in world axes to the axes of the unit shape."""
     c, s = np.cos(solids["yaw"]), np.sin(solids["yaw"])
     maps = np.zeros((len(solids), 3, 3))
     maps[:, 0] = np.stack([c, s, -solids["lean"]], axis=1)

@@ -9,10 +9,6 @@ class Streets:
 
     Together with seed, size and traffic these parameters determine all frames. Caches and data set records
     therefore contain them unchanged.
-
-    >>> level = dataclasses.replace(CITY, slopes=False)
-    >>> level.clutter, PLAIN.clutter
-    (0.12, 0.0)
     """
 
     name: str = "plain"

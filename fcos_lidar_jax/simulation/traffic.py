@@ -109,9 +109,13 @@ def sample_traffic(
                 objects.append((label, model, size, motion, place in _PARKED))
                 pedestrian = motion if name == "pedestrian" else pedestrian
                 break
-    placed_labels, models, sizes, motions, parked = zip(*objects, strict=True) if objects else [()] * 5
+    return _collected(objects)
+
+
+def _collected(objects: Sequence[tuple[int, ObjectModel, np.ndarray, np.ndarray, bool]]) -> Traffic:
+    labels, models, sizes, motions, parked = zip(*objects, strict=True) if objects else [()] * 5
     return Traffic(
-        np.array(placed_labels, np.int32),
+        np.array(labels, np.int32),
         models,
         np.array(sizes).reshape(-1, 3),
         np.concatenate([np.zeros(0, MOTION), *motions]),

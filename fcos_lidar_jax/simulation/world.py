@@ -6,10 +6,9 @@ import numpy as np
 from numpy.random import Generator
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.simulation.ground import LANE_M, Ground
+from fcos_lidar_jax.simulation.ground import LANE_M, Ground, sample_relief
 from fcos_lidar_jax.simulation.motion import make_motion, pose_at
 from fcos_lidar_jax.simulation.objects import OBJECT_MODELS, object_solids, polish, sample_paint, vary_shape
-from fcos_lidar_jax.simulation.relief import sample_relief
 from fcos_lidar_jax.simulation.scenery import sample_scenery
 from fcos_lidar_jax.simulation.solids import SOLID, place_solids
 from fcos_lidar_jax.simulation.streets import PLAIN, Streets
@@ -112,21 +111,13 @@ def sample_world(
 
 
 def class_shares(power: float) -> np.ndarray:
-    """Class frequencies, f64[10]: ``power`` 1 gives the frequencies of nuScenes, 0 equal frequencies.
-
-    >>> class_shares(0.0).round(6).tolist()
-    [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]
-    """
+    """Class frequencies, f64[10]: ``power`` 1 gives the frequencies of nuScenes, 0 equal frequencies."""
     shares = _SHARES**power
     return shares / shares.sum()
 
 
 def sample_labels(rng: Generator, number: int) -> np.ndarray:
-    """Sample the classes of a street's objects, i32: one of each class, the rest with nuScenes frequencies.
-
-    >>> len(np.unique(sample_labels(np.random.default_rng(0), 40)))
-    10
-    """
+    """Sample the classes of a street's objects, i32: one of each class, the rest with nuScenes frequencies."""
     more = rng.choice(len(NUSCENES_CLASSES), max(number - len(NUSCENES_CLASSES), 0), p=class_shares(1.0))
     return np.concatenate([np.arange(len(NUSCENES_CLASSES)), more]).astype(np.int32)[:number]
 

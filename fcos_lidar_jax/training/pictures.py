@@ -11,7 +11,7 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 
 def draw_metrics(folder: Path) -> None:
     """Draw the losses of a run as ``loss.png`` and, if it was evaluated, its mAP as ``scores.png``."""
-    from fcos_lidar_jax.visualization.curves import draw_curves
+    from fcos_lidar_jax.visualization.figure import draw_curves
 
     lines = read_metrics(folder)
     parts = dict.fromkeys(name for line in lines for name in line if name.startswith("loss/"))

@@ -33,13 +33,6 @@ def draw_bev(
     there is room, highest scores first. Truth has thin dashed black outlines filled with the colour of its class.
     A line from the centre through the front marks the heading. Half the side of the plotted square is ``limit_m``.
     If all points are to one side of the sensor, as in a camera image, the view is fitted to points and boxes.
-
-    >>> import tempfile
-    >>> file = Path(tempfile.mkdtemp()) / "bev.png"
-    >>> truth = np.array([[0, 9, 0, 4, 2, 2, 0, 0, 0]]), np.array([0])
-    >>> draw_bev(np.array([[0, 8.0, 0]]), file, limit_m=20, classes=["car"], truth=truth)
-    >>> file.exists()
-    True
     """
     boxes = [box for each in (detections, truth) if each is not None for box in each[0]]
     view = _fitted(points, boxes, limit_m)

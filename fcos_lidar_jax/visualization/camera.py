@@ -27,17 +27,6 @@ def draw_camera(
     """Draw boxes in a camera image: detections with class and score in the colour of their class, truth dashed.
 
     ``to_image`` f64[3, 4] leads from the frame of the boxes, metres, to homogeneous pixels.
-
-    >>> import tempfile
-    >>> from PIL import Image
-    >>> image, file = (Path(tempfile.mkdtemp()) / name for name in ("image.png", "boxes.png"))
-    >>> Image.new("RGB", (100, 50)).save(image)
-    >>> look_along_x = np.array([[50, -100.0, 0, 0], [25, 0, -100, 0], [1, 0, 0, 0]])
-    >>> truth = np.array([[20, 0, 0, 4, 2, 2, 0, 0, 0]]), np.array([0])
-    >>> none = np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)
-    >>> draw_camera(image, file, look_along_x, classes=["car"], detections=none, truth=truth)
-    >>> file.exists()
-    True
     """
     from PIL import Image
 

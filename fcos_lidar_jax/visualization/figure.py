@@ -1,8 +1,8 @@
-"""Matplotlib figures without a display or global state, and the colours of all figures."""
+"""Matplotlib figures without a display or global state, their colours, and curves over steps."""
 
 import colorsys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ _CLASS_COLORS = (
     *("#e377c2", "#17becf", "#2ca02c", "#ff6f00", "#5b5b5b"),
 )
 _LABEL_POINTS = 7.0
+_FEW = 40  # curves up to this length get markers, without which a single point is invisible
 _GOLDEN = 0.6180339887  # hue step, the golden ratio, for which hues never repeat
 
 
@@ -105,3 +106,38 @@ def _text_width(text: str, fontsize: float) -> float:
 def save_png(figure: Any, path: str | Path, *, dpi: int = 110) -> None:
     """Write a figure as a PNG file atomically."""
     atomic_write(path, lambda file: figure.savefig(file, dpi=dpi, format="png"))
+
+
+def draw_curves(
+    path: str | Path,
+    series: Mapping[str, Sequence[tuple[float, float]]],
+    *,
+    x_label: str,
+    y_label: str,
+    title: str,
+    log_y: bool = False,
+) -> None:
+    """Plot named series of (x, y) in one PNG file.
+
+    Non-finite points leave a gap, as do non-positive points on a logarithmic y axis.
+    """
+    figure, axis = new_axis(8, 4.5)
+    for i, (name, points) in enumerate(series.items()):
+        # When the colours repeat, lines are dashed.
+        axis.plot(
+            [x for x, _ in points],
+            [y for _, y in points],
+            label=name.replace("_", " "),
+            color=LINE_COLORS[i % len(LINE_COLORS)],
+            linestyle="-" if i < len(LINE_COLORS) else "--",
+            linewidth=1.3,
+            marker="o" if len(points) <= _FEW else None,
+            markersize=3.5,
+        )
+    if log_y:
+        axis.set_yscale("log", nonpositive="mask")
+    axis.set(xlabel=x_label, ylabel=y_label)
+    axis.set_title(title, fontsize=11)
+    if series:
+        axis.legend(fontsize=9, frameon=False)
+    save_png(figure, path)

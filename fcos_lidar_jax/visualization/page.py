@@ -23,12 +23,7 @@ _LIMIT = 2**15 - 1  # int16, for points up to 655 m
 
 @dataclasses.dataclass(frozen=True)
 class PageFrame:
-    """A cloud with its boxes, encoded for the page by :func:`page_frame`. Optional fields are None if unknown.
-
-    >>> found = np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)
-    >>> page_frame(np.array([[0, 8.0, 0, 50]]), found, name="street").pose is None
-    True
-    """
+    """A cloud with its boxes, encoded for the page by :func:`page_frame`. Optional fields are None if unknown."""
 
     name: str
     time_us: int | None
@@ -60,10 +55,6 @@ def page_frame(
         points: see :func:`encode_points`; all boxes are in their frame.
         time_us, pose: time, and pose f64[4, 4] in the world; only for frames of the same drive.
         ids: i32[m], identities over time.
-
-    >>> found = np.zeros((0, 9)), np.zeros(0, int), np.zeros(0)
-    >>> page_frame(np.array([[0, 8.0, 0, 50]]), found, name="street").num_points
-    1
     """
     boxes, labels, scores = found
     return PageFrame(
@@ -97,9 +88,6 @@ def encode_points(points: np.ndarray) -> tuple[int, float, str]:
 
     Args:
         points: f32[n, >= 4]: x, y, z in metres, intensity (0-255), optional time lag in seconds.
-
-    >>> encode_points(np.array([[1, 2, 3, 9], [1, 2, 3.001, 9], [np.nan, 0, 0, 0]], np.float32))[:2]
-    (1, 0.0)
     """
     points = points[(np.abs(points[:, :3]) < STEP_M * _LIMIT).all(axis=1)]
     lags = points[:, 4] if points.shape[1] > 4 else np.zeros(len(points))

@@ -37,14 +37,6 @@ def draw_range_image(
 
     Truth and detections, in the frame of the points, have separate panels. Each box is outlined in round 1, in the
     colour of its class, around the cells whose points lie in it; boxes without such a cell are not visible.
-
-    >>> import tempfile
-    >>> import fcos_lidar_jax as fcos
-    >>> cloud, sensor = np.array([[0, 9, 0, 50, 0]], np.float32), fcos.load_sensor("short_range")
-    >>> image = fcos.projection.project_points(cloud, np.ones(1, bool), sensor, num_rounds=1)
-    >>> draw_range_image(image, file := Path(tempfile.mkdtemp()) / "image.png")
-    >>> file.exists()
-    True
     """
     view = _View.of(azimuth_limits_rad)
     features = np.asarray(image.features)

@@ -54,12 +54,6 @@ def write_report(
         galleries: (heading, small pictures) of each gallery, arranged side by side.
         pictures: (caption, PNG or GIF file) of each picture; the files are embedded.
         wide_pictures: pictures that scroll horizontally on narrow screens instead of shrinking.
-
-    >>> import tempfile
-    >>> file = Path(tempfile.mkdtemp()) / "report.html"
-    >>> write_report(file, title="Trained & tested", summary={"mAP": 0.5})
-    >>> "<h1>Trained &amp; tested</h1>" in file.read_text(encoding="utf-8")
-    True
     """
     parts = [f"<h1>{_text(title)}</h1>"]
     if lead:

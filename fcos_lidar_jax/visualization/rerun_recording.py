@@ -31,9 +31,6 @@ def rerun_recording(
 
     Frames are written immediately. The file appears when the context ends without an error. Boxes below
     ``min_score`` are not recorded, because the viewer cannot hide them.
-
-    >>> with rerun_recording(None, ("car",)) as record:
-    ...     record(np.zeros((0, 4)), (np.zeros((0, 9)), np.zeros(0), np.zeros(0)), name="a")
     """
     if path is None:
         yield lambda *_, **__: None

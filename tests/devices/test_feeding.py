@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from toy_frames import ToyFrames
 
-from fcos_lidar_jax.devices import feeding
 from fcos_lidar_jax.devices.feeding import feed
 from fcos_lidar_jax.devices.mesh import make_mesh
 from fcos_lidar_jax.input_pipeline.loader import make_batches
@@ -154,18 +153,6 @@ def test_host_memory_may_be_reused_while_a_batch_is_alive(mesh):
     with feed(source(), mesh) as stream:
         batches = list(stream)
     assert [np.unique(each.batch["x"]).tolist() for each in batches] == [[step] for step in range(6)]
-
-
-def test_batches_are_copied_once_on_a_cpu(mesh, monkeypatch):
-    copies, aligned_copy = [], feeding._aligned_copy
-    monkeypatch.setattr(feeding, "_aligned_copy", lambda array: copies.append(aligned_copy(array)) or copies[-1])
-    sources = [np.arange(24, dtype=dtype).reshape(4, -1) for dtype in (np.uint8, np.uint16, np.float32, np.int32)]
-    with feed([HostBatch({"x": sources}, {}, ())], mesh) as stream:
-        [fed] = stream
-    for array, copy, source in zip(fed.batch["x"], copies, sources, strict=True):
-        assert array.addressable_data(0).unsafe_buffer_pointer() == copy.ctypes.data
-        assert not np.shares_memory(copy, source)
-        np.testing.assert_array_equal(array, source)
 
 
 def test_batches_in_shared_memory_of_workers_outlive_it(mesh):

@@ -1,6 +1,5 @@
 """Choice of the GPUs of a process from the variables of its launcher."""
 
-import re
 import socket
 
 import pytest
@@ -41,16 +40,12 @@ CASES = {
     "JAX's variable is empty": (FOURTH | {STEP: "8", JAX_IDS: ""}, (3,)),
 }
 INVALID = {
-    "JAX's variable": ({JAX_IDS: "0,x"}, f"{JAX_IDS}: got '0,x', expected numbers"),
-    "tasks": (FIRST | {STEP: "1(2)"}, f"{STEP}: got '1(2)', expected tasks per node, as 8 or 2(x3),1"),
-    "no tasks": (FIRST | {STEP: ""}, f"{STEP}: got '', expected tasks per node"),
-    "no node": (FIRST | {STEP: "2,1"}, "SLURM_NODEID: got '', expected a whole number"),
-    "node": (
-        FIRST | {STEP: "2,1", "SLURM_NODEID": "2"},
-        f"SLURM_NODEID: got 2, expected less than the 2 nodes of {STEP}",
-    ),
-    "rank": (SRUN | {"SLURM_LOCALID": "x"}, "SLURM_LOCALID: got 'x', expected a whole number"),
-    "size": ({MPI_SIZE: "8"}, f"{MPI_RANK}: got '', expected a whole number"),
+    "tasks": FIRST | {STEP: "1(2)"},
+    "no tasks": FIRST | {STEP: ""},
+    "no node": FIRST | {STEP: "2,1"},
+    "node": FIRST | {STEP: "2,1", "SLURM_NODEID": "2"},
+    "rank": SRUN | {"SLURM_LOCALID": "x"},
+    "no rank": {MPI_SIZE: "8"},
 }
 
 
@@ -61,10 +56,9 @@ def test_a_process_uses_its_own_gpus(case):
 
 
 @pytest.mark.parametrize("case", INVALID)
-def test_invalid_variables_are_named(case):
-    environment, message = INVALID[case]
-    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
-        local_device_ids(environment)
+def test_unreadable_variables_are_refused(case):
+    with pytest.raises(ValueError, match="variables of Slurm or Open MPI: cannot be read"):
+        local_device_ids(INVALID[case])
 
 
 @pytest.mark.parametrize(("tasks", "visible"), [("1", "all"), ("2", "0")])

@@ -3,7 +3,6 @@
 import itertools
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import contents, run_python
+from commands import contents, in_use
 from kills import killed_twice
 from scipy.spatial.transform import Rotation
 
@@ -21,8 +20,7 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import WHOLE_SWEEP
 from fcos_lidar_jax.data.box_geometry import inside_box
 from fcos_lidar_jax.data.nuscenes import NuScenes
-from fcos_lidar_jax.files import folder_lock
-from fcos_lidar_jax.sensors import NUSCENES_HDL32E, TINY, sensor_to_json
+from fcos_lidar_jax.sensors import TINY, sensor_to_json
 
 VERSION = "v1.0-synthetic"
 ORDER = ["--scenes", "3", "--keyframes", "2", "--sensor", "tiny", "--seed", "4"]
@@ -52,6 +50,13 @@ def command(out: Path, *more: str) -> list[str]:
 def synthesize(out: Path, *more: str) -> Path:
     assert cli.main(command(out, *more)) == 0
     return out
+
+
+def refusal(capsys, out: Path, *more: str) -> str:
+    """Run a command that must fail and return its single line of output."""
+    assert cli.main(command(out, *more)) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
 
 
 def tables(root: Path) -> dict[str, list[dict]]:
@@ -128,68 +133,51 @@ def test_annotated_point_counts_are_exact(street):
     assert sum(row["num_lidar_pts"] for row in found["sample_annotation"]) > 10_000
 
 
-def test_the_reader_finds_all_boxes_with_velocities_by_central_differences(street):
+def test_attributes_follow_from_the_motions(street):
+    """All annotations are read. Velocities are central differences of the reader."""
     data, found = NuScenes(street, VERSION), tables(street)
-    rows = {row["token"]: row for row in found["sample_annotation"]}
-    attribute_of = {row["token"]: row["name"] for row in found["attribute"]}
     seen, kinds, speeds = set(), set(), []
     for sample in data.sample_tokens:
-        boxes, matrix = data.boxes(sample), data.sensor_to_global(sample)[:3, :3]
+        boxes = data.boxes(sample)
         seen |= set(boxes.tokens)
-        columns = boxes.boxes, boxes.tokens, boxes.labels, boxes.attributes
-        for box, token, label, attribute in zip(*columns, strict=True):
-            row, name = rows[token], NUSCENES_CLASSES[label]
-            assert [attribute_of[t] for t in row["attribute_tokens"]] == ([attribute] if attribute else [])
-            before, after = (rows[row[side]] if row[side] else row for side in ("prev", "next"))
-            if before is after:
-                assert np.isnan(box[7:9]).all()
-                continue
-            steps = (before is not row) + (after is not row)
-            moved = np.subtract(after["translation"], before["translation"]) / (0.5 * steps)
-            np.testing.assert_allclose(box[7:9], (matrix.T @ moved)[:2], atol=1e-4)
-            speeds.append(np.hypot(*box[7:9]))
-            if attribute in ("vehicle.moving", "pedestrian.moving", "cycle.with_rider"):
-                assert speeds[-1] > 0.05
-            elif attribute != "vehicle.stopped":  # stopped vehicles may have stopped only just now
-                assert speeds[-1] < 0.01, (name, attribute)
-            assert (attribute == "") == (name in ("traffic_cone", "barrier"))
+        for box, label, attribute in zip(boxes.boxes, boxes.labels, boxes.attributes, strict=True):
+            assert (attribute == "") == (NUSCENES_CLASSES[label] in ("traffic_cone", "barrier"))
             kinds.add(attribute)
-    assert seen == set(rows)
+            speed = np.hypot(*box[7:9])
+            if np.isnan(speed):
+                continue
+            speeds.append(speed)
+            if attribute in ("vehicle.moving", "pedestrian.moving", "cycle.with_rider"):
+                assert speed > 0.05
+            elif attribute != "vehicle.stopped":  # stopped vehicles may have stopped only just now
+                assert speed < 0.01, attribute
+    assert seen == {row["token"] for row in found["sample_annotation"]}
     assert max(speeds) > 3
     assert len(kinds) >= 6
     assert {row["visibility_token"] for row in found["sample_annotation"]} == {"1", "2", "3", "4"}
 
 
-def test_old_points_stay_in_boxes_of_static_objects_and_leave_boxes_of_moving_objects(street):
-    """Compares points above the ground of the tenth and the first sweep."""
+def test_old_points_stay_in_boxes_of_static_objects(street):
+    """Compares points above the ground of the tenth and the first sweep; see test_world.py for moving objects."""
     data = NuScenes(street, VERSION)
-    stands, unposed, moves = [], [], []
-    for scene in ("train", "val"):
-        for last, token in itertools.pairwise(data.split(scene)):
-            cloud = data.sweeps(token, 10)
-            np.testing.assert_allclose(np.unique(cloud[:, 4]), np.arange(10) * 0.05, atol=1e-6)
-            newest, oldest = (cloud[cloud[:, 4] == lag, :3] for lag in (0, cloud[:, 4].max()))
-            motion = np.linalg.inv(data.sensor_to_global(last)) @ data.sensor_to_global(token)
-            assert np.linalg.norm(motion[:3, 3]) > 1
-            wrong = oldest @ motion[:3, :3].T + motion[:3, 3]  # approximately undoes the reader's transformation
-            truth = data.boxes(token)
-            for box in truth.boxes[truth.num_lidar_pts > 50]:
-                box = box + np.array([0, 0, 0.3, 0.2, 0.2, -0.6, 0, 0, 0])
-                speed = np.hypot(*box[7:9])
-                if speed > 4:  # keep the part of the box that the object has just entered
-                    gone = min(0.45 * speed, box[3])
-                    box[:2] += (box[3] - gone) / 2 * box[7:9] / speed
-                    box[3] = gone
-                now, then, unmoved = (inside_box(points, box).sum() for points in (newest, oldest, wrong))
-                if speed < 0.01 and now > 20:
-                    stands.append(then / now)
-                    unposed.append(unmoved / now)
-                elif speed > 4 and now > 20:
-                    moves.append(then / now)
-    assert min(len(stands), len(moves)) >= 5
+    stands, unposed = [], []
+    for last, token in (pair for split in ("train", "val") for pair in itertools.pairwise(data.split(split))):
+        cloud = data.sweeps(token, 10)
+        np.testing.assert_allclose(np.unique(cloud[:, 4]), np.arange(10) * 0.05, atol=1e-6)
+        newest, oldest = (cloud[cloud[:, 4] == lag, :3] for lag in (0, cloud[:, 4].max()))
+        motion = np.linalg.inv(data.sensor_to_global(last)) @ data.sensor_to_global(token)
+        assert np.linalg.norm(motion[:3, 3]) > 1
+        wrong = oldest @ motion[:3, :3].T + motion[:3, 3]  # approximately undoes the reader's transformation
+        truth = data.boxes(token)
+        for box in truth.boxes[(truth.num_lidar_pts > 50) & (np.hypot(*truth.boxes[:, 7:9].T) < 0.01)]:
+            box = box + np.array([0, 0, 0.3, 0.2, 0.2, -0.6, 0, 0, 0])
+            now, then, unmoved = (inside_box(points, box).sum() for points in (newest, oldest, wrong))
+            if now > 20:
+                stands.append(then / now)
+                unposed.append(unmoved / now)
+    assert len(stands) >= 5
     assert 0.7 < np.median(stands) < 1.4
     assert np.median(unposed) < 0.7 * np.median(stands)
-    assert np.median(moves) < 0.4 * np.median(stands), moves
 
 
 def test_bytes_depend_on_seed_and_shutter_but_not_on_workers_or_the_number_of_scenes(made, tmp_path):
@@ -218,29 +206,11 @@ def test_a_second_run_reports_that_the_data_set_is_complete(made, capsys):
     assert {file: file.stat().st_mtime_ns for file in made.rglob("*")} == stamps
 
 
-@pytest.mark.parametrize("damage", ["cut", "lost", "table", "lost table"])
-def test_a_damaged_data_set_is_not_called_finished(made, tmp_path, capsys, damage):
-    root = shutil.copytree(made, tmp_path / "data")
-    file = root / VERSION / "sample.json" if "table" in damage else sorted(root.glob("sweeps/*/*"))[3]
-    if "lost" in damage:
-        file.unlink()
-    else:
-        content = file.read_bytes()
-        file.write_bytes(content[:-20] if damage == "cut" else content.replace(b"0", b"1", 1))
-    found = "nothing" if "lost" in damage else "other content"
-    assert f"{file}: found {found}, expected the file as written" in refusal(capsys, root)
-
-
 def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, capsys):
-    root = tmp_path / "data"
-    with folder_lock(root / ".synthesize", "synthesizing"):
-        before = contents(root)
-        done = run_python("-m", "fcos_lidar_jax", *command(root))
-        assert contents(root) == before
-    (line,) = done.stderr.strip().splitlines()
-    assert done.returncode == 1
-    assert f"process {os.getpid()} on " in line
-    assert line.endswith(" is synthesizing, expected no other process")
+    with in_use(tmp_path / ".synthesize"):
+        before = contents(tmp_path)
+        assert " is at work, expected no other process" in refusal(capsys, tmp_path)
+        assert contents(tmp_path) == before
 
 
 def test_killed_runs_resume_to_the_same_bytes(tmp_path):
@@ -271,77 +241,33 @@ def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, t
     assert contents(synthesize(root)) == contents(made)
 
 
-def refusal(capsys, out: Path, *more: str) -> str:
-    """Run a command that must fail and return its single line of output."""
-    assert cli.main(command(out, *more)) == 1
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--scenes", "0"], "--scenes: got 0, expected at least 1"),
-        (["--keyframes", "-3"], "--keyframes: got -3, expected at least 1"),
-        (["--workers", "0"], "--workers: got 0, expected at least 1"),
-        (["--seed", "-1"], "--seed: got -1, expected at least 0"),
-        (["--version", "../x"], "--version: got '../x', expected a folder's name"),
-        (["--version", ".x"], "--version: got '.x', expected a folder's name"),
-        (["--version", "samples"], "--version: got 'samples', which is the name of another folder"),
-        (["--streets", "citty"], "--streets: got 'citty', expected city"),
-        (["--sensor", "none.json"], "none.json: no such sensor file, and no preset"),
+        ("--scenes 0", "--scenes: got 0, expected at least 1"),
+        ("--seed -1", "--seed: got -1, expected at least 0"),
+        ("--version ../x", "--version: got '../x', expected a folder's name"),
+        ("--version samples", "--version: got 'samples', which is the name of another folder"),
+        ("--streets citty", "--streets: got 'citty', expected city"),
     ],
 )
 def test_invalid_options_get_one_line(options, message, tmp_path, capsys):
-    assert message in refusal(capsys, tmp_path / "new", *options)
+    assert message in refusal(capsys, tmp_path / "new", *options.split())
     assert not (tmp_path / "new").exists()
 
 
-def test_another_specification_in_the_same_folder_is_rejected(made, tmp_path, capsys):
+def test_folders_with_other_contents_are_refused(made, tmp_path, capsys):
     before = contents(made)
-    changed = {"seed": ("5", "4"), "scenes": ("4", "3"), "keyframes": ("4", "2"), "version": ("v2", VERSION)}
-    changed |= {"sensor": (NUSCENES_HDL32E.name, "tiny"), "rolling_shutter": ("False", "True")}
-    changed |= {"streets": ("plain", "city")}
-    for name, (got, begun) in changed.items():
-        line = refusal(capsys, made, *(["--no-rolling-shutter"] if got == "False" else [f"--{name}", got]))
-        assert f"{name}: got {got}, expected {begun} as in the data set begun there" in line
     (tmp_path / "near.json").write_text(json.dumps({**sensor_to_json(TINY), "limit_xy_m": 9.0}))
-    line = refusal(capsys, made, "--sensor", str(tmp_path / "near.json"))
-    assert f"sensor.limit_xy_m: got 9.0, expected {TINY.limit_xy_m} as in the data set begun there" in line
-    other = {"forward_rad": 0.0, "origin_m": [1, 0, 2], "limit_z_m": [-3, 5]}  # the layout's own are written
-    (tmp_path / "moved.json").write_text(json.dumps({**sensor_to_json(TINY), **other}))
-    synthesize(made, "--sensor", str(tmp_path / "moved.json"))
-    assert contents(made) == before
-
-
-def test_folders_with_other_contents_are_rejected(made, tmp_path, capsys):
+    for option, value in (("seed", 5), ("scenes", 4), ("streets", "plain"), ("sensor", tmp_path / "near.json")):
+        line = refusal(capsys, made, f"--{option}", str(value))
+        assert f"{made}: found a data set begun with another {option}" in line
     own = tmp_path / "own"
     own.mkdir()
     (own / "thesis.txt").write_text("mine")
     assert "found other files, expected an empty folder" in refusal(capsys, own)
     assert contents(own) == {"thesis.txt": b"mine"}
-    assert "thesis.txt: found a file, expected a folder" in refusal(capsys, own / "thesis.txt")
-    copy = tmp_path / "copy"
-    shutil.copytree(made / ".synthesize", copy / ".synthesize")
-    for text, message in (("{", "not JSON"), ("[]", "order.json: $: got [], expected object")):
-        (copy / ".synthesize" / "order.json").write_text(text)
-        assert message in refusal(capsys, copy)
-
-
-def test_a_full_disk_gets_one_line_and_a_later_run_completes_the_work(made, tmp_path, capsys):
-    mount = ["mount", "-t", "tmpfs", "-o", "size=1500k", "t", str(tmp_path)]
-    if os.geteuid() or subprocess.run(mount, check=False, stderr=subprocess.DEVNULL).returncode:
-        pytest.skip("no right to mount a small tmpfs")
-    try:
-        assert cli.main(command(tmp_path / "data")) == 1
-        last = capsys.readouterr().err.strip().splitlines()[-1]
-        assert not (tmp_path / "data" / VERSION).exists()
-        sizes = {file.stat().st_size for file in tmp_path.rglob("*.bin")}
-        assert sizes == {TINY.num_rows * TINY.num_columns * 5 * 4}
-        subprocess.run(["mount", "-o", "remount,size=64m", tmp_path], check=True)
-        whole = contents(synthesize(tmp_path / "data"))
-    finally:
-        subprocess.run(["umount", tmp_path], check=True)
-    assert last.startswith("fcos-lidar: error: ")
-    assert "No space left on device" in last
-    assert whole == contents(made)
+    moved = {"forward_rad": 0.0, "origin_m": [1, 0, 2], "limit_z_m": [-3, 5]}  # the layout's own are written
+    (tmp_path / "moved.json").write_text(json.dumps({**sensor_to_json(TINY), **moved}))
+    synthesize(made, "--sensor", str(tmp_path / "moved.json"))
+    assert contents(made) == before

@@ -8,7 +8,6 @@ from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.box_geometry import count_inside
 from fcos_lidar_jax.data.frame import Frame
-from fcos_lidar_jax.input_pipeline.batching import make_batch
 from fcos_lidar_jax.projection import image_cells
 from fcos_lidar_jax.sensors import ARGOVERSE2, NUSCENES_HDL32E, SHORT_RANGE, TINY, WAYMO_TOP
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -62,20 +61,11 @@ def test_frames_are_level_with_separate_objects_of_all_classes():
     assert 0.1 < moving / len(labels) < 0.6
 
 
-def test_batches_are_padded_and_never_truncated():
-    frames = [make_frame(i, TINY) for i in range(2)]
-    batch = make_batch(frames, max_points=4096, max_boxes=16)
-    for i, frame in enumerate(frames):
-        for name, valid in (("points", batch.valid), ("boxes", batch.box_valid), ("labels", batch.box_valid)):
-            np.testing.assert_array_equal(getattr(batch, name)[i][valid[i]], getattr(frame, name))
-    with pytest.raises(ValueError, match=r"frame 0: points: got \d+, expected at most 100"):
-        make_batch(frames, max_points=100, max_boxes=16)
-    with pytest.raises(ValueError, match=r"boxes: got \d+, expected at most 2"):
-        make_batch(frames, max_points=4096, max_boxes=2)
-
-
 def test_simulated_frames_annotate_near_objects_with_enough_points():
-    near, complete = SimulatedFrames(TINY, 6, reach_m=8.0), SimulatedFrames(TINY, 6, reach_m=8.0, min_points=1)
+    near, complete = (SimulatedFrames(TINY, 6, 7, reach_m=8.0, min_points=least) for least in (5, 1))
+    assert [near.name(index) for index in (0, 2)] == ["seed 7", "seed 9"]
+    with pytest.raises(IndexError):
+        near.frame(6)
     hidden = 0
     for i in range(6):
         frame, whole = near.frame(i), complete.frame(i)
@@ -85,7 +75,7 @@ def test_simulated_frames_annotate_near_objects_with_enough_points():
         hidden += len(whole.boxes) - len(frame.boxes)
         assert not (np.abs(frame.points[:, :2]) < 1).all(axis=1).any()  # the ego vehicle
     assert hidden > 0
-    sets = complete, SimulatedFrames(TINY, 6, reach_m=20.0, min_points=1)
+    sets = complete, SimulatedFrames(TINY, 6, 7, reach_m=20.0, min_points=1)
     boxes = (np.concatenate([frames.frame(i).boxes for i in range(6)]) for frames in sets)
     distance, far = (np.median(np.hypot(*b[:, :2].T)) for b in boxes)
     assert distance < 0.8 * far
@@ -93,7 +83,7 @@ def test_simulated_frames_annotate_near_objects_with_enough_points():
 
 @pytest.fixture(scope="module")
 def fast_frames() -> list[Frame]:
-    return [make_frame(seed, SHORT_RANGE, **FUSED) for seed in range(12)]
+    return [make_frame(seed, SHORT_RANGE, **FUSED) for seed in range(8)]
 
 
 def test_fused_frames_are_reproducible_and_annotated_by_the_current_sweep(fast_frames):
@@ -110,24 +100,6 @@ def test_fused_frames_are_reproducible_and_annotated_by_the_current_sweep(fast_f
     laser = make_frame(0, ARGOVERSE2, reading=CloudReading(2, "none"))
     assert laser.points.shape[1] == 6
     assert set(np.unique(laser.points[:, 5])) <= set(range(64))
-
-
-def test_most_objects_in_fast_traffic_move_fast(fast_frames):
-    boxes, labels = (np.concatenate([getattr(f, name) for f in fast_frames]) for name in ("boxes", "labels"))
-    names, speed = np.array(NUSCENES_CLASSES)[labels], np.hypot(boxes[:, 7], boxes[:, 8])
-    moving = speed > 0.5
-    usual = np.concatenate([make_frame(seed, SHORT_RANGE, **NEAR).boxes for seed in range(12)])
-    usual_speed = np.hypot(usual[:, 7], usual[:, 8])
-    assert 0.5 < moving.mean() < 0.9
-    assert moving.mean() > 1.5 * (usual_speed > 0.5).mean()
-    assert np.median(speed[moving]) > 1.3 * np.median(usual_speed[usual_speed > 0.5])
-    assert (speed > 8).mean() > 0.4
-    driven = moving & np.isin(names, ["car", "truck", "bus", "trailer", "construction_vehicle", "motorcycle"])
-    assert speed[driven].min() >= 7.99
-    assert speed[driven].max() <= 20.01
-    assert moving[np.isin(names, ["pedestrian", "motorcycle", "bicycle"])].all()
-    assert not moving[np.isin(names, ["traffic_cone", "barrier"])].any()
-    assert min((boxes[driven, 8] > 0).sum(), (boxes[driven, 8] < 0).sum()) > 5  # same direction and oncoming
 
 
 def test_old_points_of_moving_objects_trail_by_velocity_times_lag(fast_frames):
@@ -152,27 +124,15 @@ def test_old_points_of_moving_objects_trail_by_velocity_times_lag(fast_frames):
         np.testing.assert_array_equal(counts.argmax(axis=1), np.ones(10))
 
 
-def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep():
+def test_close_points_of_fused_sweeps_are_removed_in_the_frame_of_their_sweep(fast_frames):
     frames = SimulatedFrames(SHORT_RANGE, 3, 5, reading=CloudReading(10), fast_traffic=True)
     passed = 0
     for i in range(3):
-        frame = frames.frame(i)
-        whole = make_frame(5 + i, SHORT_RANGE, **FUSED)
-        shown = whole.num_points >= 5
-        np.testing.assert_array_equal(frame.boxes, whole.boxes[shown])
-        np.testing.assert_array_equal(frame.num_points, whole.num_points[shown])
-        np.testing.assert_array_equal(frames.labels(i), whole.labels[shown])
+        frame, whole = frames.frame(i), fast_frames[5 + i]
+        np.testing.assert_array_equal(frame.boxes, whole.boxes[whole.num_points >= 5])
         dropped = [(whole.points[:, 4] == lag).sum() - (frame.points[:, 4] == lag).sum() for lag in LAGS]
         assert 0 < 0.9 * max(dropped) < min(dropped)  # each sweep sees the same ego vehicle
         close, old = (np.abs(frame.points[:, :2]) < 1).all(axis=1), frame.points[:, 4] > 0
         assert not (close & ~old).any()
         passed += (close & old).sum()  # points ahead of the ego vehicle that it has since reached
     assert passed > 20
-
-
-def test_frames_beyond_the_number_are_refused():
-    frames = SimulatedFrames(TINY, 3, first_seed=7)
-    assert [frames.name(index) for index in (0, 2)] == ["seed 7", "seed 9"]
-    for get in (frames.frame, frames.name):
-        with pytest.raises(IndexError):
-            get(3)

@@ -165,24 +165,6 @@ def test_solids_stay_within_annotated_boxes(name):
             assert 0.85 * size[2] < ends[..., 2].max() <= reach[2], size
 
 
-def test_side_views_of_cars_and_trucks_differ():
-    """Models of the same size fill different parts of the side view, depending on the class."""
-    x, z = np.linspace(-3.4, 3.4, 60)[:, None, None], np.linspace(0.1, 2.5, 40)[:, None]
-    fills = {}
-    for name in ("car", "truck", "bus", "construction_vehicle"):
-        fills[name] = []
-        for model in OBJECT_MODELS[name]:
-            solids = object_solids(model, np.array([7.0, 2.4, 2.6]), 0.2)
-            solids = solids[(solids["kind"] == BOX) & np.isinf(solids["density"])]
-            center, half = solids["center"], solids["half"]
-            inside = (np.abs(x - center[:, 0]) <= half[:, 0]) & (np.abs(z - center[:, 2]) <= half[:, 2])
-            fills[name].append(inside.any(-1))
-    for car in fills.pop("car"):
-        for name, others in fills.items():
-            for other in others:
-                assert (car & other).sum() / (car | other).sum() < 0.8, name
-
-
 def test_attributes_follow_class_and_speed():
     for name, speed, expected in (
         ("car", 0.3, "vehicle.moving"),
@@ -278,18 +260,6 @@ def test_the_seen_share_is_the_share_of_unblocked_rays():
     assert share[0] == pytest.approx(1 - hidden / wide, abs=0.04)
     assert share[1] == share[2] == 1
     assert [visibility_of(s) for s in share] == ["2", "4", "4"]
-
-
-def test_returns_from_far_dark_and_grazing_surfaces_are_lost():
-    kept = []
-    for x, albedo in ((10, 0.5), (55, 0.5), (55, 0.01)):
-        wall = make_solids(BOX, [x, 0, 0], [0.5, 40, 8], albedo=albedo)
-        sweep = scan_fine(made_by_hand(make_motion(), scenery=wall))
-        kept.append(sweep.returned.reshape(-1, FINE.num_rows)[:, 5:].sum())  # rising rays
-    near, far, dark = kept
-    assert near > 1.5 * far > 1.5 * dark
-    lasers = scan_fine(made_by_hand(make_motion())).returned.reshape(-1, FINE.num_rows)
-    assert lasers[:, 0].mean() > 0.9 > lasers[:, 4].mean()  # the ground at 18 m and beyond 70 m
 
 
 def test_intensity_follows_material_and_angle():

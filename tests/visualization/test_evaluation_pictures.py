@@ -111,6 +111,10 @@ def test_the_view_fits_points_to_one_side_and_their_boxes_but_no_full_turn(drawn
     np.testing.assert_allclose([*upright.get_xlim(), *upright.get_ylim()], [-8, 42, -2, 32])
     assert all((*axis.get_xlim(), *axis.get_ylim()) == (-50, 50) * 2 for axis in whole)
     assert {axis.get_aspect() for axis in (fitted, upright, *whole)} == {1.0}
+    assert (fitted.get_xlabel(), fitted.get_ylabel()) == (
+        "x [m]",
+        "y [m]",
+    )  # which way is ahead depends on the data
     width, height = np.transpose([figure.get_size_inches() for figure in drawn])
     assert (width == 9).all()
     assert height[1] < height[0] < height[2] == height[3] == 9.5
@@ -134,10 +138,3 @@ def test_long_titles_are_whole(drawn, name, kind):
         assert (low >= 0).all()
         assert (high <= figure.bbox.max).all()
         assert "".join(title.get_text().split()) == "".join(name.replace("\udcff", "?").split())
-
-
-def test_axis_labels_do_not_name_a_forward_direction(drawn):
-    bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=10, classes=())
-    axis = drawn[0].axes[0]
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("x [m]", "y [m]")
-    assert [line.get_marker() for line in axis.lines] == ["+"]

