@@ -15,8 +15,7 @@ The verdict follows from the 95 % interval of the gain over the seeds:
 
 import dataclasses
 import re
-import statistics
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from experiments.paper import PAPER
 from experiments.paper_tables.__main__ import TABLES
 from experiments.paper_tables.cells import changes_of, read_cells
 from experiments.paper_tables.scales import Simulated, quarter
-from experiments.paper_tables.tables import Row, Table
+from experiments.paper_tables.tables import SCORES, Row, Table
 from experiments.script import run_script, write_text
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
 from experiments.studies import mrv_ablations
@@ -35,10 +34,9 @@ RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parent / "README.md"
 _DIRECTION = "agrees only in direction"
 _OUR_NDS = (
-    " Simulated objects have no attributes, so the attribute error is 1 in every row. The mean\n"
-    "velocity error exceeds 1 m/s in all cells that record it (most with local geometry, most of CenterPoint)\n"
-    "and adds nothing to NDS, which is then at most 80. The paper's gains may include gains in these two errors;\n"
-    "the gains here do not."
+    "Simulated objects have no attributes, so the attribute error is 1 in every row. The mean velocity error\n"
+    "exceeds 1 m/s in all cells that record it (most with local geometry, most of CenterPoint). Both add nothing\n"
+    "to NDS, which is then at most 80. The paper's gains may include gains in these errors; the gains here do not."
 )
 _MARKS = ("<!-- the ledger: python -m experiments.ledger --write -->\n", "<!-- end of the ledger -->\n")
 
@@ -60,7 +58,6 @@ class Figure:
     value: Callable[[Any], float]  # Computes our figure from the file's content.
     paper: float  # The paper's figure.
     above: bool = False  # The paper states a lower bound.
-    decides: str = ""  # What would settle a disagreement.
 
 
 def _kept(rounds: int, column: str) -> Callable[[Any], float]:
@@ -80,7 +77,6 @@ def _paper_ratio(table: str, row: str, reference: str) -> float:
     return rows[row]["time_ms"] / rows[reference]["time_ms"]
 
 
-_ON_A_GPU = "the same measurement on a GPU"
 FIGURES = (
     Figure("Points that one round keeps, thousands", "mrv_figures", lambda d: _kept(1, "kept")(d) / 1000, 28),
     Figure("Points that five rounds keep, %", "mrv_figures", _kept(5, "percent"), 50, above=True),
@@ -89,7 +85,6 @@ FIGURES = (
         "mrv_figures",
         lambda d: d["times"]["multi"]["7"]["ratio"],
         _paper_ratio("table1", "multi, 7", "multi, 1"),
-        decides=_ON_A_GPU,
     ),
     *(
         Figure(
@@ -97,7 +92,6 @@ FIGURES = (
             "module_latency",
             _stem(variant),
             _paper_ratio(table, key, reference),
-            decides=_ON_A_GPU,
         )
         for row, variant, table, key, reference in (
             ("one group", "one group", "table3", "1 group", "9 groups"),
@@ -144,7 +138,7 @@ def verdict_of_figure(figure: Figure, ours: float) -> str:
 
 
 def verdict(gains: list[float], paper: float) -> tuple[str, str]:
-    """Compare gains, one per seed, with the paper's gain; returns the verdict and what would settle or reverse it.
+    """Compare gains, one per seed, with the paper's gain; returns the verdict and the seeds that would settle it.
 
     An undecided claim names the number of seeds with which the interval would separate the paper's gain from zero
     in about half of the cases, if further seeds have the same deviation.
@@ -154,9 +148,9 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
     >>> verdict([4.0, 4.1, 4.2], 1.9)[0]
     'agrees only in direction'
     >>> verdict([-2.0, -2.1, -2.2], 1.9)
-    ('disagrees', "a training run as long as the paper's")
+    ('disagrees', '')
     >>> verdict([-1.0, 0.5, 2.0], 1.0)
-    ('undecided', '12 seeds, or longer training')
+    ('undecided', '12 seeds')
     >>> verdict([2.0, 2.1], 1.9)  # two seeds say nothing about their spread
     ('undecided', 'more seeds')
     """
@@ -165,10 +159,10 @@ def verdict(gains: list[float], paper: float) -> tuple[str, str]:
         return "undecided", "more seeds"
     _, low, high = bounds
     if low <= 0 <= high and low <= paper <= high:
-        return "undecided", f"{seeds_needed(gains, paper)} seeds, or longer training"
+        return "undecided", f"{seeds_needed(gains, paper)} seeds"
     if (low > 0 and paper > 0) or (high < 0 and paper < 0):
         return "agrees" if low <= paper <= high else _DIRECTION, ""
-    return "disagrees", "a training run as long as the paper's"
+    return "disagrees", ""
 
 
 def gains_of(table: Table, row: Row, scale: Simulated, cells: Path, score: str = "mAP") -> tuple[list[float], int]:
@@ -191,8 +185,7 @@ def figure_lines(results: Path) -> Iterator[str]:
         said = verdict_of_figure(figure, ours)
         paper = f"more than {figure.paper:g}" if figure.above else f"{figure.paper:.3g}"
         source = f"[{figure.file}](results/{figure.file}.json)"
-        decides = "" if said == "agrees" else figure.decides
-        yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} | {decides} |"
+        yield f"| {figure.claim} | {paper} | {ours:.3g} | {source} | {said} |"
 
 
 def claims(score: str) -> Iterator[tuple[str, Table, Row, float]]:
@@ -201,49 +194,60 @@ def claims(score: str) -> Iterator[tuple[str, Table, Row, float]]:
         for row in table.rows:
             label, paper = table.reference_of(row).label, table.paper_difference(row).get(score)
             if row.label != label and paper is not None:
-                yield f"{table.title}: {row.label} instead of {label}", table, row, paper
-    for sizes, ablations in (("small networks", mrv_ablations.SMALL), ("sizes of compact", mrv_ablations.TABLE)):
+                yield f"{table.name}: {row.label} instead of {label}", table, row, paper
+    for sizes, ablations in (("small", mrv_ablations.SMALL), ("compact", mrv_ablations.TABLE)):
         rows = {row.label: row for row in ablations.rows}
         for (label, reference), (name, *pair_of_paper) in LOCAL_GEOMETRY.items():
             theirs, base = (PAPER["tables"][name]["rows"][key][score] for key in pair_of_paper)
             row, full = rows[label], label if reference != "without priority" else "with priority"
-            claim = f"With local geometry, {sizes}: {full} instead of {reference}"
+            claim = f"local geometry, {sizes}: {full} instead of {reference}"
             pair = Table(ablations.name, ablations.title, (rows[reference], row), reference)
             yield claim, pair, row, round(theirs - base, 2)
 
 
-def training_lines(results: Path, score: str) -> tuple[list[str], list[str]]:
-    """Return a line of Markdown for each claim about a score, and the claims without a pair of cells."""
-    scale, lines, missing = quarter(Path("unused")), list[str](), list[str]()
-    for claim, table, row, paper in claims(score):
-        gains, samples = gains_of(table, row, scale, results / "tables" / scale.name, score)
-        if not gains:
-            missing.append(f"- {claim}")
-            continue
-        said, decides = verdict(gains, paper)
-        mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
-        ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
-        source = f"{scale.name}, {len(gains)} seed{'s' if len(gains) > 1 else ''}, {samples:,} samples"
-        deviation = f"{statistics.stdev(gains):.2f}" if len(gains) > 1 else "-"
-        power = f"{deviation} | {seeds_needed(gains)}"
-        lines.append(f"| {claim} | {paper:+.2f} | {ours} | {power} | {source} | {said} | {decides} |")
+def training_lines(results: Path) -> tuple[list[str], int]:
+    """Return a line of Markdown for each claim about accuracy, and the number of claims without scores."""
+    scale, lines, missing = quarter(Path("unused")), list[str](), 0
+    papers = {score: {claim: paper for claim, _, _, paper in claims(score)} for score in SCORES}
+    for claim, table, row, _ in claims("mAP"):
+        cells = [claim]
+        for score in SCORES:
+            gains, samples = gains_of(table, row, scale, results / "tables" / scale.name, score)
+            if gains:
+                paper = papers[score][claim]
+                mean, *bounds = interval(gains) or (sum(gains) / len(gains),)
+                ours = f"{mean:+.1f}" + (f" [{bounds[0]:+.1f}, {bounds[1]:+.1f}]" if bounds else "")
+                cells += [f"{len(gains)}, {samples:,}"] if score == "mAP" else []
+                cells += [f"{paper:+.2f}", ours, ": ".join(filter(None, verdict(gains, paper)))]
+        if len(cells) > 1:
+            lines.append(f"| {' | '.join(cells)} |")
+        else:
+            missing += 1
     return lines, missing
 
 
-def _head(*columns: str) -> str:
-    names = ("claim", "paper", *columns, "verdict", "what would settle or reverse it")
-    return f"| {' | '.join(names)} |\n{'|---' * len(names)}|\n"
+def _table(columns: tuple[str, ...], lines: Iterable[str]) -> str:
+    return "\n".join((f"| {' | '.join(columns)} |", f"{'|---' * len(columns)}|", *lines))
 
 
 def as_markdown(results: Path) -> str:
     """Format the whole ledger."""
-    parts = ["Without training:\n\n" + _head("here", "from") + "\n".join(figure_lines(results))]
-    head = _head("here", "deviation", "seeds", "from")
-    lines, missing = training_lines(results, "mAP")
-    for score, rows, note in (("mAP", lines, ""), ("NDS", training_lines(results, "NDS")[0], _OUR_NDS)):
-        parts.append(f"Gains in points of {score}.{note}\n\n{head}" + "\n".join(rows))
-    if missing:
-        parts.append("Without scores of both rows for a seed:\n\n" + "\n".join(missing))
+    lines, missing = training_lines(results)
+    columns = (
+        "gain in points",
+        "seeds, samples",
+        "mAP, paper",
+        "here",
+        "verdict",
+        "NDS, paper",
+        "here",
+        "verdict",
+    )
+    parts = [
+        _table(("without training", "paper", "here", "from", "verdict"), figure_lines(results)),
+        _table(columns, lines),
+        f"{missing} other claims have no scores of both rows for a seed.\n\n{_OUR_NDS}",
+    ]
     return "\n\n".join(parts) + "\n"
 
 

@@ -121,9 +121,8 @@ COMPACT = dataclasses.replace(
 Layers at stride 1 cost most, so they are narrower than the later ones (``experiments/LOG.md``, 2026-11-22). When
 more training no longer helped, stem, first stage, pyramid and heads were widened, and the first stage got a third
 block (2026-11-27). Doubled rows contain the same points. The image wraps around, so there is no seam behind the
-vehicle. NMS at 0.1, weighted NMS and the IoU exponent are not in the paper;
-``python -m experiments.studies.post_processing`` measures what each adds. The regression axes are not in the paper
-either, nor is the second look, which orders the boxes better; ``experiments/LOG.md`` has what both add.
+vehicle. NMS at 0.1, weighted NMS, the IoU exponent, the regression axes and the second look are not in the paper;
+``experiments/LOG.md`` has what each adds.
 """
 
 KITTI_COMPACT = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Tables: rows, training of their cells, record, Markdown and pictures."""
+"""Tables: rows, training of their cells, record, Markdown and curves. ``cells.csv`` has the other scores."""
 
 import contextlib
 import dataclasses
@@ -19,17 +19,10 @@ from experiments.paper_tables.grid import run_cells
 from experiments.paper_tables.scales import NuScenesLayout, Scale, Simulated, quarter, smoke
 from experiments.script import compact_json, write_text
 from experiments.statistics import MIN_SEEDS, interval, seeds_needed
-from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import config_to_json
 from fcos_lidar_jax.files import file_lock
 
 SCORES = ("mAP", "NDS")
-_ERRORS = {
-    "trans_err": "translation, m",
-    "scale_err": "scale, 1 - IoU",
-    "orient_err": "orientation, rad",
-    "vel_err": "velocity, m/s",
-}
 _SMOKE_NOTE = "the scores mean nothing"
 
 
@@ -157,11 +150,6 @@ def run_table(table: Table, args: Args) -> dict[str, Any]:
         written = {**{name: value for name, value in record.items() if name != "trained_on"}, "rows": rows, **here}
         write_text(file.with_suffix(".json"), compact_json(written, 3) + "\n")
         write_text(file.with_suffix(".md"), text)
-        picture = file.with_suffix(".png")
-        if len(seeds) > 1 and cells:
-            draw(table, record, picture)
-        else:
-            picture.unlink(missing_ok=True)  # A picture of other seeds.
         if any(cell and "curve" in cell for row in record["rows"] for cell in row.get("scores", ())):
             draw_learning(table, record, file.with_name(f"{file.name}_curves.png"))
     return record
@@ -265,50 +253,9 @@ def as_markdown(table: Table, record: dict[str, Any]) -> str:
     drawn = ", seed by seed; 95 % intervals of Student's t" if len(record["seeds"]) > 1 else ""
     lines += ["", f"Differences are to {_references(record)}{drawn}.", *_power(record), *_warnings(record), ""]
     lines += [f"{row['label']}: {line}" for row in record["rows"] for line in row.get("diverged", ())]
-    lines += by_distance(record["rows"]) + true_positive_errors(record["rows"])
     if trained:
         lines += [f"Trained by revision {'; '.join(record['cells_of'])}.", ""]
     return "\n".join(lines + [str(line) for line in record["figures"].get("lines", [])]) + "\n"
-
-
-def by_distance(rows: list[dict[str, Any]]) -> list[str]:
-    """Format mAP and AP by distance and class, and the time of the training steps, for rows that have them."""
-    table, seconds = list[str](), list[str]()
-    for row in rows:
-        cells = [cell for cell in row.get("scores", ()) if cell and "ranges" in cell]
-        for span in cells[0]["ranges"] if cells else ():
-            every = [cell["ranges"][span] for cell in cells]
-            classes = [name for name in NUSCENES_CLASSES if all(name in scores["AP"] for scores in every)]
-            means = {name: 100 * np.mean([scores["AP"][name] for scores in every]) for name in classes}
-            values = [100 * np.mean([scores["mAP"] for scores in every]), *map(means.get, NUSCENES_CLASSES)]
-            table.append("| " + " | ".join([row["label"], span, *(_number(value) for value in values)]) + " |")
-        if cells:
-            taken = np.mean([cell["seconds_of_steps"] for cell in cells]) / 60
-            seconds.append(f"{row['label']} {taken:.0f}")
-    if not table:
-        return []
-    header = ["", "distance", "mAP", *(name.replace("_", " ") for name in NUSCENES_CLASSES)]
-    title = "mAP and AP of the classes by distance from the sensor, means over the seeds:"
-    rule = "|---" * len(header) + "|"
-    said = f"Minutes of the training's steps, on machines that may have done other things: {', '.join(seconds)}."
-    return [title, "", "| " + " | ".join(header) + " |", rule, *table, "", said, ""]
-
-
-def true_positive_errors(rows: list[dict[str, Any]]) -> list[str]:
-    """Format nuScenes' errors of true positives, for rows that have them."""
-    table = list[str]()
-    for row in rows:
-        scores = [cell for cell in row.get("scores", ()) if cell]
-        cells = [cell["errors"] for cell in scores if "errors" in cell]
-        label = row["label"] + (f" ({len(cells)} of {len(scores)} seeds)" if len(cells) < len(scores) else "")
-        for kind in cells[0] if cells else ():
-            values = [np.mean([cell[kind].get(name, np.nan) for cell in cells]) for name in _ERRORS]
-            table.append("| " + " | ".join([label, kind, *map(_number, values)]) + " |")
-    if not table:
-        return []
-    title = "Errors of true positives, of all classes and of cars, means over the seeds:"
-    header = ["", "classes", *_ERRORS.values()]
-    return [title, "", "| " + " | ".join(header) + " |", "|---" * len(header) + "|", *table, ""]
 
 
 def _power(record: dict[str, Any]) -> Iterator[str]:
@@ -360,34 +307,6 @@ def _text(value: dict[str, Any] | None, sign: bool = False) -> str:
         return "-"
     mean, *bounds = (_number(v, sign) for v in (value["interval"] or [value["mean"]]))
     return f"{mean} [{', '.join(bounds)}]" if bounds else mean
-
-
-def draw(table: Table, record: dict[str, Any], path: Path) -> None:
-    """Draw our differences in mAP with intervals, and the paper's differences."""
-    from fcos_lidar_jax.visualization.figure import new_figure, save_png
-
-    rows = record["rows"]
-    figure = new_figure(7.5, 1.4 + 0.45 * len(rows))
-    axis = figure.add_subplot()
-    for i, row in enumerate(rows):
-        ours, paper = row["mAP_difference"], row["paper_difference"].get("mAP")
-        if ours is not None:
-            mean, low, high = ours["interval"] or [ours["mean"]] * 3
-            bars = {"xerr": [[mean - low], [high - mean]], "fmt": "o", "color": "#0072b2"}
-            axis.errorbar(mean, i, **bars, label="ours, 95 % interval")
-        if paper is not None:
-            axis.plot(paper, i, "D", color="#d55e00", markersize=5, label="paper")
-    axis.axvline(0, color="#888888", linewidth=0.8)
-    axis.set_yticks(range(len(rows)), [row["label"] for row in rows])
-    axis.set_ylim(len(rows) - 0.5, -0.5)
-    axis.set_xlabel(f"mAP, points more than {_references(record)}".replace(" or ", " or\n"))
-    note = f", {_SMOKE_NOTE}" if record["scale"] == "smoke" else ""
-    figure.suptitle(f"{table.title}\n({record['scale']}, {len(record['seeds'])} seeds{note})", fontsize=11)
-    handles, labels = axis.get_legend_handles_labels()
-    kinds = dict(zip(labels, handles, strict=True))
-    axis.legend(kinds.values(), kinds.keys(), fontsize=9, frameon=False)
-    axis.spines[["top", "right"]].set_visible(False)
-    save_png(figure, path)
 
 
 def draw_learning(table: Table, record: dict[str, Any], path: Path) -> None:

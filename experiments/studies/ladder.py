@@ -14,7 +14,7 @@ in the same step ("joint"), or afterwards on the same frames, with the first tri
 
 The same command resumes a trial. Trials that are already in the file of ``--out`` are not repeated: with
 ``--out experiments/results/ladder.json`` it prints the table of the committed trials. ``experiments/LOG.md`` has
-one line per trial. Cost: half an hour of one core per trial, and some minutes once for the frames.
+an entry per question. Cost: half an hour of one core per trial, and some minutes once for the frames.
 """
 
 import dataclasses
@@ -33,7 +33,6 @@ from experiments.runs import benchmark, detections, trained
 from experiments.script import Options, run_script, save
 from experiments.statistics import interval
 from experiments.studies.centerpoint import PEER
-from experiments.studies.round_use import FirstRound
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading, Config, RefinementConfig
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
@@ -41,6 +40,7 @@ from fcos_lidar_jax.data.frame import Frame, FrameSet, SelectedFrames, WrappedFr
 from fcos_lidar_jax.files import checksum, read_json
 from fcos_lidar_jax.models import count_parameters
 from fcos_lidar_jax.presets import COMPACT, NUSCENES
+from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, sector
 from fcos_lidar_jax.simulation.frame_set import UNSEEN_SEED, SimulatedFrames
 from fcos_lidar_jax.simulation.streets import CITY
@@ -51,6 +51,7 @@ SENSOR = sector(NUSCENES_HDL32E, math.pi / 2, 272)
 TRAIN_FRAMES, TEST_FRAMES, CURVE_FRAMES, STEPS = 4000, 200, 60, 3000
 DISTANCES_M = ("0.5", "1.0", "2.0", "4.0")
 _BEHIND_M = 1.0  # Distance of a mark from the object's point.
+_STEP = 8192  # Clouds are padded to its multiples, so that few sizes are compiled.
 _BONNET_M = 2.1  # Nearer points are on the bonnet of the ego vehicle, as in the scale ``sector``.
 _SIZES = ("stem", "backbone_blocks", "backbone_widths", "fpn_channels", "head_channels")
 _LARGER = {f"model__{name}": getattr(COMPACT.model, name) for name in _SIZES}
@@ -95,6 +96,25 @@ class Args(Options):
 
 
 @dataclasses.dataclass(frozen=True)
+class FirstRound(WrappedFrames):
+    """Frames reduced to the points that the first round keeps, in their order; the annotations stay."""
+
+    frames: FrameSet
+
+    def frame(self, index: int) -> Frame:
+        frame = self.frames.frame(index)
+        number = len(frame.points)
+        points = np.pad(frame.points, ((0, -number % _STEP), (0, 0)))
+        valid = np.arange(len(points)) < number
+        image = project_points(points, valid, self.sensor, num_rounds=1, prioritize_current=False)
+        kept = np.unique(image.point_index)
+        return dataclasses.replace(frame, points=frame.points[kept[kept >= 0]])
+
+    def fingerprint(self) -> str:
+        return checksum(repr((self.frames.fingerprint(), "first round", False)).encode())
+
+
+@dataclasses.dataclass(frozen=True)
 class Marked(WrappedFrames):
     """Frames whose first round is the cloud's, and whose second round has a point only where there is an object.
 
@@ -104,7 +124,7 @@ class Marked(WrappedFrames):
     frames: FrameSet
 
     def frame(self, index: int) -> Frame:
-        frame = FirstRound(self.frames, prioritize_current=False).frame(index)
+        frame = FirstRound(self.frames).frame(index)
         inside = points_in_boxes(frame.points, frame.boxes)
         marks = frame.points[np.unique(np.concatenate([np.zeros(0, int), *inside]))]
         marks[:, :3] *= 1 + _BEHIND_M / np.linalg.norm(marks[:, :3], axis=1, keepdims=True)

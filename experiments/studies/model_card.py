@@ -7,11 +7,9 @@ Writes ``fcos_lidar_jax/weights/NAME/README.md`` from ``NAME.json``, written by 
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
 
 import fcos_lidar_jax
 from experiments.script import run_script, write_text
@@ -81,52 +79,22 @@ def _about(name: str, record: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
-    trained = record["training"]
+    legs = [*record["earlier"], record["training"]]
+    frames = sum(leg["frames_seen"] for leg in legs)
+    chain = f"{len(legs)} trainings, each from the weights of the one before" if len(legs) > 1 else "one training"
+    last = legs[-1]
+    only = ""
+    if "trained" in last:
+        numbers = f"{last['num_boxes']} boxes of at most {last['num_points']} points per frame"
+        only = f"\nThe last training changed only the second look ({numbers})."
     yield "\n## Training data\n"
-    yield "Only simulated streets:\n"
-    for leg in (*record["earlier"], trained):
-        streets = f"{leg['streets']:,} streets" if "streets" in leg else "as many streets"
-        steps = f"{leg['steps']:,} of {leg['steps_planned']:,} planned steps"
-        done = f"{leg['frames_seen']:,} frames of {streets}, {steps}"
-        seconds, machine = leg["seconds_of_steps"], f" on {leg['device']}" if "device" in leg else ""
-        time = f"{seconds / 3600:.1f} hours" if seconds > 3600 else f"{seconds / 60:.0f} minutes"
-        more = (f", {leg['parameters']:,} parameters" if "parameters" in leg else "") + _average(leg)
-        more += _second_look(leg)
-        yield f"- from {leg['begun_with']}, seed {leg['seed']}: {done}, {time} of training steps{machine}{more}"
-    if any(leg["begun_with"] == name for leg in (*record["earlier"], trained)):
-        yield f"\nA run from {name} started from the weights of the run before it. If the preset had become"
-        yield "larger, `experiments.studies.widened_weights` enlarged them first."
-    legs = (*record["earlier"], trained)
+    yield f"Only simulated streets: {frames:,} frames in {chain}.{only}"
+    yield f"`experiments/results/{name}.json` has the seeds, steps, scores and machines, and the weights that were"
+    yield "averaged. If the preset had become larger, `experiments.studies.widened_weights` enlarged them first."
     if share := next((leg["logit_adjustment"] for leg in reversed(legs) if "logit_adjustment" in leg), None):
         yield "\nnuScenes and the training streets have different class frequencies. So the export added"
         yield f"{share} log(frequency in nuScenes / frequency in training) to each class logit (logit adjustment)."
     yield f"\nTrained and exported by `python -m experiments.studies.shipped_weights --name {name} --work FOLDER`."
-    yield from _curve([*record["earlier"], trained])
-
-
-def _second_look(leg: Mapping[str, Any]) -> str:
-    if "trained" not in leg:
-        return ""
-    numbers = f"{leg['num_boxes']} boxes of at most {leg['num_points']} points per frame"
-    return f", only the second look ({numbers}), with everything else frozen"
-
-
-def _average(leg: Mapping[str, Any]) -> str:
-    if "averaged_with" not in leg:
-        return ""
-    share, other = (leg["averaged_with"][key] for key in ("share", "hash"))
-    return f"; averaged with earlier weights (share {share}, hash {other[:12]})"
-
-
-def _curve(legs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Table of the last mAP during each training, over the frames of all trainings."""
-    begins = np.cumsum([0, *(leg["frames_seen"] for leg in legs[:-1])]).tolist()
-    last = [(begin, *leg["curve"][-1]) for begin, leg in zip(begins, legs, strict=True) if leg["curve"]]
-    if not last:
-        return
-    yield "\nThe last score during each of these trainings, on the same few unseen frames:\n"
-    yield "| training frames, all together | mAP |\n|---|---|"
-    yield from (f"| {begin + seen:,} | {score:.3f} |" for begin, seen, score in last)
 
 
 def _figures(file: Path, weights: str) -> Iterator[str]:

@@ -10,7 +10,6 @@ import pytest
 from made_evaluation import make_task, random_boxes, truth_of
 from metrics_oracle import assert_numbers, score_frames
 
-from experiments.statistics import paired_difference
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
 from fcos_lidar_jax.evaluation.examples import choose_examples, sensor_boxes
@@ -203,8 +202,6 @@ def test_all_resampled_sets_are_scored_over_the_same_classes():
     drawn = bootstrap(evaluation, repeats=60)["mean_ap"]
     ap = evaluation.summary["mean_dist_aps"][OWN[0]]
     assert drawn["high"] < 0.75 * ap  # sets without the second class must not score the AP of the first class
-    other = evaluate_frames([*found, missed, missed], [*truths, rare, rare], metric_of(OWN))
-    assert paired_difference(evaluation, other, repeats=20) == (0, 0)
 
 
 def test_groups_of_samples_are_drawn_together():

@@ -1,7 +1,6 @@
 """The cache of frames: made once, bit-identical, recreated if damaged, refused for other frame sets."""
 
 import dataclasses
-import json
 import multiprocessing
 import pickle
 import re
@@ -14,7 +13,6 @@ from refusal import refused
 from toy_frames import ToyFrames, toy_frame
 
 from experiments.cached import CachedFrames
-from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.config import CloudReading
 from fcos_lidar_jax.data.frame import Frame
 from fcos_lidar_jax.sensors import SHORT_RANGE, TINY
@@ -107,55 +105,6 @@ def test_a_folder_of_other_frames_is_refused(tmp_path, toy):
         with refused(f"{folder / 'frames.json'}: {line}"):
             CachedFrames(other, folder)
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
-
-
-def test_a_folder_that_is_not_a_cache_is_refused(tmp_path, toy):
-    folder = tmp_path / "cache"
-    CachedFrames(toy, folder).frame(0)
-    description = folder / "frames.json"
-    record = json.loads(description.read_text())
-    for content, line in (
-        ("{", "not JSON"),
-        ("[]", "frames.json: $: got [], expected object"),
-        (json.dumps({**record, "more": 1}), "more: found 1, expected nothing"),
-        (json.dumps({**record, "version": "0.0.9"}), "version: found 0.0.9"),
-    ):
-        description.write_text(content)
-        with refused(line):
-            CachedFrames(toy, folder)
-    description.unlink()
-    with refused("found 000000.npz without frames.json, expected a new folder"):
-        CachedFrames(toy, folder)
-    (tmp_path / "file").touch()
-    with refused("found a file, expected a folder"):
-        CachedFrames(toy, tmp_path / "file")
-
-
-def test_frame_sets_that_json_cannot_describe_are_refused(tmp_path):
-    @dataclasses.dataclass(frozen=True)
-    class Opaque(Toy):
-        source: object = dataclasses.field(default_factory=object)
-
-    class Plain:
-        classes, sensor = NUSCENES_CLASSES, TINY
-        __len__, frame, labels, name = Toy.__len__, Toy.frame, Toy.labels, Toy.name
-
-    with refused("Opaque: expected fields that JSON can hold"):
-        CachedFrames(Opaque(), tmp_path / "cache")
-    with refused("got Plain, expected a dataclass"):
-        CachedFrames(Plain(), tmp_path / "cache")
-    assert not (tmp_path / "cache").exists()
-
-
-def test_a_frame_that_cannot_be_made_leaves_no_file(tmp_path):
-    class Broken(Toy):
-        def frame(self, index: int) -> Frame:
-            raise ValueError("no such street")
-
-    cached = CachedFrames(Broken(), tmp_path / "cache")
-    with refused("no such street"):
-        cached.frame(0)
-    assert [p.name for p in cached.folder.iterdir()] == ["frames.json"]
 
 
 def read_all(folder: Path, toy: Toy) -> list[Frame]:

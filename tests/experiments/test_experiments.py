@@ -43,27 +43,6 @@ def train_table(tmp_path, monkeypatch):
     return run
 
 
-def test_a_row_is_announced_when_its_training_begins_and_not_when_it_is_known(train_table, capsys):
-    rows = (Row("one", change(projection__num_rounds=1)), Row("three", change(projection__num_rounds=3)))
-    table = Table("own", "Own", rows, reference="one")
-    train_table(table, rows=("one",))
-    assert capsys.readouterr().err.splitlines() == ["cell 1 of 1: one, seed 0"]
-    train_table(table)
-    assert capsys.readouterr().err.splitlines() == ["cell 2 of 2: three, seed 0"]
-
-
-def test_a_table_of_ones_own_has_no_columns_of_the_paper_and_says_what_smoke_is_worth(train_table, tmp_path):
-    rows = (Row("one", change(projection__num_rounds=1)), Row("three", change(projection__num_rounds=3)))
-    for seeds in ((0,), (0, 1)):
-        train_table(Table("own", "Own", rows, reference="one"), seeds=seeds)
-        text = (tmp_path / "smoke" / "own.md").read_text()
-        assert "paper" not in text
-        assert "the scores mean nothing" in text
-        assert ("Two seeds can agree by chance" in text) == (len(seeds) == 2)
-    train_table(TABLES["table1"])
-    assert "mAP, paper | difference, paper" in (tmp_path / "smoke" / "table1.md").read_text()
-
-
 EXAMPLES = [p.relative_to(EXPERIMENTS.parent) for p in EXPERIMENTS.rglob("*.py") if ">>> " in p.read_text()]
 
 
@@ -72,15 +51,6 @@ def test_the_examples_in_the_docstrings_hold(name):
     result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.attempted > 0
     assert result.failed == 0
-
-
-def test_change_replaces_fields_at_any_depth():
-    changed = change(num_sweeps=1, model__stem__dilations=(1, 1, 1), projection__num_rounds=7)(NUSCENES)
-    assert (changed.num_sweeps, changed.model.stem.dilations, changed.projection.num_rounds) == (1, (1, 1, 1), 7)
-    back = dataclasses.replace(changed, num_sweeps=10, model=NUSCENES.model, projection=NUSCENES.projection)
-    assert back == NUSCENES
-    with pytest.raises(TypeError, match="roundz"):
-        change(projection__roundz=3)(NUSCENES)
 
 
 def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_table, capsys):
@@ -95,7 +65,6 @@ def test_tables_show_differences_seed_by_seed_beside_the_papers(tmp_path, train_
     assert text in capsys.readouterr().out
     assert "| multi, 5 rounds | 50.50 [44.15, 56.85] | +40.00 [+40.00, +40.00] | 57.08 | +2.06 |" in text
     assert "| multi, 1 round | 10.50 [4.15, 16.85] | - | 55.02 | - |" in text, "no difference to itself"
-    assert (tmp_path / "smoke" / "table1.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_table_names_the_seeds_that_each_difference_needs():
@@ -120,14 +89,6 @@ def test_a_table_names_the_seeds_that_each_difference_needs():
     assert "would exclude zero" not in text(2)
 
 
-def test_chosen_rows_come_with_their_references():
-    chosen = TABLES["table1"].only(("single, 5 rounds",))
-    assert [row.label for row in chosen.rows] == ["single, 1 round", "single, 5 rounds", "multi, 1 round"]
-    assert TABLES["table1"].only(()) == TABLES["table1"]
-    with pytest.raises(ValueError, match="--rows: got 'nine', expected some of: tied, untied"):
-        TABLES["table6"].only(("untied", "nine"))
-
-
 def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
     @dataclasses.dataclass
     class Looked(Pretended):
@@ -140,42 +101,6 @@ def test_learning_is_drawn_where_it_was_looked_at(tmp_path, train_table):
         drawn = folder / "smoke" / "table6_curves.png"
         assert drawn.exists() == isinstance(scale, Looked)
     assert drawn.read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_row_without_a_curve_is_left_out_of_the_picture(tmp_path):
-    """All of its cells diverged."""
-    curve = {"curve": [[100, 0.1], [200, 0.2]]}
-    rows = [{"label": "gone", "scores": [None, None]}, {"label": "there", "scores": [None, curve]}]
-    record = {"rows": rows, "scale": "sector", "seeds": [0, 1]}
-    tables.draw_learning(TABLES["table1"], record, tmp_path / "curves.png")
-    assert (tmp_path / "curves.png").stat().st_size > 1000
-
-
-def test_scores_by_distance_and_class_are_means_over_the_seeds(tmp_path):
-    spans = [{"all": {"mAP": 0.1, "AP": {"car": 0.2, "bus": 0.4}}}, {"all": {"mAP": 0.3, "AP": {"car": 0.4}}}]
-    cells = [{"ranges": one, "seconds_of_steps": 60 * (i + 1)} for i, one in enumerate(spans)]
-    rows = [{"label": "ours", "scores": [*cells, None]}, {"label": "untrained"}]
-    lines = tables.by_distance(rows)
-    names, values = (line.strip("| ").split(" | ") for line in (lines[2], lines[4]))
-    shown = dict(zip(["", *names], values, strict=True))
-    assert (shown[""], shown["distance"], shown["mAP"]) == ("ours", "all", "20.00")
-    assert (shown["car"], shown["bus"]) == ("30.00", "-")  # a bus is not in the frames of both seeds
-    assert any("ours 2" in line for line in lines[5:])  # minutes, rounded
-    assert tables.by_distance([{"label": "none", "scores": [{"mAP": 0.1}, None]}]) == []
-
-
-def test_errors_of_true_positives_are_means_over_the_seeds():
-    names = "trans_err", "scale_err", "orient_err", "vel_err", "attr_err"
-    errors = [
-        {"mean": dict(zip(names, (0.5, 0.2, 1.0, v, 1.0), strict=True)), "car": {"vel_err": v}} for v in (1, 2)
-    ]
-    rows = [{"label": "ours", "scores": [*({"errors": e} for e in errors), None]}, {"label": "untrained"}]
-    *_, whole, cars, _ = tables.true_positive_errors(rows)
-    assert whole == "| ours | mean | 0.50 | 0.20 | 1.00 | 1.50 |"
-    assert cars == "| ours | car | - | - | - | 1.50 |"
-    rows[0]["scores"].append({"mAP": 0.1})  # of a former version, without errors
-    assert tables.true_positive_errors(rows)[-3] == "| ours (2 of 3 seeds) | mean | 0.50 | 0.20 | 1.00 | 1.50 |"
-    assert tables.true_positive_errors([{"label": "none", "scores": [{"mAP": 0.1}, None]}]) == []
 
 
 def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_table):
@@ -196,23 +121,6 @@ def test_a_diverged_cell_is_reported_and_the_others_are_shown(tmp_path, train_ta
     gone = dataclasses.replace(scale, diverges=tuple((n, 0) for n in (1, 3, 5, 7)))
     record = train_table(TABLES["table1"], scale=gone, out=tmp_path / "gone", runs=tmp_path / "gone")
     assert all(row["mAP"] is None for row in record["rows"])
-
-
-def test_only_figures_leaves_the_finished_table_alone(tmp_path, train_table):
-    options = {"table": TABLES["table2"], "figures": lambda _: {"columns": {"with priority": {"kept": 3.0}}}}
-    train_table(**options)
-    before = (tmp_path / "smoke" / "table2.md").read_text()
-    assert "seeds [0]; epochs 40; batch size 2; accumulate 1; precision float32.\n" in before
-    assert "interval" not in before, "one seed has none"
-    train_table(**options, only_figures=True)
-    assert (tmp_path / "smoke" / "table2.md").read_text() == before
-    assert "3.00" in (tmp_path / "smoke" / "table2_figures.md").read_text()
-
-
-def test_a_picture_of_other_seeds_does_not_stay(tmp_path, train_table):
-    for seeds in ((0, 1), (0,)):
-        train_table(TABLES["table6"], seeds=seeds)
-        assert (tmp_path / "smoke" / "table6.png").exists() == (len(seeds) > 1)
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,12 @@
 
 import dataclasses
 import json
-import os
 import subprocess
-import sys
 
 import pytest
 
 from experiments.benchmarks import gpu_programs
-from experiments.benchmarks.gpu_programs import PROGRAMS, Args, all_programs, check, count_kernels
+from experiments.benchmarks.gpu_programs import PROGRAMS, Args, check, count_kernels
 from experiments.hardware import hardware
 from fcos_lidar_jax.presets import PRESETS
 
@@ -56,13 +54,6 @@ def test_kernels_are_counted_by_loop_and_of_branches_the_larger():
     assert loops == [(5, 2), (None, 1)]
 
 
-def test_all_programs_hold_every_preset_and_the_check():
-    programs = all_programs()
-    assert programs.items() >= PROGRAMS.items()
-    for kind in ("train", "detect"):
-        assert {p.preset for p in programs.values() if p.kind == kind} == set(PRESETS)
-
-
 @pytest.mark.parametrize("name", ["train-compact", "train-nuscenes-8-devices", "detect-nuscenes", "train-kitti"])
 def test_programs_match_the_package(name):
     """Shapes of the arguments, which of them are split over the devices, and what is given away."""
@@ -105,15 +96,3 @@ def test_a_program_that_kills_the_compiler_is_reported_in_its_line(tmp_path, mon
         "train-compact",
     ]
     assert environments[0]["PYTHONPATH"].startswith(str(tmp_path))
-
-
-def test_a_missing_plugin_and_unknown_programs_are_one_line(tmp_path):
-    command = [sys.executable, "-m", "experiments.benchmarks.gpu_programs", "--plugin", str(tmp_path)]
-    for options, line in (
-        ([], "run bash .ci/gpu"),
-        (["--programs", "x"], "--programs: got 'x', expected some of"),
-    ):
-        done = subprocess.run([*command, *options], capture_output=True, text=True, check=False, env=os.environ)
-        assert (done.returncode, done.stdout) == (1, "")
-        assert line in done.stderr
-        assert len(done.stderr.splitlines()) == 1

@@ -1,13 +1,12 @@
 """The ledger says what the result files say."""
 
 import csv
-import math
 import shutil
 from pathlib import Path
 
 import pytest
 
-from experiments.ledger import README, RESULTS, as_markdown, claims, gains_of, training_lines, verdict, with_ledger
+from experiments.ledger import README, RESULTS, as_markdown, claims, gains_of, verdict, with_ledger
 from experiments.paper_tables.paper_rows import PAPER_TABLES
 from experiments.paper_tables.scales import quarter
 
@@ -38,25 +37,12 @@ def test_gains_are_differences_of_cells_that_differ_only_in_the_rounds(score):
         assert (gains, samples) == (pytest.approx(expected), 8000)
 
 
-def test_the_ledger_shows_the_deviation_of_the_gains_and_the_seeds_they_need():
-    """Priority of the current sweep, by a loop over the rows of the file: t(0.975, 3) / sqrt(4) = 1.591."""
-    scores = {}
-    with (RESULTS / "tables/sector/cells.csv").open(newline="") as file:
-        for row in csv.DictReader(file):
-            scores[row["changes"], int(row["seed"])] = 100 * float(row["scores.mAP"])
-    gains = [scores["base", s] - scores["projection.prioritize_current=false", s] for s in (0, 1, 2)]
-    mean = sum(gains) / 3
-    deviation = math.sqrt(sum((gain - mean) ** 2 for gain in gains) / 2)
-    assert 1.591 * deviation < mean < 4.303 * deviation / math.sqrt(3)
-    (line,) = [line for line in training_lines(RESULTS, "mAP")[0] if line.startswith("| Table 2")]
-    assert f" | {deviation:.2f} | 4 | " in line
-
-
-def test_a_claim_is_in_the_ledger_with_its_gain_or_as_not_run():
+def test_a_claim_is_in_the_ledger_with_its_gain_or_counted_as_not_run():
     ledger, names = as_markdown(RESULTS), [claim for claim, *_ in claims("mAP")]
     assert len(names) == len(set(names)) > 15
-    for claim in names:
-        assert (f"| {claim} | +" in ledger or f"| {claim} | -" in ledger) != (f"- {claim}\n" in ledger)
+    shown = [claim for claim in names if f"| {claim} | 3, 8,000 | " in ledger]
+    assert f"\n{len(names) - len(shown)} other claims have no scores" in ledger
+    assert shown
 
 
 def test_velocity_adds_nothing_to_nds_as_the_ledger_says():
@@ -116,13 +102,13 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
         lines.append(f'"{changes}",0,{score},{score},cpu,abc')
     (tmp_path / "cells.csv").write_text("\n".join(lines) + "\n")
     shutil.copy(RESULTS / "tables/sector/scale.json", tmp_path)
-    found = {"small networks": {}, "sizes of compact": {}}
+    found = {"small": {}, "compact": {}}
     for claim, table, row, paper in claims("mAP"):
         if "local geometry" in claim:
             size, _, text = claim.rpartition(", ")[2].partition(": ")
             gains, samples = gains_of(table, row, quarter(Path("unused")), tmp_path)
             found[size][text] = ([round(gain) for gain in gains], samples, paper)
-    assert found["small networks"] == {
+    assert found["small"] == {
         "five rounds of ten sweeps instead of one round of ten sweeps": ([10], 8000, 2.06),
         "five rounds of ten sweeps instead of five rounds of one sweep": ([20], 8000, 3.66),
         "five rounds of one sweep instead of one round of one sweep": ([5], 8000, 0.28),
@@ -132,5 +118,5 @@ def test_gains_with_local_geometry_are_relative_to_the_row_without_the_addition(
         "five rounds of ten sweeps with round offsets instead of one round of one sweep": ([45], 8000, 3.94),
         "with priority instead of without priority": ([-10], 8000, 2.79),
     }
-    papers = {text: ([], 16_000, paper) for text, (_, _, paper) in found["small networks"].items()}
-    assert found["sizes of compact"] == papers
+    papers = {text: ([], 16_000, paper) for text, (_, _, paper) in found["small"].items()}
+    assert found["compact"] == papers

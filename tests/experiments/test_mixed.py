@@ -4,7 +4,6 @@ import dataclasses
 
 import pytest
 
-from experiments.cached import CachedFrames
 from experiments.mixed import MixedFrames
 from fcos_lidar_jax.sensors import KITTI_HDL64E, TINY
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
@@ -23,11 +22,6 @@ def test_every_third_frame_is_of_the_other_set():
     assert (len(MIXED), MIXED.sensor, MIXED.name(3)) == (6, TINY, FIRST.name(3))
 
 
-def test_the_fingerprint_depends_on_both_sets_and_the_period():
-    others = (dataclasses.replace(MIXED, other=FIRST), dataclasses.replace(MIXED, period=2))
-    assert len({MIXED.fingerprint(), *(other.fingerprint() for other in others)}) == 3
-
-
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
@@ -38,9 +32,3 @@ def test_the_fingerprint_depends_on_both_sets_and_the_period():
 def test_sets_that_do_not_fit_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         MixedFrames(FIRST, dataclasses.replace(FIRST, **changed), 3)
-
-
-def test_a_cache_keeps_them_apart(tmp_path):
-    cache = CachedFrames(MIXED, tmp_path)
-    assert (cache.frame(3).points == OTHER.frame(3).points).all()
-    assert (CachedFrames(MIXED, tmp_path).frame(3).points == OTHER.frame(3).points).all()

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.changes import change
-from experiments.paper_tables import scales
 from experiments.paper_tables.scales import quarter, smoke
-from experiments.paper_tables.tables import Args
 from experiments.studies import centerpoint
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.cloud_policy import make_cloud
@@ -17,7 +15,6 @@ from fcos_lidar_jax.inference.detect import make_detect
 from fcos_lidar_jax.locations import image_layout
 from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import CENTERPOINT_COMPACT
-from fcos_lidar_jax.types import Detections
 
 
 def test_both_detectors_share_all_but_themselves(tmp_path):
@@ -74,36 +71,3 @@ def test_after_equal_time_the_slower_detector_has_seen_fewer_samples(own_ms, pee
     for row in record["rows"]:
         del row["scores"]
     assert list(centerpoint.equal_time(record)) == []
-
-
-def test_the_peer_refuses_a_data_set():
-    with pytest.raises(ValueError, match="--scale: got nuscenes, expected smoke or sector"):
-        centerpoint.main(Args(scale="nuscenes"))
-
-
-def test_a_cell_that_is_looked_at_says_how_long_and_how_far(tmp_path, monkeypatch):
-    """A detector that finds all within 20 m and nothing beyond, after two steps of 1.5 and 2.5 seconds."""
-    plain = smoke(tmp_path)
-    extent = {"reach_m": 40.0, "sensor": quarter(tmp_path).sensor, "num_objects": 40}
-    scale = dataclasses.replace(plain, evaluations=1, **extent)
-    records = [{"step": 1, "seconds": 1.5}, {"step": 2, "seconds": 2.5, "test/mAP": 0.25}]
-
-    def near(_, frames):
-        seen = [frames.frame(i) for i in range(len(frames))]
-        found = []
-        for frame in seen:
-            close = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1]) < 20
-            scores = np.ones(len(close), np.float32)
-            found.append(Detections(frame.boxes, scores, frame.labels, close, np.int32(0)))
-        return found, seen
-
-    monkeypatch.setattr(scales, "trained", lambda *_, **__: None)
-    monkeypatch.setattr(scales, "detections", near)
-    monkeypatch.setattr(scales, "read_metrics", lambda _: records)
-    scores = scale.score(scale.base, 0, tmp_path)
-    assert scores["seconds_of_steps"] == 4
-    assert scores["curve"] == [[2 * scale.base.optimizer.batch_size, 0.25]]
-    assert scores["ranges"]["0-20 m"]["mAP"] == pytest.approx(1)
-    assert scores["ranges"]["20-40 m"]["mAP"] == 0
-    assert 0 < scores["ranges"]["all"]["mAP"] < 1
-    assert "ranges" not in dataclasses.replace(scale, evaluations=0).score(scale.base, 0, tmp_path)

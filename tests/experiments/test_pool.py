@@ -42,10 +42,3 @@ def test_processes_fill_the_pool_and_end(cache):
         assert (pool.frame(0).points == FRAMES.frame(0).points).all()
         assert len(cache.made()) >= 3
     assert not multiprocessing.active_children()
-
-
-def test_no_process_starts_for_a_full_cache(cache):
-    for index in range(len(FRAMES)):
-        cache.frame(index)
-    with simulating(cache, 2):
-        assert not multiprocessing.active_children()

@@ -1,0 +1,51 @@
+"""Every script of the experiments: its help, which imports all that it uses, and mistakes before the work."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted(
+    ".".join(file.relative_to(ROOT).with_suffix("").parts)
+    for file in (ROOT / "experiments").rglob("*.py")
+    if "run_script(" in (text := file.read_text()) or "run_measurement(" in text
+)
+SCRIPTS.remove("experiments.script")
+
+
+def run(script: str, options: list[str], monkeypatch, folder: Path) -> object:
+    """Run a script as its command does, in an empty folder; returns the exit code."""
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("FCOS_LIDAR_REAL_DATA", raising=False)
+    monkeypatch.delitem(sys.modules, script, raising=False)
+    monkeypatch.setattr(sys, "argv", [script, *options])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(script, run_name="__main__")
+    return ended.value.code
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_the_help_of_a_script_names_its_command(script, monkeypatch, tmp_path, capsys):
+    assert run(script, ["--help"], monkeypatch, tmp_path) == 0
+    assert script.removesuffix(".__main__") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("script", "options", "message"),
+    [
+        ("studies.centerpoint", ["--scale", "nuscenes"], "--scale: got nuscenes, expected smoke or sector"),
+        ("studies.mrv_ablations", ["--scale", "nuscenes"], "--scale: got nuscenes, expected smoke or sector"),
+        ("studies.mrv_ablations", ["--epochs", "0"], "--epochs: got 0, expected at least 1"),
+        ("studies.ladder", ["--trials", "base", "magic"], "--trials: got 'magic', expected some of base,"),
+        ("studies.overfit_keyframe", [], "--data: missing, expected the folder that holds nuscenes_scene0061/"),
+        ("studies.shipped_weights", ["--name", "hdl32e", "--export"], "--export: only for a training,"),
+        ("benchmarks.gpu_programs", ["--plugin", "."], "--plugin: .: no nvidia/cuda_nvcc there: run bash .ci/gpu"),
+    ],
+)
+def test_a_mistake_is_one_line_before_the_work(script, options, message, monkeypatch, tmp_path, capsys):
+    assert run(f"experiments.{script}", options, monkeypatch, tmp_path) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert list(tmp_path.iterdir()) == []
