@@ -126,7 +126,7 @@ def test_clouds_without_usable_points_are_reported_once_and_no_others_refused(ro
     [
         (
             lambda text: re.sub(r'"format_version": \d+', '"format_version": 99', text),
-            "format: got ('fcos_lidar_index', 99), expected",
+            "('fcos_lidar_index', 99)",
         ),
         (lambda text: text[:100], "index.json: not JSON"),
         (lambda text: text.replace("fcos_lidar_index", "other"), "index.json: format: got ('other', 3), expected"),
