@@ -275,7 +275,8 @@ def _function(program: Program) -> tuple[Any, tuple[Any, ...], tuple[bool, ...],
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         return make_detect(detector), (variables, spec(n, c), spec(n, dtype=jnp.bool_)), (False,) * 3, ()
     clouds = spec(b, n, c), spec(b, n, dtype=jnp.bool_)
-    batch = Batch(*clouds, spec(b, m, 9), spec(b, m, dtype=jnp.int32), spec(b, m, dtype=jnp.bool_))
+    arrays: Any = (*clouds, spec(b, m, 9), spec(b, m, dtype=jnp.int32), spec(b, m, dtype=jnp.bool_))
+    batch = Batch(*arrays)
     return make_train_step(detector, optimizer), (state, batch), (False, True), (0,)
 
 

@@ -124,9 +124,12 @@ def test_clouds_without_usable_points_are_reported_once_and_no_others_refused(ro
 @pytest.mark.parametrize(
     ("damage", "expected"),
     [
-        (lambda text: re.sub(r'"format_version": \d+', '"format_version": 99', text), "format: got .*99"),
+        (
+            lambda text: re.sub(r'"format_version": \d+', '"format_version": 99', text),
+            "('fcos_lidar_index', 99)",
+        ),
         (lambda text: text[:100], "index.json: not JSON"),
-        (lambda text: text.replace("fcos_lidar_index", "other"), "index.json: format: got .*other"),
+        (lambda text: text.replace("fcos_lidar_index", "other"), "index.json: format: got ('other', 3), expected"),
     ],
 )
 def test_an_invalid_index_is_rebuilt_with_a_message(root, tmp_path, capsys, damage, expected):
