@@ -13,6 +13,7 @@ import fcos_lidar_jax as fcos
 CORE = [name for name in fcos._MODULES if (Path(fcos.__file__).parent / f"{name}.py").is_file()]
 
 
+@pytest.mark.slow
 def test_the_package_offers_its_modules_and_imports_none_of_them():
     assert {"projection", "iou", "nms", "losses", "inference", "load_detector", "__version__"} <= set(dir(fcos))
     code = (

@@ -7,6 +7,7 @@ from commands import run_python
 
 SCRIPT = """
 import multiprocessing, os, signal, time
+import pytest
 from fcos_lidar_jax.workers import end_with_parent
 def work(ready):
     end_with_parent()
@@ -21,6 +22,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_worker_exits_when_its_parent_is_killed(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(SCRIPT)

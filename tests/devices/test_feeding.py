@@ -168,6 +168,7 @@ def test_batches_are_copied_once_on_a_cpu(mesh, monkeypatch):
         np.testing.assert_array_equal(array, source)
 
 
+@pytest.mark.slow
 def test_batches_in_shared_memory_of_workers_outlive_it(mesh):
     options = {"seed": 0, "num_steps": 6, "threads": 0}
     with make_batches(ToyFrames(), PLAIN, **options) as batches:

@@ -113,6 +113,7 @@ def run(monkeypatch, *options):
     return ended.value.code
 
 
+@pytest.mark.slow
 def test_the_file_holds_the_objects_of_each_setting(tmp_path, monkeypatch):
     out = tmp_path / "record.json"
     assert run(monkeypatch, "--frames", "1", "--out", str(out)) == 0

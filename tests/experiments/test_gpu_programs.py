@@ -13,6 +13,8 @@ from experiments.benchmarks.gpu_programs import PROGRAMS, Args, all_programs, ch
 from experiments.hardware import hardware
 from fcos_lidar_jax.presets import PRESETS
 
+pytestmark = pytest.mark.slow
+
 MODULE = """HloModule jit_step
 
 %fused (p: f32[4]) -> f32[4] {

@@ -135,6 +135,7 @@ def shipped(exported, tmp_path, monkeypatch):
     return tmp_path / "weights", json.loads((tmp_path / "results" / "hdl32e.json").read_text())
 
 
+@pytest.mark.slow
 def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
     package, record = shipped
     exported, run = (load_checkpoint(p) for p in (package / "hdl32e", tmp_path / "run/checkpoints/00000003"))
@@ -169,6 +170,7 @@ def test_logits_are_adjusted_for_the_class_frequencies_of_nuscenes():
     assert np.sum(shares * np.exp(np.array(classes) / 0.4)) == pytest.approx(1)  # objects stay as frequent
 
 
+@pytest.mark.slow
 def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path):
     package, _ = shipped
     run = load_checkpoint(tmp_path / "run/checkpoints/00000003")
@@ -200,6 +202,7 @@ def save_and_hash(folder: Path, checkpoint: Checkpoint) -> str:
     return json.loads((folder / "checkpoint.json").read_text())["hash"]
 
 
+@pytest.mark.slow
 def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     package, record = shipped
     before = {file: file.read_bytes() for file in package.rglob("*") if file.is_file()}
@@ -245,6 +248,7 @@ def test_weights_beyond_float16_are_not_exported(tmp_path):
         save_checkpoint(tmp_path / "c", half_precision(Checkpoint(CONFIG, TINY, large, 1)))
 
 
+@pytest.mark.slow
 def test_a_card_has_only_the_figures_of_its_weights(shipped, tmp_path):
     package, record = shipped
     card = package / "hdl32e" / "README.md"
@@ -270,6 +274,7 @@ def test_a_card_of_other_weights_is_refused(shipped, tmp_path):
         model_card.write_card("hdl32e", tmp_path)
 
 
+@pytest.mark.slow
 def test_fine_tuning_trains_the_network_and_keeps_the_augmentation_of_its_checkpoint(tmp_path, monkeypatch):
     """Other weights of the same name are another run."""
     runs = []

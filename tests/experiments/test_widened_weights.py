@@ -46,6 +46,7 @@ def images():
     return images_of(jnp.asarray(features, jnp.float32).at[..., 7, :].set(1.0))
 
 
+@pytest.mark.slow
 def test_the_larger_network_predicts_the_same(both, images):
     old, new = (
         detector.apply(variables, images)[0] for detector, variables in zip((SMALL, LARGE), both, strict=True)
@@ -54,6 +55,7 @@ def test_the_larger_network_predicts_the_same(both, images):
         np.testing.assert_allclose(own, other, rtol=1e-3, atol=1e-3 * np.abs(own).max())
 
 
+@pytest.mark.slow
 def test_the_weights_that_ignore_new_channels_have_gradients(both, images):
     """Otherwise no new channel could ever be used."""
     old, variables = both
@@ -86,6 +88,7 @@ def variables_at(tree, path):
     return np.asarray(tree)
 
 
+@pytest.mark.slow
 def test_the_command_replaces_the_weights_only_if_they_predict_the_same(tmp_path, monkeypatch, capsys):
     config = dataclasses.replace(CONFIG, model=MODEL)
     before = Checkpoint(config, SENSOR, jax.tree.map(np.float16, drawn(SMALL, 3)), 5)

@@ -111,6 +111,7 @@ def test_tokens_and_chains_refer_to_existing_rows(made):
         assert chain[0]["num_lidar_pts"] > 0 < chain[-1]["num_lidar_pts"]
 
 
+@pytest.mark.slow
 def test_annotated_point_counts_are_exact(street):
     """Counts points of a rolling shutter in the global frame with the quaternions of the files."""
     found, data = tables(street), NuScenes(street, VERSION)
@@ -192,6 +193,7 @@ def test_old_points_stay_in_boxes_of_static_objects_and_leave_boxes_of_moving_ob
     assert np.median(moves) < 0.4 * np.median(stands), moves
 
 
+@pytest.mark.slow
 def test_bytes_depend_on_seed_and_shutter_but_not_on_workers_or_the_number_of_scenes(made, tmp_path):
     expected = contents(made)
     assert contents(synthesize(tmp_path / "again", "--workers", "2")) == expected
@@ -231,6 +233,7 @@ def test_a_damaged_data_set_is_not_called_finished(made, tmp_path, capsys, damag
     assert f"{file}: found {found}, expected the file as written" in refusal(capsys, root)
 
 
+@pytest.mark.slow
 def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, capsys):
     root = tmp_path / "data"
     with folder_lock(root / ".synthesize", "synthesizing"):
@@ -243,6 +246,7 @@ def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, 
     assert line.endswith(" is synthesizing, expected no other process")
 
 
+@pytest.mark.slow
 def test_killed_runs_resume_to_the_same_bytes(tmp_path):
     quick = ["--streets", "plain", "--no-rolling-shutter", "--workers", "1"]
     killed = killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", *quick))
@@ -255,6 +259,7 @@ def test_killed_runs_resume_to_the_same_bytes(tmp_path):
     assert len(states) >= 6  # kills at different stages
 
 
+@pytest.mark.slow
 def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, tmp_path):
     root = tmp_path / "data"
     started = [sys.executable, "-m", "fcos_lidar_jax", *command(root, "--workers", "2")]
@@ -328,6 +333,7 @@ def test_folders_with_other_contents_are_rejected(made, tmp_path, capsys):
         assert message in refusal(capsys, copy)
 
 
+@pytest.mark.slow
 def test_a_full_disk_gets_one_line_and_a_later_run_completes_the_work(made, tmp_path, capsys):
     mount = ["mount", "-t", "tmpfs", "-o", "size=1500k", "t", str(tmp_path)]
     if os.geteuid() or subprocess.run(mount, check=False, stderr=subprocess.DEVNULL).returncode:

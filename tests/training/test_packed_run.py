@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 
+import pytest
 from tiny_run import STEPS, bits, train_tiny, weights
 
 from fcos_lidar_jax.devices.feeding import feed
@@ -10,6 +11,7 @@ from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.types import Batch, PackedBatch
 
 
+@pytest.mark.slow
 def test_a_run_with_packed_batches_is_bit_identical(tmp_path, monkeypatch):
     kinds = []
 

@@ -71,6 +71,7 @@ def trainer():
     return detector, make_state(detector, optimizer, key), *counted(make_train_step(detector, optimizer))
 
 
+@pytest.mark.slow
 def test_a_short_run_learns_one_simulated_frame_and_compiles_once(trainer):
     """Finds the large objects; experiments/studies/overfit_keyframe.py trains for longer."""
     detector, state, step, traces = trainer
@@ -143,6 +144,7 @@ def test_a_step_refuses_a_batch_whose_arrays_do_not_fit_each_other(trainer, name
         jax.eval_shape(step, state, batch)
 
 
+@pytest.mark.slow
 def test_a_step_on_a_packed_batch_is_bit_identical():
     """To a step on a plain batch with its valid rows in front; in any order, the metrics are bit-identical.
 
@@ -287,6 +289,7 @@ def four_frames() -> Batch:
     return batch
 
 
+@pytest.mark.slow
 def test_micro_batches_and_samples_without_boxes_do_not_change_the_box_losses():
     detector, batch = toy_detector(), four_frames()
     params = detector.init(jax.random.key(0))["params"]
