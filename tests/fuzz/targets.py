@@ -9,10 +9,10 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from random import Random
 
 import jax
 import numpy as np
+from hypothesis import strategies as st
 from jax import export
 from made_argoverse2 import START_NS, STEP_NS, write_boxes, write_poses, write_sweep
 from made_bags import Messages, structured, write_recording
@@ -66,7 +66,7 @@ from fcos_lidar_jax.simulation.render import DatasetSpec
 from fcos_lidar_jax.training.metrics_log import read_metrics
 from fcos_lidar_jax.training.plan import check_run
 
-from .mutators import mutate, mutate_bytes, mutate_json
+from .mutations import Strategy, bytes_changed, json_changed
 
 CONFIG = dataclasses.replace(QUICKSTART, max_points=64)
 _RNG = np.random.default_rng(0)
@@ -75,6 +75,7 @@ POSE = np.eye(4).tolist()
 SPEC = DatasetSpec(scenes=1, seed=0, keyframes=1, sensor=TINY, rolling_shutter=False, version="v")
 
 Files = Mapping[str, bytes]
+"""Path below a folder -> content."""
 Read = Callable[[Path, str], None]
 """Reads a folder, given the name of the changed file in it; raises InvalidError for an invalid result."""
 
@@ -88,17 +89,12 @@ class Target:
     """A kind of file."""
 
     name: str
-    files: Files  # path below the folder -> content
+    files: Callable[[], Files]  # valid
     read: Read
-    changed: tuple[str, ...] = ()  # files to mutate; () for all
-    mutate: Callable[[str, bytes, Random], bytes] = mutate
+    changed: tuple[str, ...] = ("",)  # the names of the files to damage begin so
+    damaged: Callable[[str, bytes], Strategy] | None = None  # instead of the changes for the file's ending
     seal: Callable[[Path, str], None] | None = None  # corrects checksums, for half of the inputs
-    share: float = 1.0  # of the inputs, relative to the others
     alone: bool = False  # messages must name the file, not only the folder
-
-    @property
-    def mutable(self) -> tuple[str, ...]:
-        return self.changed or tuple(self.files)
 
 
 def expect(condition: object, what: str) -> None:
@@ -137,9 +133,16 @@ def check_columns(boxes: BoxColumns) -> None:
     expect(((boxes.label >= 0) & (boxes.label < len(NUSCENES_CLASSES))).all(), "a label that is no class")
 
 
-def _cloud(sensor: Sensor, **options: dict) -> Read:
+LAYOUTS = {
+    "three.bin": {"columns": 3, "dtype": "float64"},
+    "five.bin": {"columns": 5},
+    "half.pcd.bin": {"columns": 6, "dtype": "float16"},
+}
+
+
+def _cloud(sensor: Sensor) -> Read:
     def read(folder: Path, name: str) -> None:
-        check_points(read_points(folder / name, sensor, **options.get(name.partition(".")[0], {})), sensor)
+        check_points(read_points(folder / name, sensor, **LAYOUTS.get(name, {})), sensor)
 
     return read
 
@@ -378,12 +381,13 @@ def _exported() -> bytes:
     return b"fcos-lidar-detector 1 " + checksum(content).encode() + b"\n" + content
 
 
-def _mutate_exported(name: str, content: bytes, rng: Random) -> bytes:
-    """Change the line of JSON, or any bytes."""
+@st.composite
+def _exported_changed(draw: st.DrawFn, name: str, content: bytes) -> bytes:
+    """The line of JSON, or any bytes."""
     first, line, program = content.split(b"\n", 2)
-    if rng.random() < 0.5:
-        return mutate_bytes(content, rng)
-    return b"\n".join((first, mutate_json(line, rng), program))
+    if draw(st.booleans()):
+        return draw(bytes_changed(content))
+    return b"\n".join((first, draw(json_changed(line)), program))
 
 
 def _seal_exported(folder: Path, name: str) -> None:
@@ -397,17 +401,21 @@ def _read_exported(folder: Path, name: str) -> None:
     expect(isinstance(detector.fingerprint, str) and detector.config.classes, "no detector")
 
 
-def _description() -> dict[str, object]:
+def _hashed(description: dict[str, object]) -> bytes:
+    return _json({**description, "hash": checksum(json.dumps(description, sort_keys=True).encode())})
+
+
+def _description() -> Files:
     description = {"format": 3, "step": 4, "files": {"a": "0"}, "data": "", "score": None}
-    return {**description, "config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY)}
+    description |= {"config": config_to_json(CONFIG), "sensor": sensor_to_json(TINY)}
+    return {"checkpoint.json": _hashed(json.loads(_json(description)))}
 
 
 def _seal_description(folder: Path, name: str) -> None:
     description = json.loads((folder / name).read_bytes())
     if isinstance(description, dict):
         description.pop("hash", None)
-        description["hash"] = checksum(json.dumps(description, sort_keys=True).encode())
-        (folder / name).write_text(json.dumps(description))
+        (folder / name).write_bytes(_hashed(description))
 
 
 FRAMES = ToyFrames(1)
@@ -435,112 +443,133 @@ def _synthesize(folder: Path, name: str = "") -> None:
     write_dataset(SPEC, folder, workers=1, report=lambda done: None)
 
 
+LAG, RING = np.zeros(60), np.arange(60) % 32
+FEW = POINTS[:12].astype("f4")
+
+
+def _raw_files() -> Files:
+    return {
+        "a.pcd.bin": _raw("f4", POINTS[:, 3], RING),
+        "three.bin": _raw("f8"),
+        "five.bin": _raw("f4", POINTS[:, 3], LAG),
+        "half.pcd.bin": _raw("f2", POINTS[:, 3], RING, LAG),
+    }
+
+
+def _list_files() -> Files:
+    listed = [{"file": f"{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("a", 5))]
+    return {"a.json": _json(listed), "a.npy": _saved(np.save, FEW)}
+
+
+def _keyframe_files() -> Files:
+    columns = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
+    box = {"class": "car", "num_lidar_pts": 3, **dict(zip(columns, range(1, 10), strict=True))}
+    boxes = [box, {**box, "vx": None, "vy": None}]
+    return {"boxes.json": _json({"lidar_file": "a.npy", "boxes": boxes}), "a.npy": _saved(np.save, FEW)}
+
+
+def _sensor_files() -> Files:
+    beams = {"lowest": -9, "highest": 3, "rows": 4}
+    given = {"name": "b", "num_columns": 9, "inclinations_deg": beams}
+    return {"a.json": _json(sensor_to_json(TINY)), "b.json": _json(given)}
+
+
+def _results_file() -> Files:
+    found = {"a": [], "b": [{**_box(), "sample_token": "b", "detection_score": 0.5}] * 2}
+    return {"a.json": _json({"meta": LIDAR_META, "results": found})}
+
+
+def _truth_file() -> Files:
+    truth = {token: {"ego_translation": [0.0, 0, 0], "boxes": [_box(num_pts=3)] * 2} for token in "ab"}
+    truth["b"]["boxes"] = [_box(detection_name="static_object.bicycle_rack", attribute_name="", num_pts=-1)]
+    return {"a.json": _json(truth)}
+
+
+def _detections_file() -> Files:
+    box = {"label": "car", "score": 0.5, "box": [1, 2, 3, 4, 2, 1.5, 0, None, None]}
+    frames = [{"name": "a", "boxes": [box] * 2}, {"name": "b", "boxes": []}]
+    return {"a.json": _json({"classes": ["car", "sign"], "frames": frames})}
+
+
+def _metrics_file() -> Files:
+    lines = [{"step": step, "seconds": 0.1, "loss": [0.5, float("nan")]} for step in range(1, 5)]
+    return {"metrics.jsonl": b"".join(_json(line) + b"\n" for line in lines)}
+
+
 def plain_name(name: str) -> str:
     """The name of a target in small letters without spaces; for formats, their name."""
     return name.lower().replace(" ", "")
 
 
-def make_targets() -> list[Target]:
-    """All targets, with files that their readers accept."""
-    lag, ring = np.zeros(60), np.arange(60) % 32
-    raw = {
-        "a.pcd.bin": _raw("f4", POINTS[:, 3], ring),
-        "three.bin": _raw("f8"),
-        "five.bin": _raw("f4", POINTS[:, 3], lag),
-        "half.pcd.bin": _raw("f2", POINTS[:, 3], ring, lag),
-    }
-    layouts = {"three": {"columns": 3, "dtype": "float64"}, "five": {"columns": 5}}
-    layouts["half"] = {"columns": 6, "dtype": "float16"}
-    arrays = {
-        "a.npy": _saved(np.save, POINTS[:12].astype("f4")),
-        "b.npy": _saved(np.save, np.column_stack([POINTS, lag, ring])[:12]),
-    }
-    archives = {
-        "a.npz": _saved(np.savez_compressed, POINTS[:12].astype("f4")),
-        "b.npz": _saved(np.savez, points=POINTS[:12].astype("f4"), other=ring),
-    }
-    sweep = _files(lambda folder: write_sweep(folder, 0, np.column_stack([POINTS, np.arange(60) % 64])))
-    drive = _files(_argoverse2_files)
-    tables = _files(lambda folder: write_nuscenes(folder, *make_tables(1)))
-    index = _files(_index_files)
-    _column_checksums()  # once for all processes
-    synthesized = _files(_synthesize)
-    listed = [{"file": f"{n}.npy", "timestamp_us": t, "sensor_to_world": POSE} for n, t in (("a", 9), ("a", 5))]
-    boxes = [
-        {"class": "car", **dict(zip(("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy"), range(1, 10), strict=True))}
-    ]
-    boxes = [{**box, "num_lidar_pts": 3} for box in (*boxes, {**boxes[0], "vx": None, "vy": None})]
-    found = {"a": [], "b": [{**_box(), "sample_token": "b", "detection_score": 0.5}] * 2}
-    truth = {t: {"ego_translation": [0.0, 0, 0], "boxes": [_box(num_pts=3)] * 2} for t in "ab"}
-    truth["b"]["boxes"] = [_box(detection_name="static_object.bicycle_rack", attribute_name="", num_pts=-1)]
-    detection = {"label": "car", "score": 0.5, "box": [1, 2, 3, 4, 2, 1.5, 0, None, None]}
-    frames = [{"name": "a", "boxes": [detection] * 2}, {"name": "b", "boxes": []}]
-    lines = [{"step": step, "seconds": 0.1, "loss": [0.5, float("nan")]} for step in range(1, 5)]
-    sensors = {"a.json": sensor_to_json(TINY)}
-    sensors["b.json"] = {
-        "name": "b",
-        "num_columns": 9,
-        "inclinations_deg": {"lowest": -9, "highest": 3, "rows": 4},
-    }
-    records = tuple(name for name in synthesized if name.startswith(".synthesize/"))
-    is_column = [name for name in index if name.startswith("index/")]
-    file_target = functools.partial(Target, alone=True)
-    return [
-        file_target("raw points", raw, _cloud(NUSCENES_HDL32E, **layouts)),
-        file_target("raw points of KITTI", {"a.bin": _raw("f4", POINTS[:, 3] / 100)}, _cloud(KITTI_HDL64E)),
-        file_target("npy", arrays, _cloud(NUSCENES_HDL32E), share=2),
-        file_target("npz", archives, _cloud(NUSCENES_HDL32E), share=2),
-        file_target("pcd", _pcd_files(), _cloud(NUSCENES_HDL32E), share=4),
-        file_target("feather", {"a.feather": next(iter(sweep.values()))}, _cloud(ARGOVERSE2), share=2),
-        Target("Argoverse 2", drive, _read_argoverse2, share=0.5),
-        Target("KITTI", _kitti_files(), lambda folder, _: check_first(KittiFrames(folder, "train"))),
-        Target("folder", _folder_files(), _read_folder),
-        Target("nuScenes", tables, _read_nuscenes, share=0.5),
-        Target("nuScenes index", index, _read_index, tuple(is_column), share=0.5),
-        Target("list of sweeps", {"a.json": _json(listed), "a.npy": arrays["a.npy"]}, _read_sweeps, ("a.json",)),
-        Target(
-            "keyframe",
-            {"boxes.json": _json({"lidar_file": "a.npy", "boxes": boxes}), "a.npy": arrays["a.npy"]},
-            lambda folder, _: check_boxes(read_keyframe(folder, NUSCENES_HDL32E).boxes, "box {}".format),
-        ),
-        file_target("sensor", {name: _json(record) for name, record in sensors.items()}, _read_sensor),
-        file_target("poses", {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),
-        Target("recordings of ROS", _files(_recordings), _read_recording, share=0.25),  # 25 ms each
-        file_target("class map", {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map),
-        file_target(
-            "results",
-            {"a.json": _json({"meta": LIDAR_META, "results": found})},
-            lambda folder, name: check_columns(read_results(folder / name, ("a", "b")).boxes),
-        ),
-        file_target("ground truth", {"a.json": _json(truth)}, _read_truth),
-        file_target(
-            "detections", {"a.json": _json({"classes": ["car", "sign"], "frames": frames})}, _read_detections
-        ),
-        file_target("run.json", {"run.json": _json(RUN_SPEC)}, _read_run),
-        file_target(
-            "metrics.jsonl", {"metrics.jsonl": b"".join(_json(line) + b"\n" for line in lines)}, _read_metrics
-        ),
-        file_target("resume log", _files(_resume_log), _read_resume_log),
-        Target(
-            "checkpoint.json",
-            {"checkpoint.json": _json(_description())},
-            _read_description,
-            seal=_seal_description,
-        ),
-        file_target(
-            "exported detector",
-            {"a.fcos": _exported()},
-            _read_exported,
-            mutate=_mutate_exported,
-            seal=_seal_exported,
-        ),
-        Target("ground-truth database", _files(lambda folder: prepare_database(FRAMES, folder)), _read_database),
-        Target(
-            "cached frames",
-            _files(lambda folder: CachedFrames(FRAMES, folder).frame(0)),
-            _read_cached,
-            mutate=lambda _, content, rng: mutate_bytes(content, rng),
-            share=0.5,
-        ),
-        Target("records of synthesize", synthesized, _synthesize, records),
-    ]
+def _written(write: Callable[[Path], object]) -> Callable[[], Files]:
+    return lambda: _files(write)
+
+
+_file = functools.partial(Target, alone=True)
+TARGETS = [
+    _file("raw points", _raw_files, _cloud(NUSCENES_HDL32E)),
+    _file("raw points of KITTI", lambda: {"a.bin": _raw("f4", POINTS[:, 3] / 100)}, _cloud(KITTI_HDL64E)),
+    _file(
+        "npy",
+        lambda: {
+            "a.npy": _saved(np.save, FEW),
+            "b.npy": _saved(np.save, np.column_stack([POINTS, LAG, RING])[:12]),
+        },
+        _cloud(NUSCENES_HDL32E),
+    ),
+    _file(
+        "npz",
+        lambda: {
+            "a.npz": _saved(np.savez_compressed, FEW),
+            "b.npz": _saved(np.savez, points=FEW, other=RING),
+        },
+        _cloud(NUSCENES_HDL32E),
+    ),
+    _file("pcd", _pcd_files, _cloud(NUSCENES_HDL32E)),
+    _file(
+        "feather",
+        _written(lambda folder: write_sweep(folder, 0, np.column_stack([POINTS, np.arange(60) % 64]))),
+        _cloud(ARGOVERSE2),
+    ),
+    Target("Argoverse 2", _written(_argoverse2_files), _read_argoverse2),
+    Target("KITTI", _kitti_files, lambda folder, _: check_first(KittiFrames(folder, "train"))),
+    Target("folder", _folder_files, _read_folder),
+    Target("nuScenes", _written(lambda folder: write_nuscenes(folder, *make_tables(1))), _read_nuscenes),
+    Target("nuScenes index", _written(_index_files), _read_index, ("index/",)),
+    Target("list of sweeps", _list_files, _read_sweeps, ("a.json",)),
+    Target(
+        "keyframe",
+        _keyframe_files,
+        lambda folder, _: check_boxes(read_keyframe(folder, NUSCENES_HDL32E).boxes, "box {}".format),
+    ),
+    _file("sensor", _sensor_files, _read_sensor),
+    _file("poses", lambda: {"a.txt": b"# t\n0.5 1 2 3 0 0 0 1\n1.25 2 2 3 0.6 0 0 0.8\n"}, _read_poses),
+    Target("recordings of ROS", _written(_recordings), _read_recording),
+    _file("class map", lambda: {"a.json": _json({"Car": "car", "Misc": None})}, _read_class_map),
+    _file(
+        "results",
+        _results_file,
+        lambda folder, name: check_columns(read_results(folder / name, ("a", "b")).boxes),
+    ),
+    _file("ground truth", _truth_file, _read_truth),
+    _file("detections", _detections_file, _read_detections),
+    _file("run.json", lambda: {"run.json": _json(RUN_SPEC)}, _read_run),
+    _file("metrics.jsonl", _metrics_file, _read_metrics),
+    _file("resume log", _written(_resume_log), _read_resume_log),
+    Target("checkpoint.json", _description, _read_description, seal=_seal_description),
+    _file(
+        "exported detector",
+        lambda: {"a.fcos": _exported()},
+        _read_exported,
+        damaged=_exported_changed,
+        seal=_seal_exported,
+    ),
+    Target("ground-truth database", _written(lambda folder: prepare_database(FRAMES, folder)), _read_database),
+    Target(
+        "cached frames",
+        _written(lambda folder: CachedFrames(FRAMES, folder).frame(0)),
+        _read_cached,
+        damaged=lambda _, content: bytes_changed(content),
+    ),
+    Target("records of synthesize", _written(_synthesize), _synthesize, (".synthesize/",)),
+]

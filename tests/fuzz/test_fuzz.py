@@ -1,92 +1,118 @@
-"""The short form of the fuzzing, and a test that it notices every kind of failure."""
+"""Each reader refuses a damaged file in one line, or returns valid data.
 
-import json
-import re
+``FUZZ_INPUTS=30000 pytest tests/fuzz -k kitti`` reads more files than usual.
+"""
+
+import contextlib
+import os
+import resource
+import warnings
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
 from typing import get_args
 
-from commands import run_python
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from fcos_lidar_jax.input_pipeline.open import Format
 
-from .targets import plain_name
+from .mutations import damaged
+from .targets import TARGETS, InvalidError, Target, plain_name
+
+INPUTS = int(os.environ.get("FUZZ_INPUTS", "40"))  # per reader
+LONGEST_MESSAGE = 20_000  # characters, without the file's name: room for a few of the longest values
+MEMORY = 1 << 29  # bytes of address space that a reader may add
+FUZZ = settings(
+    max_examples=INPUTS,
+    deadline=timedelta(seconds=10),
+    derandomize=True,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
 
 
-def test_every_reader_refuses_in_one_line_or_returns_valid_data(tmp_path):
-    out = tmp_path / "fuzz.json"
-    done = run_python("-m", "tests.fuzz", "--inputs", 10_000, "--workers", 1, "--memory-mib", 512, "--out", out)
-    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
-    record = json.loads(out.read_text())
-    assert (record["failures"], record["python_malloc"]) == (0, "debug")
-    assert record["inputs"] >= 9_900
-    accepted, refused = ({n for n, c in record["targets"].items() if c[what]} for what in ("accepted", "refused"))
-    # Logs skip damaged lines; a run spec that differs in anything is of another run.
-    assert record["targets"].keys() - refused == {"metrics.jsonl", "resume log"}
-    assert record["targets"].keys() - accepted <= {"run.json"}
-    fuzzed = set(map(plain_name, record["targets"]))
-    assert set(get_args(Format)) - fuzzed == {"simulated"}
+@contextlib.contextmanager
+def limited_memory() -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def test_targets_are_named_as_formats_are(tmp_path):
-    out = tmp_path / "fuzz.json"
-    run = ("-m", "tests.fuzz", "--inputs", 20, "--workers", 1, "--out", out, "--only")
-    done = run_python(*run, "argoverse2", "KITTI")
-    assert done.returncode == 0, done.stderr
-    assert set(json.loads(out.read_text())["targets"]) == {"Argoverse 2", "KITTI"}
-    done = run_python(*run, "kitti", "kiti")
-    assert done.returncode == 1
-    assert re.search("--only: got 'kiti', expected some of .*KITTI", done.stderr)
+def is_accepted(target: Target, folder: Path, name: str) -> bool:
+    """Whether the reader accepts its file; a refusal must be one short line that names the file."""
+    where = str(folder / name if target.alone else folder)
+    try:
+        with limited_memory():
+            target.read(folder, name)
+    except ValueError as error:
+        message = str(error)
+        assert where in message, f"a message that does not name the file: {message[:500]}"
+        assert message.splitlines() == [message], f"a message of several lines: {message[:500]}"
+        longest = LONGEST_MESSAGE + message.count(where) * len(where)
+        assert len(message) <= longest, f"a message that is too long: {message[:500]}"
+        return False
+    return True
 
 
-MISTREATED = """
-import ctypes, json, sys, time, warnings
-from pathlib import Path
-from tests.fuzz.engine import Limits, fuzz
-from tests.fuzz.targets import InvalidError, Target
-
-def refuse(message):
-    raise ValueError(message)
-
-def invalid():
-    raise InvalidError("half a result")
-
-wrong = {
-    "nothing": lambda file: None,
-    "refusal": lambda file: refuse(f"{file}: wrong"),
-    "other exception": lambda file: {}["key"],
-    "warning": lambda file: warnings.warn("hm"),
-    "no name": lambda file: refuse("wrong"),
-    "two lines": lambda file: refuse(f"{file}: wrong\\nindeed"),
-    "long": lambda file: refuse(f"{file}: {'wrong' * 5000}"),
-    "invalid": lambda file: invalid(),
-    "memory": lambda file: bytearray(1 << 30),
-    "hang": lambda file: time.sleep(60),
-    "crash": lambda file: ctypes.string_at(0),
-}
-def target(name, treat):
-    return Target(name, {"a.txt": b"1 2 3"}, lambda folder, file: treat(folder / file), alone=True)
-
-limits = Limits(memory_mib=256, seconds=1)
-counts, failures = fuzz([target(*each) for each in wrong.items()], 22, seed=0, workers=3, limits=limits)
-print(json.dumps([{n: vars(c) for n, c in counts.items()}, {f.target: f.problem for f in failures}]))
-"""
+def write(files: dict[str, bytes], folder: Path) -> None:
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
 
 
-def test_every_kind_of_failure_is_noticed():
-    done = run_python("-c", MISTREATED)
-    assert done.returncode == 0, done.stderr
-    counts, problems = json.loads(done.stdout)
-    assert {count["inputs"] for count in counts.values()} == {2}
-    assert counts["nothing"]["accepted"] == counts["refusal"]["refused"] == 2
-    assert {name for name, count in counts.items() if count["failed"] == 2} == set(problems)
-    found = {name: problem.partition(" at ")[0].removesuffix(",") for name, problem in problems.items()}
-    assert found == {
-        "other exception": "KeyError",
-        "warning": "UserWarning",
-        "no name": "a message that does not name the file",
-        "two lines": "a message of several lines",
-        "long": "a message that is too long",
-        "invalid": "accepted: half a result",
-        "memory": "MemoryError",
-        "hang": "takes too long",
-        "crash": "ends the process with -11",
-    }
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: plain_name(target.name))
+def test_damaged_files_are_refused_in_one_line_or_give_valid_data(target, tmp_path):
+    files, refused = dict(target.files()), 0
+    names = [name for name in files if name.startswith(target.changed)]
+    write(files, tmp_path)
+    assert all(is_accepted(target, tmp_path, name) for name in names)
+
+    @FUZZ
+    @given(st.data(), st.sampled_from(names), st.booleans())
+    def read(data, name, sealed):
+        nonlocal refused
+        content = data.draw((target.damaged or damaged)(name, files[name]))
+        (tmp_path / name).write_bytes(content)
+        if sealed and target.seal is not None:
+            with contextlib.suppress(ValueError, RecursionError):  # no longer JSON
+                target.seal(tmp_path, name)
+        try:
+            refused += not is_accepted(target, tmp_path, name)
+        finally:
+            write(files, tmp_path)
+
+    read()
+    # Logs skip damaged lines.
+    assert bool(refused) == (target.name not in ("metrics.jsonl", "resume log"))
+
+
+def test_every_format_has_a_target():
+    assert set(get_args(Format)) - {plain_name(target.name) for target in TARGETS} == {"simulated"}
+
+
+def raise_(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("read", "problem"),
+    [
+        (lambda file: {}["key"], "key"),
+        (lambda file: warnings.warn("hm", stacklevel=1), "hm"),
+        (lambda file: raise_(ValueError("wrong")), "does not name the file"),
+        (lambda file: raise_(ValueError(f"{file}: wrong\nindeed")), "of several lines"),
+        (lambda file: raise_(ValueError(f"{file}: {'wrong' * 5000}")), "too long"),
+        (lambda file: raise_(InvalidError("half a result")), "half a result"),
+        (lambda file: bytearray(1 << 30), None),
+    ],
+)
+def test_every_kind_of_failure_is_noticed(read, problem, tmp_path):
+    target = Target("a", dict, lambda folder, name: read(folder / name), alone=True)
+    with pytest.raises((AssertionError, KeyError, UserWarning, InvalidError, MemoryError), match=problem):
+        is_accepted(target, tmp_path, "a.txt")

@@ -264,6 +264,7 @@ def test_a_run_that_ends_early_resumes_bit_identical(finished, tmp_path, capsys,
     assert without_times(folder) == without_times(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [STEPS - 1, STEPS])
 def test_a_run_that_is_killed_in_its_last_step_or_only_save_begins_again(finished, tmp_path, steps):
     folder, options = tmp_path / "run", {"save": 9, "weights": weights()}
@@ -357,6 +358,7 @@ def test_a_run_that_is_killed_while_saving_resumes_bit_identical(finished, stopp
     assert checkpoint_names(folder) == ["00000003", "00000004"]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_before_its_first_checkpoint_resumes_with_the_initial_weights(finished, begun):
     assert bits(train_tiny(begun, evaluate=2, tests=TESTS, resume=True, weights=weights())) == bits(finished[1])
     assert scores(begun) == scores(finished[0])  # the initial weights are not evaluated
@@ -375,6 +377,7 @@ def test_a_full_disk_is_reported_in_one_line_and_loses_no_checkpoint(stopped):
     assert [load_checkpoint(path).step for path in sorted(refused.parent.iterdir())] == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_without_a_mean_ap_is_saved_without_a_score(tmp_path, capsys):
     """The test frames have no boxes, so the mean over classes is NaN."""
     none = np.zeros(0, np.int32)

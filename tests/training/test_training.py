@@ -307,6 +307,7 @@ def test_micro_batches_and_samples_without_boxes_do_not_change_the_box_losses():
         np.testing.assert_allclose(losses, [losses[0]] * 4, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axes", "micro_batches"), [("lidar", (1, 2)), ("ray", (1,))])
 def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches):
     """Compares with NumPy, with and without micro-batches: cross-entropy over positives, L1 over candidates."""
@@ -399,6 +400,7 @@ def test_a_warning_names_a_frame_that_does_not_fit_the_sensor():
     assert warning.startswith(f"{made.name(1)}: points do not fit")
 
 
+@pytest.mark.slow
 def test_the_target_of_the_score_factor_is_the_iou_or_the_centreness():
     """Predictions are half a metre above the truth: centreness is constant, and IoU depends on the height."""
     detector, batch = toy_detector(), jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], four_frames())
