@@ -21,6 +21,8 @@ from fcos_lidar_jax.refinement.stage import best_boxes, over_samples, refinement
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 from fcos_lidar_jax.training.step import make_gradient
 
+pytestmark = pytest.mark.slow
+
 FROZEN = dataclasses.replace(SMALL, freeze_detector=True)
 CONFIGS = {"FCOS-LiDAR": tiny_run.CONFIG, "CenterPoint": tiny_peer.CONFIG}
 BOTH = pytest.mark.parametrize("name", CONFIGS)
