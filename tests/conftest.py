@@ -36,16 +36,26 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # a process 
 
 
 # Most of the time goes to compilation, so programs are compiled without optimisation, except where the last bits
-# matter: in exported programs, projection, assignment, overlaps and losses.
-_OPTIMISED = ("test_export", "test_projection", "test_assignment", "test_iou", "test_nms", "test_losses")
+# matter: in exported programs, projection and overlaps.
+_OPTIMISED = ("test_export", "test_projection", "test_iou")
 
 
 def _is_quick(path: Path) -> bool:
     return path.stem not in _OPTIMISED
 
 
+_NETWORKS = ("centerpoint", "checkpoints", "inference", "models", "refinement", "training")
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What is optimised comes first, for a change of the mode forgets all programs; short doctests come last."""
+    """Examples that compile networks are slow.
+
+    What is optimised comes first, for a change of the mode forgets all programs; short doctests come last.
+    """
+    for item in items:
+        if isinstance(item, pytest.DoctestItem) and item.path.parent.name in _NETWORKS:
+            item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: _is_quick(item.path))
 
 

@@ -55,6 +55,7 @@ for check in (True, False):
 """
 
 
+@pytest.mark.slow
 def test_sums_means_and_gradients_on_two_devices():
     done = run_python("-c", TWO, JAX_NUM_CPU_DEVICES="2")
     assert done.returncode == 0, done.stderr[-2000:]

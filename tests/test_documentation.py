@@ -140,6 +140,7 @@ def make_drive(folder: Path) -> None:
     (folder / "poses.json").write_text(json.dumps(poses))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=page_name)
 def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
     if page.name in RUN_ELSEWHERE:

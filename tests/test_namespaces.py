@@ -8,6 +8,7 @@ import pytest
 import fcos_lidar_jax as fcos
 
 
+@pytest.mark.slow
 def test_the_package_offers_its_modules_and_imports_none_of_them():
     assert {"projection", "iou", "nms", "losses", "inference", "load_detector", "__version__"} <= set(dir(fcos))
     code = (

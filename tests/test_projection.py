@@ -105,8 +105,9 @@ def test_the_image_of_a_sector_is_part_of_the_image_of_the_turn():
     assert int(seen.num_dropped) == valid.sum() - (np.asarray(seen.point_index) >= 0).sum()
 
 
-@pytest.mark.parametrize("num_rounds", range(1, 8))
-@pytest.mark.parametrize("prioritize_current", [True, False])
+@pytest.mark.parametrize(
+    ("num_rounds", "prioritize_current"), [(1, True), (2, False), (5, True), (5, False), (7, True)]
+)
 def test_rounds_keep_the_same_points_as_loops(num_rounds, prioritize_current):
     points = cloud(num_rounds)
     valid = np.random.default_rng(9).random(len(points)) < 0.9

@@ -71,6 +71,7 @@ def test_boxes_equal_class_wise_suppression(outputs):
     assert (np.diff(scores) <= 0).all()
 
 
+@pytest.mark.slow
 def test_points_to_boxes_in_any_order_and_of_nothing():
     detector = build_detector(dataclasses.replace(CONFIG, max_points=4096), SENSOR)
     variables, detect = jax.jit(detector.init)(jax.random.key(0)), jax.jit(make_detect(detector))

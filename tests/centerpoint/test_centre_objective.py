@@ -68,6 +68,7 @@ def test_sums_equal_a_loop_over_boxes(config):
     assert count.sum() > 3
 
 
+@pytest.mark.slow
 def test_every_group_is_divided_by_its_own_boxes():
     detector, variables = prepared(GROUPED)
     batch, objective = host_batch(), jax.jit(make_objective(detector))
@@ -91,6 +92,7 @@ def test_every_group_is_divided_by_its_own_boxes():
     assert float(totals["positives"] / of_batch.counts["positives"]) == pytest.approx(total, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_batch_without_points_or_boxes_has_finite_losses_and_gradients():
     detector, variables = prepared(CONFIG)
     batch = host_batch()

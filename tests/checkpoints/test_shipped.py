@@ -29,6 +29,7 @@ def test_shipped_weights_are_small_and_match_the_preset(name):
     assert dataclasses.replace(shipped.config, **trained) == config
 
 
+@pytest.mark.slow
 def test_shipped_weights_detect_on_unseen_streets():
     detector = load_detector("quickstart")
     assert evaluate(detector, unseen_frames(detector.sensor, 12)).summary["mean_ap"] > 0.4

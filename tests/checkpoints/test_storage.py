@@ -261,6 +261,7 @@ def disk(tmp_path):
     subprocess.run(["umount", folder], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_reported_in_one_line_and_keeps_the_old_checkpoint(disk, written, checkpoint, state):
     shutil.copytree(written, disk / "c")
     newer, filler, before = dataclasses.replace(checkpoint, step=8), disk / "filler", contents(disk)

@@ -14,6 +14,8 @@ from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
+pytestmark = pytest.mark.slow
+
 onnx = pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
 pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")
 

@@ -32,6 +32,7 @@ def home(tmp_path_factory):
 PARTS = ["prepare", "network", "postprocess"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "parts"), [("checkpoint", PARTS), ("detector.fcos", [])])
 def test_each_stage_and_the_whole_are_timed(home, tmp_path, capsys, name, parts):
     clouds, out = (home / "0.npy", home / "1.npy"), tmp_path / "times.json"

@@ -16,6 +16,8 @@ from fcos_lidar_jax.inference import load_trained
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
+pytestmark = pytest.mark.slow
+
 STEPS = 20
 
 

@@ -119,6 +119,7 @@ def test_detect_turns_clouds_for_the_detector_and_boxes_back(home, tmp_path):
     assert frame["boxes"] == [box["box"] for box in ahead]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--page", "page.html", "--pictures", "pictures"]], ids=["plain", "drawn"])
 def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more):
     monkeypatch.chdir(tmp_path)
@@ -159,6 +160,7 @@ def test_an_interrupted_detect_resumes(home, tmp_path, capsys, monkeypatch, more
         assert names == [f"000{i}_{name}.npy.png" for i, name in enumerate("abcd", 1)]
 
 
+@pytest.mark.slow
 def test_pictures_of_files_with_one_name_follow_their_numbers(home, tmp_path, capsys, monkeypatch):
     """A resumed call has one more file before the others, so the second number is of another file."""
     monkeypatch.chdir(tmp_path)
@@ -237,6 +239,7 @@ def test_pages_and_pictures_show_boxes_from_one_score(home, tmp_path, monkeypatc
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -428,6 +431,7 @@ def drive(home):
     return home / "demo"
 
 
+@pytest.mark.slow
 def test_demo_writes_the_metrics_of_evaluate_on_its_drive(drive, home, tmp_path):
     place = ["--data-root", drive / "drive", "--split", "train", "--checkpoint", home / "checkpoint"]
     command("evaluate --no-report --out", tmp_path / "evaluation", *place)

@@ -95,6 +95,7 @@ def assert_turned_back(boxes, expected, origin=(0, 0, 0)):
         np.testing.assert_allclose(one["box"][7:], [vy, -vx], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_commands_name_the_sensor_and_the_presets_that_fit_the_data(kitti, tmp_path, capsys, monkeypatch):
     def advised(*words, code=0):
         assert cli.main([str(word) for text in words for word in str(text).split()]) == code
@@ -126,6 +127,7 @@ def test_commands_name_the_sensor_and_the_presets_that_fit_the_data(kitti, tmp_p
     assert not any("expected --sensor" in line for line in fitting)  # others are about the 256 columns
 
 
+@pytest.mark.slow
 def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys):
     folder, drive = kitti / "training" / "velodyne", kitti / "day" / "drive"
     boxes = detect(tmp_path / "boxes.json", folder, "--full-turn --page", tmp_path / "page.html")
@@ -215,6 +217,7 @@ def test_an_error_comes_without_notes_that_it_makes_moot(kitti, tmp_path, capsys
         assert not re.search("rotated|recorded by|rows", "".join(others))
 
 
+@pytest.mark.slow
 def test_options_stand_for_the_sensor_of_the_data(kitti, tmp_path, capsys):
     inside, copy = kitti / "training" / "velodyne" / "000000.bin", kitti / "elsewhere" / "cloud.bin"
     out = tmp_path / "boxes.json"
@@ -242,6 +245,7 @@ def test_argoverse2_is_turned_and_shifted(tmp_path):
     assert_turned_back(boxes, by_hand, (1.35, 0, 1.64))
 
 
+@pytest.mark.slow
 def test_nuscenes_data_are_brought_to_a_detector_of_another_mount(tmp_path, capsys):
     """A detector with x ahead and the LiDAR above the rear axle, as in Argoverse 2."""
     rows = dataclasses.replace(NUSCENES_HDL32E, num_columns=128)
@@ -286,6 +290,7 @@ def test_nuscenes_data_are_brought_to_a_detector_of_another_mount(tmp_path, caps
         assert_turned_back(by_hand["boxes"], found, (1.35, 0, 1.64))
 
 
+@pytest.mark.slow
 def test_evaluates_own_data_of_other_axes_and_units(tmp_path):
     """The same data with x ahead, and intensities of a quarter."""
     right = make_folder(tmp_path / "right", sensor=fcos.load_sensor("short_range"), train=0, val=2)

@@ -70,6 +70,7 @@ def by_tables(home, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_results_against_a_file_of_truth_and_against_the_tables(home, by_tables, tmp_path, capsys):
     results, truth = home / "results.json", home / "truth.json"
     run(Evaluate(DataOptions(), tmp_path, results=results, ground_truth=truth, report=False))
@@ -132,6 +133,7 @@ def leaves(value):
     return [value]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_evaluated_and_an_interrupted_evaluation_resumes(home, tmp_path, monkeypatch, capsys):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     options = {"checkpoint": home / "checkpoint", **place(home), "report": False}
@@ -189,6 +191,7 @@ def test_a_resume_log_of_another_detector_is_not_used(home):
     assert _fingerprint(*runs[0]) not in fingerprints
 
 
+@pytest.mark.slow
 def test_an_earlier_report_is_removed(home, tmp_path):
     by_files(tmp_path, read(home / "results.json"), read(home / "truth.json"))
     assert (tmp_path / "out" / "report.html").is_file()
@@ -232,6 +235,7 @@ def test_with_a_class_map_the_metric_is_not_the_official_one(home, tmp_path):
     assert (tmp_path / "out" / "detections.json").exists()
 
 
+@pytest.mark.slow
 def test_results_need_only_the_tables(home, by_tables, tmp_path, capsys):
     """Without point files the report shows only boxes. The folder's name is not valid UTF-8."""
     root = tmp_path / os.fsdecode(b"M\xfcnchen")

@@ -78,6 +78,7 @@ def test_a_bug_is_one_line_that_names_its_report(capsys, tmp_path, monkeypatch):
     assert f"jax {__import__('jax').__version__}" in text
 
 
+@pytest.mark.slow
 def test_an_unknown_platform_is_one_line(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((9, 4)))
     words = ["project", tmp_path / "a.npy", "--out", tmp_path / "a.npz"]
@@ -240,6 +241,7 @@ print(json.dumps(codes))
 C_LOCALE = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variables", [{"PYTHONIOENCODING": "ascii"}, C_LOCALE], ids=["encoding", "locale"])
 def test_helps_and_errors_are_shown_on_a_terminal_without_unicode(variables):
     helps = [[*words, "--help"] for words in ([], *([name] for name in _COMMANDS))]
@@ -249,6 +251,7 @@ def test_helps_and_errors_are_shown_on_a_terminal_without_unicode(variables):
     assert "--gr" in done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_closed_output_pipe_ends_in_silence():
     read, write = os.pipe()
     os.close(read)

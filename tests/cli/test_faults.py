@@ -14,6 +14,8 @@ from forked import Forked, signal_at
 
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
 
+pytestmark = pytest.mark.slow
+
 VERSION = "v1.0-synthetic"
 SYNTHESIZE = ["synthesize", "--scenes", "2", "--keyframes", "3", "--sensor", "short_range"]
 

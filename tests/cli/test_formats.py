@@ -92,6 +92,7 @@ def test_every_format_is_tried():
     assert {make.__name__ for make in MAKERS} | {"folder"} == set(get_args(Format))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", MAKERS)
 def test_prepares_trains_evaluates_and_detects(make, tmp_path, capsys):
     """The network does not depend on the format; ``test_train.py`` trains FCOS-LiDAR's."""
@@ -146,6 +147,7 @@ ORDER = "(max_points); older sweeps go first, then random points"
 COUNTED = f"points left out in total: the detector takes at most 4096 per cloud {ORDER}"
 
 
+@pytest.mark.slow
 def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):
     """By detect, evaluate and Python, for a cloud with more points than the detector accepts."""
     root, data = own_data(tmp_path, train=2, val=1)
@@ -228,6 +230,7 @@ TRAINING, EVALUATION = "train quickstart --no-copy-paste", "evaluate --checkpoin
 A, B, C = (f"{i:03d}" for i in range(3))
 
 
+@pytest.mark.slow
 def test_warns_if_frames_are_both_trained_and_evaluated_on(messages):
     overlap = "of the 2 evaluation frames are also training frames"
     assert f"1 {overlap}" in messages(TRAINING, {"train": [A, B], "val": [B, C]})
@@ -241,6 +244,7 @@ def test_warns_if_frames_are_both_trained_and_evaluated_on(messages):
         assert "no splits" not in messages(line, {"train": [A, B], "val": [C]})
 
 
+@pytest.mark.slow
 def test_prepares_into_another_folder_and_evaluates_given_detections(tmp_path, monkeypatch):
     """For data on a read-only disk; training finds the objects there, and the report names the frames."""
     root, data = own_data(tmp_path, train=2, val=2)
@@ -271,6 +275,7 @@ def test_a_command_recognises_its_data_set_once(tmp_path, monkeypatch):
     recognise.assert_called_once_with(tmp_path / "data")
 
 
+@pytest.mark.slow
 def test_training_warns_of_another_sensors_clouds_before_compiling(tmp_path, capsys, monkeypatch):
     frames = SimulatedFrames(fcos.load_sensor("nuscenes_hdl32e"), 2)
     wrong = InMemoryFrames((frames.frame(0), frames.frame(1)), fcos.load_sensor("short_range"), frames.classes)
@@ -282,6 +287,7 @@ def test_training_warns_of_another_sensors_clouds_before_compiling(tmp_path, cap
     assert compiling.startswith("compiling")
 
 
+@pytest.mark.slow
 def test_larger_batches_change_boxes_only_by_rounding():
     detector = fcos.load_detector("quickstart")
     frames = fcos.open_frames(format="simulated", split="val", sensor=detector.sensor)

@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 import numpy as np
+import pytest
 from commands import assert_one_line_error, command
 from linear_network import linear_network
 from made_folder import CLASSES, make_folder
@@ -17,6 +18,7 @@ from fcos_lidar_jax.data.folder import FolderFrames
 PAGE = (Path(__file__).parents[2] / "docs" / "own_data.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_page_leads_from_an_empty_folder_to_an_evaluated_detector(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     namespace: dict = {}
@@ -69,6 +71,7 @@ def test_the_number_of_targets_of_copy_paste_matters_only_with_copy_paste(tmp_pa
     assert_one_line_error(capsys, args, rf"copy_paste.targets: got \(.*\), {expected}")
 
 
+@pytest.mark.slow
 def test_clouds_without_points_are_counted(tmp_path, capsys):
     data, run = make_folder(tmp_path / "data"), tmp_path / "run"
     for name in ("000", "004"):  # one of four to train on, and one of two to evaluate

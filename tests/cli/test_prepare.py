@@ -46,6 +46,7 @@ def test_prints_a_record_and_a_second_run_changes_nothing(root, tmp_path, capsys
     assert all(f.stat().st_mtime_ns == stamp for f, stamp in stamps.items())
 
 
+@pytest.mark.slow
 def test_workers_and_kills_end_in_the_same_bytes(root, tmp_path):
     command(*prepare(root, tmp_path / "whole"))
     expected = contents(tmp_path / "whole")
@@ -186,6 +187,7 @@ def test_a_version_without_annotations_only_gets_an_index(root, tmp_path, capsys
     assert len(NuScenes(copy, VERSION, index=tmp_path / "i").sample_tokens) == 4 * SCENES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "finished"), [("16k", set()), ("152k", {"index.json"})])
 def test_a_full_disk_gets_one_line_and_nothing_half_written(root, tmp_path, size, finished):
     small = tmp_path / "small"

@@ -24,6 +24,8 @@ from fcos_lidar_jax.sensors import sensor_to_json
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
+pytestmark = pytest.mark.slow
+
 SRUN = {
     "SLURM_JOB_ID": "7",
     "SLURM_STEP_NODELIST": "localhost",

@@ -93,6 +93,7 @@ def cuboids(frame):
     return found
 
 
+@pytest.mark.slow
 def test_a_drive_in_openlabel(home, lines, tmp_path):
     out = stream(home, tmp_path / "labels.json", "--track --output-format openlabel")
     [(root, content)] = json.loads(out.read_text()).items()

@@ -90,6 +90,7 @@ def without_file(lines):
     return [{name: value for name, value in line.items() if name != "file"} for line in lines]
 
 
+@pytest.mark.slow
 def test_boxes_equal_detect_with_the_same_sweeps(home, tmp_path, capsys):
     lines = stream(home, tmp_path / "boxes.jsonl", home / "drive", "--poses", home / "poses.json")
     listed = json.loads((home / "poses.json").read_text())
@@ -110,6 +111,7 @@ def test_boxes_equal_detect_with_the_same_sweeps(home, tmp_path, capsys):
         assert line["file"] == str(home / listed[index]["file"])
 
 
+@pytest.mark.slow
 def test_all_forms_of_a_drive_have_the_same_boxes(home, tmp_path):
     out = tmp_path / "boxes.jsonl"
     expected = without_file(stream(home, out, home / "drive", "--poses", home / "poses.json"))
@@ -122,6 +124,7 @@ def test_all_forms_of_a_drive_have_the_same_boxes(home, tmp_path):
         assert lines[2]["file"] == f"{source}: /points: message 2"
 
 
+@pytest.mark.slow
 def test_keyframes_option_skips_the_boxes_of_other_sweeps(home, tmp_path, capsys):
     (tmp_path / "sensor.json").write_text(json.dumps(sensor_to_json(TINY)))
     data = f"--data-root {tmp_path}/data --scene {{scene}} --checkpoint {home}/checkpoint"
@@ -345,6 +348,7 @@ def test_a_log_of_argoverse2_is_a_source(home, tmp_path):
     assert stream(home, tmp_path / "b.jsonl", folder, "--poses", tmp_path / "poses.json") == lines
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_a_real_scene_has_the_same_boxes_in_all_forms(real_data, home, tmp_path):
     root, out = real_data / "nuscenes_scene0523", tmp_path / "boxes.jsonl"

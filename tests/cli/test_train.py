@@ -52,6 +52,7 @@ def train(root: Path, out: Path, *more: str) -> list[str]:
     return ["train", "quickstart", *where, *sensor, *NETWORK_OPTIONS, *often, *tests, *more]
 
 
+@pytest.mark.slow
 def test_trains_evaluates_and_prints_the_best_checkpoint(root, tmp_path, capsys):
     start, out = root.parent / "start", tmp_path / "run"
     options = ["--samples", "1:2", "--copy-paste.min-points", "3", "--second-look", "on"]
@@ -118,6 +119,7 @@ def stop(process: Forked, number: int, out: Path, beyond: int = 0) -> tuple[int,
     return code, errors, len(read_metrics(out))
 
 
+@pytest.mark.slow
 def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
     """tests/training/test_run.py compares the result of a resumed run."""
     out = tmp_path / "run"
@@ -150,6 +152,7 @@ def test_auto_resume_continues_a_run_and_says_when_it_starts_one(root, tmp_path,
     assert capsys.readouterr().err.count("no run to resume, starting one") == 1
 
 
+@pytest.mark.slow
 def test_a_signal_to_one_process_stops_both_after_the_same_step(root, tmp_path, child):
     """tests/cli/test_processes.py compares their steps with a single process."""
     with socket.socket() as free:
@@ -234,6 +237,7 @@ def test_objects_of_more_sweeps_are_taken_and_their_frames_opened_once(root, tmp
     assert_one_line_error(capsys, renamed, "cut from other frames than split 'train', .* as --class-map or --full")
 
 
+@pytest.mark.slow
 def test_a_refused_resume_leaves_the_objects_of_the_run(root, tmp_path, capsys):
     out = tmp_path / "run"
     command(*train(root, out, "--samples", "0:1", "--val-split", "none"))

@@ -250,6 +250,7 @@ def test_too_few_points_give_no_warning():
     assert sensor_mismatch(np.zeros((0, 3), np.float32), TINY) is None
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_real_clouds_fit_their_sensor_only(real_data):
     patterns = ("nuscenes_scene0[01]*/*.pcd.bin", "nuscenes_scene0523/samples/*/*.bin")

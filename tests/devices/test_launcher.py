@@ -61,6 +61,7 @@ def test_unreadable_variables_are_refused(case):
         local_device_ids(INVALID[case])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tasks", "visible"), [("1", "all"), ("2", "0")])
 def test_jax_hides_no_gpu_from_the_only_process_of_a_machine(tasks, visible):
     """Checks the setting that the CUDA backend of the installed JAX starts with."""

@@ -82,6 +82,7 @@ def check_odd_batch(mesh) -> None:
         shard_batch({"x": np.zeros((3, 1))}, mesh)
 
 
+@pytest.mark.slow
 def test_two_devices_share_a_batch_in_both_forms():
     code = (
         "import jax, numpy as np, test_mesh as t; mesh = t.make_mesh(); assert mesh.size == 2; "

@@ -4,6 +4,8 @@ import pytest
 import quick
 from commands import run_python
 
+pytestmark = pytest.mark.slow
+
 PREDICTIONS = """
 import jax, numpy as np
 from tiny_run import REFINED as CONFIG, SENSOR, FRAMES, weights

@@ -290,6 +290,7 @@ def test_invalid_detections_are_named(names, boxes, message, tmp_path):
         read_detections(file, ["a", "b"], OWN)
 
 
+@pytest.mark.slow
 def test_files_and_report_of_own_classes(tmp_path):
     """Uses class names that are invalid file names, and a class without truth."""
     found, truths = made(OWN, [0, 1, 2, 3])

@@ -178,6 +178,7 @@ def test_a_class_map_is_undone_and_names_match_in_lower_case(root, tmp_path):
 TIME = '"eval_time": [0-9.e-]*'
 
 
+@pytest.mark.slow
 def test_evaluate_writes_and_prints_it(root, tmp_path, capsys):
     write(tmp_path / "map.json", json.dumps(TO_NUSCENES))
     frames = MappedFrames(KittiFrames(root), fcos.load_detector("quickstart").classes, TO_NUSCENES)

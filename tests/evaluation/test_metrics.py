@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 from made_evaluation import RACK, make_task, truth_of
-from metrics_oracle import assert_numbers, in_rack, kept, score, turned, yaw
+from metrics_oracle import assert_numbers, score, turned, yaw
 
 from fcos_lidar_jax.evaluation import evaluate_detections, metrics
 from fcos_lidar_jax.evaluation.bootstrap import bootstrap
@@ -109,29 +109,6 @@ def test_all_numbers_match_loops(seed, ties):
     tables, results = make_task(seed, ties=ties, absent=("bus", "traffic_cone") if seed == 3 else ())
     truth = truth_of(tables)
     assert_numbers(evaluate_detections(results, truth), score(results["results"], truth))
-
-
-def test_the_tasks_cover_every_case():
-    """Otherwise the comparisons with loops and the devkit prove less than they claim."""
-    seen = {"in a rack": 0, "beyond": 0, "no points": 0, "velocity": 0, "attribute": 0, "tie": 0, "empty": 0}
-    for seed in range(4):
-        tables, results = make_task(seed)
-        truth = truth_of(tables)
-        for token, boxes in results["results"].items():
-            there = truth[token]["boxes"]
-            racks = [box for box in there if box["detection_name"] == RACK]
-            for box in [*boxes, *there]:
-                cycle = box["detection_name"] in ("bicycle", "motorcycle")
-                seen["in a rack"] += cycle and any(in_rack(box, rack) for rack in racks)
-                seen["no points"] += box.get("num_pts") == 0
-                seen["velocity"] += box["velocity"] is None
-                seen["attribute"] += "num_pts" in box and not box["attribute_name"]
-            others = [box for box in there if box not in racks]
-            seen["beyond"] += len(others) > len(kept(others, truth[token]["ego_translation"], []))
-            scores = [box["detection_score"] for box in boxes]
-            seen["tie"] += len(set(scores)) < len(scores)
-            seen["empty"] += not boxes
-    assert min(seen.values()) > 0, seen
 
 
 def task(seed=0, **options):

@@ -228,6 +228,7 @@ def tiny_smoke(cache):
     return dataclasses.replace(smoke(cache), base=base, sensor=tiny_run.SENSOR, **sizes)
 
 
+@pytest.mark.slow
 def test_the_table_of_a_variant_of_the_documents_runs(tmp_path, monkeypatch, capsys):
     text = (EXPERIMENTS.parent / "docs" / "variant.md").read_text()
     change_of_config, table = re.findall(r"```(?:python|\{code-block\} python)\n(.*?)```", text, re.DOTALL)[:2]

@@ -11,6 +11,8 @@ from experiments.benchmarks.gpu_programs import PROGRAMS, Args, check, count_ker
 from experiments.hardware import hardware
 from fcos_lidar_jax.presets import PRESETS
 
+pytestmark = pytest.mark.slow
+
 MODULE = """HloModule jit_step
 
 %fused (p: f32[4]) -> f32[4] {

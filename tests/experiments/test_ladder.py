@@ -49,6 +49,7 @@ def _linear():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_linear")
 def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys):
     """Four steps on four frames with a linear network: that everything is there, not what it is."""
@@ -69,6 +70,7 @@ def test_a_trial_is_trained_scored_and_summarised(tmp_path, monkeypatch, capsys)
     assert capsys.readouterr().out.count("| local geometry | 4 |") == 2  # in both tables
 
 
+@pytest.mark.slow
 def test_the_second_round_marks_the_objects_and_the_first_stays():
     made = SimulatedFrames(TINY, 1)
     frame, marked = made.frame(0), Marked(made).frame(0)

@@ -35,6 +35,7 @@ CHANGED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make_scale", [quarter, smoke])
 def test_every_row_changes_the_named_part_only(tmp_path, make_scale):
     scale = make_scale(tmp_path)

@@ -34,6 +34,7 @@ def test_both_detectors_share_all_but_themselves(tmp_path):
     assert sum(min(base.inference.candidates_per_level, len(base.classes) * size) for size in sizes) == 4450
 
 
+@pytest.mark.slow
 def test_the_stages_that_are_timed_are_the_detector(tmp_path):
     scale = smoke(tmp_path)
     points = scale.clouds(scale.base.num_sweeps)[0]

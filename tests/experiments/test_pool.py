@@ -36,6 +36,7 @@ def test_new_frames_are_found(cache, monkeypatch):
     assert pool.name(5) == FRAMES.name(3)
 
 
+@pytest.mark.slow
 def test_processes_fill_the_pool_and_end(cache):
     with simulating(cache, 1):
         pool = PooledFrames(cache, least=3)

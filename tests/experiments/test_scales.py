@@ -74,6 +74,7 @@ def test_a_simulated_row_that_would_change_nothing_is_refused(tmp_path, fields, 
         scale.check(change(**fields)(scale.base))
 
 
+@pytest.mark.slow
 def test_the_full_scale_trains_on_one_split_and_evaluates_on_the_other(tmp_path, monkeypatch):
     splits = tmp_path / "splits.json"
     splits.write_text('{"mini_train": ["scene-0001"], "mini_val": ["scene-0002"]}')

@@ -11,6 +11,7 @@ from experiments.script import run_measurement
 from experiments.studies import device_equivalence as study
 
 
+@pytest.mark.slow
 def test_five_steps_are_the_same_on_one_device_and_on_eight_in_two_processes(tmp_path, monkeypatch):
     out = tmp_path / "record.json"
     for name, value in child_environment().items():

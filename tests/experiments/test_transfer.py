@@ -89,6 +89,7 @@ def shipped(exported, tmp_path, monkeypatch):
     return tmp_path / "weights", json.loads((tmp_path / "results" / "hdl32e.json").read_text())
 
 
+@pytest.mark.slow
 def test_exported_weights_are_the_runs_rounded_to_float16(shipped, tmp_path):
     package, record = shipped
     exported, run = (load_checkpoint(p) for p in (package / "hdl32e", tmp_path / "run/checkpoints/00000003"))
@@ -123,6 +124,7 @@ def test_logits_are_adjusted_for_the_class_frequencies_of_nuscenes():
     assert np.sum(shares * np.exp(np.array(classes) / 0.4)) == pytest.approx(1)  # objects stay as frequent
 
 
+@pytest.mark.slow
 def test_exported_weights_can_be_averaged_with_earlier_ones(shipped, tmp_path):
     package, _ = shipped
     run = load_checkpoint(tmp_path / "run/checkpoints/00000003")
@@ -152,6 +154,7 @@ def save_and_hash(folder: Path, checkpoint: Checkpoint) -> str:
     return json.loads((folder / "checkpoint.json").read_text())["hash"]
 
 
+@pytest.mark.slow
 def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     package, record = shipped
     before = {file: file.read_bytes() for file in package.rglob("*") if file.is_file()}

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.data.frame import InMemoryFrames
@@ -73,6 +74,7 @@ def test_a_note_says_if_only_one_heading_is_known(capsys):
         assert capsys.readouterr().err == expected
 
 
+@pytest.mark.slow
 def test_frames_with_x_ahead_give_the_boxes_of_frames_with_y_ahead(capsys):
     detector = fcos.load_detector("quickstart")
     frame = unseen_frames(detector.sensor, 1).frame(0)

@@ -84,6 +84,7 @@ def test_boxes_draw_themselves_in_a_notebook(made):
     assert Image.open(io.BytesIO(png)).width > 500
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_to_draw_only():
     code = (
         "import sys, numpy as np; from fcos_lidar_jax.inference import DetectedBoxes; "

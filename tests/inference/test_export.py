@@ -20,6 +20,8 @@ from fcos_lidar_jax.inference.export import PLATFORMS, export_detector, load_exp
 from fcos_lidar_jax.sensors import TINY, sensor_from_json
 from fcos_lidar_jax.simulation.frames import make_frame
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 VARIABLES = untrained(TINY_CONFIG, TINY)
 

@@ -144,6 +144,7 @@ def test_a_detector_accepts_files_and_warns_about_clouds_of_another_sensor(tmp_p
         detector(make_frame(0, NUSCENES_HDL32E).points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", ["lidar", "ray"])
 def test_centres_are_offset_along_the_axes_of_the_configuration(axes):
     """The network predicts the same everywhere: one class, and the centre one metre along the first axis."""
@@ -193,6 +194,7 @@ def test_weights_are_transferred_once(monkeypatch):
     assert "placed" not in repr(detector)
 
 
+@pytest.mark.slow
 def test_detections_with_flips_are_equivariant_to_mirrored_clouds():
     sensor = dataclasses.replace(SENSOR, origin_m=(0.5, -0.25, 0.0))
     inference = dataclasses.replace(CONFIG.inference, flips="xy", merge_iou=0.3)

@@ -17,6 +17,8 @@ from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.presets import COMPACT, NUSCENES, QUICKSTART
 from fcos_lidar_jax.sensors import sector
 
+pytestmark = pytest.mark.slow
+
 onnx = pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
 openvino = pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")
 

@@ -22,6 +22,8 @@ from fcos_lidar_jax.models import build_detector
 from fcos_lidar_jax.sensors import TINY
 from fcos_lidar_jax.simulation.frames import make_frame
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("onnx", reason="onnx, of the extra cpu, is not installed")
 pytest.importorskip("openvino", reason="openvino, of the extra cpu, is not installed")
 

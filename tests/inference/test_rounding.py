@@ -11,6 +11,8 @@ from fcos_lidar_jax.inference.detect import make_stages
 from fcos_lidar_jax.models import heads
 from fcos_lidar_jax.simulation.frame_set import unseen_frames
 
+pytestmark = pytest.mark.slow
+
 
 def rounded(x, bits):
     """The nearest float32 with this number of fraction bits, ties to even."""

@@ -41,6 +41,7 @@ def test_every_epoch_samples_equally_often_for_each_class(epoch):
     assert len(set(frames[frames < 60])) > 10
 
 
+@pytest.mark.slow
 def test_all_frames_of_a_class_are_equally_likely():
     order = order_of(SHOWS)
     many = np.concatenate([epoch_of(order, epoch) for epoch in range(60)])

@@ -80,6 +80,7 @@ def test_points_beyond_physical_limits_are_not_cut(tmp_path):
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_clouds_without_usable_points_are_counted_also_if_they_were_read_before(tmp_path, capsys, workers):
     frames = [toy_frame(seed) for seed in range(3)]
@@ -172,6 +173,7 @@ def test_objects_have_min_points_and_shards_may_be_empty(tmp_path):
     assert len(build(tmp_path / "empty", frames, scenes=())) == 0
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes_as_one_process(tmp_path, whole):
     reports = []
     build(tmp_path, workers=2, report=lambda done, total: reports.append((done, total)))
@@ -245,6 +247,7 @@ def whole_of_many(tmp_path_factory):
     return contents(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_build_resumes_to_the_same_bytes(tmp_path, whole_of_many, sent):
     script = tmp_path / "build.py"
@@ -363,6 +366,7 @@ def test_all_frames_must_have_the_columns_of_the_sensor(tmp_path):
     assert build(tmp_path / "c", six, scenes=(("t", (0,)),)).points(0).shape[1] == 6
 
 
+@pytest.mark.slow
 def test_an_error_in_a_worker_reaches_the_caller(tmp_path):
     with pytest.raises(IndexError):
         build(tmp_path, ListedFrames((toy_frame(0),)), scenes=(("s", (0,)), ("t", (1,))), workers=2)

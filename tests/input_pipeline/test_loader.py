@@ -251,6 +251,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_ends_early_prints_no_warning(tmp_path):
     script = tmp_path / "leave.py"
     script.write_text(LEFT_EARLY)
@@ -258,6 +259,7 @@ def test_a_run_that_ends_early_prints_no_warning(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "4 4\n", "")
 
 
+@pytest.mark.slow
 def test_workers_ignore_the_signals_that_the_main_process_handles(alone, objects):
     with make_batches(
         ToyFrames(), CONFIG, seed=0, num_steps=STEPS, threads=0, objects=objects, workers=1
@@ -303,6 +305,7 @@ class Broken(ToyFrames):
         raise ValueError(f"sweeps/{index}.bin: got 3 bytes, expected 20")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("threads", "workers"), [(0, 0), (2, 0), (0, 1)])
 def test_an_unreadable_file_stops_the_run_with_its_message(threads, workers):
     with refused(".bin: got 3 bytes, expected 20"):
@@ -341,6 +344,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_workers_end_when_the_main_process_is_killed(tmp_path):
     script = tmp_path / "orphaned.py"
     script.write_text(ORPHANED)

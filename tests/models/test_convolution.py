@@ -89,10 +89,16 @@ def test_batches_of_gradients_and_gradients_of_batches(case):
     assert_close([found_x[:, 0], found_kernel], [to_x, to_kernel], 1e-5)
 
 
-@pytest.mark.parametrize("dtype", TOLERANCES)
-@pytest.mark.parametrize("dilation", [3, 2])
-@pytest.mark.parametrize("circular", [False, True])
-@pytest.mark.parametrize("size", [(3, 3), (5, 3), (3, 1)])
+@pytest.mark.parametrize(
+    ("size", "dilation", "circular", "dtype"),
+    [
+        ((3, 3), 3, False, "float32"),
+        ((3, 3), 2, True, "bfloat16"),
+        ((5, 3), 2, False, "float32"),
+        ((5, 3), 3, True, "float32"),
+        ((3, 1), 3, True, "float32"),
+    ],
+)
 def test_weight_gradients_by_phases_are_the_librarys(size, circular, dilation, dtype):
     """Of sizes that the dilation divides and does not divide, as a GPU computes them."""
     rng = np.random.default_rng(0)
@@ -169,6 +175,7 @@ def test_small_images_have_no_rows(monkeypatch):
         assert program.as_text().count("stablehlo.while") == loops
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", TOLERANCES)
 def test_a_networks_losses_and_gradients_are_those_with_the_librarys(precision, monkeypatch):
     model = dataclasses.replace(CONFIG.model, precision=precision)
@@ -210,6 +217,7 @@ for case in CASES:
 """
 
 
+@pytest.mark.slow
 def test_two_devices_exchange_only_the_sums():
     done = run_python("-c", "import sys; sys.path.insert(0, 'tests/models')\n" + SHARDED, JAX_NUM_CPU_DEVICES="2")
     assert done.returncode == 0, done.stderr

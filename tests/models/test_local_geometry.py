@@ -160,21 +160,23 @@ def test_features_are_two_layers_of_the_offsets_and_of_the_points_own_numbers():
 
 
 @pytest.mark.parametrize("later_rounds", [False, True])
-@pytest.mark.parametrize("points", [0, 1])
-def test_gradients_are_finite_where_nothing_is_near(points, later_rounds):
-    image = np.zeros((1, 4, 9, 18), np.float32)
-    image[0, 2, 4, [0, 2, 14]] = points
+def test_gradients_are_finite_where_nothing_is_near(later_rounds):
     module = LocalGeometry(5, MEAN, SCALE, later_rounds=later_rounds)
-    variables = module.init(jax.random.key(0), jnp.asarray(image), train=False)
+    images = np.zeros((2, 1, 4, 9, 18), np.float32)
+    images[1, 0, 2, 4, [0, 2, 14]] = 1  # nothing at all, and a single point
+    variables = jax.jit(lambda image: module.init(jax.random.key(0), image, train=False))(images[0])
 
     def total(params, image):
         y, _ = module.apply({**variables, "params": params}, image, train=True, mutable=["batch_stats"])
         return (y**2).sum()
 
-    gradients = jax.jit(jax.grad(total, argnums=(0, 1)))(variables["params"], jnp.asarray(image))
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradients))
+    gradient = jax.jit(jax.grad(total, argnums=(0, 1)))
+    for image in images:
+        gradients = gradient(variables["params"], image)
+        assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradients))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tied", [False, True])
 def test_it_joins_the_heads_of_every_level_and_nothing_else_changes(tied):
     model = dataclasses.replace(CONFIG.model, tied_heads=tied)

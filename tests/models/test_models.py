@@ -56,6 +56,7 @@ def variables_of(module, *inputs):
     return {"params": fill(shapes["params"]), "batch_stats": zeros}
 
 
+@functools.cache
 def parameters(config, sensor=NUSCENES_HDL32E):
     return count_parameters(jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))["params"])
 
@@ -96,16 +97,15 @@ def stem_of_groups(params, image, config):
     [
         {"num_convs": 2},
         {"num_convs": 1, "group_rounds": False},
-        {"num_convs": 2, "group_rounds": False},
         {"num_convs": 2, "groups": "modalities"},
         {"num_convs": 2, "groups": "all"},
     ],
 )
 def test_the_stem_convolves_each_group_separately(choices):
     config = dataclasses.replace(SMALL_STEM, channels_per_type=12, **choices)  # several bundles
-    image = normal(0, 2, 8, 12, 27)
+    image = normal(0, 2, 6, 8, 18)
     params = variables_of(Stem(config), image)["params"]
-    cotangent = np.asarray(normal(1, 2, 8, 12, 8))
+    cotangent = np.asarray(normal(1, 2, 6, 8, 8))
 
     def value(params, image, stem):
         out = stem(params, image)
@@ -189,7 +189,7 @@ def test_batch_norm_is_the_library_one_over_parts():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), stats, expected_stats)
 
 
-@pytest.mark.parametrize(("channels", "groups"), [(64, 32), (128, 32), (32, 16), (6, 3)])
+@pytest.mark.parametrize(("channels", "groups"), [(64, 32), (6, 3)])
 def test_group_norm_is_the_library_one(channels, groups):
     x = normal(0, 2, 4, 6, channels) * 2 + 3
     library = nn.GroupNorm(num_groups=groups, epsilon=1e-5, use_fast_variance=False)
@@ -249,6 +249,7 @@ def receptive_profiles():
     return {"own": np.abs(np.asarray(own)), "all": np.abs(np.asarray(every))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", range(6))
 def test_level_outputs_are_centred_on_index_times_stride(level, receptive_profiles):
     """Alignment: the gradient with respect to the image is symmetric about index * stride.
@@ -268,6 +269,7 @@ def test_level_outputs_are_centred_on_index_times_stride(level, receptive_profil
                 assert seen[0] + seen[-1] == 2 * 128
 
 
+@pytest.mark.slow
 def test_circular_network_commutes_with_a_turn():
     """With circular width, rolling the input by 32 columns rolls every output."""
     network = Network(with_model(CONFIG, circular_width=True, stem=SMALL_STEM).model, 10)

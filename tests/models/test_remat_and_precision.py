@@ -7,6 +7,7 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import tiny_run
 
 from fcos_lidar_jax.models import build_detector
@@ -30,6 +31,7 @@ def forward_and_backward(**model):
     return found, sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(kept))
 
 
+@pytest.mark.slow
 def test_remat_changes_what_is_kept_for_the_backward_pass_and_nothing_else():
     """Outputs and statistics are equal to the bit, gradients up to rounding; half as much is kept."""
     (plain, kept), (remat, kept_less) = forward_and_backward(), forward_and_backward(remat=True)
@@ -41,6 +43,7 @@ def test_remat_changes_what_is_kept_for_the_backward_pass_and_nothing_else():
     assert kept_less < 0.6 * kept
 
 
+@pytest.mark.slow
 def test_bfloat16_stays_inside_the_network_and_close_to_float32():
     """What goes in and comes out is float32, forwards and backwards. A number of eight bits is wrong by 0.2 % in
     the mean, ten layers of them by less than ten times that. The gradients of random weights are off by more, most

@@ -96,6 +96,7 @@ def test_it_is_evaluated(run, frames):
     assert evaluate(fcos.load_detector(run), frames).summary["mean_dist_aps"]["car"] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_commands_detect_export_and_time_it(run, frames, tmp_path):
     np.save(tmp_path / "cloud.npy", frames.frame(0).points)
     command("export --checkpoint", run, "--batch any --out", tmp_path / "toy.fcos")

@@ -14,6 +14,8 @@ from fcos_lidar_jax.evaluation import evaluate_detections
 from fcos_lidar_jax.evaluation.results import LIDAR_META, result_entries
 from fcos_lidar_jax.types import Detections
 
+pytestmark = pytest.mark.slow
+
 NuScenesDevkit = pytest.importorskip("nuscenes.nuscenes").NuScenes
 
 TASKS = [

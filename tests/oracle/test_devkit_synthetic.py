@@ -13,6 +13,8 @@ from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.data.nuscenes.names import CATEGORY_TO_CLASS
 from fcos_lidar_jax.evaluation.results import LIDAR_META
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("nuscenes")
 
 VERSION = "v1.0-synthetic"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny_peer
 import tiny_run
+from linear_network import linear_network
 from tiny_run import LOOK as SMALL
 from tiny_run import SENSOR, bits, host_batch, train_tiny, untrained
 
@@ -20,6 +21,8 @@ from fcos_lidar_jax.refinement.network import SecondLook
 from fcos_lidar_jax.refinement.stage import best_boxes, over_samples, refinement_sums, trainable
 from fcos_lidar_jax.training import make_optimizer, make_state, make_train_step
 from fcos_lidar_jax.training.step import make_gradient
+
+pytestmark = pytest.mark.slow
 
 FROZEN = dataclasses.replace(SMALL, freeze_detector=True)
 CONFIGS = {"FCOS-LiDAR": tiny_run.CONFIG, "CenterPoint": tiny_peer.CONFIG}
@@ -169,19 +172,29 @@ def test_best_boxes_are_padded():
     assert best_boxes(boxes, 3)[3].tolist() == [True, True, False]
 
 
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """A run without a second look, of a network that compiles quickly."""
+    folder = tmp_path_factory.mktemp("first")
+    with linear_network():
+        train_tiny(folder)
+        yield folder
+
+
 @pytest.mark.parametrize("refinement", [SMALL, FROZEN], ids=["joint", "frozen"])
-def test_training_starts_from_weights_without_a_second_look(tmp_path, refinement, capsys):
-    train_tiny(tmp_path / "first")
+def test_training_starts_from_weights_without_a_second_look(first, tmp_path, refinement, capsys):
     # So few steps predict nothing that is more probable.
     inference = dataclasses.replace(tiny_run.CONFIG.inference, min_probability=0.0)
     config = dataclasses.replace(tiny_run.CONFIG, refinement=refinement, inference=inference)
-    train_tiny(tmp_path / "second", config=config, weights=str(tmp_path / "first"))
+    train_tiny(tmp_path / "second", config=config, weights=str(first))
     assert "has no second look: it starts with random weights" in capsys.readouterr().err
-    first, second = (load_checkpoint(tmp_path / name) for name in ("first", "second"))
-    assert second.config.refinement == refinement
-    same = bits(first.variables["params"]) == bits(
-        {k: v for k, v in second.variables["params"].items() if k != "refinement"}
-    )
-    assert same == refinement.freeze_detector
-    train_tiny(tmp_path / "third", weights=str(tmp_path / "second"))
+    before, after = load_checkpoint(first), load_checkpoint(tmp_path / "second")
+    assert after.config.refinement == refinement
+    detector_of = {k: v for k, v in after.variables["params"].items() if k != "refinement"}
+    assert (bits(before.variables["params"]) == bits(detector_of)) == refinement.freeze_detector
+
+
+def test_the_second_look_of_weights_is_left_out_without_one(first, tmp_path, capsys):
+    train_tiny(tmp_path / "second", config=tiny_run.REFINED, weights=str(first), steps=1)
+    train_tiny(tmp_path / "third", weights=str(tmp_path / "second"), steps=1)
     assert "the second look is left out" in capsys.readouterr().err

@@ -69,22 +69,19 @@ def test_a_box_of_the_right_class_stands_before_a_nearer_one():
 def test_without_boxes_or_objects_everything_is_background():
     boxes, labels, valid, *truth = map(jnp.asarray, scene(0))
     none = jnp.zeros((0, 7)), jnp.zeros(0, jnp.int32), jnp.zeros(0, bool)
-    alone = match_boxes(boxes, labels, valid, *none, **OPTIONS)
+    alone = match(boxes, labels, valid, *none, **OPTIONS)
     assert (alone.label == 3).all()
     assert not alone.near.any()
     np.testing.assert_array_equal(alone.weight, valid)
-    assert match_boxes(*none, *truth, **OPTIONS).label.shape == (0,)
+    assert match(*none, *truth, **OPTIONS).label.shape == (0,)
 
 
-def test_eager_jit_and_vmap_agree():
+def test_batches_equal_their_samples():
     scenes = [scene(seed) for seed in range(2)]
-    both = jax.vmap(functools.partial(match_boxes, **OPTIONS))(*map(np.stack, zip(*scenes, strict=True)))
+    both = jax.jit(jax.vmap(functools.partial(match_boxes, **OPTIONS)))(*map(np.stack, zip(*scenes, strict=True)))
     for i, one in enumerate(scenes):
-        for found in (
-            match_boxes(*map(jnp.asarray, one), **OPTIONS),
-            jax.tree.map(lambda leaf, i=i: leaf[i], both),
-        ):
-            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, match(*one, **OPTIONS))
+        found = jax.tree.map(lambda leaf, i=i: leaf[i], both)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, match(*one, **OPTIONS))
 
 
 def test_residuals_are_coded_in_the_frame_of_the_box():
@@ -99,15 +96,10 @@ def test_residuals_are_coded_in_the_frame_of_the_box():
 
 
 def test_gradients_are_finite_for_degenerate_boxes():
-    boxes = jnp.zeros((3, 9))
-    gradients = [
-        jax.grad(lambda b: encode_residual(b, boxes).sum())(boxes),
-        jax.grad(lambda b: encode_residual(boxes, b).sum())(boxes),
-        *jax.grad(lambda b, r: move_boxes(b, r).sum(), argnums=(0, 1))(boxes, jnp.zeros((3, 8))),
-        jax.grad(
-            lambda b: match_boxes(
-                b, jnp.zeros(3, int), jnp.ones(3, bool), boxes, jnp.zeros(3, int), jnp.ones(3, bool), **OPTIONS
-            ).residual.sum()
-        )(boxes),
-    ]
-    assert all(np.isfinite(g).all() for g in gradients)
+    def total(a, b, residual):
+        labels, valid = jnp.zeros(3, int), jnp.ones(3, bool)
+        matched = match_boxes(a, labels, valid, b, labels, valid, **OPTIONS).residual
+        return encode_residual(a, b).sum() + move_boxes(a, residual).sum() + matched.sum()
+
+    boxes, gradient = jnp.zeros((3, 9)), jax.jit(jax.grad(total, argnums=(0, 1, 2)))
+    assert all(np.isfinite(g).all() for g in gradient(boxes, boxes, jnp.zeros((3, 8))))

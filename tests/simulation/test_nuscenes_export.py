@@ -116,6 +116,7 @@ def test_tokens_and_chains_refer_to_existing_rows(made):
         assert chain[0]["num_lidar_pts"] > 0 < chain[-1]["num_lidar_pts"]
 
 
+@pytest.mark.slow
 def test_annotated_point_counts_are_exact(street):
     """Counts points of a rolling shutter in the global frame with the quaternions of the files."""
     found, data = tables(street), NuScenes(street, VERSION)
@@ -180,6 +181,7 @@ def test_old_points_stay_in_boxes_of_static_objects(street):
     assert np.median(unposed) < 0.7 * np.median(stands)
 
 
+@pytest.mark.slow
 def test_bytes_depend_on_seed_and_shutter_but_not_on_workers_or_the_number_of_scenes(made, tmp_path):
     expected = contents(made)
     assert contents(synthesize(tmp_path / "again", "--workers", "2")) == expected
@@ -213,6 +215,7 @@ def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, 
         assert contents(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_killed_runs_resume_to_the_same_bytes(tmp_path):
     quick = ["--streets", "plain", "--no-rolling-shutter", "--workers", "1"]
     killed = killed_twice(tmp_path / "killed", "--out", command(tmp_path / "none", *quick))
@@ -225,6 +228,7 @@ def test_killed_runs_resume_to_the_same_bytes(tmp_path):
     assert len(states) >= 6  # kills at different stages
 
 
+@pytest.mark.slow
 def test_workers_end_with_the_command_and_a_later_run_completes_the_work(made, tmp_path):
     root = tmp_path / "data"
     started = [sys.executable, "-m", "fcos_lidar_jax", *command(root, "--workers", "2")]

@@ -3,6 +3,7 @@
 The network does not matter here; ``tests/cli/test_train.py`` trains FCOS-LiDAR's.
 """
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -10,7 +11,6 @@ import json
 import os
 import shutil
 import signal
-from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -73,10 +73,6 @@ def begun(finished, tmp_path) -> Path:
     folder.mkdir()
     shutil.copy(finished[0] / "run.json", folder)
     return folder
-
-
-def losses(folder: Path) -> list[float]:
-    return [line["loss/total"] for line in read_metrics(folder) if "loss/total" in line]
 
 
 def scores(folder: Path) -> dict[int, float]:
@@ -193,7 +189,7 @@ def disturb(monkeypatch, at: int, how) -> None:
         first = first_step
         return loader.make_batches(*args, first_step=first_step, **kwargs)
 
-    @contextmanager
+    @contextlib.contextmanager
     def disturbed(batches, mesh):
         with feed(batches, mesh) as stream:
             yield (how(host) if step == at else host for step, host in enumerate(stream, start=first))
@@ -202,10 +198,9 @@ def disturb(monkeypatch, at: int, how) -> None:
     monkeypatch.setattr(runs, "feed", disturbed)
 
 
-def signalled(number: int, times: int = 1):
+def signalled(number: int):
     def send(host):
-        for _ in range(times):
-            os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)
         return host
 
     return send
@@ -216,51 +211,69 @@ def overflowing(host):
     return dataclasses.replace(host, batch=dataclasses.replace(host.batch, points=points))
 
 
-def test_a_run_that_stops_fails_and_resumes_is_bit_identical(finished, tmp_path, capsys, monkeypatch):
-    whole, state, _ = finished
-    folder = tmp_path / "run"
+def without_times(folder: Path) -> list[dict]:
+    times = {"seconds", "waiting_seconds", "samples_per_second"}
+    return [{name: line[name] for name in line.keys() - times} for line in read_metrics(folder)]
 
-    def train(at, how, **kwargs):
-        disturb(monkeypatch, at, how)
-        return train_tiny(folder, evaluate=2, tests=TESTS, save=10, **kwargs)
 
-    with pytest.raises(KeyboardInterrupt):
-        train(0, signalled(signal.SIGINT), weights=weights())
-    assert "stopped after step 1, which is saved" in capsys.readouterr().err
-    assert checkpoint_names(folder) == ["00000001"]
-    with pytest.raises(SystemExit) as stopped:
-        # Clusters may send SIGTERM twice within a second.
-        exit_code("train", lambda: train(2, signalled(signal.SIGTERM, times=2), resume=True))
-    assert stopped.value.code == 143
+def cut_description(folder: Path) -> None:
     newest = folder / "checkpoints" / "00000003" / "checkpoint.json"
     newest.write_text(newest.read_text()[:-9])
-    message = r"^step 3: not finite: .*; samples: seed \d+, seed \d+; the last checkpoint is .*/0000000[23]$"
-    with pytest.raises(NonFiniteLossError, match=message):
-        train(2, overflowing, resume=True)
-    assert "going back to the checkpoint before" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as stopped:  # also in the last step, so that no further run starts
-        exit_code("train", lambda: train(STEPS - 1, signalled(signal.SIGTERM), resume=True))
-    assert stopped.value.code == 143
-    assert f"stopped after step {STEPS}, which is saved" in capsys.readouterr().err
-    assert bits(train(-1, None, resume=True)) == bits(state)
-    times = {"seconds", "waiting_seconds", "samples_per_second"}
-    resumed, uninterrupted = (
-        [{name: line[name] for name in line.keys() - times} for line in read_metrics(run)]
-        for run in (folder, whole)
-    )
-    assert resumed == uninterrupted
 
 
-def test_a_run_that_is_stopped_at_an_evaluation_step_evaluates_when_it_resumes(finished, tmp_path, monkeypatch):
-    folder, options = tmp_path / "run", {"evaluate": 2, "tests": TESTS}
-    disturb(monkeypatch, 1, signalled(signal.SIGTERM))
-    with pytest.raises(SystemExit):
+# How a run ends: the step and what happens in it, the steps between its saves, a change of its folder afterwards;
+# then the checkpoints in the folder, and what is said when the run stops or resumes. Steps 2 and 4 are evaluated.
+TERM = signalled(signal.SIGTERM)
+EVENTS = {
+    "Ctrl-C": (0, signalled(signal.SIGINT), 9, None, "1", "stopped after step 1, which is saved"),
+    "SIGTERM": (2, TERM, 9, None, "2 3", "stopped after step 3, which is saved"),
+    "SIGTERM in a step that is evaluated": (1, TERM, 1, None, "1 2", "stopped after step 2"),
+    "SIGTERM in the last step": (3, TERM, 9, None, "2 4", "stopped after step 4"),  # so that no further run starts
+    "a loss that is not finite": (2, overflowing, 1, None, "1 2", ""),
+    "a damaged checkpoint": (2, TERM, 1, cut_description, "2 3", "going back to the checkpoint before"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("event", EVENTS)
+def test_a_run_that_ends_early_resumes_bit_identical(finished, tmp_path, capsys, monkeypatch, event):
+    step, happens, save, change, left, said = EVENTS[event]
+    whole, state, _ = finished
+    folder, options = tmp_path / "run", {"save": save, "evaluate": 2, "tests": TESTS}
+
+    def run():
         train_tiny(folder, weights=weights(), **options)
-    assert checkpoint_names(folder) == ["00000001", "00000002"]
-    assert scores(folder) == {}
+
+    disturb(monkeypatch, step, happens)
+    if happens is overflowing:
+        message = r"^step 3: not finite: .*; samples: seed \d+, seed \d+; the last checkpoint is .*/00000002$"
+        with pytest.raises(NonFiniteLossError, match=message):
+            run()
+    elif event == "Ctrl-C":
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    else:
+        with pytest.raises(SystemExit, match="143"):
+            exit_code("train", run)
+    if change is not None:
+        change(folder)
+    assert checkpoint_names(folder) == [f"{int(number):08d}" for number in left.split()]
     disturb(monkeypatch, -1, None)
+    assert bits(train_tiny(folder, resume=True, **options)) == bits(state)
+    assert said in capsys.readouterr().err
+    assert without_times(folder) == without_times(whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [STEPS - 1, STEPS])
+def test_a_run_that_is_killed_in_its_last_step_or_only_save_begins_again(finished, tmp_path, steps):
+    folder, options = tmp_path / "run", {"save": 9, "weights": weights()}
+    train_tiny(folder, **options)
+    shutil.rmtree(folder / "checkpoints")
+    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (folder / "metrics.jsonl").write_text("".join(lines[:steps]))
     assert bits(train_tiny(folder, resume=True, **options)) == bits(finished[1])
-    assert scores(folder) == scores(finished[0])
+    assert checkpoint_names(folder) == ["00000004"]
 
 
 def test_processes_with_other_data_are_refused_before_the_run_starts(tmp_path, monkeypatch):
@@ -294,38 +307,7 @@ def test_processes_that_find_other_checkpoints_are_refused(finished, tmp_path, m
     assert checksums[0] != checksums[1] == checksums[2]
 
 
-@pytest.mark.parametrize(("every", "first"), [({"evaluate": 2}, 1), ({"evaluate": 9, "save": 9}, 4)])
-def test_a_run_without_its_checkpoints_keeps_its_metrics(finished, tmp_path, every, first):
-    folder = shutil.copytree(finished[0], tmp_path / "run")
-    shutil.rmtree(folder / "checkpoints")
-    before = contents(folder)
-    message = f"checkpoints: found none, but metrics of 4 steps, and this schedule saves step {first}: expected"
-    with pytest.raises(ValueError, match=message):
-        train_tiny(folder, tests=TESTS, weights=weights(), resume=True, **every)
-    assert contents(folder) == before
-
-
-def test_a_run_that_would_save_only_at_its_end_begins_again_if_it_was_killed_before(tmp_path):
-    run = tmp_path / "run"
-    first = train_tiny(run, save=9, weights=weights())
-    for steps in (STEPS - 1, STEPS):  # killed in the last step, or in its save
-        shutil.rmtree(run / "checkpoints")
-        lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
-        (run / "metrics.jsonl").write_text("".join(lines[:steps]))
-        assert len(losses(run)) == steps
-        again = train_tiny(run, save=9, weights=weights(), resume=True)
-        assert [path.name for path in (run / "checkpoints").iterdir()] == ["00000004"]
-        assert bits(again) == bits(first)
-
-
-def test_a_new_run_does_not_empty_other_metrics(tmp_path):
-    (tmp_path / "metrics.jsonl").write_text('{"epoch": 1}\n')
-    with pytest.raises(ValueError, match=r"metrics\.jsonl: found metrics without run\.json, expected another"):
-        train_tiny(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["metrics.jsonl"]
-    assert (tmp_path / "metrics.jsonl").read_text() == '{"epoch": 1}\n'
-
-
+@pytest.mark.slow
 def test_weights_in_half_precision_are_trained_in_float32(tmp_path):
     half, same = (
         {"weights": jax.tree.map(cast, weights())}
@@ -368,6 +350,7 @@ def stopped(finished, tmp_path_factory) -> tuple[Path, Path, list[str]]:
     return full, killed, done.stderr.splitlines()
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_while_saving_resumes_bit_identical(finished, stopped):
     _, folder, _ = stopped
     assert [name[:9] for name in checkpoint_names(folder)] == [".00000003", "00000001", "00000002"]
@@ -375,12 +358,14 @@ def test_a_run_that_is_killed_while_saving_resumes_bit_identical(finished, stopp
     assert checkpoint_names(folder) == ["00000003", "00000004"]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_before_its_first_checkpoint_resumes_with_the_initial_weights(finished, begun):
     assert bits(train_tiny(begun, evaluate=2, tests=TESTS, resume=True, weights=weights())) == bits(finished[1])
     assert scores(begun) == scores(finished[0])  # the initial weights are not evaluated
     assert checkpoint_names(begun) == checkpoint_names(finished[0])
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_reported_in_one_line_and_loses_no_checkpoint(stopped):
     """A limit of the file size, from the third checkpoint on, fails as a full disk does."""
     folder, _, messages = stopped
@@ -392,6 +377,7 @@ def test_a_full_disk_is_reported_in_one_line_and_loses_no_checkpoint(stopped):
     assert [load_checkpoint(path).step for path in sorted(refused.parent.iterdir())] == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_without_a_mean_ap_is_saved_without_a_score(tmp_path, capsys):
     """The test frames have no boxes, so the mean over classes is NaN."""
     none = np.zeros(0, np.int32)
@@ -406,26 +392,71 @@ def test_a_checkpoint_without_a_mean_ap_is_saved_without_a_score(tmp_path, capsy
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("field", "value", "got"),
     [
-        (lambda spec: spec["config"]["loss"].update(l1_weight=9.0), r"config.loss.l1_weight: was 9.0, got 0.25"),
-        (lambda spec: spec["sensor"].update(num_columns=8), "sensor.num_columns: was 8, got 64"),
-        (lambda spec: spec.update(steps=5), "steps: was 5, got 4"),
-        (lambda spec: spec.update(seed=1), "seed: was 1, got 0"),
-        (lambda spec: spec.pop("seed"), "seed: was 'nothing', got 0"),
-        (lambda spec: spec.pop("ground_truth_database"), "ground_truth_database: was 'nothing', got None"),
-        (lambda spec: spec["config"]["model"].pop("remat"), "config.model.remat: was 'nothing', got False"),
-        (lambda spec: spec.update(ground_truth_database="x"), "ground_truth_database: was 'x', got None"),
-        (lambda spec: spec.update(data="other frames"), "data: was 'other frames', got "),
+        ("config.loss.l1_weight", 9.0, "0.25"),
+        ("config.model.remat", None, "False"),
+        ("sensor.num_columns", 8, "64"),
+        ("steps", 5, "4"),
+        ("seed", 1, "0"),
+        ("seed", None, "0"),
+        ("ground_truth_database", None, "None"),
+        ("ground_truth_database", "x", "None"),
+        ("data", "other frames", ""),
     ],
 )
-def test_a_different_specification_is_refused_and_the_field_named(begun, change, message):
+def test_a_different_specification_is_refused_and_the_field_named(begun, field, value, got):
     spec = json.loads((begun / "run.json").read_text())
-    change(spec)
+    *path, name = field.split(".")
+    place = functools.reduce(dict.__getitem__, path, spec)
+    place[name] = value
+    if value is None:
+        del place[name]
     (begun / "run.json").write_text(json.dumps(spec))
-    with pytest.raises(ValueError, match=rf"run.json: {message}.*: only the same run can be resumed$"):
+    was = repr("nothing" if value is None else value)
+    with pytest.raises(
+        ValueError, match=rf"run.json: {field}: was {was}, got {got}.*: only the same run can be resumed$"
+    ):
         train_tiny(begun, resume=True)
     assert [path.name for path in begun.iterdir()] == ["run.json"]
+
+
+LOST = "checkpoints: found none, but metrics of 4 steps, and this schedule saves step"
+REFUSED = {  # what is removed from the folder of a run and written to it, options, and the error
+    "another run": ("", {}, {}, "holds a run, expected another folder or --resume, in Python resume=T"),
+    "no run": (
+        "run.json metrics.jsonl checkpoints",
+        {},
+        {"resume": True},
+        "run.json: found nothing, expected the run",
+    ),
+    "no folder": (".", {}, {"resume": True}, "run.json: found nothing, expected the run"),
+    "no JSON": ("", {"run.json": "{"}, {"resume": True}, "run.json: not JSON"),
+    "a checkpoint": ("run.json", {}, {}, "00000004: found a checkpoint without run.json, expected another"),
+    "metrics": (
+        "run.json checkpoints",
+        {},
+        {},
+        r"metrics\.jsonl: found metrics without run\.json, expected another",
+    ),
+    "no checkpoints": ("checkpoints", {}, {"resume": True}, f"{LOST} 1: expected the"),
+    "no last checkpoint": ("checkpoints", {}, {"resume": True, "save": 9, "evaluate": 9}, f"{LOST} 4"),
+    "a file": (".", {".": ""}, {}, "found a file, expected a folder"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_folder_without_the_run_is_refused_and_unchanged(finished, tmp_path, case):
+    removed, written, options, message = REFUSED[case]
+    folder = shutil.copytree(finished[0], tmp_path / "run")
+    for path in (folder / name for name in removed.split()):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for name, text in written.items():
+        (folder / name).write_text(text)
+    before = contents(tmp_path), set(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=message):
+        train_tiny(folder, **{"evaluate": 2, "tests": TESTS, "weights": weights(), **options})
+    assert (contents(tmp_path), set(tmp_path.rglob("*"))) == before
 
 
 @pytest.mark.parametrize("part", ["params", "network"])
@@ -443,6 +474,7 @@ def begin_again(run):
     (run / "metrics.jsonl").unlink()
 
 
+@pytest.mark.slow
 def test_other_weights_behind_a_path_are_refused_if_the_run_would_read_them_again(tmp_path):
     start, run = tmp_path / "start", tmp_path / "run"
     options = {"weights": start, "steps": 1}
@@ -477,24 +509,7 @@ def test_a_different_ground_truth_database_of_the_same_frames_is_refused(begun, 
         train_tiny(begun, resume=True, config=config, objects=other)
 
 
-def test_a_folder_with_another_run_or_none_is_refused(begun, tmp_path):
-    with pytest.raises(ValueError, match=r"holds a run, expected another folder or --resume, in Python resume=T"):
-        train_tiny(begun)
-    with pytest.raises(ValueError, match=r"run.json: found nothing, expected the run to resume"):
-        train_tiny(tmp_path / "nothing", resume=True)
-    assert not (tmp_path / "nothing").exists()
-    (begun / "run.json").write_text("{")
-    with pytest.raises(ValueError, match=r"run.json: not JSON"):
-        train_tiny(begun, resume=True)
-    (begun / "run.json").unlink()
-    (begun / "checkpoints" / "00000900").mkdir(parents=True)
-    with pytest.raises(ValueError, match=r"00000900: found a checkpoint without run.json, expected another"):
-        train_tiny(begun)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="found a file, expected a folder"):
-        train_tiny(tmp_path / "file")
-
-
+@pytest.mark.slow
 def test_a_run_that_is_killed_during_an_evaluation_repeats_it_on_resume(finished, tmp_path, monkeypatch):
     folder, evaluate, evaluated = tmp_path / "run", runs._evaluate, []
 

@@ -70,6 +70,7 @@ def trainer():
     return detector, make_state(detector, optimizer, key), *counted(make_train_step(detector, optimizer))
 
 
+@pytest.mark.slow
 def test_a_short_run_learns_one_simulated_frame_and_compiles_once(trainer):
     """Finds the large objects; experiments/studies/overfit_keyframe.py trains for longer."""
     detector, state, step, traces = trainer
@@ -267,6 +268,7 @@ def four_frames() -> Batch:
     return batch
 
 
+@pytest.mark.slow
 def test_micro_batches_and_samples_without_boxes_do_not_change_the_box_losses():
     detector, batch = toy_detector(), four_frames()
     params = detector.init(jax.random.key(0))["params"]
@@ -284,6 +286,7 @@ def test_micro_batches_and_samples_without_boxes_do_not_change_the_box_losses():
         np.testing.assert_allclose(losses, [losses[0]] * 4, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axes", "micro_batches"), [("lidar", (1, 2)), ("ray", (1,))])
 def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches):
     """Compares with NumPy, with and without micro-batches: cross-entropy over positives, L1 over candidates."""
@@ -376,6 +379,7 @@ def test_a_warning_names_a_frame_that_does_not_fit_the_sensor():
     assert warning.startswith(f"{made.name(1)}: points do not fit")
 
 
+@pytest.mark.slow
 def test_the_target_of_the_score_factor_is_the_iou_or_the_centreness():
     """Predictions are half a metre above the truth: centreness is constant, and IoU depends on the height."""
     detector, batch = toy_detector(), jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], four_frames())

@@ -93,6 +93,7 @@ def test_a_damaged_image_is_named(image, content):
         )
 
 
+@pytest.mark.slow
 def test_a_report_of_kitti_has_boxes_in_the_camera_images(tmp_path):
     make_kitti(tmp_path / "kitti", train=1, val=1)
     frames = SelectedFrames(KittiFrames(tmp_path / "kitti"), (1, 0))

@@ -8,6 +8,8 @@ from fcos_lidar_jax.sensors import NUSCENES_HDL32E
 from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.visualization.page import page_frame, write_page
 
+pytestmark = pytest.mark.slow
+
 CLASSES = ("car", "truck")
 BLUE, RED = (31, 119, 180), (214, 39, 40)  # colours of the first two classes
 LIGHT, DARK = (251, 251, 250), (16, 18, 20)  # backgrounds
