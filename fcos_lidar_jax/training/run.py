@@ -17,7 +17,7 @@ import jax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
-from fcos_lidar_jax.checkpoints.preemption import stop_requests
+from fcos_lidar_jax.checkpoints.preemption import StopRequest, stop_requests
 from fcos_lidar_jax.checkpoints.storage import Checkpoint, NonFiniteStateError
 from fcos_lidar_jax.config import Config
 from fcos_lidar_jax.data.class_mapping import MappedFrames
@@ -41,6 +41,7 @@ from fcos_lidar_jax.training.step import detection_variables, make_state, make_t
 from fcos_lidar_jax.types import HostBatch, TrainState
 
 _NUM_PICTURES = 2  # number of test frames drawn at an evaluation
+_STOPPING = "stopping after this step or evaluation, which is saved"
 
 Hook = Callable[[int, Record], None]
 """Called with the number of steps and the metrics of the last one, or the scores of the evaluation after it."""
@@ -90,7 +91,7 @@ def train(
             :func:`fcos_lidar_jax.augment.check_augmentation`, or processes have different runs or data.
         OSError: another process trains in the folder, or writing failed.
         NonFiniteLossError, NonFiniteStateError: a value is not finite; earlier checkpoints remain.
-        KeyboardInterrupt: after Ctrl-C, once the state is saved.
+        KeyboardInterrupt: after Ctrl-C, once the state is saved; before the first step, nothing is saved.
         SystemExit: after SIGTERM, once the state is saved; both also if the signal came during the last step.
 
     >>> from fcos_lidar_jax.presets import QUICKSTART
@@ -161,20 +162,23 @@ def train(
             lend=True,
             order=run.order,
         )
-        asked = stop_requests("stopping after this step or evaluation, which is saved", active=not several)
-        with asked as request, batches as prepared, feed(prepared, mesh) as stream:
+        request: StopRequest | None = None  # none while the first step is compiled: there is nothing to save
+        with contextlib.ExitStack() as asked, batches as prepared, feed(prepared, mesh) as stream:
 
             def stopping(done: int) -> bool:
+                nonlocal request
                 if several:  # all stop after the same step, whichever of them received the signal
                     return multihost_utils.reached_preemption_sync_point(done)
+                request = request or asked.enter_context(stop_requests(_STOPPING))
                 return request.signal is not None
 
             state = _take_steps(run, mesh, start, stream, pending, log, hooks, stopping)
         if is_main_process:
             draw_metrics(run.folder)
-    if (done := int(state.step)) < steps or request.signal is not None:
+    stopped_by = None if request is None else request.signal
+    if (done := int(state.step)) < steps or stopped_by is not None:
         tell(f"stopped after step {done}, which is saved")
-        if request.signal == signal.SIGINT:
+        if stopped_by == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + signal.SIGTERM)
     return state
