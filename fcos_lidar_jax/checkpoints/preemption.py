@@ -24,9 +24,9 @@ class StopRequest:
 def stop_requests(line: str | None = None, *, active: bool = True) -> Iterator[StopRequest]:
     """Turn the first Ctrl-C or SIGTERM into a request that the run checks between steps; a second Ctrl-C ends it.
 
-    Further SIGTERMs change nothing, because clusters may send two within a second; the entry point of the command
-    line ends the process at one that comes later. Signals keep their handlers with ``active=False`` and outside
-    the main thread, where Python delivers none.
+    Further SIGTERMs change nothing, because clusters may send two; the command line ends the process at a later
+    one. Signals keep their handlers with ``active=False`` and outside the main thread, where Python
+    delivers none.
 
     The first signal prints the line, if one is given, on standard error at once, even while XLA compiles.
     """
@@ -34,9 +34,12 @@ def stop_requests(line: str | None = None, *, active: bool = True) -> Iterator[S
     in_main_thread = threading.current_thread() is threading.main_thread()
     handlers = {number: signal.getsignal(number) for number in _SIGNALS if active and in_main_thread}
 
-    def ask(number: int, _: FrameType | None) -> None:
-        request.signal = request.signal or number
-        signal.signal(signal.SIGINT, handlers[signal.SIGINT])
+    def ask(number: int, frame: FrameType | None) -> None:
+        # This handler stays, for the command line ends the process if the first signal has its own handler.
+        if request.signal is None:
+            request.signal = number
+        elif number == signal.SIGINT and callable(before := handlers[signal.SIGINT]):
+            before(number, frame)
 
     def tell(number: int) -> None:
         nonlocal told

@@ -1,6 +1,7 @@
 """Entry point of the command line, which turns each failure into one line and an exit code."""
 
 import contextlib
+import gc
 import io
 import os
 import platform
@@ -15,7 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TextIO
 
 from fcos_lidar_jax import __version__
-from fcos_lidar_jax.cli.signals import ended_by_a_second, ended_while_importing, ending_signals, raising_again
+from fcos_lidar_jax.cli.signals import ending_signals
 
 _LESS_MEMORY = (
     "for training, --optimizer.accumulate N splits each batch into N parts, --model.precision bfloat16 halves the "
@@ -39,9 +40,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if words == ["--version"]:
             print(f"fcos-lidar {__version__}")
             return
-        with ended_while_importing("fcos-lidar"):
-            from fcos_lidar_jax.cli.commands import parse
-        parse(words)()
+        from fcos_lidar_jax.cli.commands import parse
+        from fcos_lidar_jax.cli.compilation_cache import use_compilation_cache
+
+        gc.set_threshold(100_000, 50, 100)  # looking for garbage takes much of the time of tracing
+        command = parse(words)
+        use_compilation_cache()
+        command()
 
     return exit_code("fcos-lidar", work)
 
@@ -49,9 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def exit_code(program: str, work: Callable[[], object]) -> int:
     """Call ``work`` and explain a failure in one line on standard error, which starts with the program's name.
 
-    Unexpected exceptions are treated as bugs: the line names a file with the full report. SIGTERM and SIGHUP raise
-    an exception in ``work``, so that it leaves no half-written files. A second Ctrl-C at least a second later, or
-    another signal at least five seconds later, ends the process at once, even while a program is compiled.
+    Unexpected exceptions are treated as bugs: the line names a file with the full report. Ctrl-C, SIGTERM and
+    SIGHUP raise an exception in ``work``, so that it leaves no half-written files; while XLA compiles, they end
+    the process after a few seconds. A second signal, at least two seconds later, ends it at once.
 
     Returns:
         0; 1 after a failure; 130 after Ctrl-C; 141 if the reader of the output has gone.
@@ -67,7 +72,7 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
             sys.stdout.reconfigure(errors="replace")
     stopped = None
     try:
-        with ending_signals() as numbers, ended_by_a_second(numbers, program):
+        with ending_signals(program):
             code = _attempt(program, work)
     except BrokenPipeError:
         code = _CLOSED_PIPE
@@ -86,8 +91,7 @@ def exit_code(program: str, work: Callable[[], object]) -> int:
 
 def _attempt(program: str, work: Callable[[], object]) -> int:
     try:
-        with raising_again():
-            work()
+        work()
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.point_files import read_points
@@ -61,6 +60,8 @@ class PoseTrack(NamedTuple):
         >>> track.at(100_000, "poses")[0].tolist()
         [1.0, 0.0, 0.0, 0.5]
         """
+        from scipy.spatial.transform import Rotation, Slerp  # SciPy takes long to import
+
         known_us, rotations, translations = self
         last = int(np.searchsorted(known_us, time_us))
         if last < len(known_us) and known_us[last] == time_us:

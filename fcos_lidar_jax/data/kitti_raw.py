@@ -5,7 +5,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import MAX_POINTS, read_points
@@ -66,6 +65,8 @@ def _read_oxts(file: Path) -> dict[str, float]:
 def _imu_to_world(
     latitude: float, longitude: float, altitude: float, roll: float, pitch: float, yaw: float, *, scale: float
 ) -> np.ndarray:
+    from scipy.spatial.transform import Rotation  # SciPy takes long to import
+
     north = np.log(np.tan(np.deg2rad(90 + latitude) / 2))
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()

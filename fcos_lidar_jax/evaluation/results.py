@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.classes import NUSCENES_CLASSES
 from fcos_lidar_jax.evaluation import json_io
@@ -139,6 +138,8 @@ def result_entries(
     >>> entry["size"], entry["rotation"], entry["attribute_name"]
     ([2.0, 4.0, 1.0], [1.0, 0.0, 0.0, 0.0], 'vehicle.moving')
     """
+    from scipy.spatial.transform import Rotation  # SciPy takes long to import
+
     valid = np.flatnonzero(np.asarray(found.valid))[:MAX_BOXES]
     boxes = np.asarray(found.boxes, np.float64)[valid]
     names = [classes[int(label)] for label in np.asarray(found.labels)[valid]]

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fcos_lidar_jax.data.nuscenes.names import BICYCLE_RACK, CATEGORY_TO_CLASS
 from fcos_lidar_jax.simulation.lidar import SWEEP_S
@@ -196,6 +195,8 @@ def visibility_of(share: float) -> str:
 
 def pose_fields(pose: np.ndarray) -> Row:
     """Table fields of a 4x4 pose: translation and rotation (w, x, y, z)."""
+    from scipy.spatial.transform import Rotation  # SciPy takes long to import
+
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
     return {"translation": pose[:3, 3].tolist(), "rotation": quaternion.tolist()}
 

@@ -37,6 +37,7 @@ from fcos_lidar_jax.training.step import detection_variables, make_state, make_t
 from fcos_lidar_jax.types import HostBatch, TrainState
 
 _NUM_PICTURES = 2  # number of test frames drawn at an evaluation
+_STOPPING = "stopping after this step or evaluation, which is saved"
 
 
 def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> TrainState:
@@ -52,7 +53,7 @@ def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> 
             :func:`fcos_lidar_jax.augment.check_augmentation`, or processes have different runs or data.
         OSError: another process trains in the folder, or writing failed.
         NonFiniteLossError, NonFiniteStateError: a value is not finite; earlier checkpoints remain.
-        KeyboardInterrupt: after Ctrl-C, once the state is saved.
+        KeyboardInterrupt: after Ctrl-C, once the state is saved; before the first step, nothing is saved.
         SystemExit: after SIGTERM, once the state is saved; both also if the signal came during the last step.
     """
     with agreed("cannot train"):
@@ -77,12 +78,12 @@ def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> 
         log = MetricsLog(spec.out, first_step=first) if is_main_process else None
         if log is not None:
             held.callback(log.close)
-        state, request = _train(run, mesh, start, pending, log)
+        state, stopped_by = _train(run, mesh, start, pending, log)
         if is_main_process:
             draw_metrics(spec.out)
-    if (done := int(state.step)) < spec.steps or request.signal is not None:
+    if (done := int(state.step)) < spec.steps or stopped_by is not None:
         tell(f"stopped after step {done}, which is saved")
-        if request.signal == signal.SIGINT:
+        if stopped_by == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + signal.SIGTERM)
     return state
@@ -90,8 +91,8 @@ def train(config: Config, frames: FrameSet, out: str | Path, **options: Any) -> 
 
 def _train(
     run: Run, mesh: Mesh, start: TrainState, pending: bool, log: MetricsLog | None
-) -> tuple[TrainState, StopRequest]:
-    """Train from a state to the end, or until a signal asks to stop; also returns the request."""
+) -> tuple[TrainState, int | None]:
+    """Train from a state to the end, or until a signal asks to stop; also returns the signal."""
     spec, several = run.spec, jax.process_count() > 1
     for line in run.warnings:
         tell(f"warning: {line}")
@@ -112,15 +113,18 @@ def _train(
         lend=True,
         order=run.order,
     )
-    asked = stop_requests("stopping after this step or evaluation, which is saved", active=not several)
-    with asked as request, batches as prepared, feed(prepared, mesh) as stream:
+    request: StopRequest | None = None  # none while the first step is compiled: there is nothing to save
+    with contextlib.ExitStack() as asked, batches as prepared, feed(prepared, mesh) as stream:
 
         def stopping(done: int) -> bool:
+            nonlocal request
             if several:  # all stop after the same step, whichever of them received the signal
                 return multihost_utils.reached_preemption_sync_point(done)
+            request = request or asked.enter_context(stop_requests(_STOPPING))
             return request.signal is not None
 
-        return _take_steps(run, mesh, start, stream, pending, log, stopping), request
+        state = _take_steps(run, mesh, start, stream, pending, log, stopping)
+    return state, None if request is None else request.signal
 
 
 def _take_steps(

@@ -2,12 +2,9 @@
 
 import os
 import signal
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from commands import child_environment
 
 from fcos_lidar_jax.checkpoints.preemption import after_the_block, stop_requests
 
@@ -85,28 +82,3 @@ def test_a_signal_is_delayed_until_the_end_of_the_block(previous, number):
         work()
     assert done == [number]
     assert signal.getsignal(number) == previous
-
-
-BLOCKED = """
-import hashlib
-from fcos_lidar_jax.checkpoints.preemption import stop_requests
-with stop_requests("stopping"):
-    print("working", flush=True)
-    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # minutes without any Python
-"""
-
-
-def test_a_line_answers_the_first_signal_while_c_code_blocks_the_main_thread():
-    words = [sys.executable, "-c", BLOCKED]
-    with subprocess.Popen(words, env=child_environment(), stdout=-1, stderr=-1, text=True) as process:
-        try:
-            assert process.stdout.readline() == "working\n"
-            process.send_signal(signal.SIGINT)
-            line = "stopping; press Ctrl-C again to stop now, without saving\n"
-            assert process.stderr.readline() == line
-            process.send_signal(signal.SIGINT)
-            with pytest.raises(subprocess.TimeoutExpired):
-                process.wait(0.5)
-        finally:
-            process.kill()
-        assert process.stderr.read() == ""

@@ -1,6 +1,8 @@
 """``fcos-lidar train`` on a small simulated data set, and one line per mistake."""
 
 import dataclasses
+import functools
+import hashlib
 import json
 import re
 import shutil
@@ -25,6 +27,7 @@ from fcos_lidar_jax.config import RefinementConfig
 from fcos_lidar_jax.data.frame import SelectedFrames
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.sensors import sensor_to_json
+from fcos_lidar_jax.training import run
 from fcos_lidar_jax.training.metrics_log import read_metrics
 
 VERSION = "v1.0-synthetic"
@@ -138,6 +141,31 @@ def test_signals_save_a_checkpoint_and_resume_continues(root, tmp_path, child):
     assert checkpoints(out) == [f"{step:08d}" for step in (stopped_at, end)]
     # No step was repeated or left out.
     assert [line["step"] for line in read_metrics(out)] == list(range(1, end + 1))
+
+
+def compile_for_minutes(begun: Path) -> None:
+    """Let the first call of the training step stay in C code, like a compilation."""
+
+    def step(state, batch):
+        begun.touch()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+
+    use()
+    run.jit_step = lambda *_: step
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_the_compilation_ends_the_run_within_seconds(root, tmp_path, number):
+    begun, out = tmp_path / "begun", tmp_path / "run"
+    process = Forked(train(root, out, *long(root)), functools.partial(compile_for_minutes, begun))
+    until = time.monotonic() + 200
+    while not begun.exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.05)
+    process.send_signal(number)
+    code, _, errors = process.end(timeout_s=10)
+    assert code == 128 + number, errors
+    assert "Traceback" not in errors
+    assert checkpoints(out) == []
 
 
 def test_auto_resume_continues_a_run_and_says_when_it_starts_one(root, tmp_path, capsys, monkeypatch):

@@ -155,6 +155,7 @@ def test_host_memory_may_be_reused_while_a_batch_is_alive(mesh):
     assert [np.unique(each.batch["x"]).tolist() for each in batches] == [[step] for step in range(6)]
 
 
+@pytest.mark.slow
 def test_batches_in_shared_memory_of_workers_outlive_it(mesh):
     options = {"seed": 0, "num_steps": 6, "threads": 0}
     with make_batches(ToyFrames(), PLAIN, **options) as batches:

@@ -185,6 +185,7 @@ def test_the_weights_in_the_package_are_scored_without_a_run(shipped, tmp_path):
     assert {file: file.read_bytes() for file in package.rglob("*") if file.is_file()} == before
 
 
+@pytest.mark.slow
 def test_a_card_has_only_the_figures_of_its_weights(shipped, tmp_path):
     package, record = shipped
     card = package / "hdl32e" / "README.md"
@@ -203,6 +204,7 @@ def test_a_card_has_only_the_figures_of_its_weights(shipped, tmp_path):
     load_checkpoint(package / "hdl32e")  # the card is no part of the checkpoint
 
 
+@pytest.mark.slow
 def test_fine_tuning_trains_the_network_and_keeps_the_augmentation_of_its_checkpoint(tmp_path, monkeypatch):
     """Other weights of the same name are another run."""
     runs = []

@@ -33,6 +33,7 @@ def drawn(detector, seed):
     )
 
 
+@pytest.mark.slow
 def test_the_command_replaces_the_weights_only_if_they_predict_the_same(tmp_path, monkeypatch, capsys):
     config = dataclasses.replace(CONFIG, model=MODEL)
     before = Checkpoint(config, SENSOR, jax.tree.map(np.float16, drawn(SMALL, 3)), 5)

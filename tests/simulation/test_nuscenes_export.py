@@ -208,6 +208,7 @@ def test_a_second_run_reports_that_the_data_set_is_complete(made, capsys):
     assert {file: file.stat().st_mtime_ns for file in made.rglob("*")} == stamps
 
 
+@pytest.mark.slow
 def test_a_second_process_in_the_folder_is_refused_and_leaves_nothing(tmp_path, capsys):
     with in_use(tmp_path / ".synthesize"):
         before = contents(tmp_path)

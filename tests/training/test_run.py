@@ -225,7 +225,7 @@ def cut_description(folder: Path) -> None:
 # then the checkpoints in the folder, and what is said when the run stops or resumes. Steps 2 and 4 are evaluated.
 TERM = signalled(signal.SIGTERM)
 EVENTS = {
-    "Ctrl-C": (0, signalled(signal.SIGINT), 9, None, "1", "stopped after step 1, which is saved"),
+    "Ctrl-C": (1, signalled(signal.SIGINT), 9, None, "2", "stopped after step 2, which is saved"),
     "SIGTERM": (2, TERM, 9, None, "2 3", "stopped after step 3, which is saved"),
     "SIGTERM in a step that is evaluated": (1, TERM, 1, None, "1 2", "stopped after step 2"),
     "SIGTERM in the last step": (3, TERM, 9, None, "2 4", "stopped after step 4"),  # so that no further run starts
