@@ -65,7 +65,7 @@ def test_programs_match_the_package(name):
     assert callable(function)
     assert len(given) == len(split)
     if program.kind == "train":
-        assert given[1].xyz.shape == (program.batch, config.max_points, 3)
+        assert given[1].points.shape[:2] == (program.batch, config.max_points)
         assert (split, donated) == ((False, True), (0,))
     else:
         assert given[1].shape[0] == config.max_points
