@@ -209,7 +209,7 @@ class RefinementConfig:
     box_channels: Counts = (128, 128)  # Channels of the layers on each box.
     move_boxes: bool = True  # Move the boxes in detection; without, only their scores change.
     first_score_weight: Share = 0.0
-    """Weight of the detector's score in the geometric mean with the second look's; 0 ignores it. The mean of both is
+    """Weight of the detector's score in the geometric mean with the second look's; 0 ignores it. The mean is
     more robust on data unlike the training's."""
     radius_range_m: tuple[float, float] = (1.0, 2.0)
     """Limits of the radius of an object, metres: a box whose centre is within half of the object's longer side can

@@ -90,7 +90,7 @@ def test_every_core_module_has_its_test_file():
     core = (
         {p.stem for p in (ROOT / "fcos_lidar_jax").glob("*.py")}
         - {"__init__", "__main__", "types"}
-        - {"classes", "presets"}
+        - {"classes", "fields", "presets"}
     )  # of tests/test_config.py
     tested = {p.stem.removeprefix("test_") for p in (ROOT / "tests").glob("test_*.py")}
     assert core - tested == set()

@@ -4,12 +4,17 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from fcos_lidar_jax.data.cloud_policy import Cloud
+from fcos_lidar_jax.nms import rotated_nms
 from fcos_lidar_jax.types import Detections
 
 SHOWN_SCORE = 0.3  # pictures, pages and recordings show boxes from this score
+
+_SHOWN_OVERLAP = 0.1  # IoU on the ground from which two boxes stand for one object
+_BLOCK = 128  # The number of boxes is padded to a multiple of this, so that few programs are compiled.
 
 ScoredBoxes = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Boxes [m, 9], ``x, y, z, l, w, h, yaw, vx, vy``, labels i32[m] and scores f32[m] of one cloud."""
@@ -64,3 +69,30 @@ def confident(found: Detections, min_score: float) -> ScoredBoxes:
     """Boxes, labels and scores of the detections of one cloud that reach a score."""
     kept = np.asarray(found.valid) & (np.asarray(found.scores) >= min_score)
     return np.asarray(found.boxes)[kept], np.asarray(found.labels)[kept], np.asarray(found.scores)[kept]
+
+
+def one_per_object(found: ScoredBoxes) -> ScoredBoxes:
+    """Leave out boxes that overlap a better box of any class on the ground, for pictures and pages.
+
+    >>> boxes = np.array([[0, 0, 0, 4, 2, 2, 0, 0, 0], [0.5, 0, 0, 4, 2, 2, 0, 0, 0], [9, 0, 0, 4, 2, 2, 0, 0, 0]])
+    >>> one_per_object((boxes, np.array([0, 1, 1]), np.array([0.4, 0.8, 0.5])))[1:]
+    (array([1, 1]), array([0.8, 0.5]))
+    """
+    rows = rows_of_objects(found)
+    boxes, labels, scores = (np.asarray(part)[rows] for part in found)
+    return boxes, labels, scores
+
+
+def rows_of_objects(found: ScoredBoxes) -> np.ndarray:
+    """Rows of the boxes that :func:`one_per_object` keeps."""
+    boxes, _, scores = (np.asarray(part) for part in found)
+    number = len(boxes)
+    padding = -(-max(number, 1) // _BLOCK) * _BLOCK - number
+    padded = np.pad(boxes.reshape(-1, 9)[:, :7].astype(np.float32), ((0, padding), (0, 0)))
+    index, used = _best(padded, np.pad(scores.astype(np.float32), (0, padding)), np.arange(len(padded)) < number)
+    return np.sort(np.asarray(index)[np.asarray(used)])
+
+
+@jax.jit
+def _best(boxes: jax.Array, scores: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return rotated_nms(boxes, scores, valid, iou_threshold=_SHOWN_OVERLAP, max_outputs=len(boxes))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes, one_per_object
 from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, set_title, write_labels
 
 _SIZE_IN = 9.0
@@ -29,10 +29,11 @@ def draw_bev(
 ) -> None:
     """Plot a cloud from above: x to the right, y up, higher points darker, a cross at the origin.
 
-    Detections have solid outlines in the colour of their class, with class and score, or only the score, where
-    there is room, highest scores first. Truth has thin dashed black outlines filled with the colour of its class.
-    A line from the centre through the front marks the heading. Half the side of the plotted square is ``limit_m``.
-    If all points are to one side of the sensor, as in a camera image, the view is fitted to points and boxes.
+    Detections, one per object, have solid outlines in the colour of their class, with class and score, or only the
+    score, where there is room, highest scores first. Truth has thin dashed black outlines filled with the colour
+    of its class. A line from the centre through the front marks the heading. ``limit_m`` is half the side of the
+    plotted square. If all points are to one side of the sensor, as in a camera image, the view is fitted to points
+    and boxes.
     """
     boxes = [box for each in (detections, truth) if each is not None for box in each[0]]
     view = _fitted(points, boxes, limit_m)
@@ -67,7 +68,8 @@ def bev_on(
             axis.fill(*corners_from_above(box), color=class_color(label), alpha=0.3, linewidth=0, zorder=1)
             _outline(axis, box, limit_m, color="black", linewidth=0.9, linestyle=_DASHES, zorder=5)
             present.add(int(label))
-    visible = [d for d in zip(*(detections or ()), strict=True) if _in_view(d[0], limit_m)]
+    shown = () if detections is None else one_per_object(detections)
+    visible = [d for d in zip(*shown, strict=True) if _in_view(d[0], limit_m)]
     for box, label, _ in visible:
         _outline(axis, box, limit_m, color=class_color(label), linewidth=1.7, zorder=4)
         present.add(int(label))

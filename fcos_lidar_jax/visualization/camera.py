@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes, one_per_object
 from fcos_lidar_jax.visualization.bev import corners_from_above
 from fcos_lidar_jax.visualization.figure import class_color, new_figure, save_png, write_labels
 
@@ -26,7 +26,8 @@ def draw_camera(
 ) -> None:
     """Draw boxes in a camera image: detections with class and score in the colour of their class, truth dashed.
 
-    ``to_image`` f64[3, 4] leads from the frame of the boxes, metres, to homogeneous pixels.
+    Detections are drawn one per object. ``to_image`` f64[3, 4] leads from the frame of the boxes, metres, to
+    homogeneous pixels.
     """
     from PIL import Image
 
@@ -45,7 +46,7 @@ def draw_camera(
     for box, label in zip(*truth, strict=True):
         axis.plot(*_edges(box, to_image).T, color=class_color(label), linewidth=1.0, linestyle="--")
     labels = []
-    for box, label, score in zip(*detections, strict=True):
+    for box, label, score in zip(*one_per_object(detections), strict=True):
         edges = _edges(box, to_image)
         axis.plot(*edges.T, color=class_color(label), linewidth=1.6)
         low, high = np.clip([edges.min((0, 1)), edges.max((0, 1))], 0, (width, height)) if len(edges) else (0, 0)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.cloud_policy import MAX_TIME_LAG_S
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, ScoredBoxes, TrueBoxes, rows_of_objects
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.sensors import Sensor
 from fcos_lidar_jax.visualization.figure import class_color
@@ -49,23 +49,24 @@ def page_frame(
     ids: np.ndarray | None = None,
     truth: TrueBoxes | None = None,
 ) -> PageFrame:
-    """Encode a cloud and its boxes compactly, so that many frames fit into memory.
+    """Encode a cloud and its boxes, one per object, compactly, so that many frames fit into memory.
 
     Args:
         points: see :func:`encode_points`; all boxes are in their frame.
         time_us, pose: time, and pose f64[4, 4] in the world; only for frames of the same drive.
         ids: i32[m], identities over time.
     """
-    boxes, labels, scores = found
+    rows = rows_of_objects(found)
+    boxes, labels, scores = (np.asarray(part)[rows] for part in found)
     return PageFrame(
         name,
         time_us,
         None if pose is None else np.ravel(pose).tolist(),
         *encode_points(points),
         _numbers(boxes),
-        np.asarray(labels).tolist(),
+        labels.tolist(),
         _numbers(scores),
-        None if ids is None else ids.tolist(),
+        None if ids is None else ids[rows].tolist(),
         None if truth is None else _numbers(truth[0]),
         None if truth is None else np.asarray(truth[1]).tolist(),
     )

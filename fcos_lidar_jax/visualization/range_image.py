@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.data.box_geometry import points_in_boxes
-from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes
+from fcos_lidar_jax.evaluation.records import ScoredBoxes, TrueBoxes, one_per_object
 from fcos_lidar_jax.types import CHANNELS, RangeImage
 from fcos_lidar_jax.visualization.figure import EMPTY, class_color, new_figure, save_png, set_title, write_labels
 
@@ -35,14 +35,16 @@ def draw_range_image(
     are grey. The range scale is logarithmic, because most cells are near. The time lag is omitted if all points
     are current.
 
-    Truth and detections, in the frame of the points, have separate panels. Each box is outlined in round 1, in the
-    colour of its class, around the cells whose points lie in it; boxes without such a cell are not visible.
+    Truth and detections, one per object, have separate panels; both are in the frame of the points. Each box is
+    outlined in round 1, in the colour of its class, around the cells whose points lie in it; boxes without such a
+    cell are not visible.
     """
     view = _View.of(azimuth_limits_rad)
     features = np.asarray(image.features)
     rows, columns, _, rounds = features.shape
     lags = features[:, :, _LAG].any()
-    outlines = [(k, given) for k, given in (("truth", truth), ("detections", detections)) if given is not None]
+    shown = None if detections is None else one_per_object(detections)
+    outlines = [(k, given) for k, given in (("truth", truth), ("detections", shown)) if given is not None]
     panels = [(_RANGE, 0, outline) for outline in outlines or [None]]
     panels += [(channel, 0, None) for channel in (_INTENSITY, _LAG) if channel == _INTENSITY or lags]
     panels += [(_RANGE, r, None) for r in range(1, rounds)]

@@ -81,8 +81,14 @@ FILES = {
     "missing tokens": (results_of("a"), "sample b and 1 more: missing"),
     "extra": (results_of("abcde"), "sample d and 1 more: not expected: expected the 3 samples of split 'val'"),
     "501 boxes": (results_of("bc", a=[box("a")] * 501), "sample a: box 500: got 501 boxes, expected at most 500"),
-    "twice": (b'{"meta": {}, "results": {"a": [], "b": [],\n "b" : [], "a": []}}', "results: a: occurs twice"),
-    "twice at the end": (b'{"meta": {}, "results": {"a": [], "b": [], "b": []}}', "results: b: occurs twice"),
+    "twice": (
+        b'{"meta": {}, "results": {"a": [], "b": [],\n "b" : [], "a": []}}',
+        "results: sample a: occurs twice",
+    ),
+    "twice at the end": (
+        b'{"meta": {}, "results": {"a": [], "b": [], "b": []}}',
+        "results: sample b: occurs twice",
+    ),
     "sample an object": (results_of(a={}), "sample a: expected `array`, got `object`"),
     "box a list": (results_of(a=[[]]), "sample a: box 0: expected `object`, got `array`"),
     "results a list": ({"meta": {}, "results": []}, "results: expected `object`, got `array`"),

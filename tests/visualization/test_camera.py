@@ -54,7 +54,14 @@ def pixels_of_edges(box):
     "box", [[12, 1, 0.2, 4, 2, 1.5, 0.4, 0, 0], [2, 0, -0.5, 6, 3, 0.4, 0.1, 0, 0]], ids=["in front", "beside"]
 )
 def test_lines_follow_the_edges(image, drawn, box):
-    draw_camera(image, "x.png", LOOK, classes=CLASSES, detections=(np.array([box]), [2], [0.5]), truth=NOTHING)
+    draw_camera(
+        image,
+        "x.png",
+        LOOK,
+        classes=CLASSES,
+        detections=(np.array([box]), np.array([2]), np.array([0.5])),
+        truth=NOTHING,
+    )
     [axis] = drawn[0].axes
     lines = [line.get_xydata() for line in axis.get_lines()]
     expected = pixels_of_edges(box)
@@ -89,7 +96,12 @@ def test_a_damaged_image_is_named(image, content):
     image.write_bytes(content)
     with refused(str(image), "expected a PNG or JPEG image"):
         draw_camera(
-            image, image.with_name("x.png"), LOOK, classes=CLASSES, detections=(*NOTHING, []), truth=NOTHING
+            image,
+            image.with_name("x.png"),
+            LOOK,
+            classes=CLASSES,
+            detections=(*NOTHING, np.zeros(0)),
+            truth=NOTHING,
         )
 
 

@@ -75,8 +75,15 @@ def boxes_at(*places):
     return boxes
 
 
-def test_class_and_score_stand_beside_boxes_without_overlaps(drawn):
+def test_boxes_that_overlap_a_better_one_are_left_out(drawn):
+    found = boxes_at((0, 0), (0.5, 0), (9, 9)), np.array([2, 3, 3]), np.array([0.4, 0.8, 0.5])
+    bev.draw_bev(np.zeros((0, 3)), "x.png", limit_m=25, classes=NUSCENES_CLASSES, detections=found)
+    assert [text.get_text() for text in drawn[0].axes[0].texts] == ["trailer 0.80", "trailer 0.50"]
+
+
+def test_class_and_score_stand_beside_boxes_without_overlaps(drawn, monkeypatch):
     """Of six boxes in one place, the best have class and score; those without room have no text."""
+    monkeypatch.setattr(bev, "one_per_object", lambda found: found)
     boxes = boxes_at(*[(0, 0)] * 6, (-20, 15))
     labels, scores = np.array([8] * 6 + [2]), np.array([0.31, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4])
     bev.draw_bev(
