@@ -88,7 +88,8 @@ def measure(args: Args) -> dict[str, Any]:
     reading = cut_reading(1)
     frame = read_keyframe(folder, sensor, reading=reading) if folder else make_frame(0, sensor, reading=reading)
     shapes = jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))
-    variables = None if args.weights is None else load_trained(args.weights).variables
+    # In NumPy, because each step gives its arrays away.
+    variables = None if args.weights is None else jax.device_get(load_trained(args.weights).variables)
     calls = {"train step": training_steps(config, sensor, [frame], variables)}
     if config.refinement is not None:
         alone = dataclasses.replace(config, refinement=None)
