@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fcos_lidar_jax.evaluation.records import SHOWN_SCORE
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, one_per_object
 from fcos_lidar_jax.files import atomic_write
 from fcos_lidar_jax.projection import project_points
 from fcos_lidar_jax.sensors import Sensor
@@ -41,8 +41,12 @@ def draw_drive(
 
     path = Path(path)
     files = [path.with_name(f"{path.stem}_{number:02d}.png") for number in range(len(scenes))]
-    shown = list[Any]([part[s.detections[2] >= SHOWN_SCORE] for part in s.detections] for s in scenes)
-    labels = {int(k) for scene, found in zip(scenes, shown, strict=True) for k in (*found[1], *scene.truth[1])}
+    shown = []
+    for scene in scenes:
+        boxes, labels, scores = scene.detections
+        kept = scores >= SHOWN_SCORE
+        shown.append(one_per_object((boxes[kept], labels[kept], scores[kept])))
+    present = {int(k) for scene, found in zip(scenes, shown, strict=True) for k in (*found[1], *scene.truth[1])}
     title = f"{title}: score {SHOWN_SCORE:g} and more, truth dashed"
     size = max(len(scene.points) for scene in scenes)  # one size, so that the projection is compiled once
     pictures = []
@@ -51,7 +55,7 @@ def draw_drive(
         strip, view = figure.subplots(2, 1, height_ratios=(1, 7.4))
         _draw_ranges(strip, scene.points, size, sensor)
         bev_on(view, scene.points, limit_m=limit_m, classes=classes, detections=found, truth=scene.truth)
-        class_legend(figure, sorted(labels), classes, detections=True, truth=True)
+        class_legend(figure, sorted(present), classes, detections=True, truth=True)
         set_title(strip, f"{title}, {number * _SCENE_S:.1f} s", fontsize=11)
         save_png(figure, file, dpi=_DPI)
         with Image.open(file) as picture:
