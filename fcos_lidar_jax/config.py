@@ -19,6 +19,7 @@ from fcos_lidar_jax.fields import (
     Counts,
     Natural,
     Positive,
+    Positives,
     Share,
     check,
     check_per_class,
@@ -118,17 +119,7 @@ class ModelConfig:
     background_prior: Between = 0.99  # Our choice: initial background probability.
     channel_mean: tuple[float, ...] = (0.0, 0.0, -1.24, 12.5, 0.0, -0.21, 25.5, 0.0, 0.224)
     """Our choice: means subtracted from the nine channels in preprocessing."""
-    channel_scale: Annotated[tuple[float, ...], Bounds(0.0, above=True)] = (
-        11.4,
-        11.4,
-        1.15,
-        10.7,
-        1.8,
-        0.19,
-        22.4,
-        1.0,
-        0.144,
-    )
+    channel_scale: Positives = (11.4, 11.4, 1.15, 10.7, 1.8, 0.19, 22.4, 1.0, 0.144)
     """Our choice: scales by which the nine channels are divided in preprocessing."""
 
     def __post_init__(self) -> None:

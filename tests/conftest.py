@@ -31,7 +31,9 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, usual)
 
-jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / "jax"))
+# XLA rounds differently on another number of cores, which the key of a cached program does not contain.
+_CORES = len(os.sched_getaffinity(0))
+jax.config.update("jax_compilation_cache_dir", str(_PACKAGE.parent / ".cache" / f"jax-{_CORES}"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # a process compiles hundreds of small programs
 
 

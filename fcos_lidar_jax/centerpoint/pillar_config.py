@@ -17,10 +17,7 @@ class PillarConfig:
 
     range_m: Positive = 51.2  # Half the side of the square of pillars around the sensor, metres.
     pillar_m: Positive = 0.2  # Side of a pillar, metres.
-    point_channels: Annotated[tuple[int, ...], Bounds(2)] = (
-        64,
-        64,
-    )  # Channels of the layers applied to each point.
+    point_channels: Annotated[tuple[int, ...], Bounds(2)] = (64, 64)  # Channels of the layers on each point.
     backbone_blocks: tuple[int, int, int] = (3, 5, 5)
     """3x3 convolutions per stage after the first, which halves the resolution."""
     backbone_widths: Annotated[tuple[int, int, int], Bounds(1)] = (64, 128, 256)  # Channels per stage.

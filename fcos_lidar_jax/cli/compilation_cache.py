@@ -45,14 +45,18 @@ def use_compilation_cache() -> None:
 
 
 def _make_folder() -> Path:
-    """The folder for this version and this processor: computers of several kinds may share a home."""
+    """The folder for this version, this processor and this number of cores.
+
+    Computers of several kinds may share a home, and XLA compiles other sums for other numbers of cores, which
+    round differently.
+    """
     given = os.environ.get("XDG_CACHE_HOME", "")
     root = (Path(given) if os.path.isabs(given) else Path.home() / ".cache") / "fcos_lidar_jax"
     if not root.exists():
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         off = "JAX_ENABLE_COMPILATION_CACHE=false turns this off"
         tell(f"compiled programs are kept in {root}, so that later commands start faster; {off}")
-    folder = root / f"jax-{jax.__version__}-jaxlib-{jaxlib.__version__}-{_processor()}"
+    folder = root / f"jax-{jax.__version__}-jaxlib-{jaxlib.__version__}-{_processor()}-{_cores()}"
     for each in (root, folder):
         each.mkdir(mode=0o700, exist_ok=True)
         status = each.stat()
@@ -70,6 +74,10 @@ def _processor() -> str:
         return os.uname().machine
     lines = [line for line in first if re.match(_CPUINFO, line)]
     return hashlib.blake2b("\n".join(lines).encode(), digest_size=6).hexdigest()
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _remove_oldest(root: Path) -> None:

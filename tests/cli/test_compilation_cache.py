@@ -136,10 +136,11 @@ def test_the_settings_of_jax_come_first(tmp_path, settings, given):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_version_or_processor_has_its_own_folder(tmp_path, settings, monkeypatch):
+def test_another_version_processor_or_number_of_cores_has_its_own_folder(tmp_path, settings, monkeypatch):
     folders = set()
     for name, value in (
         ("_processor", lambda: "other"),
+        ("_cores", lambda: 77),
         ("jaxlib", types.SimpleNamespace(__version__="0.1")),
         (None, None),
     ):
@@ -149,7 +150,7 @@ def test_another_version_or_processor_has_its_own_folder(tmp_path, settings, mon
             settings["jax_compilation_cache_dir"] = None
             use_compilation_cache()
         folders.add(settings["jax_compilation_cache_dir"])
-    assert len(folders) == 3
+    assert len(folders) == 4
 
 
 def test_the_programs_that_were_used_last_are_kept(tmp_path, settings, monkeypatch):
