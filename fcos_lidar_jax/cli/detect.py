@@ -106,8 +106,8 @@ def run(args: Detect) -> None:
         """Write all outputs. Pictures need the clouds again, since an interrupted call may have read some."""
         pictured = any(path is not None for path in (args.pictures, args.page, args.rrd))
         with open_sinks(args, classes, clouds.sensor, title=f"Boxes of {args.checkpoint.name}", more=place) as add:
-            for index, (_, line) in enumerate(lines):
-                add(json.loads(line)[0], clouds.frame(index).points if pictured else no_points(clouds.sensor))
+            for index, record in enumerate(json.loads(line)[0] for _, line in lines):
+                add(record, clouds.frame(index).points if pictured else no_points(clouds.sensor))
 
     how: dict[str, Any] = {"batch_size": args.batch_size, "yaw_rad": aligned.yaw_rad, "notes": notes}
     how |= {"options": [args.min_score, args.labels], "unit": "files"}

@@ -37,7 +37,7 @@ _OPTIONS = {
 }
 """Options that not every kind of drive takes, and the names that their functions give them."""
 
-_STAGES = "reading", "detection", "writing"
+_STAGES: tuple[str, ...] = "reading", "detection", "writing"
 _TRACKED_SCORE = 0.5  # Of boxes with lower scores, most are on no object, and their tracks last for a few sweeps.
 
 

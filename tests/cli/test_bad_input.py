@@ -128,7 +128,7 @@ train quickstart --data-root HOME/none => none: no such folder
 train quickstart --format simulated --num-processes 2 => expected all or none
 prepare --data-root HOME/none --index OUT => none: no such folder
 prepare DATA --index OUT --workers 0 => --workers: got 0, expected at least 1
-prepare DATA --index OUT --train-split other => split 'other': not found
+prepare DATA --index HOME/index --train-split other => split 'other': not found
 project HOME/none.bin => none.bin: no such file
 project HOME/good.npy --sensor sonar => sonar: no such sensor
 project HOME/good.npy --sensor argoverse2 => good.npy: no laser number
@@ -149,7 +149,7 @@ demo --out HOME/good.npy => --out: .*: found a file
 
 @pytest.mark.parametrize(("line", "message"), BAD)
 def test_a_bad_input_gets_one_line_and_leaves_nothing(home, tmp_path, capsys, line, message):
-    line += "" if "OUT" in line or "--out " in line else " --out OUT"
+    line += "" if any(word in line for word in ("OUT", "--out ", "--index ")) else " --out OUT"
     own = line.split()[0] in ("detect", "stream") and "--checkpoint" not in line
     line += " --checkpoint HOME/checkpoint" if own else ""
     line = line.replace("DATA", f"--data-root HOME/data --version {VERSION}")

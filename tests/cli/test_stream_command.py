@@ -1,8 +1,10 @@
 """``fcos-lidar stream``: the boxes of ``detect --sweeps``, whatever form a drive was recorded in."""
 
+import contextlib
 import dataclasses
 import json
 import re
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -188,19 +190,29 @@ def test_prints_the_time_of_each_stage(home, tmp_path, capsys):
     assert float(matches[0][2]) > 0
 
 
-def test_sweeps_before_an_invalid_cloud_are_written(home, tmp_path, capsys):
+def test_all_outputs_have_the_sweeps_before_an_invalid_cloud(home, tmp_path, capsys, monkeypatch):
     for index in range(2):
         np.save(tmp_path / f"{index}.npy", make_frame(index, TINY).points)
     (tmp_path / "2.npy").write_text("nothing")
+    recorded = []
+
+    @contextlib.contextmanager
+    def recording(path, classes, *, min_score):
+        yield (record := Mock())
+        recorded.append(record.call_count)
+
+    monkeypatch.setattr("fcos_lidar_jax.cli.sinks.rerun_recording", recording)
+    monkeypatch.setattr(cli_stream, "check_rerun", Mock())
     out, page = tmp_path / "boxes.jsonl", tmp_path / "page.html"
-    args = ["stream", str(tmp_path), "--checkpoint", str(home / "checkpoint"), "--page", str(page), "--out"]
+    views = ["--page", str(page), "--rrd", str(tmp_path / "a.rrd")]
+    args = ["stream", str(tmp_path), "--checkpoint", str(home / "checkpoint"), *views, "--out", str(out)]
     for more in ([], ["--output-format", "openlabel"]):
         page.unlink(missing_ok=True)
-        assert main([*args, str(out), *more]) == 1
+        assert main([*args, *more]) == 1
         *_, told, error = capsys.readouterr().err.splitlines()
         assert told == "the outputs have the 2 sweeps before the failure"
         assert "2.npy: not a readable .npy" in error
-        assert len(page_content(page)["frames"]) == 2
+        assert len(page_content(page)["frames"]) == recorded.pop() == 2
         if more:
             assert list(json.loads(out.read_text())["openlabel"]["frames"]) == ["0", "1"]
         else:

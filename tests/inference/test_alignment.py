@@ -63,7 +63,7 @@ def test_files_of_several_sensors_and_wrong_scales_are_refused(tmp_path):
         f"{kitti} of kitti_hdl64e and {other} of another, expected files of one sensor, or --data-sensor"
     ):
         align(NUSCENES_HDL32E, paths=[kitti, other])
-    with refused("intensity_scale: got -1.0, expected a positive number"):
+    with refused("intensity_scale: got -1.0, expected within (0, 1e+30]"):
         align(NUSCENES_HDL32E, intensity_scale=-1.0)
 
 

@@ -111,7 +111,7 @@ def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_
     monkeypatch.setattr(results, "predict", predict)
     with pytest.raises(KeyboardInterrupt):
         run()
-    run(options)
+    run(options=options)
     assert detected == [0, 1, "interrupted", *again]
     assert written == [(f"toy {i}", b'[{"index": %d}]' % i) for i in range(4)]
     told = capsys.readouterr().err
