@@ -35,7 +35,7 @@ from fcos_lidar_jax.evaluation.metrics import evaluate
 from fcos_lidar_jax.evaluation.results import read_results, result_entries, write_results
 from fcos_lidar_jax.evaluation.truth import split_truth
 from fcos_lidar_jax.files import checksum, file_lock
-from fcos_lidar_jax.inference import CloudDetector
+from fcos_lidar_jax.inference import CloudDetector, Prediction
 from fcos_lidar_jax.inference.prediction_log import write_predictions
 from fcos_lidar_jax.input_pipeline import database
 from fcos_lidar_jax.input_pipeline.database import GroundTruthDatabase
@@ -310,8 +310,9 @@ def write_submission(detector: CloudDetector, frames: NuScenesFrames, file: Path
     data, tokens = frames.nuscenes, frames.tokens
     file.parent.mkdir(parents=True, exist_ok=True)
 
-    def entries(index: int, found: Any) -> list[dict[str, Any]]:
-        return result_entries(found, tokens[index], data.sensor_to_global(tokens[index]), detector.classes)
+    def entries(found: Prediction) -> tuple[list[dict[str, Any]], str]:
+        token = tokens[found.index]
+        return result_entries(found.detections, token, data.sensor_to_global(token), detector.classes), ""
 
     write_predictions(detector, frames, file, entries=entries, write=write_results)
 

@@ -1,17 +1,14 @@
 """``fcos-lidar detect``: the boxes of point files."""
 
-import contextlib
 import dataclasses
-import itertools
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 import tyro
 
 from fcos_lidar_jax.cli import options
@@ -24,26 +21,19 @@ from fcos_lidar_jax.cli.checks import (
     check_score,
 )
 from fcos_lidar_jax.cli.options import alignment_of, option
-from fcos_lidar_jax.cli.result_files import check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import no_usable_points, truncation, unusable_clouds
+from fcos_lidar_jax.cli.sinks import check_result_files, check_results, open_sinks
+from fcos_lidar_jax.data.cloud_policy import truncation
 from fcos_lidar_jax.data.clouds import CloudFiles, find_clouds
-from fcos_lidar_jax.data.frame import files_fingerprint
+from fcos_lidar_jax.data.frame import no_points
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.recorded import usual_sensor
 from fcos_lidar_jax.data.sweeps import ListedSweep, read_list
-from fcos_lidar_jax.evaluation.json_io import write_lines
-from fcos_lidar_jax.evaluation.records import cloud_record, confident, read_boxes, select
-from fcos_lidar_jax.evaluation.resume_log import ResumeLog
-from fcos_lidar_jax.files import file_lock
-from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.alignment import Alignment
-from fcos_lidar_jax.inference.prediction import predict_groups
-from fcos_lidar_jax.inference.prediction_log import detections_fingerprint
-from fcos_lidar_jax.progress import Progress, tell
-from fcos_lidar_jax.sensors import KITTI_HDL64E, Sensor, sensor_to_json
-from fcos_lidar_jax.types import Detections
-from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
-from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
+from fcos_lidar_jax.evaluation.records import SHOWN_SCORE, cloud_record, select
+from fcos_lidar_jax.inference import Prediction, load_detector
+from fcos_lidar_jax.inference.prediction_log import log_of, write_predictions
+from fcos_lidar_jax.progress import tell
+from fcos_lidar_jax.sensors import KITTI_HDL64E
+from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
 _INPUT = f"Point files ({', '.join(ENDINGS)}), one cloud per file, or folders of them."
 
@@ -90,26 +80,40 @@ def run(args: Detect) -> None:
     parts = [Path(sweep.file) for sweep in sweeps]
     _check(args, [*files, *parts])
     detector = load_detector(args.checkpoint, backend=args.backend)
-    place: dict[str, Any] = msgspec.to_builtins(sweeps[0]) if sweeps else {}  # of the current sweep
-    check_results(args, detector.classes, posed=bool(sweeps), clouds=parts[:1] or files)
+    classes, config = detector.classes, detector.config
+    check_results(args, classes, posed=bool(sweeps), clouds=parts[:1] or files)
     aligned = alignment_of(args, detector.sensor, parts or files)
-    if len(parts) > (num_sweeps := detector.config.num_sweeps):
-        line = f"fuses the first {num_sweeps} of {len(parts)} sweeps, as the detector was trained"
-        aligned = dataclasses.replace(aligned, notes=(*aligned.notes, f"{args.sweeps}: {line}"))
-    clouds = _clouds(args, files, detector, aligned.data)
-    states = [files_fingerprint(clouds.sources(i), Path("/"), str(file)) for i, file in enumerate(files)]
-    with _resume_log(args, detector, aligned) as log:
-        _detect(args, detector, aligned, clouds, states, log)
-        lines = (entry[1:-1] for _, entry in log.entries(states))  # an entry is a list of one record
-        if args.output_format == "json":
-            write_lines(args.out, b'{"files": [', lines, b"]}\n")
-        else:
-            how = {"annotator": f"fcos-lidar, {args.checkpoint.name}", "calibration": args.calibration}
-            with result_files(args.output_format, args.out, detector.classes, **how) as write:
-                for line in lines:
-                    write({**json.loads(line), **place})
-        if args.page is not None or args.rrd is not None:
-            _write_views(args, clouds, detector, (json.loads(entry)[0] for _, entry in log.entries(states)))
+    notes = aligned.notes
+    if len(parts) > config.num_sweeps:
+        line = f"fuses the first {config.num_sweeps} of {len(parts)} sweeps, as the detector was trained"
+        notes = (*notes, f"{args.sweeps}: {line}")
+    reading = dataclasses.replace(config.reading, remove_close=args.remove_close or config.reading.remove_close)
+    layout: dict[str, Any] = {name: getattr(args, name) for name in ("columns", "dtype", "full_turn")}
+    clouds = CloudFiles(files, aligned.data, reading, max_points=args.max_file_points, **layout)
+    shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
+    place = msgspec.to_builtins(sweeps[0]) if sweeps and args.output_format != "json" else None
+
+    def entries(found: Prediction) -> tuple[list[dict[str, Any]], str]:
+        assert found.cloud is not None
+        min_score = args.min_score if found.note is None else math.inf  # without usable points, no boxes
+        kept = select(found.detections, classes, min_score=min_score, labels=args.labels)
+        record = {"file": str(files[found.index]), **cloud_record(kept, found.cloud, classes)}
+        clear = sum(box["score"] >= shown_score for box in record["boxes"])
+        boxes = f"{len(record['boxes'])} boxes, {clear} of score {shown_score:g} and more"
+        return [record], f"{record['file']}: {boxes}"
+
+    def write(_: Path, lines: Iterator[tuple[str, bytes]]) -> None:
+        """Write all outputs. Pictures need the clouds again, since an interrupted call may have read some."""
+        pictured = any(path is not None for path in (args.pictures, args.page, args.rrd))
+        with open_sinks(args, classes, clouds.sensor, title=f"Boxes of {args.checkpoint.name}", more=place) as add:
+            for index, record in enumerate(json.loads(line)[0] for _, line in lines):
+                add(record, clouds.frame(index).points if pictured else no_points(clouds.sensor))
+
+    how: dict[str, Any] = {"batch_size": args.batch_size, "yaw_rad": aligned.yaw_rad, "notes": notes}
+    how |= {"options": [args.min_score, args.labels], "unit": "files"}
+    removed = write_predictions(detector, clouds, args.out, entries=entries, write=write, **how)
+    if line := truncation(removed["truncated"], config):
+        tell(line)
 
 
 def _inputs(args: Detect) -> tuple[tuple[Path, ...], list[ListedSweep]]:
@@ -139,7 +143,7 @@ def _check(args: Detect, read: Sequence[Path]) -> None:
     """Check the options, and that no output replaces a file to read."""
     check_at_least(args, 1, "batch_size", "max_file_points")
     check_score(args)
-    log = _log_file(args)
+    log = log_of(args.out)
     if args.rrd is not None:
         check_rerun()
     check_result_files(args, read)
@@ -148,143 +152,3 @@ def _check(args: Detect, read: Sequence[Path]) -> None:
     if args.pictures is not None:
         check_outside("--pictures", args.pictures, args.checkpoint)
         check_out_folder(args.pictures, "--pictures")
-
-
-def _clouds(args: Detect, files: tuple[Path, ...], detector: CloudDetector, sensor: Sensor) -> CloudFiles:
-    reading = detector.config.reading
-    return CloudFiles(
-        files,
-        sensor,
-        dataclasses.replace(reading, remove_close=args.remove_close or reading.remove_close),
-        columns=args.columns,
-        dtype=args.dtype,
-        max_points=args.max_file_points,
-        full_turn=args.full_turn,
-    )
-
-
-def _log_file(args: Detect) -> Path:
-    out = args.out if args.out.name else args.out.absolute()  # such as ".", for KITTI's files
-    return out.parent / f".{out.name}.resume_log"
-
-
-@contextlib.contextmanager
-def _resume_log(args: Detect, detector: CloudDetector, aligned: Alignment) -> Iterator[ResumeLog]:
-    """The log of the files that an interrupted call with the same options has finished; deleted in the end."""
-    file = _log_file(args)
-    same = args.remove_close, args.columns, args.dtype, args.min_score, args.labels, args.batch_size
-    same += sensor_to_json(aligned.data), aligned.yaw_rad, args.full_turn
-    with file_lock(file) as held:
-        if not held:
-            raise BlockingIOError(f"{args.out}: in use: another process is detecting, expected no other process")
-        with ResumeLog(file, detections_fingerprint(detector, *same)) as log:
-            try:
-                yield log
-            except BaseException:
-                if not file.stat().st_size:
-                    file.unlink()
-                raise
-        file.unlink(missing_ok=True)
-
-
-def _detect(
-    args: Detect,
-    detector: CloudDetector,
-    aligned: Alignment,
-    clouds: CloudFiles,
-    states: Sequence[str],
-    log: ResumeLog,
-) -> None:
-    """Detect in the files whose present state is not in the log or whose picture is missing."""
-    pictures = [
-        None if args.pictures is None else args.pictures / f"{index:04d}_{file.name}.png"
-        for index, file in enumerate(clouds.files, 1)
-    ]
-    todo = [
-        index
-        for index, (state, picture) in enumerate(zip(states, pictures, strict=True))
-        if state not in log or (picture is not None and not _drawn(picture, state, log))
-    ]
-    progress, num_truncated, unusable = Progress("files", len(clouds)), 0, dict[str, Any]()
-    if done := len(states) - len(todo):
-        progress.show(done, "detected before")
-    how: dict[str, Any] = {"batch_size": args.batch_size, "yaw_rad": aligned.yaw_rad, "notes": aligned.notes}
-    groups = predict_groups(detector, clouds, indices=todo, **how)
-
-    def finish(index: int, entries: list[dict[str, Any]]) -> None:
-        log.add(states[index], entries)
-        if (picture := pictures[index]) is not None:
-            log.add(_token(picture), [{"of": states[index]}])
-
-    for number, prediction in enumerate(itertools.chain.from_iterable(groups), done + 1):
-        index, detections, cloud = prediction.index, prediction.detections, prediction.cloud
-        assert prediction.frame is not None
-        assert cloud is not None
-        file, points = clouds.files[index], prediction.frame.points
-        line = no_usable_points(file, cloud, int(detections.num_dropped), detector.sensor)
-        min_score = args.min_score if line is None else math.inf  # without usable points, no boxes
-        detections = select(detections, detector.classes, min_score=min_score, labels=args.labels)
-        shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
-        if (picture := pictures[index]) is not None:
-            _draw(picture, points, detections, detector, shown_score)
-        record = cloud_record(detections, cloud, detector.classes)
-        if line is None:
-            finish(index, [{"file": str(file), **record}])
-        else:
-            unusable[line] = index, [{"file": str(file), **record}]
-        num_truncated += cloud.num_truncated
-        scores = [box["score"] for box in record["boxes"]]
-        clear = sum(score >= shown_score for score in scores)
-        progress.show(number, f"{file}: {len(scores)} boxes, {clear} of score {shown_score:g} and more")
-    if line := unusable_clouds([*unusable], len(clouds)):
-        tell(f"note: {line}")
-    for finished in unusable.values():  # not before: if all are unusable, the next call must fail, too
-        finish(*finished)
-    if line := truncation(num_truncated, detector.config):
-        tell(line)
-
-
-def _token(picture: Path) -> str:
-    """Key of a picture in the log of finished files."""
-    return f"picture {picture.absolute()}"
-
-
-def _drawn(picture: Path, state: str, log: ResumeLog) -> bool:
-    """Whether a picture shows this state of its file. Once files are added, its number belongs to another file."""
-    token = _token(picture)
-    if token not in log or not picture.exists():
-        return False
-    (_, entry), *_ = log.entries([token])
-    return json.loads(entry)[0]["of"] == state
-
-
-def _draw(
-    path: Path, points: np.ndarray, detections: Detections, detector: CloudDetector, min_score: float
-) -> None:
-    from fcos_lidar_jax.visualization.bev import draw_bev
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    limit_m, title = detector.sensor.limit_xy_m, f"{path.stem}: boxes of score {min_score:g} and more"
-    boxes = confident(detections, min_score)
-    draw_bev(points, path, detections=boxes, limit_m=limit_m, classes=detector.classes, title=title)
-
-
-def _write_views(
-    args: Detect, clouds: CloudFiles, detector: CloudDetector, results: Iterable[dict[str, Any]]
-) -> None:
-    """Write the page and the recording for rerun.
-
-    Reads all clouds again, because an interrupted call may have detected in some of them.
-    """
-    frames = list[PageFrame]()
-    min_score = SHOWN_SCORE if args.min_score is None else args.min_score
-    with rerun_recording(args.rrd, detector.classes, min_score=min_score) as record_rerun:
-        for index, result in enumerate(results):
-            points, name = clouds.frame(index).points, clouds.files[index].name
-            found = read_boxes(result, detector.classes)
-            record_rerun(points, found, name=name)
-            if args.page is not None:
-                frames.append(page_frame(points, found, name=name))
-    if args.page is not None:
-        title = f"Boxes of {args.checkpoint.name}"
-        write_page(args.page, frames, clouds.sensor, classes=detector.classes, title=title, min_score=min_score)

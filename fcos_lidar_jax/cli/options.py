@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from fcos_lidar_jax import inference, sensors
-from fcos_lidar_jax.cli import result_files
+from fcos_lidar_jax.cli import sinks
 from fcos_lidar_jax.inference.alignment import Alignment, align
 
 
@@ -74,7 +74,7 @@ Labels = Annotated[
     tuple[str, ...] | None, option("NAME...", default="all classes", text="Leave out boxes of other classes.")
 ]
 OutputFormat = Annotated[
-    result_files.Format,
+    sinks.Format,
     option(
         text="Format of --out: JSON; a nuScenes results file, in the global frame; KITTI result files, for which "
         "--out is a folder; or an ASAM OpenLABEL 1.0 file."

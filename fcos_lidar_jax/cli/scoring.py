@@ -51,7 +51,7 @@ def run_detector(task: Task, out: Path, *, batch_size: int = 1, yaw_rad: float |
         task.detector,
         task.frames,
         out / comparison.file,
-        entries=comparison.entries,
+        entries=lambda found: (comparison.entries(found.index, found.detections), ""),
         write=comparison.write,
         batch_size=batch_size,
         yaw_rad=yaw_rad,

@@ -2,10 +2,9 @@
 
 import contextlib
 import dataclasses
-import functools
-import json
+import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,23 +15,20 @@ import tyro
 from fcos_lidar_jax.cli import options
 from fcos_lidar_jax.cli.checks import check_at_least, check_outputs, check_score, option_name
 from fcos_lidar_jax.cli.options import alignment_of, option
-from fcos_lidar_jax.cli.result_files import FORMATS, check_result_files, check_results, result_files
-from fcos_lidar_jax.data.cloud_policy import sensor_mismatch, truncation, unusable_clouds
+from fcos_lidar_jax.cli.sinks import check_result_files, check_results, closing_at_failure, open_sinks
+from fcos_lidar_jax.data.cloud_policy import truncation, unusable_clouds
 from fcos_lidar_jax.data.clouds import find_clouds
 from fcos_lidar_jax.data.drives import Drive
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS
 from fcos_lidar_jax.data.sweeps import Sweep
-from fcos_lidar_jax.evaluation.records import cloud_record, confident, select
-from fcos_lidar_jax.files import line_writer
+from fcos_lidar_jax.evaluation.records import cloud_record, read_boxes, select
 from fcos_lidar_jax.inference import CloudDetector, load_detector
-from fcos_lidar_jax.inference.alignment import Alignment
-from fcos_lidar_jax.inference.stream import SweepDetections, detect_stream
+from fcos_lidar_jax.inference.stream import detect_stream
 from fcos_lidar_jax.inference.tracks import Tracks, to_world, track
 from fcos_lidar_jax.input_pipeline.open_drive import FOLDER, RECORDINGS, SCENE, Recording, find_recording
 from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import NUSCENES_HDL32E, Sensor, in_frame_of
-from fcos_lidar_jax.visualization.page import SHOWN_SCORE, PageFrame, page_frame, write_page
-from fcos_lidar_jax.visualization.rerun_recording import check_rerun, rerun_recording
+from fcos_lidar_jax.visualization.rerun_recording import check_rerun
 
 _OPTIONS = {
     **{name: name for name in ("poses", "topic", "odometry", "columns", "dtype")},
@@ -41,6 +37,7 @@ _OPTIONS = {
 }
 """Options that not every kind of drive takes, and the names that their functions give them."""
 
+_STAGES: tuple[str, ...] = "reading", "detection", "writing"
 _TRACKED_SCORE = 0.5  # Of boxes with lower scores, most are on no object, and their tracks last for a few sweeps.
 
 
@@ -99,98 +96,82 @@ class Stream:
 
 
 def run(args: Stream) -> None:
-    """Detect, write one line per sweep, and the page at the end."""
+    """Detect, and add every sweep to all outputs as soon as it is ready."""
     if args.track and args.min_score is None:
         args = dataclasses.replace(args, min_score=_TRACKED_SCORE)
     kind = _find(args)
     detector = load_detector(args.checkpoint, backend=args.backend)
-    source = args.source or args.data_root or Path()
-    paths, sensor = find_clouds((source,)) if kind is FOLDER else [source], detector.sensor
+    classes, sensor, source = detector.classes, detector.sensor, args.source or args.data_root or Path()
+    paths = find_clouds((source,)) if kind is FOLDER else [source]
     scene_sensor = in_frame_of(sensor, NUSCENES_HDL32E) if kind is SCENE else None
     aligned = alignment_of(args, sensor, paths, scene_sensor)
     drive = _open(args, kind, detector, aligned.data)
     _tell_notes(drive.notes)
-    frames: list[PageFrame] = []
-    tracks, before_us, num_truncated, num_points = Tracks(), None, 0, 0
-    unusable, progress = list[str | None](), Progress("sweeps", None)
-    shown_score = SHOWN_SCORE if args.min_score is None else args.min_score
-    with (
-        rerun_recording(args.rrd, detector.classes, min_score=shown_score) as record_rerun,
-        _write_lines(args, detector.classes) as write_line,
-        _Timing() as timing,
-    ):
-        how: dict[str, Any] = {"sensor": aligned.data, "yaw_rad": aligned.yaw_rad, "at_us": drive.at_us}
-        if not drive.posed:
-            how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
-        detect = functools.partial(detect_stream, detector=detector, **how)
-        for found in timing.detect(_announcing(drive.sweeps, aligned), detect):
-            points = found.cloud.points[found.cloud.valid]
-            if not num_points and (line := sensor_mismatch(_untruncated(found.sweep, aligned), detector.sensor)):
-                tell(f"warning: {line}")
-            num_points += len(points)
-            unusable.append(found.unusable)
-            kept = select(found.detections, detector.classes, min_score=args.min_score, labels=args.labels)
-            record = _record(dataclasses.replace(found, detections=kept), detector.classes, drive)
-            boxes, labels, scores = confident(kept, 0.0)
-            ids = None
-            if args.track:
-                dt = 0.0 if before_us is None else (found.sweep.time_us - before_us) / 1e6
-                tracks, ids = track(tracks, to_world(boxes, found.sweep.sensor_to_world), labels, scores, dt)
-                record["boxes"] = [b | {"track": int(i)} for b, i in zip(record["boxes"], ids, strict=True)]
-            token = drive.tokens.get(found.sweep.time_us)
-            write_line(record if args.output_format == "json" else {**record, "token": token})
-            details = {"name": Path(found.sweep.name).name, "ids": ids}
-            if drive.posed:
-                details |= {"time_us": found.sweep.time_us, "pose": found.sweep.sensor_to_world}
-            points = found.sweep.points[:, :4]
-            record_rerun(points, (boxes, labels, scores), **details)
-            if args.page is not None:
-                frames.append(page_frame(points, (boxes, labels, scores), **details))
-            before_us, num_truncated = found.sweep.time_us, num_truncated + found.cloud.num_truncated
-            progress.show(len(unusable), f"{found.sweep.name}: {len(boxes)} boxes")
-        if line := unusable_clouds([*filter(None, unusable)], len(unusable)):
+    tell("compiling the detector")
+    how: dict[str, Any] = {"aligned": aligned, "at_us": drive.at_us}
+    if not drive.posed:
+        how["reading"] = dataclasses.replace(detector.config.reading, num_sweeps=1)
+    notes, num_truncated, progress = list[str | None](), 0, Progress("sweeps", None)
+    add_tracks = _tracker(classes)
+    views = {"title": args.scene or str(args.source), "in_lines": True}
+    with contextlib.ExitStack() as sinks, _Timing() as timing:
+        add = sinks.enter_context(open_sinks(args, classes, aligned.data, **views))
+        with closing_at_failure(sinks, notes):
+            for found in detect_stream(_in_order(drive, timing), detector, **how):
+                timing.begin("writing")
+                assert found.sweep is not None
+                assert found.cloud is not None
+                kept = select(found.detections, classes, min_score=args.min_score, labels=args.labels)
+                record = _place(found.sweep, drive) | cloud_record(kept, found.cloud, classes)
+                if args.track:
+                    add_tracks(record["boxes"], found.sweep)
+                if args.output_format != "json":
+                    record["token"] = drive.tokens.get(found.sweep.time_us)
+                add(record, found.sweep.points[:, :4])
+                notes.append(found.note)
+                num_truncated += found.cloud.num_truncated
+                progress.show(len(notes), f"{found.sweep.name}: {len(record['boxes'])} boxes")
+                timing.end_sweep()
+        if line := unusable_clouds([*filter(None, notes)], len(notes)):
             drive.notes.append(line)
     _tell_notes(drive.notes)
     if line := truncation(num_truncated, detector.config):
         tell(line)
     tell(timing.summary())
-    if args.page is not None:
-        title = args.scene or str(args.source)
-        write_page(args.page, frames, aligned.data, classes=detector.classes, title=title, min_score=shown_score)
 
 
-@contextlib.contextmanager
-def _write_lines(args: Stream, classes: tuple[str, ...]) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A function that writes a record as a line, or in another format. The first line replaces an earlier file."""
-    with contextlib.ExitStack() as stack:
-        if args.output_format != "json":
-            how = {"annotator": f"fcos-lidar, {args.checkpoint.name}", "calibration": args.calibration}
-            yield stack.enter_context(result_files(args.output_format, args.out, classes, **how))
-            return
-        opened: list[Callable[[bytes], None]] = []
-
-        def write(record: dict[str, Any]) -> None:
-            if not opened:
-                opened.append(stack.enter_context(line_writer(args.out)))
-            opened[0](json.dumps(record).encode())
-
-        yield write
-
-
-def _untruncated(sweep: Sweep, aligned: Alignment) -> np.ndarray:
-    """Points of a sweep in the detector's frame, before the truncation, which would hide a denser sensor."""
-    points = sweep.points.copy()
-    points[:, 4] = 0
-    return aligned.points(points)
+def _in_order(drive: Drive, timing: "_Timing") -> Iterator[Sweep]:
+    """The sweeps, with poses only those that are later than all before; in the end, a note counts the others."""
+    latest_us, others = -math.inf, list[str]()
+    timing.begin("reading")
+    for sweep in drive.sweeps:
+        timing.begin("detection")
+        if sweep.time_us <= latest_us:
+            others.append(sweep.name)
+        if sweep.time_us > latest_us or not drive.posed:
+            yield sweep
+        latest_us = max(latest_us, sweep.time_us)
+        timing.begin("reading")
+    if others:
+        how = "skipped" if drive.posed else "kept, since the order only matters with poses"
+        found = f"sweeps that are not later than all before: {len(others)}, the first is {others[0]}"
+        drive.notes.append(f"{found}; {how}")
 
 
-def _announcing(sweeps: Iterable[Sweep], aligned: Alignment) -> Iterator[Sweep]:
-    """The sweeps. After reading the first one, print the notes, and say that the detector is compiled."""
-    for number, sweep in enumerate(sweeps):
-        if not number:
-            aligned.tell_notes()
-            tell("compiling the detector")
-        yield sweep
+def _tracker(classes: tuple[str, ...]) -> Callable[[list[dict[str, Any]], Sweep], None]:
+    """A function that adds the numbers of their tracks to the boxes of one sweep after another."""
+    tracks, before_us = Tracks(), None
+
+    def add_tracks(records: list[dict[str, Any]], sweep: Sweep) -> None:
+        nonlocal tracks, before_us
+        boxes, labels, scores = read_boxes({"boxes": records}, classes)
+        dt = 0.0 if before_us is None else (sweep.time_us - before_us) / 1e6
+        tracks, ids = track(tracks, to_world(boxes, sweep.sensor_to_world), labels, scores, dt)
+        before_us = sweep.time_us
+        for record, number in zip(records, ids.tolist(), strict=True):
+            record["track"] = number
+
+    return add_tracks
 
 
 def _tell_notes(notes: list[str]) -> None:
@@ -202,7 +183,8 @@ class _Timing(contextlib.AbstractContextManager):
     """Seconds per sweep and stage, and the number of programs compiled after the first sweep."""
 
     def __init__(self) -> None:
-        self._seconds, self._programs = list[tuple[float, float, float]](), 0
+        self._seconds, self._programs = [dict.fromkeys(_STAGES, 0.0)], 0
+        self._stage, self._began = "detection", time.perf_counter()
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def __exit__(self, *error: object) -> None:
@@ -211,37 +193,27 @@ class _Timing(contextlib.AbstractContextManager):
     def _listen(self, event: str, *_: object, **__: object) -> None:
         self._programs += event.endswith("/backend_compile_duration")
 
-    def detect(
-        self, sweeps: Iterable[Sweep], detect: Callable[[Iterable[Sweep]], Iterator[SweepDetections]]
-    ) -> Iterator[SweepDetections]:
-        """Detections in sweeps. What the caller does with one until it takes the next one counts as writing."""
-        reading, began = 0.0, time.perf_counter()
+    def begin(self, stage: str) -> None:
+        """End the stage before and begin another one, which may continue."""
+        now = time.perf_counter()
+        self._seconds[-1][self._stage] += now - self._began
+        self._stage, self._began = stage, now
 
-        def read() -> Iterator[Sweep]:
-            nonlocal reading
-            before = time.perf_counter()
-            for sweep in sweeps:
-                reading += time.perf_counter() - before  # including sweeps that are only fused
-                yield sweep
-                before = time.perf_counter()
-
-        for found in detect(read()):
-            ready = time.perf_counter()
-            yield found
-            self._seconds.append((reading, ready - began - reading, time.perf_counter() - ready))
-            if len(self._seconds) == 1:
-                self._programs = 0
-            reading, began = 0.0, time.perf_counter()
+    def end_sweep(self) -> None:
+        self.begin("detection")
+        if len(self._seconds) == 1:
+            self._programs = 0
+        self._seconds.append(dict.fromkeys(_STAGES, 0.0))
 
     def summary(self) -> str:
         """A line with the medians. The first sweep, which includes the compilation, is listed separately."""
-        number = len(self._seconds)
-        if number < 2:
+        (first, *others), number = self._seconds[:-1] or [{}], len(self._seconds) - 1
+        if not others:
             return f"{number} sweeps"
-        medians = zip(np.median(self._seconds[1:], axis=0), ("reading", "detection", "writing"), strict=True)
-        later = ", ".join(f"{1e3 * seconds:.1f} ms {stage}" for seconds, stage in medians)
-        first = f"the first, which compiles, {sum(self._seconds[0]):.1f} s"
-        return f"{number} sweeps: {first}; the others {later} (medians), {self._programs} compilations"
+        medians = {stage: 1e3 * np.median([seconds[stage] for seconds in others]) for stage in _STAGES}
+        later = ", ".join(f"{ms:.1f} ms {stage}" for stage, ms in medians.items())
+        compiled = f"the first, which compiles, {sum(first.values()):.1f} s"
+        return f"{number} sweeps: {compiled}; the others {later} (medians), {self._programs} compilations"
 
 
 def _find(args: Stream) -> Recording:
@@ -270,7 +242,7 @@ def _find(args: Stream) -> Recording:
         check_rerun()
     check_result_files(args, keep)
     check_outputs(args.checkpoint, [*keep, args.out], page=args.page, rrd=args.rrd)
-    if FORMATS[args.output_format].in_world and args.data_root is not None and not args.keyframes:
+    if args.output_format == "nuscenes" and args.data_root is not None and not args.keyframes:
         raise ValueError("--output-format nuscenes: expected --keyframes with --data-root: samples are keyframes")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     return kind
@@ -289,12 +261,10 @@ def _open(args: Stream, kind: Recording, detector: CloudDetector, sensor: Sensor
     return drive
 
 
-def _record(found: SweepDetections, classes: tuple[str, ...], drive: Drive) -> dict[str, Any]:
-    """A line with the fields of ``fcos-lidar detect``; unknown values are null."""
-    sweep = found.sweep
+def _place(sweep: Sweep, drive: Drive) -> dict[str, Any]:
+    """The first fields of a line; unknown values are null."""
     return {
         "file": sweep.name,
         "timestamp_us": sweep.time_us if drive.timed else None,
         "sensor_to_world": np.asarray(sweep.sensor_to_world).tolist() if drive.posed else None,
-        **cloud_record(found.detections, found.cloud, classes),
     }

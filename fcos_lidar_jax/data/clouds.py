@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points
+from fcos_lidar_jax.data.frame import Frame, FrameSet, drop_close, files_fingerprint, no_points, unlabelled
 from fcos_lidar_jax.data.kitti import camera_calibration, in_camera
 from fcos_lidar_jax.data.point_files import ENDINGS, MAX_POINTS, read_points
 from fcos_lidar_jax.data.sweeps import read_list, read_sweeps
+from fcos_lidar_jax.files import checksum
 from fcos_lidar_jax.sensors import Sensor
 
 
@@ -39,12 +40,11 @@ class CloudFiles(FrameSet):
         else:
             how = {"full_turn": self.full_turn, **layout}
             points, num_close = read_cloud(file, self.sensor, self.reading, **how)
-        return dataclasses.replace(self.truth(index), points=points, num_close=num_close)
+        return unlabelled(points, num_close)
 
     def truth(self, index: int) -> Frame:
         """A frame without boxes; reads nothing."""
-        none = np.zeros(0, np.int32)
-        return Frame(no_points(self.sensor), np.zeros((0, 9), np.float32), none, none)
+        return unlabelled(no_points(self.sensor))
 
     def labels(self, index: int) -> np.ndarray:
         return np.zeros(0, np.int32)
@@ -61,9 +61,12 @@ class CloudFiles(FrameSet):
         return [file] if calibration is None else [file, calibration]
 
     def fingerprint(self) -> str:
-        reading = self.files, self.sensor, self.reading, self.columns, self.dtype, self.full_turn
-        files = {file for index in range(len(self)) for file in self.sources(index)}
-        return files_fingerprint(files, Path("/"), reading)
+        """Of how files are read; :meth:`clouds_fingerprint` is of the files."""
+        reading = self.sensor, self.reading, self.columns, self.dtype, self.full_turn
+        return checksum(repr(reading).encode())
+
+    def clouds_fingerprint(self, indices: Iterable[int]) -> str:
+        return files_fingerprint({file for i in indices for file in self.sources(i)}, Path("/"), None)
 
 
 def read_cloud(

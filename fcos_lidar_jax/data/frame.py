@@ -231,6 +231,12 @@ def no_points(sensor: Sensor) -> np.ndarray:
     return np.zeros((0, sensor.point_columns), np.float32)
 
 
+def unlabelled(points: np.ndarray, num_close: int = 0) -> Frame:
+    """A frame without boxes."""
+    none = np.zeros(0, np.int32)
+    return Frame(points, np.zeros((0, 9), np.float32), none, none, num_close)
+
+
 def without_points(frame: Frame) -> Frame:
     """Drop a frame's points, and free their memory."""
     return dataclasses.replace(frame, points=frame.points[:0].copy(), num_close=0)  # a view would keep the cloud

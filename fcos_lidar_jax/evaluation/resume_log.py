@@ -1,7 +1,6 @@
 """Log of the detections of finished samples, from which an interrupted run resumes."""
 
 import json
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,18 +55,24 @@ class ResumeLog:
             self._stream.flush()
         self.places[token] = start, len(text)
 
-    def entries(self, tokens: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """Iterate over samples and their entries as JSON, in the order of ``tokens``."""
-        for token in tokens:
-            start, length = self.places[token]
-            self._stream.seek(start)
-            yield token, self._stream.read(length)
+    def entry(self, token: str) -> bytes:
+        """The entries of a sample as JSON."""
+        start, length = self.places[token]
+        self._stream.seek(start)
+        return self._stream.read(length)
+
+    def discard(self) -> None:
+        """Delete the file; entries can still be read."""
+        self.path.unlink(missing_ok=True)
 
     def __enter__(self) -> "ResumeLog":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind in (KeyboardInterrupt, SystemExit) and len(self):
-            tell("the same command resumes")
+        if kind is not None and self.path.exists():
+            if len(self):
+                tell("the same command resumes")
+            elif not self.path.stat().st_size:
+                self.discard()
         with naming(self.path):
             self._stream.close()

@@ -4,7 +4,8 @@ from fcos_lidar_jax.inference.detect import Stages, make_detect, make_stages
 from fcos_lidar_jax.inference.detected_boxes import DetectedBox, DetectedBoxes
 from fcos_lidar_jax.inference.detector import CloudDetector, TrainedDetector
 from fcos_lidar_jax.inference.load import Backend, load_detector, load_trained
-from fcos_lidar_jax.inference.prediction import Prediction, evaluate, predict
+from fcos_lidar_jax.inference.loop import Prediction
+from fcos_lidar_jax.inference.prediction import evaluate, predict
 
 __all__ = [
     "Backend",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fcos_lidar_jax.data.cloud_policy import sensor_mismatch
 from fcos_lidar_jax.data.folder import sensor_file
 from fcos_lidar_jax.data.recorded import check_scale, recorded_by
 from fcos_lidar_jax.data.sweeps import about_z, turned
@@ -63,6 +64,14 @@ class Alignment:
         """Print the notes, once per process. Call it after reading points, because an error makes them moot."""
         for line in (*self.notes, *self._unknown_heading()):
             tell(line, once=True)
+
+    def announce(self, points: np.ndarray) -> None:
+        """Print what is done to clouds, of which ``points`` is the first, in the detector's frame."""
+        self.tell_notes()
+        if line := self.describe():
+            tell(line)
+        if line := sensor_mismatch(points, self.detector):
+            tell(f"warning: {line}")
 
     def _unknown_heading(self) -> tuple[str, ...]:
         """A line if clouds are not rotated because only one of the headings is known."""

@@ -14,15 +14,16 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from fcos_lidar_jax.config import Config
-from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, no_usable_points, sensor_mismatch, truncation
+from fcos_lidar_jax.data.cloud_policy import Cloud, sensor_mismatch, truncation
 from fcos_lidar_jax.data.clouds import read_cloud
-from fcos_lidar_jax.data.frame import drop_close
+from fcos_lidar_jax.data.frame import drop_close, unlabelled
 from fcos_lidar_jax.data.point_files import points_from_array
 from fcos_lidar_jax.devices.mesh import make_mesh, replicate, shard_batch
 from fcos_lidar_jax.evaluation.records import confident, point_counts
 from fcos_lidar_jax.inference.alignment import align
 from fcos_lidar_jax.inference.detect import make_detect, over_clouds
 from fcos_lidar_jax.inference.detected_boxes import DetectedBoxes
+from fcos_lidar_jax.inference.loop import Request, detect_clouds
 from fcos_lidar_jax.models import Detector, Variables, build_detector
 from fcos_lidar_jax.progress import tell
 from fcos_lidar_jax.refinement import without_second_look
@@ -114,17 +115,14 @@ class CloudDetector(abc.ABC):
         else:
             rows, num_close = drop_close(_scaled_once(points, data), data, reading)
         aligned.tell_notes()
-        rows = aligned.points(rows)
-        if line := sensor_mismatch(rows, self.sensor):
+        request = Request(0, str(points) if is_file else "points", lambda: unlabelled(rows, num_close))
+        how: dict[str, Any] = {"devices": jax.local_devices()[:1], "ahead": 0, "quiet": True}
+        [prediction] = detect_clouds(self.program, self.config, aligned, [request], **how)
+        found, cloud = prediction.detections, prediction.cloud
+        assert cloud is not None
+        mismatch = sensor_mismatch(aligned.points(rows), self.sensor)
+        for line in filter(None, (mismatch, truncation(cloud.num_truncated, self.config), prediction.note)):
             warnings.warn(line, stacklevel=2)
-        cloud = make_cloud(rows, self.config, sensor=self.sensor, num_close=num_close)
-        if line := truncation(cloud.num_truncated, self.config):
-            warnings.warn(line, stacklevel=2)
-        found = self.detect(cloud)
-        name = points if is_file else "points"
-        if line := no_usable_points(name, cloud, int(found.num_dropped), self.sensor):
-            warnings.warn(line, stacklevel=2)
-        found = aligned.back(found)
         boxes, labels, scores = confident(found, 0.0)
         counts = ({"file": str(points)} if is_file else {}) | point_counts(found, cloud)
         used = aligned.inverse.points(cloud.points[cloud.valid])

@@ -3,7 +3,7 @@
 import contextlib
 import json
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,16 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from fcos_lidar_jax.config import config_to_json
-from fcos_lidar_jax.data.cloud_policy import no_usable_points, unusable_clouds
+from fcos_lidar_jax.data.cloud_policy import unusable_clouds
 from fcos_lidar_jax.data.frame import FrameSet
 from fcos_lidar_jax.devices.agreement import agreed, check_same
 from fcos_lidar_jax.evaluation.resume_log import ResumeLog
-from fcos_lidar_jax.files import checksum
+from fcos_lidar_jax.files import checksum, file_lock
 from fcos_lidar_jax.inference.detector import CloudDetector
-from fcos_lidar_jax.inference.prediction import Prediction, predict_groups
+from fcos_lidar_jax.inference.loop import Prediction
+from fcos_lidar_jax.inference.prediction import predict
 from fcos_lidar_jax.progress import Progress, tell
 from fcos_lidar_jax.sensors import sensor_to_json
-from fcos_lidar_jax.types import Detections
 
 _REASONS = ("close", "invalid", "truncated")  # reasons for removing points
 
@@ -31,22 +31,25 @@ def write_predictions(
     frames: FrameSet,
     path: Path,
     *,
-    entries: Callable[[int, Detections], list[dict[str, Any]]],
+    entries: Callable[[Prediction], tuple[list[dict[str, Any]], str]],
     write: Callable[[Path, Iterator[tuple[str, bytes]]], None],
-    batch_size: int = 1,
-    yaw_rad: float | None = None,
-    notes: tuple[str, ...] = (),
+    options: object = None,
+    unit: str = "frames",
+    **how: Any,
 ) -> dict[str, int]:
     """Detect boxes in all frames, whose names are unique, and write a results file.
 
     A resume log next to the file keeps the detections of finished frames until the file is written, except for
-    frames without usable points: a resumed run reads and counts them again. Several processes share the frames,
-    and the first writes; the path is the same for all. A SIGTERM to any process stops all after the same frames.
+    frames without usable points: a resumed run detects in them again, and in frames whose files have changed.
+    Several processes share the frames, and the first writes; the path is the same for all. A SIGTERM to any
+    process stops all after the same frames.
 
     Args:
-        entries: converts the index of a frame and its detections to the entries of the file.
+        entries: converts a prediction to the entries of the file, and a text for the line of progress.
         write: writes the file from names of frames with entries as JSON.
-        batch_size, yaw_rad, notes: see :func:`fcos_lidar_jax.inference.prediction.predict_groups`.
+        options: what else the entries depend on, as JSON.
+        unit: what frames are called, for the line of progress.
+        how: ``batch_size``, ``yaw_rad`` and ``notes`` of :func:`fcos_lidar_jax.inference.predict`.
 
     Returns:
         number of points removed by all processes in this run, by reason: ``close``, ``invalid``, ``truncated``.
@@ -56,47 +59,77 @@ def write_predictions(
         ValueError, OSError: the processes have different detectors or frames; another process failed.
         SystemExit: after SIGTERM, in a cluster.
     """
-    file = path.with_name(f"{path.stem}.resume_log")
-    removed, unusable = [0] * len(_REASONS), dict[str, tuple[str, Any]]()
+    removed, number, finished = [0] * len(_REASONS), 0, None
     with contextlib.ExitStack() as held:
-        log = None
         with agreed("cannot detect"):
-            names = [frames.name(index) for index in range(len(frames))]
-            shared = detections_fingerprint(detector, names, batch_size, yaw_rad)
+            same, names = (how.get("batch_size", 1), how.get("yaw_rad")), [*map(frames.name, range(len(frames)))]
             if jax.process_index() == 0:
-                log = held.enter_context(ResumeLog(file, _fingerprint(detector, frames, batch_size, yaw_rad)))
-        check_same(shared, "detector, frames or batch size")
-        done = multihost_utils.broadcast_one_to_all(np.array([log is not None and name in log for name in names]))
-        progress = Progress("frames", len(frames))
-        if log is not None:
-            progress.show(len(log))
-        how: dict[str, Any] = {"batch_size": batch_size, "yaw_rad": yaw_rad, "notes": notes}
-        groups = predict_groups(detector, frames, indices=np.flatnonzero(~done).tolist(), **how)
-        number = 0
-        for number, group in enumerate(groups, 1):
-            removed = [sum(counts) for counts in zip(removed, *map(_removed, group), strict=True)]
-            lines = [_unusable(detector, names[prediction.index], prediction) for prediction in group]
-            without = _in_any_process([line is not None for line in lines])
+                log = held.enter_context(_open_log(path, _fingerprint(detector, frames, *same, options)))
+                finished = _Finished(log, frames, names, unit)
+        check_same(detections_fingerprint(detector, names, *same), "detector, frames or batch size")
+        todo = np.ones(len(names), bool) if finished is None else finished.todo
+        how["indices"] = np.flatnonzero(multihost_utils.broadcast_one_to_all(todo)).tolist()
+        for number, prediction in enumerate(predict(detector, frames, **how), 1):
+            removed = [sum(counts) for counts in zip(removed, _removed(prediction), strict=True)]
+            unusable = _in_any_process(prediction.note is not None)
             with agreed("cannot write"):
-                if log is not None:
-                    for prediction, line, is_unusable in zip(group, lines, without, strict=True):
-                        name, found = names[prediction.index], entries(prediction.index, prediction.detections)
-                        if is_unusable:
-                            unusable[name] = line or f"{name}: no usable points", found
-                        else:
-                            log.add(name, found)
-                        progress.show(len(log) + len(unusable))
+                if finished is not None:
+                    finished.add(prediction, *entries(prediction), unusable=unusable)
             _stop_after_sigterm(number)
         _stop_after_sigterm(number + 1)  # if it arrived during the last group
         with agreed("cannot write"):
-            if log is not None:
-                if len(unusable) == len(frames):
-                    file.unlink(missing_ok=True)
-                if line := unusable_clouds([line for line, _ in unusable.values()], len(frames)):
-                    tell(f"note: {line}")
-                write(path, _in_order(names, log, {name: found for name, (_, found) in unusable.items()}))
-                file.unlink(missing_ok=True)
+            if finished is not None:
+                write(path, finished.entries())
+                finished.log.discard()
     return dict(zip(_REASONS, _sum_over_processes(removed), strict=True))
+
+
+class _Finished:
+    """The log of finished frames, without those that have no usable points until all are finished."""
+
+    def __init__(self, log: ResumeLog, frames: FrameSet, names: list[str], unit: str) -> None:
+        self.log, self.names, self.unusable = log, names, dict[str, tuple[str, list[dict[str, Any]]]]()
+        self.keys = [f"{name}\t{frames.clouds_fingerprint([index])}" for index, name in enumerate(names)]
+        self.todo = np.array([key not in log for key in self.keys], bool)
+        self.number, self.progress = len(self.keys) - int(self.todo.sum()), Progress(unit, len(frames))
+        if self.number:
+            self.progress.show(self.number, "detected before")
+
+    def add(self, prediction: Prediction, found: list[dict[str, Any]], text: str, *, unusable: bool) -> None:
+        key = self.keys[prediction.index]
+        if unusable:
+            line = prediction.note or f"{self.names[prediction.index]}: no usable points"
+            self.unusable[key] = line, found
+        else:
+            self.log.add(key, found)
+        self.number += 1
+        self.progress.show(self.number, text)
+
+    def entries(self) -> Iterator[tuple[str, bytes]]:
+        """Names with entries as JSON, in order. Refuses frames of which none has usable points."""
+        if len(self.unusable) == len(self.keys):
+            self.log.discard()
+        if line := unusable_clouds([line for line, _ in self.unusable.values()], len(self.keys)):
+            tell(f"note: {line}")
+        for key, (_, found) in self.unusable.items():
+            self.log.add(key, found)
+        return ((name, self.log.entry(key)) for name, key in zip(self.names, self.keys, strict=True))
+
+
+def log_of(path: Path) -> Path:
+    """The resume log beside a results file, or a folder of them."""
+    path = path if path.name else path.absolute()  # such as "."
+    return path.with_name(f".{path.name}.resume_log")
+
+
+@contextlib.contextmanager
+def _open_log(path: Path, fingerprint: str) -> Iterator[ResumeLog]:
+    file = log_of(path)
+    with file_lock(file) as held:
+        if not held:
+            raise BlockingIOError(f"{path}: in use: another process is detecting, expected no other process")
+        with ResumeLog(file, fingerprint) as log:
+            yield log
 
 
 def _stop_after_sigterm(number: int) -> None:
@@ -108,25 +141,8 @@ def _stop_after_sigterm(number: int) -> None:
         raise SystemExit(128 + signal.SIGTERM)
 
 
-def _unusable(detector: CloudDetector, name: str, prediction: Prediction) -> str | None:
-    """A line about a cloud without usable points that this process has read, or None."""
-    if prediction.cloud is None:
-        return None
-    return no_usable_points(name, prediction.cloud, int(prediction.detections.num_dropped), detector.sensor)
-
-
-def _in_any_process(flags: list[bool]) -> list[bool]:
-    """Whether each flag is set in any process."""
-    return multihost_utils.process_allgather(np.array(flags)[None], tiled=True).any(axis=0).tolist()
-
-
-def _in_order(names: Sequence[str], log: ResumeLog, others: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
-    """Names with entries as JSON, from the log and from the ``others``, which are not in it."""
-    for name in names:
-        if name in others:
-            yield name, json.dumps(others[name]).encode()
-        else:
-            yield from log.entries([name])
+def _in_any_process(flag: bool) -> bool:
+    return bool(multihost_utils.process_allgather(np.array([flag]), tiled=True).any())
 
 
 def _removed(prediction: Prediction) -> list[int]:
@@ -148,6 +164,5 @@ def detections_fingerprint(detector: CloudDetector, *others: object) -> str:
     return checksum(json.dumps(inputs, sort_keys=True).encode())
 
 
-def _fingerprint(detector: CloudDetector, frames: FrameSet, batch_size: int, yaw_rad: float | None) -> str:
-    data = frames.fingerprint(), frames.clouds_fingerprint(range(len(frames))), sensor_to_json(frames.sensor)
-    return detections_fingerprint(detector, *data, batch_size, yaw_rad)
+def _fingerprint(detector: CloudDetector, frames: FrameSet, *how: object) -> str:
+    return detections_fingerprint(detector, frames.fingerprint(), sensor_to_json(frames.sensor), *how)

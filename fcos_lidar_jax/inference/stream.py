@@ -1,29 +1,21 @@
 """Detection in a drive, sweep by sweep, with a rolling window of sweeps and one compiled program."""
 
 import dataclasses
+import functools
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
+from typing import Any
 
+import jax
 import numpy as np
 
 from fcos_lidar_jax.config import CloudReading
-from fcos_lidar_jax.data.cloud_policy import Cloud, make_cloud, no_usable_points, tell_truncation
+from fcos_lidar_jax.data.frame import unlabelled
 from fcos_lidar_jax.data.sweeps import Sweep, fuse_sweeps
-from fcos_lidar_jax.inference.alignment import align
+from fcos_lidar_jax.inference.alignment import Alignment, align
 from fcos_lidar_jax.inference.detector import CloudDetector
-from fcos_lidar_jax.progress import tell
+from fcos_lidar_jax.inference.loop import Prediction, Request, detect_clouds
 from fcos_lidar_jax.sensors import Sensor
-from fcos_lidar_jax.types import Detections
-
-
-@dataclasses.dataclass(frozen=True)
-class SweepDetections:
-    """Detections in one sweep, fused with the sweeps before it."""
-
-    sweep: Sweep  # the current sweep, unchanged
-    cloud: Cloud  # input of the network: the sweeps of the window in the frame of the current one, rotated
-    detections: Detections  # NumPy arrays, in the frame of the sweep
-    unusable: str | None = None  # a line if the sweep has no usable points, and so no boxes
 
 
 def detect_stream(
@@ -34,14 +26,15 @@ def detect_stream(
     at_us: Collection[int] | None = None,
     sensor: Sensor | None = None,
     yaw_rad: float | None = None,
-) -> Iterator[SweepDetections]:
+    aligned: Alignment | None = None,
+) -> Iterator[Prediction]:
     """Detect boxes in every sweep as it arrives, fused with the sweeps before it.
 
     The boxes are bit-identical to ``fcos-lidar detect --sweeps`` with the same sweeps. A sweep without usable
     points has no boxes, whatever the sweeps before it.
 
     Args:
-        sweeps: sweeps in temporal order; may be an iterator that waits for the next sweep.
+        sweeps: sweeps, in temporal order if they are fused; may be an iterator that waits for the next sweep.
         reading: number of sweeps to fuse and points to drop; by default as in training. Use one sweep if the poses
             are unknown.
         at_us: times of the sweeps to detect in; other sweeps are only fused into later ones. By default all.
@@ -50,9 +43,10 @@ def detect_stream(
         yaw_rad: rotation of the sweeps about z before detection, undone for the boxes, instead of the angle
             between the headings: pi / 2 if x points forward in the sweeps and y in the training data. Detection
             degrades for orientations absent from training.
+        aligned: instead of ``sensor`` and ``yaw_rad``.
 
     Raises:
-        ValueError: names a sweep that is not later than the sweep before.
+        ValueError: names a sweep that is to be fused with others and is not later than the sweep before.
 
     >>> import numpy as np
     >>> from fcos_lidar_jax.data.sweeps import Sweep
@@ -63,29 +57,29 @@ def detect_stream(
     >>> [found.sweep.time_us for found in detect_stream(sweeps, load_detector("quickstart"))]
     [0, 1]
     """
-    reading, aligned = reading or detector.config.reading, align(detector.sensor, sensor, yaw_rad=yaw_rad)
-    window: deque[Sweep] = deque(maxlen=reading.num_sweeps)
-    before: Sweep | None = None
-    for sweep in sweeps:
-        if before is not None and sweep.time_us <= before.time_us:
-            raise ValueError(
-                f"{sweep.name}: time: got {sweep.time_us} us, expected more than the {before.time_us} us of the "
-                f"sweep before, {before.name}"
-            )
-        if before is None and (line := aligned.describe()):
-            tell(line)
-        window.appendleft(sweep)
-        before = sweep
-        if at_us is not None and sweep.time_us not in at_us:
-            continue
-        points, num_close = fuse_sweeps(window, aligned.data, reading)
-        points = aligned.points(points)
-        cloud = make_cloud(points, detector.config, sensor=detector.sensor, num_close=num_close)
-        tell_truncation(sweep.name, cloud, detector.config)
-        detections = detector.detect(cloud)
-        line = no_usable_points(sweep.name, cloud, int(detections.num_dropped), detector.sensor)
-        if line is None and cloud.points[cloud.valid, 4].min() > 0:
-            line = f"{sweep.name}: only older sweeps have usable points"
-        if line is not None:
+    aligned = align(detector.sensor, sensor, yaw_rad=yaw_rad) if aligned is None else aligned
+    requests = _requests(sweeps, aligned.data, reading or detector.config.reading, at_us)
+    how: dict[str, Any] = {"devices": jax.local_devices()[:1], "ahead": 0}
+    for found in detect_clouds(detector.program, detector.config, aligned, requests, **how):
+        cloud, note, detections = found.cloud, found.note, found.detections
+        assert cloud is not None
+        assert found.sweep is not None
+        if note is None and cloud.points[cloud.valid, 4].min() > 0:
+            note = f"{found.sweep.name}: only older sweeps have usable points"
+        if note is not None:
             detections = dataclasses.replace(detections, valid=np.zeros_like(detections.valid))
-        yield SweepDetections(sweep, cloud, aligned.back(detections), line)
+        yield dataclasses.replace(found, detections=detections, note=note)
+
+
+def _requests(
+    sweeps: Iterable[Sweep], sensor: Sensor, reading: CloudReading, at_us: Collection[int] | None
+) -> Iterator[Request]:
+    window: deque[Sweep] = deque(maxlen=reading.num_sweeps)
+    for index, sweep in enumerate(sweeps):
+        if reading.num_sweeps > 1 and window and sweep.time_us <= window[0].time_us:
+            before = f"the {window[0].time_us} us of the sweep before, {window[0].name}"
+            raise ValueError(f"{sweep.name}: time: got {sweep.time_us} us, expected more than {before}")
+        window.appendleft(sweep)
+        if at_us is None or sweep.time_us in at_us:
+            fused = functools.partial(fuse_sweeps, [*window], sensor, reading)
+            yield Request(index, sweep.name, lambda fused=fused: unlabelled(*fused()), sweep)

@@ -24,17 +24,13 @@ def check_rerun() -> None:
 
 @contextlib.contextmanager
 def rerun_recording(
-    path: Path | None, classes: Sequence[str], *, min_score: float = 0.0
+    path: Path, classes: Sequence[str], *, min_score: float = 0.0
 ) -> Iterator[Callable[..., None]]:
-    """Yield a function that records frames, with the arguments of :func:`~.page.page_frame`; nothing without a
-    path.
+    """Yield a function that records frames, with the arguments of :func:`~.page.page_frame`.
 
     Frames are written immediately. The file appears when the context ends without an error. Boxes below
     ``min_score`` are not recorded, because the viewer cannot hide them.
     """
-    if path is None:
-        yield lambda *_, **__: None
-        return
     import rerun as rr  # pyright: ignore[reportMissingImports]
 
     with atomic_path(path) as temporary:

@@ -79,27 +79,6 @@ def test_the_python_of_the_export_page_runs(home):
     assert ran.stdout == "(500, 9)\n", ran.stderr
 
 
-WRONG = {
-    "export --format onnx": "expected --network-only and --format onnx together",
-    "export --network-only": "expected --network-only and --format onnx together",
-    "export --network-only --format onnx --batch 2": "--points, --batch: expected without --network-only",
-    "detect HOME/clouds --backend openvino --batch-size 0": "--batch-size: got 0",
-}
-
-
-@pytest.mark.parametrize("line", WRONG)
-def test_mistakes_get_one_line(home, tmp_path, capsys, line):
-    words = f"{line} --checkpoint HOME/checkpoint --out {tmp_path / 'a'}".replace("HOME", str(home)).split()
-    assert_one_line_error(capsys, words, WRONG[line])
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_exported_program_has_no_other_backend(home, tmp_path, capsys):
-    command("export --checkpoint", home / "checkpoint", "--out", tmp_path / "detector.fcos")
-    words = ["benchmark", "--backend", "openvino", "--checkpoint", str(tmp_path / "detector.fcos")]
-    assert_one_line_error(capsys, words, "detector.fcos: found an exported program, expected a checkpoint")
-
-
 def test_a_missing_package_is_one_line(home, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     words = ["export", "--network-only", "--format", "onnx", "--checkpoint", str(home / "checkpoint"), "--out"]

@@ -6,7 +6,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, mistakes
+from commands import command
 from tiny_run import TINY_CONFIG, untrained
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
@@ -89,17 +89,3 @@ def test_without_files_the_clouds_are_simulated(home, tmp_path, capsys):
     record = json.loads((tmp_path / "a.json").read_text())
     assert list(record["stages"]) == ["clean", "detect", "whole"]
     assert list(record["throughput"]) == ["1"]
-
-
-BAD = mistakes("""
---repeats 0 => --repeats: got 0, expected at least 1
---batch 0 => --batch: got 0, expected at least 1
---batch 2 => batch size: got 2, expected 1
-none.npy => none.npy: no such file
-""")
-
-
-@pytest.mark.parametrize(("line", "message"), BAD)
-def test_mistakes_get_one_line(home, capsys, line, message):
-    words = ["benchmark", *line.split(), "--checkpoint", str(home / "detector.fcos")]
-    assert_one_line_error(capsys, words, message)

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, page_content
+from commands import command, page_content
 from made_argoverse2 import make_log
 from made_folder import make_folder
 from made_kitti import make_kitti
@@ -22,7 +22,7 @@ from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.data.kitti import TO_NUSCENES
 from fcos_lidar_jax.evaluation.records import cloud_record
 from fcos_lidar_jax.files import file_lock
-from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, TINY, sensor_to_json
+from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, NUSCENES_HDL32E, sensor_to_json
 
 SMALL = "--checkpoint small --out"
 
@@ -177,23 +177,6 @@ def test_a_kitti_cloud_gives_the_same_boxes_in_every_way(kitti, tmp_path, capsys
         assert told.count("clouds rotated by 90 degrees") == 1
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "evaluate --data-root DATA --class-map MAP --no-report",
-        "detect DATA/clouds --data-sensor DATA/sensor.json",
-        "detect DATA/clouds",
-        "stream DATA/clouds",
-    ],
-)
-def test_a_sensor_with_other_rows_gives_a_warning(tmp_path, capsys, words):
-    data = make_folder(tmp_path / "data", sensor=TINY, train=0, val=1)
-    (tmp_path / "map.json").write_text(json.dumps({"vehicle": "car"}))
-    command(words.replace("DATA", str(data)).replace("MAP", f"{tmp_path}/map.json"), SMALL, tmp_path / "out")
-    line = "warning: tiny has 16 rows, and the detector's sensor 32: expect poor detections\n"
-    assert capsys.readouterr().err.count(line) == 1
-
-
 def test_an_error_comes_without_notes_that_it_makes_moot(kitti, tmp_path, capsys):
     good, damaged = kitti / "training" / "velodyne", tmp_path / "training" / "velodyne"
     damaged.mkdir(parents=True)
@@ -333,31 +316,3 @@ def test_the_sensor_of_own_data_is_used_for_their_files(tmp_path, capsys):
     [evaluated] = json.loads((tmp_path / "scores" / "detections.json").read_text())["frames"]
     assert evaluated["boxes"] == expected
     assert fcos.load_detector("small")(data / "clouds" / "000.npy").to_dict()["boxes"] == expected
-
-
-def test_what_cannot_be_meant_is_refused_in_one_line(kitti, tmp_path, capsys):
-    inside, copy = kitti / "training" / "velodyne" / "000000.bin", kitti / "elsewhere" / "cloud.bin"
-    np.zeros((9, 5), np.float32).tofile(tmp_path / "cloud.pcd.bin")
-    for words, message in (
-        (f"detect {inside} {copy}", "got .*bin of .* and .*bin of .*, expected files of one sensor"),
-        (f"detect {copy} --data-sensor sonar", "sonar: no such sensor file"),
-        (
-            f"detect {copy} --full-turn",
-            "--full-turn: expected none for .*cloud.bin: only files of KITTI are cropped",
-        ),
-        (f"detect {copy} --intensity-scale -1", "intensity_scale: got -1.*, expected within .0, 1e"),
-        (
-            f"detect {tmp_path}/cloud.pcd.bin --intensity-scale 9",
-            "cloud.pcd.bin: intensity scale: got 9, expected",
-        ),
-        (f"stream {tmp_path} --intensity-scale 9", "cloud.pcd.bin: intensity scale: got 9, expected none"),
-        (
-            "stream --data-root x --scene a --intensity-scale 9",
-            "--intensity-scale: expected none with --data-root",
-        ),
-    ):
-        assert_one_line_error(capsys, [*words.split(), *SMALL.split(), str(tmp_path / "out")], message)
-    results = f"evaluate --data-root {kitti} --results {kitti}/map.json --checkpoint small --out {tmp_path}/scores"
-    assert_one_line_error(
-        capsys, [*results.split(), "--yaw-deg", "9"], "--yaw-deg: got 9.0, expected none with --res"
-    )

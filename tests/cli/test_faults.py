@@ -88,7 +88,7 @@ def test_a_killed_evaluation_resumes_to_the_same_files(home, tmp_path):
     for finished in (1, 2):  # frames in the log: each process adds one
         code, _, errors = Forked([*evaluate(home), "--out", out], killed).end()
         assert code == -signal.SIGKILL, errors
-        assert len((out / "results_nusc.resume_log").read_bytes().splitlines()) == 1 + finished
+        assert len((out / ".results_nusc.json.resume_log").read_bytes().splitlines()) == 1 + finished
     assert not (out / "results_nusc.json").exists()
     command(*evaluate(home), "--out", out)
     assert contents(out) == contents(home / "evaluated")

@@ -33,7 +33,6 @@ from fcos_lidar_jax.input_pipeline.open import Format
 from fcos_lidar_jax.presets import QUICKSTART
 from fcos_lidar_jax.sensors import ARGOVERSE2, KITTI_HDL64E, Sensor, sensor_to_json
 from fcos_lidar_jax.simulation.frame_set import SimulatedFrames
-from fcos_lidar_jax.simulation.frames import make_frame
 from fcos_lidar_jax.training.run import train
 
 STEPS = 2
@@ -194,18 +193,6 @@ def test_the_same_cloud_gives_the_same_boxes_in_every_way(tmp_path, capsys):
         assert re.fullmatch(".* points per cell.* points left out.*" if frame["name"] == "000" else "", found)
         assert len(detections) > 0
         assert detections.to_dict()["boxes"] == frame["boxes"]
-
-
-def test_a_cloud_of_another_sensor_causes_one_warning(tmp_path, capsys):
-    cloud = make_frame(0, fcos.load_sensor("nuscenes_hdl32e")).points
-    np.save(tmp_path / "cloud.npy", cloud)
-    command("detect", tmp_path / "cloud.npy", "--checkpoint quickstart --out", tmp_path / "boxes.json")
-    [line] = [line for line in capsys.readouterr().err.splitlines() if "do not fit" in line]
-    assert line.startswith("warning: ")
-    command("project", tmp_path / "cloud.npy", "--sensor short_range --out", tmp_path / "image.npz")
-    assert f"warning: {tmp_path / 'cloud.npy'}: points do not fit" in capsys.readouterr().err
-    command("project", tmp_path / "cloud.npy", "--out", tmp_path / "image.npz")
-    assert capsys.readouterr().err == ""
 
 
 @pytest.fixture

@@ -145,19 +145,6 @@ def test_an_invalid_index_is_rebuilt_with_a_message(root, tmp_path, capsys, dama
 
 
 @pytest.mark.parametrize(
-    ("more", "expected"),
-    [
-        ("--workers 0", "--workers: got 0, expected at least 1"),
-        ("--num-sweeps 0", "--num-sweeps: got 0, expected at least 1"),
-        ("--train-split other", "split 'other': not found"),
-        ("--version v0", "v0: no such folder"),
-    ],
-)
-def test_mistakes_get_one_line(root, tmp_path, capsys, more, expected):
-    assert_one_line_error(capsys, prepare(root, tmp_path / "i", *more.split()), expected)
-
-
-@pytest.mark.parametrize(
     ("splits", "more", "expected"),
     [
         (None, "--train-split train", "split 'train': scene-0001: no such scene in"),

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tiny_run import TINY_CONFIG, untrained
 
 from fcos_lidar_jax.checkpoints import Checkpoint, save_checkpoint
-from fcos_lidar_jax.cli.result_files import result_files
+from fcos_lidar_jax.cli.sinks import _kitti
 from fcos_lidar_jax.config import InferenceConfig
 from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
@@ -197,7 +196,7 @@ def test_keyframes_of_nuscenes_are_called_by_their_tokens(home, tmp_path):
 
 def test_a_second_cloud_of_a_name_is_refused(tmp_path):
     (tmp_path / "000000.txt").write_text(calibration_text())
-    with result_files("kitti", tmp_path / "out", ["car"], annotator="", calibration=tmp_path) as write:
+    with _kitti(tmp_path / "out", ["car"], tmp_path) as write:
         write({"file": "a/000000.bin", "boxes": []})
         with pytest.raises(ValueError, match=r"^b/000000\.npy: got a second cloud named 000000, "):
             write({"file": "b/000000.npy", "boxes": []})
@@ -205,7 +204,7 @@ def test_a_second_cloud_of_a_name_is_refused(tmp_path):
 
 def test_calibrations_beside_the_folder_of_the_clouds_are_found_from_within_it(home, tmp_path, monkeypatch):
     monkeypatch.chdir(home / "training" / "velodyne")
-    with result_files("kitti", tmp_path, ["car"], annotator="") as write:
+    with _kitti(tmp_path, ["car"], None) as write:
         write({"file": "000000.npy", "boxes": []})
     assert [file.name for file in tmp_path.iterdir()] == ["000000.txt"]
 
@@ -252,14 +251,8 @@ def test_result_files_of_kitti(home, lines, tmp_path, command_line, capsys, monk
     assert left_out in told
 
 
-def test_labels_and_files_of_own_data_are_not_overwritten(home, tmp_path, capsys):
+def test_files_of_own_data_are_not_overwritten(home, tmp_path, capsys):
     call = ["detect", str(home / "training" / "velodyne"), "--checkpoint", str(home / "checkpoint"), "--out"]
-    label = tmp_path / "label_2" / "000000.txt"
-    label.parent.mkdir()
-    label.write_text("Car 0.00 0 0.1 10 20 30 40 1.5 1.6 3.9 1 2 9 0.2\n")
-    message = "000000.txt: found labels, which have no score"
-    assert_one_line_error(capsys, [*call, str(label.parent), "--output-format", "kitti"], message)
-    assert label.read_text().startswith("Car 0.00 0 0.1")
     (tmp_path / "clouds").mkdir()
     places = ["boxes/000.json", "sweeps/000.json", "splits.json"]
     for out in map(tmp_path.joinpath, places):
@@ -269,41 +262,6 @@ def test_labels_and_files_of_own_data_are_not_overwritten(home, tmp_path, capsys
     command(*call, out)  # not own data yet: any folder may be called clouds
     (tmp_path / "boxes").mkdir()
     assert_one_line_error(capsys, [*call, str(out)], "the place of a file of own data, expected another one")
-
-
-MISTAKES = [
-    ("--output-format kitti --calibration HOME/nowhere", "nowhere: no such file"),
-    ("--output-format kitti --calibration HOME", r"kitti: .*000000.txt: no such file, expected --calibration"),
-    ("--calibration HOME", "--calibration: expected only with --output-format kitti"),
-    ("--output-format nuscenes", "--output-format nuscenes: found no poses"),
-    ("--labels car submarine", "--labels: got 'submarine', expected some of barrier, truck"),
-]
-
-
-@pytest.mark.parametrize(("words", "message"), MISTAKES)
-@pytest.mark.parametrize("name", ["detect", "stream"])
-def test_wrong_combinations_get_one_line(home, tmp_path, capsys, name, words, message):
-    words = words.replace("HOME", str(home)).split()
-    where = ["--checkpoint", str(home / "checkpoint"), "--out", str(tmp_path / "out")]
-    assert_one_line_error(capsys, [name, str(home / "training" / "velodyne"), *where, *words], message)
-
-
-def test_other_classes_are_not_of_nuscenes(home, tmp_path, capsys):
-    words = ["--checkpoint", str(home / "other"), "--out", str(tmp_path / "out"), "--output-format", "nuscenes"]
-    source = ["stream", str(home / "training" / "velodyne"), "--poses", str(home / "poses.json")]
-    assert_one_line_error(
-        capsys, [*source, *words], "nuscenes: got the classes hovercraft, tractor, expected only"
-    )
-
-
-@pytest.mark.parametrize(
-    "line", ["detect HOME/training/velodyne --out OUT", "evaluate --format simulated --out OUT"]
-)
-def test_recordings_need_rerun(home, tmp_path, capsys, monkeypatch, line):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    words = [*line.replace("HOME", str(home)).split(), "--out", str(tmp_path / "out")]
-    words += ["--checkpoint", str(home / "checkpoint"), "--rrd", str(tmp_path / "a.rrd")]
-    assert_one_line_error(capsys, words, "--rrd: rerun is not installed")
 
 
 def test_detect_and_evaluate_write_recordings(home, tmp_path):

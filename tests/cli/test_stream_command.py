@@ -1,12 +1,14 @@
 """``fcos-lidar stream``: the boxes of ``detect --sweeps``, whatever form a drive was recorded in."""
 
+import contextlib
 import dataclasses
 import json
 import re
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from commands import assert_one_line_error, command, mistakes, page_content
+from commands import assert_one_line_error, command, page_content
 from made_argoverse2 import STEP_NS, make_log
 from made_bags import FORMS, structured, write_recording
 from scipy.spatial.transform import Rotation
@@ -18,7 +20,6 @@ from fcos_lidar_jax.cli import stream as cli_stream
 from fcos_lidar_jax.data.argoverse2 import Argoverse2Frames
 from fcos_lidar_jax.data.nuscenes import NuScenes
 from fcos_lidar_jax.geometry import pose_matrix
-from fcos_lidar_jax.inference.stream import detect_stream
 from fcos_lidar_jax.sensors import TINY, sensor_to_json
 from fcos_lidar_jax.simulation.frames import make_frame
 
@@ -46,20 +47,6 @@ def home(tmp_path_factory):
         listed.append({"file": f"drive/{name}", "timestamp_us": stamp // 1000, "sensor_to_world": pose})
     (folder / "poses.txt").write_text("\n".join(lines))
     (folder / "poses.json").write_text(json.dumps(listed))
-
-    for name, poses in (("backwards", listed[::-1]), ("short", listed[:-1])):
-        (folder / f"{name}.json").write_text(json.dumps(poses))
-    invalid = {
-        "gap": f"{lines[0]}\n1800000000 0 0 0 0 0 0 1",
-        "twice": f"{lines[0]}\n{lines[0]}",
-        "words": "1 2 3",
-        "long": f"{lines[0]}\n1800000000 0 0 0 0 0 0 7",
-        "none": "# nothing",
-        "late": "1 0 0 0 0 0 0 1",
-    }
-    for name, text in invalid.items():
-        (folder / f"{name}.txt").write_text(text)
-    (folder / "poses.mcap").write_text("not a recording")
 
     def content(make):
         yield "/imu", make.text("nothing")
@@ -203,16 +190,34 @@ def test_prints_the_time_of_each_stage(home, tmp_path, capsys):
     assert float(matches[0][2]) > 0
 
 
-def test_sweeps_before_an_invalid_cloud_are_written(home, tmp_path, capsys):
+def test_all_outputs_have_the_sweeps_before_an_invalid_cloud(home, tmp_path, capsys, monkeypatch):
     for index in range(2):
         np.save(tmp_path / f"{index}.npy", make_frame(index, TINY).points)
     (tmp_path / "2.npy").write_text("nothing")
-    out = tmp_path / "boxes.jsonl"
-    args = ["stream", str(tmp_path), "--checkpoint", str(home / "checkpoint"), "--out", str(out)]
-    assert_one_line_error(capsys, args, "2.npy: not a readable .npy")
-    assert [json.loads(line)["file"] for line in out.read_text().splitlines()] == [
-        str(tmp_path / f"{index}.npy") for index in range(2)
-    ]
+    recorded = []
+
+    @contextlib.contextmanager
+    def recording(path, classes, *, min_score):
+        yield (record := Mock())
+        recorded.append(record.call_count)
+
+    monkeypatch.setattr("fcos_lidar_jax.cli.sinks.rerun_recording", recording)
+    monkeypatch.setattr(cli_stream, "check_rerun", Mock())
+    out, page = tmp_path / "boxes.jsonl", tmp_path / "page.html"
+    views = ["--page", str(page), "--rrd", str(tmp_path / "a.rrd")]
+    args = ["stream", str(tmp_path), "--checkpoint", str(home / "checkpoint"), *views, "--out", str(out)]
+    for more in ([], ["--output-format", "openlabel"]):
+        page.unlink(missing_ok=True)
+        assert main([*args, *more]) == 1
+        *_, told, error = capsys.readouterr().err.splitlines()
+        assert told == "the outputs have the 2 sweeps before the failure"
+        assert "2.npy: not a readable .npy" in error
+        assert len(page_content(page)["frames"]) == recorded.pop() == 2
+        if more:
+            assert list(json.loads(out.read_text())["openlabel"]["frames"]) == ["0", "1"]
+        else:
+            names = [json.loads(line)["file"] for line in out.read_text().splitlines()]
+            assert names == [str(tmp_path / f"{index}.npy") for index in range(2)]
 
 
 def test_empty_sweeps_have_no_boxes_and_are_counted(home, tmp_path, capsys):
@@ -250,21 +255,6 @@ def test_the_first_sweep_with_points_tells_another_sensor(home, tmp_path, capsys
     assert capsys.readouterr().err.count("no intensity is above 1") == 1
 
 
-def test_an_interruption_leaves_whole_lines(home, tmp_path, monkeypatch):
-    def interrupted(*args, **options):
-        for number, found in enumerate(detect_stream(*args, **options)):
-            yield found
-            if number == 1:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli_stream, "detect_stream", interrupted)
-    out = tmp_path / "boxes.jsonl"
-    assert (
-        main(["stream", str(home / "drive"), "--checkpoint", str(home / "checkpoint"), "--out", str(out)]) == 130
-    )
-    assert [set(json.loads(line)) >= {"file", "boxes"} for line in out.read_text().splitlines()] == [True, True]
-
-
 def test_a_recording_for_rerun(home, tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     file = tmp_path / "drive.rrd"
@@ -273,61 +263,21 @@ def test_a_recording_for_rerun(home, tmp_path):
     assert len(lines) == SWEEPS
 
 
-MISTAKES = mistakes(r"""
-HOME/drive --poses HOME/backwards.json => 17000000003\d+.npy: time: got 17000000003\d+ us, expected
-HOME/drive --poses HOME/short.json => short.json: no pose of .*17000000004\d+.npy
-HOME/drive --poses HOME/gap.txt => gap.txt: .*17000000001\d+.npy: at 1700000000.1\d* s: a gap in the poses
-HOME/drive --poses HOME/twice.txt => twice.txt: line 2: time: got 1700000000.\d+ s after 1700000000.\d+ s
-HOME/drive --poses HOME/words.txt => words.txt: line 1: got '1 2 3', expected t x y z qx qy qz qw
-HOME/drive --poses HOME/long.txt => long.txt: line 2: rotation: got .* expected a unit quaternion
-HOME/drive --poses HOME/none.txt => none.txt: no pose in it
-HOME/drive --poses HOME/nothing.txt => nothing.txt: no such file
-HOME/drive --track => --track: found no poses
-=> expected either a folder of point files or a recording
---data-root HOME => --data-root and --scene together
-HOME/drive --keyframes => --keyframes: expected only with --data-root
---data-root HOME --scene a --poses HOME/poses.txt => --poses: expected only with a folder
---data-root HOME --scene a => expected
-HOME/drive --min-score 2 => --min-score: got 2, expected
-HOME/drive --yaw-deg nan => --yaw-deg: got nan, expected an angle
-HOME/nowhere => nowhere: no such file or folder
-HOME/drive --out HOME/drive/1700000000000000000.npy => --out: .*the same file as
-HOME/drive --out HOME/checkpoint/checkpoint.json => --out: .*inside of the checkpoint
---data-root HOME --scene a --max-file-points 5 => --max-file-points: expected only with a folder
-HOME/drive --follow-links => --follow-links: expected only with --data-root
-HOME/drive --poses HOME/poses.txt --page HOME/poses.txt => --page: .*the same file as .*poses.txt
-HOME/drive --topic /points => --topic: expected only with a ROS recording
-HOME/ros1.bag --odometry tf --poses HOME/poses.txt => --poses: expected only with .* without --odom
-HOME/ros1.bag --columns 4 => --columns: expected only with a folder of point files
-HOME/ros1.bag --topic /x => ros1.bag: topic: got '/x', .*: /points \(sensor_msgs/msg/Point
-HOME/ros1.bag --track => --track: found no poses, expected .*--odometry
-HOME/other.bag => other.bag: no such file or folder
-HOME/poses.mcap => poses.mcap: cannot be read: File magic is invalid
-HOME/ros1.bag --poses HOME/late.txt => late.txt: .*/points: message 0: at 17.* a gap
-HOME/ros1.bag --page HOME/ros1.bag => --page: .*the same file
-""")
-
-
-@pytest.mark.parametrize(("line", "message"), MISTAKES)
-def test_mistakes_get_one_line(home, tmp_path, capsys, line, message):
-    args = ["stream", *line.replace("HOME", str(home)).split(), "--checkpoint", str(home / "checkpoint")]
-    out = tmp_path / "boxes.jsonl"
-    out.write_text("an earlier result")
-    before = {file: file.read_bytes() for file in home.rglob("*") if file.is_file()}
-    assert_one_line_error(capsys, args if "--out" in args else [*args, "--out", str(out)], message)
-    assert all(file.read_bytes() == content for file, content in before.items())
-    # The first new line replaces the earlier result.
-    assert (out.read_text() == "an earlier result") == ("backwards.json" not in line)
-
-
-def test_time_going_back_is_one_line_after_what_came_before(home, tmp_path, capsys):
-    cloud = structured(make_frame(0, TINY).points)
-    times = (5000, 4000)
+def test_sweeps_out_of_order_are_kept_without_poses_and_skipped_with_them(home, tmp_path, capsys):
+    cloud, times = structured(make_frame(0, TINY).points), [5000, 4000, 0, 5000, 6000]
     bag = write_recording(tmp_path / "a", "sqlite", lambda make: (("/p", make.cloud(t, cloud)) for t in times))
-    out = tmp_path / "boxes.jsonl"
-    args = ["stream", str(bag), "--checkpoint", str(home / "checkpoint"), "--out", str(out)]
-    assert_one_line_error(capsys, args, r"a: /p: message 1: time: got 4 us, expected more than the 5 us of")
-    assert len(out.read_text().splitlines()) == 1
+    lines = stream(home, tmp_path / "a.jsonl", bag)
+    assert [line["timestamp_us"] for line in lines] == [5, 4, 0, 5, 6]
+    assert all(line["boxes"] == lines[0]["boxes"] for line in lines)
+    note = "note: sweeps that are not later than all before: {}, the first is {}; {}"
+    assert note.format(3, f"{bag}: /p: message 1", "kept") in capsys.readouterr().err
+    listed = json.loads((home / "poses.json").read_text())
+    listed.insert(1, listed.pop(2))
+    (home / "jump.json").write_text(json.dumps(listed))
+    for more in ("", "--track"):
+        found = stream(home, tmp_path / "b.jsonl", home / "drive", "--poses", home / "jump.json", more)
+        assert [line["timestamp_us"] for line in found] == [TIMES_US[i] for i in (0, 2, 3, 4)]
+        assert note.format(1, home / listed[2]["file"], "skipped") in capsys.readouterr().err
 
 
 def test_a_log_of_argoverse2_is_a_source(home, tmp_path):

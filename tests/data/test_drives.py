@@ -83,6 +83,37 @@ def test_a_cloud_listed_twice_is_refused(poses):
 
 
 @pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 0 0 0 0 0 0 1\n9 0 0 0 0 0 0 1", "0.1.npy: at 0.1 s: a gap in the poses"),
+        ("8 0 0 0 0 0 0 1", "0.1.npy: at 0.1 s: a gap in the poses"),
+        (
+            "0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1",
+            "poses.txt: line 2: time: got 0.0 s after 0.0 s, expected a later one",
+        ),
+        ("1 2 3", "poses.txt: line 1: got '1 2 3', expected t x y z qx qy qz qw"),
+        (
+            "0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 7",
+            "poses.txt: line 2: rotation: got [7.0, 0.0, 0.0, 0.0], expected a unit",
+        ),
+        ("# nothing", "poses.txt: no pose in it"),
+        (None, "poses.txt: no such file"),
+        ([], "poses.json: no pose of"),
+    ],
+)
+def test_poses_that_do_not_fit_are_refused(poses, text, message):
+    np.save(poses / "clouds" / "0.1.npy", CLOUD)
+    file = poses / ("poses.json" if isinstance(text, list) else "poses.txt")
+    entry = {"file": "clouds/other.npy", "sensor_to_world": np.eye(4).tolist(), "timestamp_us": 0}
+    if text is None:
+        file.unlink()
+    else:
+        file.write_text(json.dumps([entry]) if isinstance(text, list) else text)
+    with refused(message):
+        folder_drive(poses / "clouds", TINY, file)
+
+
+@pytest.mark.parametrize(
     "line", ["x 0 0 0 0 0 0 1", "1 0 0 0 0 0 1", "1 0 0 nan 0 0 0 1", "nan 0 0 0 0 0 0 1", "1e999 0 0 0 0 0 0 1"]
 )
 def test_lines_that_are_not_poses_are_refused(tmp_path, line):

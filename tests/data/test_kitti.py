@@ -67,20 +67,23 @@ def test_a_point_file_is_cropped_like_its_frame_unless_it_lies_elsewhere(root, c
         np.testing.assert_array_equal(in_camera(other, points), points)
 
 
-def test_the_fingerprint_of_point_files_depends_on_all_that_their_points_do(root):
-    files = tuple((root / "training" / "velodyne").iterdir())
+def test_the_fingerprints_of_point_files_depend_on_all_that_their_points_do(root):
+    files = tuple(sorted((root / "training" / "velodyne").iterdir()))
     clouds = CloudFiles(files, KITTI_HDL64E)
-    prints = [clouds.fingerprint()]
-    for change in (
-        {"files": files[::-1]},
+    changes = (
+        {},
         {"sensor": dataclasses.replace(KITTI_HDL64E, intensity_scale=1.0)},
         {"sensor": dataclasses.replace(KITTI_HDL64E, origin_m=(0.0, 0.0, 1.7))},
+        {"reading": CloudReading(remove_close="all")},
+        {"columns": 5},
         {"full_turn": True},
-    ):
-        prints.append(dataclasses.replace(clouds, **change).fingerprint())
+    )
+    prints = {dataclasses.replace(clouds, **change).fingerprint() for change in changes}
+    assert len(prints) == len(changes)
+    before = [clouds.clouds_fingerprint([index]) for index in range(2)]
     (root / "training" / "calib" / "000007.txt").write_text(calibration_text() + "\n")
-    prints.append(clouds.fingerprint())
-    assert len(set(prints)) == len(prints)
+    after = [clouds.clouds_fingerprint([index]) for index in range(2)]
+    assert [a == b for a, b in zip(before, after, strict=True)] == [True, False]
 
 
 def test_frames_are_sorted_by_name_and_have_points_boxes_labels_and_counts(root):

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from refusal import refused
 
 import fcos_lidar_jax as fcos
 from fcos_lidar_jax.data.frame import InMemoryFrames
@@ -54,6 +55,16 @@ def test_a_sensor_with_another_number_of_rows_gives_a_warning(capsys):
     expected = "warning: vlp16 has 16 rows, and the detector's sensor 32: expect poor detections"
     assert capsys.readouterr().err.count(expected) == 1
     assert align(NUSCENES_HDL32E, dataclasses.replace(NUSCENES_HDL32E, forward_rad=0.0)).notes == ()
+
+
+def test_files_of_several_sensors_and_wrong_scales_are_refused(tmp_path):
+    kitti, other = tmp_path / "training" / "velodyne" / "000000.bin", tmp_path / "cloud.bin"
+    with refused(
+        f"{kitti} of kitti_hdl64e and {other} of another, expected files of one sensor, or --data-sensor"
+    ):
+        align(NUSCENES_HDL32E, paths=[kitti, other])
+    with refused("intensity_scale: got -1.0, expected within (0, 1e+30]"):
+        align(NUSCENES_HDL32E, intensity_scale=-1.0)
 
 
 def test_a_note_says_if_only_one_heading_is_known(capsys):

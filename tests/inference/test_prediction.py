@@ -10,7 +10,7 @@ from tiny_run import CONFIG, FRAMES, TESTS, weights
 
 from fcos_lidar_jax.data.frame import Frame, WrappedFrames
 from fcos_lidar_jax.inference import TrainedDetector, prediction
-from fcos_lidar_jax.inference.prediction import evaluate, predict, predict_groups
+from fcos_lidar_jax.inference.prediction import evaluate, predict
 from fcos_lidar_jax.models import build_detector
 
 
@@ -46,27 +46,21 @@ class OnlyTruth(WrappedFrames):
 
 
 def test_only_boxes_are_read_of_frames_that_another_process_has_read(detector, compared, monkeypatch):
-    def groups(*args, **options):
-        for group in predict_groups(detector, TESTS):
-            yield [dataclasses.replace(found, frame=None, cloud=None) for found in group]
+    def read_elsewhere(*args, **options):
+        return (dataclasses.replace(found, frame=None, cloud=None) for found in predict(detector, TESTS))
 
-    monkeypatch.setattr(prediction, "predict_groups", groups)
+    monkeypatch.setattr(prediction, "predict", read_elsewhere)
     evaluate(detector, OnlyTruth(TESTS))
     assert [set(frame.num_points.tolist()) for frame in compared] == [{70}, {71}]
     np.testing.assert_array_equal(compared[1].boxes, TESTS.frame(1).boxes)
 
 
-def test_groups_contain_one_batch_per_device(detector):
-    size = 2 * len(jax.devices())
-    groups = list(predict_groups(detector, FRAMES, indices=[7, 3, 5], batch_size=2))
-    indices = [[found.index for found in group] for group in groups]
-    assert indices == [[7, 3, 5][i : i + size] for i in range(0, 3, size)]
-    one_by_one = list(predict(detector, FRAMES, indices=[7, 3, 5], batch_size=2))
-    assert [found.index for found in one_by_one] == [7, 3, 5]
-    for a, b in zip(one_by_one, (found for group in groups for found in group), strict=True):
-        jax.tree.map(np.testing.assert_array_equal, a.detections, b.detections)
-
+def test_frames_are_processed_in_order(detector):
+    found = list(predict(detector, FRAMES, indices=[7, 3, 5], batch_size=2))
+    assert [each.index for each in found] == [7, 3, 5]
+    [alone] = predict(detector, FRAMES, indices=[3], batch_size=2)
+    jax.tree.map(np.testing.assert_array_equal, alone.detections, found[1].detections)
     with pytest.raises(ValueError, match="frames: got 'str', expected a set of frames, as open_frames returns"):
-        next(inspect.unwrap(predict_groups)(detector, "my_lidar"))  # without the type checks of the tests
+        inspect.unwrap(predict)(detector, "my_lidar")  # without the type checks of the tests
     with pytest.raises(ValueError, match="batch_size: got 0, expected at least 1"):
-        next(predict(detector, FRAMES, batch_size=0))
+        predict(detector, FRAMES, batch_size=0)

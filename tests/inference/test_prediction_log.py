@@ -8,7 +8,7 @@ from toy_frames import ToyFrames
 from fcos_lidar_jax.data.cloud_policy import Cloud
 from fcos_lidar_jax.inference import load_detector
 from fcos_lidar_jax.inference import prediction_log as results
-from fcos_lidar_jax.inference.prediction import Prediction
+from fcos_lidar_jax.inference.loop import Prediction
 from fcos_lidar_jax.types import Detections
 
 
@@ -30,30 +30,31 @@ def test_points_of_a_cloud_that_another_process_has_read_are_not_counted():
     assert results._removed(Prediction(0, nothing, None, None)) == [0, 0, 0]
 
 
-def cloud_and_boxes(num_dropped):
+def boxes_cloud_and_note(num_dropped):
     cloud = Cloud(np.zeros((9, 5)), np.ones(9, bool), num_points=9, num_close=0, num_invalid=0, num_truncated=0)
     nothing = np.zeros((0, 9)), *np.zeros((2, 0)), np.zeros(0, bool)
-    return cloud, Detections(*nothing, num_dropped=np.int32(num_dropped))
+    note = None if num_dropped < 9 else "none of its 9 points is usable"
+    return Detections(*nothing, num_dropped=np.int32(num_dropped)), cloud, note
 
 
 @pytest.mark.parametrize("unusable", [1, 3])
 def test_frames_without_usable_points_are_reported_and_only_such_frames_refused(
     unusable, monkeypatch, tmp_path, capsys
 ):
-    def predict_groups(detector, frames, *, indices, **how):
+    def predict(detector, frames, *, indices, **how):
         for index in indices:
-            cloud, boxes = cloud_and_boxes(9 if index < unusable else 4)
-            yield [Prediction(index, boxes, None, cloud)]
+            boxes, cloud, note = boxes_cloud_and_note(9 if index < unusable else 4)
+            yield Prediction(index, boxes, None, cloud, note)
 
-    monkeypatch.setattr(results, "predict_groups", predict_groups)
+    monkeypatch.setattr(results, "predict", predict)
     detector = load_detector("quickstart")
     frames, out = ToyFrames(size=3), tmp_path / "detections.json"
 
     def run():
-        how = {"entries": lambda index, boxes: [], "write": lambda path, entries: path.write_text("")}
+        how = {"entries": lambda found: ([], ""), "write": lambda path, entries: path.write_text("")}
         results.write_predictions(detector, frames, out, **how)
 
-    first = f"{frames.name(0)}: none of its 9 points is usable"
+    first = "none of its 9 points is usable"
     if unusable == 3:
         for _ in range(2):
             with refused(first):
@@ -65,46 +66,53 @@ def test_frames_without_usable_points_are_reported_and_only_such_frames_refused(
 
 
 def test_frames_without_usable_points_of_other_processes_are_counted(monkeypatch, tmp_path, capsys):
-    def predict_groups(detector, frames, *, indices, **how):
-        cloud, boxes = cloud_and_boxes(9)
-        yield [Prediction(index, boxes, None, cloud if index == 2 else None) for index in range(3)]
+    def predict(detector, frames, *, indices, **how):
+        boxes, cloud, note = boxes_cloud_and_note(9)
+        own = [(cloud, note) if index == 2 else (None, None) for index in range(3)]
+        yield from (Prediction(index, boxes, None, *each) for index, each in enumerate(own))
+
+    others = iter([True, False, False])
 
     def of_two(own, tiled):
-        return np.concatenate([own, [[True, False, False]]]) if own.dtype == bool else own
+        return np.concatenate([own, [next(others)]]) if own.dtype == bool else own
 
-    assert results._in_any_process([True, False]) == [True, False]
-    monkeypatch.setattr(results, "predict_groups", predict_groups)
+    assert [results._in_any_process(flag) for flag in (True, False)] == [True, False]
+    monkeypatch.setattr(results, "predict", predict)
     monkeypatch.setattr(results.multihost_utils, "process_allgather", of_two)
-    how = {"entries": lambda index, boxes: [], "write": lambda path, entries: [*entries]}
+    how = {"entries": lambda found: ([], ""), "write": lambda path, entries: [*entries]}
     results.write_predictions(load_detector("quickstart"), ToyFrames(size=3), tmp_path / "x.json", **how)
     told = capsys.readouterr().err
     assert "note: 2 of 3 clouds without usable points" in told
     assert "the first is toy 0: no usable points\n" in told
 
 
+@pytest.mark.parametrize(("options", "again"), [(None, [0, 2, 3]), ([0.5], [0, 1, 2, 3])])
 def test_a_resumed_run_also_counts_the_frames_without_usable_points_of_the_part_before(
-    monkeypatch, tmp_path, capsys
+    monkeypatch, tmp_path, capsys, options, again
 ):
     detected, written = [], []
 
-    def predict_groups(detector, frames, *, indices, **how):
+    def predict(detector, frames, *, indices, **how):
         for index in indices:
             if len(detected) == 2:
                 detected.append("interrupted")
                 raise KeyboardInterrupt
-            cloud, boxes = cloud_and_boxes(9 if index in (0, 3) else 4)
+            boxes, cloud, note = boxes_cloud_and_note(9 if index in (0, 3) else 4)
             detected.append(index)
-            yield [Prediction(index, boxes, None, cloud)]
+            yield Prediction(index, boxes, None, cloud, note)
 
-    def run():
-        how = {"entries": lambda index, _: [{"index": index}], "write": lambda _, found: written.extend(found)}
+    def run(**how):
+        how |= {
+            "entries": lambda found: ([{"index": found.index}], ""),
+            "write": lambda _, found: written.extend(found),
+        }
         results.write_predictions(load_detector("quickstart"), ToyFrames(size=4), tmp_path / "x.json", **how)
 
-    monkeypatch.setattr(results, "predict_groups", predict_groups)
+    monkeypatch.setattr(results, "predict", predict)
     with pytest.raises(KeyboardInterrupt):
         run()
-    run()
-    assert detected == [0, 1, "interrupted", 0, 2, 3]
+    run(options=options)
+    assert detected == [0, 1, "interrupted", *again]
     assert written == [(f"toy {i}", b'[{"index": %d}]' % i) for i in range(4)]
     told = capsys.readouterr().err
     assert "note: 2 of 4 clouds without usable points" in told
