@@ -39,7 +39,6 @@ _FIELDS = (
     *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
 )
 _TYPES = {name.lower(): name for name in (*CLASSES, "DontCare")}
-_NOWHERE_M = -1000.0  # position of a line with a box in the image only
 _SHAPES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
@@ -215,10 +214,9 @@ def read_objects(file: Path, *, scored: bool = False) -> tuple[list[str], np.nda
     """All lines of a label or result file, DontCare too: types, and the numbers that follow them, f64[m, 15].
 
     The columns are truncation, occlusion, alpha, left, top, right, bottom, height, width, length, x, y, z,
-    rotation_y and score; the score is NaN where the line has none. Types are KITTI's, whatever their case in the
-    file.
+    rotation_y and score; the score is NaN where the line has none. Types in any case become KITTI's.
 
-    Result files (``scored``) need scores, and are read as by the development kit: other types stay as they are, and
+    Result files (``scored``) need scores, and are read as by the development kit: other types stay as they are;
     height to rotation_y of lines with a box in the image only, without a size or a position, are NaN.
     """
     lengths, expected = ((16,), "16, the score last") if scored else ((15, 16), "15, or 16 with a score")
@@ -236,7 +234,7 @@ def read_objects(file: Path, *, scored: bool = False) -> tuple[list[str], np.nda
         places.append(where)
     fields = np.array(rows, np.float64).reshape(-1, 15)
     if scored:
-        flat = (fields[:, 7:10] <= 0).any(axis=1) | (fields[:, 10:13] == _NOWHERE_M).any(axis=1)
+        flat = (fields[:, 7:10] <= 0).any(axis=1) | (fields[:, 10:13] == -1000).any(axis=1)
         fields[flat, 7:14] = np.nan
     objects = np.flatnonzero(np.isin(types, CLASSES) & ~np.isnan(fields[:, 7]))
     boxes = np.pad(fields[objects][:, [10, 11, 12, 9, 8, 7, 13]], ((0, 0), (0, 2)), constant_values=np.nan)

@@ -36,8 +36,7 @@ def evaluate_kitti(
     detections therefore stay below 100, as in the development kit.
 
     Args:
-        results_dir: folder of files ``NAME.txt``, a detection per line, with a score; or the folder above, if it is
-            called ``data``, as for the development kit.
+        results_dir: folder of files ``NAME.txt``, a detection per line, with a score, or of their folder ``data``.
         label_dir: folder of the label files of the same names, such as ``training/label_2``.
         classes: of :data:`MIN_OVERLAP`.
 
@@ -92,9 +91,8 @@ def describe_kitti(metrics: dict[str, Any]) -> str:
     few = [n for n, scores in metrics["classes"].items() if 0 < scores["num_truth"]["moderate"] <= _POSITIONS]
     if few:
         lines.append(f"few objects of {', '.join(few)}: with fewer than 41 even perfect detections stay below 100")
-    if skipped := metrics["unknown_types"]:
-        listed = ", ".join(f"{count} {name}" for name, count in skipped.items())
-        lines.append(f"skipped, none of KITTI's types: {listed}")
+    if skipped := [f"{count} {name}" for name, count in metrics["unknown_types"].items()]:
+        lines.append(f"skipped, none of KITTI's types: {', '.join(skipped)}")
     if metrics["image_only"]:
         lines.append(f"without a box in 3D, and therefore false: {metrics['image_only']} detections")
     if metrics.get("left_out"):
