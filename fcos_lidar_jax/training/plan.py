@@ -152,6 +152,8 @@ def plan_run(spec: RunSpec, mesh: Mesh) -> Run:
     config, frames = spec.config, spec.frames
     order = SampleOrder(frames, config, seed=spec.seed)
     check_counts(frames)
+    for read in filter(None, (frames, spec.tests)):
+        read.check_files(range(len(read)))
     check_batch_size(config.optimizer.batch_size, mesh)
     options = {"threads": spec.threads, "workers": spec.workers, "num_processes": jax.process_count()}
     check_loader_options(config, **options)

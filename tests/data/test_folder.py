@@ -253,8 +253,10 @@ def test_damaged_missing_and_surplus_files_are_refused(root, case):
 def test_wrong_files_in_a_list_of_sweeps_are_refused(root, sweeps, index, name, message):
     sweeps[index]["file"] = name.format(root=root) if isinstance(name, str) else name
     write(root / "sweeps" / "b.json", sweeps)
-    with refused(message, root / "sweeps/b.json"):
-        read_all(root)
+    frames = FolderFrames(root, reading=CloudReading(3, "all"))
+    for read in (lambda: frames.frame(1), lambda: frames.check_files([1]), frames.fingerprint):
+        with refused(message, root / "sweeps/b.json"):
+            read()
 
 
 def test_time_offsets_within_a_sweep_are_refused_as_lags(root):

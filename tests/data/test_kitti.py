@@ -180,7 +180,7 @@ def test_points_inside_the_camera_box_are_inside_the_lidar_box(tmp_path, calibra
 
 def test_types_are_classes_and_map_to_nuscenes(root):
     kinds = [*CLASSES, "DontCare"]
-    write(root / L, "".join(label_text(CAR, kind).replace("\n", " 0.9\n") for kind in kinds))
+    write(root / L, "".join(label_text(CAR, kind.upper()).replace("\n", " 0.9\n") for kind in kinds))
     boxes, labels = read_labels(root / L)
     assert [CLASSES[i] for i in labels] == kinds[:-1]
     np.testing.assert_array_equal(boxes, np.repeat(boxes[:1], 8, axis=0))
@@ -208,7 +208,7 @@ def label(**changes) -> str:
 L, C, S = "training/label_2/000007.txt", "training/calib/000007.txt", "ImageSets/val.txt"
 BAD = {
     "short line": (L, " ".join(GOOD[:-1]), "line 1: got 14 values, expected 15"),
-    "type": (L, label(kind="car"), "line 2: type: got 'car', expected Car"),
+    "type": (L, label(kind="Bicycle"), "line 2: type: got 'Bicycle', expected Car"),
     "word": (L, label(w="wide"), "line 2: width: got 'wide', expected a finite number"),
     "NaN": (L, label(ry="nan"), "line 2: rotation_y: got 'nan', expected a finite number"),
     "too large": (L, label(x="1e39"), "line 2: x: got '1e39', expected a finite number"),

@@ -562,6 +562,19 @@ def test_single_sweeps_are_reported_if_several_are_configured(tmp_path, capsys):
     assert "warning: num_sweeps: got 3, but the frames hold one sweep each: expected 1" in capsys.readouterr().err
 
 
+class PartialFrames(InMemoryFrames):
+    def check_files(self, indices):
+        raise ValueError(f"{len([*indices])} keyframes are missing")
+
+
+@pytest.mark.parametrize("which", ["frames", "tests"])
+def test_missing_files_are_refused_before_the_first_step(tmp_path, which):
+    partial = PartialFrames(tuple(FRAMES.frame(i) for i in range(2)), FRAMES.sensor, FRAMES.classes)
+    with pytest.raises(ValueError, match="2 keyframes are missing"):
+        train_tiny(tmp_path / "run", **{"tests": TESTS, which: partial})
+    assert not (tmp_path / "run").exists()
+
+
 class UnreadableFrames(InMemoryFrames):
     def frame(self, index):
         raise ValueError("clouds/0.npy: empty file")
