@@ -14,6 +14,7 @@ from tiny_run import CONFIG, SENSOR, images_of
 from fcos_lidar_jax.config import ModelConfig, StemConfig
 from fcos_lidar_jax.locations import STRIDES, image_layout
 from fcos_lidar_jax.models import build_detector, count_parameters, layers
+from fcos_lidar_jax.models import detector as module
 from fcos_lidar_jax.models.detector import Network, network_input
 from fcos_lidar_jax.models.fpn import FeaturePyramid
 from fcos_lidar_jax.models.layers import BatchNorm, GroupNorm
@@ -29,6 +30,13 @@ def normal(seed: int, *shape: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
+def with_model(config, **changes):
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **changes))
+
+
+SMALL_STEM = StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2))
+
+
 def test_all_parts_have_the_same_channels():
     number, rounds = len(CHANNELS), 5
     image = project_points(np.zeros((1, 5)), np.zeros(1, bool), TINY, num_rounds=1)
@@ -39,7 +47,55 @@ def test_all_parts_have_the_same_channels():
         number * rounds
     )
     for preset in PRESETS.values():
-        assert len(preset.model.channel_mean) == len(preset.model.channel_scale) == number
+        assert 9 <= len(preset.model.channel_mean) == len(preset.model.channel_scale) <= number
+
+
+TEN = {
+    "channel_mean": (*QUICKSTART.model.channel_mean, 0.5),
+    "channel_scale": (*QUICKSTART.model.channel_scale, 0.3),
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "first_kernels"),
+    [
+        ({"stem": SMALL_STEM}, 10),
+        ({"stem": dataclasses.replace(SMALL_STEM, groups="modalities")}, 6),
+        ({"stem": dataclasses.replace(SMALL_STEM, groups="all")}, 1),
+        ({"stem": dataclasses.replace(SMALL_STEM, group_rounds=False)}, 20),
+        ({"local_geometry": True, "round_offsets": True, "stem": SMALL_STEM}, 10),
+    ],
+)
+def test_a_channel_of_your_own_takes_two_numbers_and_a_function(changes, first_kernels):
+    """tests/training/test_own_loop.py trains with one."""
+    config = with_model(CONFIG, **TEN, **changes)
+    config = dataclasses.replace(config, projection=dataclasses.replace(config.projection, num_rounds=2))
+    detector = build_detector(config, SENSOR)
+    variables = jax.eval_shape(detector.init, jax.random.key(0))
+    first = [name for name in variables["params"]["stem"]["branch0"] if name.startswith("conv0_")]
+    assert len(first) == first_kernels
+    cloud = jnp.zeros((1, 4, 5)), jnp.zeros((1, 4), bool)
+    images = jax.eval_shape(jax.vmap(detector.prepare), *cloud)
+    with pytest.raises(ValueError, match=r"^features: got \(1, 16, 64, 9, 2\), expected 10 channels, as in ch"):
+        jax.eval_shape(detector.apply, variables, images)
+    own = jax.ShapeDtypeStruct((*images.features.shape[:3], 10, 2), jnp.float32)
+    outputs, _ = jax.eval_shape(detector.apply, variables, dataclasses.replace(images, features=own))
+    assert outputs.logits.shape[-1] == len(CONFIG.classes) + 1
+
+
+def test_a_detector_without_the_last_channel_still_runs(monkeypatch):
+    """What a channel at the end of CHANNELS does to older checkpoints."""
+
+    def with_another(*args, **options):
+        image = project_points(*args, **options)
+        return dataclasses.replace(image, features=jnp.pad(image.features, ((0, 0), (0, 0), (0, 1), (0, 0))))
+
+    monkeypatch.setattr(module, "CHANNELS", (*CHANNELS, "own"))
+    monkeypatch.setattr(module, "project_points", with_another)
+    build = build_detector.__wrapped__
+    for more, number in (({}, 9), (TEN, 10)):
+        image = build(with_model(CONFIG, **more), SENSOR).prepare(jnp.zeros((4, 5)), jnp.zeros(4, bool))
+        assert image.features.shape[2] == number
 
 
 def fill(tree, seed: int = 0):
@@ -59,13 +115,6 @@ def variables_of(module, *inputs):
 @functools.cache
 def parameters(config, sensor=NUSCENES_HDL32E):
     return count_parameters(jax.eval_shape(build_detector(config, sensor).init, jax.random.key(0))["params"])
-
-
-def with_model(config, **changes):
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, **changes))
-
-
-SMALL_STEM = StemConfig(channels_per_type=4, out_channels=8, dilations=(1, 2))
 
 
 def stem_of_groups(params, image, config):
