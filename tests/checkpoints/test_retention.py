@@ -118,12 +118,6 @@ def test_an_interruption_of_the_replacement_keeps_the_old_checkpoint(copy, monke
     assert contents(copy) == before
 
 
-def test_a_run_resumes_from_the_newest_checkpoint(copy):
-    checkpoint, state = copy.newest(state_at(0))
-    assert (checkpoint.step, checkpoint.score) == (6, 0.1)
-    assert bits(state) == bits(state_at(6))
-
-
 def test_corrupt_checkpoints_are_skipped_with_a_warning(copy, capsys):
     truncate(copy.folder / "00000006")
     (copy.folder / "00000004" / "checkpoint.json").write_text("{")
