@@ -188,19 +188,6 @@ def test_leftovers_of_killed_saves_are_ignored_and_removed_by_the_next_save(copy
     assert steps(copy) == [2, 4, 6, 8]
 
 
-def test_a_failed_save_changes_nothing(copy, monkeypatch):
-    before = contents(copy)
-
-    def full(*_, **__):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(storage, "_save_arrays", full)
-    with pytest.raises(OSError, match="No space left"):
-        save(copy, 8)
-    assert contents(copy) == before
-    assert list(copy.folder.glob(".*")) == []
-
-
 def test_a_run_stands_for_its_last_or_best_checkpoint(copy):
     run = copy.folder.parent
     assert find_checkpoint(run) == copy.folder / "00000006"

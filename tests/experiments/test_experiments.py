@@ -21,12 +21,10 @@ from experiments.paper_tables import __main__ as all_tables
 from experiments.paper_tables import submission as table8
 from experiments.paper_tables import tables
 from experiments.paper_tables.__main__ import TABLES, TablesArgs
-from experiments.paper_tables.cells import add_cell, run_name
-from experiments.paper_tables.grid import run_cell
 from experiments.paper_tables.scales import smoke
 from experiments.paper_tables.tables import Args, Row, Table, run_table
 from experiments.script import run_script
-from fcos_lidar_jax.presets import NUSCENES, QUICKSTART
+from fcos_lidar_jax.presets import NUSCENES
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -182,26 +180,6 @@ def test_table_8_changes_the_heads_and_the_pasting_and_quotes_the_papers_gains(t
     assert [c.model.head_channels for c in (fade, c128, both)] == [64, 128, 128]
     gains = [row["paper_difference"] for row in train_table(table8.TABLE)["rows"]]
     assert gains == [{}, {"mAP": 2}, {"mAP": 0.6}, {}]
-
-
-def test_table_8_submits_nothing_of_a_run_that_did_not_end(tmp_path, monkeypatch):
-    config, scale = table8.wide(table8.faded(QUICKSTART)), Pretended()
-    args = Args(seeds=(0,), out=tmp_path, runs=tmp_path / "runs")
-    monkeypatch.setattr(table8, "make_scale", lambda _: scale)
-    other_row = 'No results file: the row "c128 and fade" was not trained with seed 0.'
-    assert table8.submission(args) == [other_row]
-    folders = {"results": tmp_path / "smoke", "runs": args.runs / "smoke"}
-    cell = run_cell(config, scale, 0, **folders)
-    run = folders["runs"] / run_name(cell["changes"], 0)
-    said = f"No results file: no finished run in {run}, the cell was trained elsewhere."
-    assert table8.submission(args) == [said]
-    (run / "run.json").write_text('{"steps": 20}')
-    for step, ended in (("00000010", False), ("00000020", True)):
-        (run / "checkpoints" / step).mkdir(parents=True)
-        assert table8.finished(run) is ended
-    gone = {**cell, "diverged": "step 7: loss/l1 is not finite"}
-    add_cell(folders["results"], scale, gone, locks=tmp_path)
-    assert table8.submission(args) == ["No results file: the training of seed 0 diverged."]
 
 
 def tiny_smoke(cache):
