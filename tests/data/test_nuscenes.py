@@ -372,28 +372,6 @@ def test_counts_of_the_real_scene_equal_the_annotated_ones(real_data):
 
 
 @pytest.mark.real_data
-def test_static_structure_of_the_real_scene_is_aligned(real_data):
-    """Voxels of 0.3 m above the ground, shared by a keyframe and the three before it."""
-    data = NuScenes(real_data / "nuscenes_scene0523", "v1.0-scene0523")
-
-    def overlap(cloud: np.ndarray) -> float:
-        cloud = cloud[(cloud[:, 2] > -1.2) & (np.abs(cloud[:, :2]) < 30).all(axis=1)]
-        cells, current = np.floor(cloud[:, :3] / 0.3).astype(int), cloud[:, 4] == 0
-        now, before = (set(map(tuple, part)) for part in (cells[current], cells[~current]))
-        return len(now & before) / len(now)
-
-    aligned, apart, keyframes = [], [], data.sample_tokens
-    for i in range(5, 35, 6):
-        aligned.append(overlap(data.sweeps(keyframes[i], 4)))
-        parts = [data.sweeps(sample, 1) for sample in keyframes[i - 3 : i + 1][::-1]]
-        for lag, part in enumerate(parts):
-            part[:, 4] = lag
-        apart.append(overlap(np.concatenate(parts)))
-    print(f"overlap of static voxels: {np.mean(aligned):.3f} with poses, {np.mean(apart):.3f} without")
-    assert np.mean(aligned) > 1.5 * np.mean(apart)
-
-
-@pytest.mark.real_data
 def test_the_real_scene_equals_that_of_the_official_devkit(real_data):
     official = pytest.importorskip("nuscenes.nuscenes", reason="the official devkit is not installed")
     from nuscenes.utils.data_classes import LidarPointCloud

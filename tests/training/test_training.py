@@ -274,24 +274,6 @@ def four_frames() -> Batch:
 
 
 @pytest.mark.slow
-def test_micro_batches_and_samples_without_boxes_do_not_change_the_box_losses():
-    detector, batch = toy_detector(), four_frames()
-    params = detector.init(jax.random.key(0))["params"]
-    copies = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 4, axis=0), batch)
-    one = dataclasses.replace(copies, box_valid=copies.box_valid & np.array([[True], [False], [False], [False]]))
-    metrics = []
-    for accumulate in (1, 2):
-        config = with_optimizer(batch_size=4, accumulate=accumulate)
-        gradient = jax.jit(make_gradient(toy_detector(config)))
-        metrics += [gradient(params, {}, samples)[2] for samples in (one, copies)]
-    assert [int(each["positives"]) for each in metrics] == [int(metrics[0]["positives"]) * n for n in (1, 4, 1, 4)]
-    for part in ("l1", "iou", "iou_prediction"):
-        losses = [each[f"loss/{part}"] for each in metrics]
-        assert losses[0] > 0
-        np.testing.assert_allclose(losses, [losses[0]] * 4, rtol=1e-4)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("axes", "micro_batches"), [("lidar", (1, 2)), ("ray", (1,))])
 def test_each_loss_is_divided_by_the_number_of_its_locations(axes, micro_batches):
     """Compares with NumPy, with and without micro-batches: cross-entropy over positives, L1 over candidates."""
