@@ -60,8 +60,8 @@ def crop_points(
     half = jnp.minimum(boxes[:, 3:6], limit_m) / 2 + margin_m
     frame = jnp.cos(boxes[:, 6]), jnp.sin(boxes[:, 6])
 
-    # Bit b of word w tells whether row 32 w + b is inside: a bit per point is faster to count than a byte. The last
-    # axis is the words', so that XLA tests and packs many of them at once.
+    # Bit b of word w tells whether row 32 w + b is inside: a bit per point is faster to count than a byte. Words
+    # are the last axis, so that XLA tests and packs many of them at once.
     position = jnp.where(usable[:, None], points[:, :3], _FAR_M).reshape(num_words, _WORD, 3)
     bit_major = [position[..., i].T for i in range(3)]
     local = _to_frame(bit_major, boxes[:, None, None], [f[:, None, None] for f in frame])
