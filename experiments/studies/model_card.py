@@ -90,7 +90,7 @@ def _training(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     yield "\n## Training data\n"
     yield f"Only simulated streets: {frames:,} frames in {chain}.{only}"
     yield f"`experiments/results/{name}.json` has the seeds, steps, scores and machines, and the weights that were"
-    yield "averaged. If the preset had become larger, `experiments.studies.widened_weights` enlarged them first."
+    yield "averaged. If the preset had become larger, they were enlarged first."
     if share := next((leg["logit_adjustment"] for leg in reversed(legs) if "logit_adjustment" in leg), None):
         yield "\nnuScenes and the training streets have different class frequencies. So the export added"
         yield f"{share} log(frequency in nuScenes / frequency in training) to each class logit (logit adjustment)."
