@@ -1,10 +1,9 @@
-"""The study of equivalence with a network and images that take seconds; its processes import this module.
-
-Most of the time of a step in float64 is that of convolutions, which XLA computes slowly on CPUs.
-"""
+"""The study of equivalence with the linear network; its processes import this module."""
 
 import dataclasses
 
+import linear_network
+import optax
 import tiny_run
 
 from experiments.studies import device_equivalence as study
@@ -14,6 +13,13 @@ SENSOR = dataclasses.replace(study.SENSOR, num_columns=32)
 _work = study.work
 
 
+def make_optimizer(*_):
+    """Not AdamW, which turns rounding of a gradient near zero into a full-size step."""
+    sgd = optax.inject_hyperparams(lambda learning_rate, b1: optax.sgd(learning_rate, b1))(0.01, 0.9)
+    return optax.chain(optax.identity(), sgd)
+
+
 def work(*args) -> None:
-    study.CONFIG, study.SENSOR = CONFIG, SENSOR
+    linear_network.use()
+    study.CONFIG, study.SENSOR, study.make_optimizer = CONFIG, SENSOR, make_optimizer
     _work(*args)

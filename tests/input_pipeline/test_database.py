@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import oracles
 import pytest
-from commands import child_environment
+from commands import child_environment, contents
 from refusal import refused
 from toy_frames import ListedFrames, SceneFrames, ToyFrames, toy_frame
 
@@ -32,10 +32,6 @@ SCENES = (("scene-b", (0, 1, 2)), ("scene-a", (3,)), ("scene-c", (6, 4)))
 
 def build(folder, frames=None, *, scenes=SCENES, source="f", **options):
     return prepare_database(SceneFrames(frames or ToyFrames(), scenes, source), folder, **options)
-
-
-def contents(folder):
-    return {p.name: p.read_bytes() for p in sorted(Path(folder).iterdir())}
 
 
 @pytest.fixture(scope="module")
